@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from recon import Measurement, reconstruct
-from recon.base import fft as project_fft
 from recon.base.metrics import psnr
+from recon.base.threads import set_threads
 from recon.evaluation.content import dense_picture
 from recon.evaluation.lenslets import build_camera
 
@@ -84,7 +84,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=3)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    project_fft.set_threads(1)
+    set_threads(1)
     print(f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, {os.cpu_count()} cores, {platform.machine()}")
     curves: dict[str, list[float]] = {}
     for photons in PHOTONS:

@@ -27,7 +27,7 @@ from scipy.optimize import linear_sum_assignment
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from recon.base import fft as project_fft
+from recon.base.threads import set_threads
 from recon.evaluation.lenslets import LensletCamera, build_camera
 from recon.streams.activity import aligned, baseline, change, fading, find_regions, motion
 from recon.streams.video import BLOCK, VideoSolver, stream_problem
@@ -324,7 +324,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("activity-benchmark"))
     options = parser.parse_args()
     options.out.mkdir(exist_ok=True)
-    project_fft.set_threads(1)
+    set_threads(1)
     print(f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, {os.cpu_count()} cores, {platform.machine()}")
     default = neurons(options.frames, **DEFAULT)
     print("default", default[0], flush=True)

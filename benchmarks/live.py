@@ -32,8 +32,8 @@ from drivers.errors import DeviceTimeoutError
 from drivers.frame import FrameMetadata
 from instrument.live.live import LiveView
 from recon import reconstruct
-from recon.base import fft as project_fft
 from recon.base.metrics import psnr
+from recon.base.threads import set_threads
 from recon.streams.live import LiveReconstructor
 
 PHOTONS = 1e4
@@ -165,7 +165,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="also as CSV")
     options = parser.parse_args()
     if options.threads:
-        project_fft.set_threads(options.threads)
+        set_threads(options.threads)
     when, load = datetime.now(UTC), os.getloadavg()[0]
     print(f"{when:%Y-%m-%d %H:%M} UTC, {os.cpu_count()} cores, {platform.machine()}, load {load:.1f}")
     rows = []

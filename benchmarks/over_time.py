@@ -20,7 +20,7 @@ import numpy as np
 from activity import SHAPE, expose, points
 from scipy import ndimage
 
-from recon.base import fft as project_fft
+from recon.base.threads import set_threads
 from recon.evaluation.lenslets import build_camera
 from recon.streams.joint import OVER_TIME, solve_together
 from recon.streams.video import stream_problem
@@ -92,7 +92,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    project_fft.set_threads(1)
+    set_threads(1)
     print(f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, {os.cpu_count()} cores, {platform.machine()}")
     found: dict[tuple[float, str], list[float]] = {}
     for photons in PHOTONS:

@@ -35,11 +35,11 @@ from scipy import fft
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.options import InputOptions, VideoOptions
 from instrument.reconstruction.video import VideoRequest, prepare_video
 from instrument.reconstruction.video_work import cluster, in_process, on_cluster
-from recon.base import fft as project_fft
 from recon.base.metrics import psnr
+from recon.base.threads import set_threads
 from recon.streams.video import COLD_ITERATIONS, VideoSolver, stream_problem
 from tests.mocks.recordings import write_recording
 
@@ -144,7 +144,7 @@ def overhead(psf, frames) -> dict[str, float]:
                     out=out,
                     psf=folder / "psf.npy",
                     inputs=InputOptions(dark=0.0, binning=1),
-                    block=8,
+                    video=VideoOptions(block=8),
                 )
                 job = prepare_video(request).job
                 blocks = list(range(len(job.blocks)))
@@ -173,7 +173,7 @@ def offline(psf, frames) -> float:
                 out=out,
                 psf=folder / "psf.npy",
                 inputs=InputOptions(dark=0.0, binning=1),
-                block=len(frames) // 2,
+                video=VideoOptions(block=len(frames) // 2),
             )
             job = prepare_video(request).job
             began_s = time.perf_counter()
@@ -191,7 +191,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     if options.only != "offline":
-        project_fft.set_threads(1)
+        set_threads(1)
     when, load = datetime.now(UTC), os.getloadavg()[0]
     print(f"{when:%Y-%m-%d %H:%M} UTC, {os.cpu_count()} cores, {platform.machine()}, load {load:.1f}")
     if options.only == "offline":

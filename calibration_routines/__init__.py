@@ -16,7 +16,7 @@ _HOMES = {
     "procedure": "CalibrationError Listener",
     "psf.exposure": "AutoExposure ExposureOutcome auto_expose expose_scene expose_source",
     "psf.sampling": "GridSweep Sampling axial_planes grid_sweep lateral_spacing",
-    "psf.sweep": "SweepCalibration calibrate_sweep finish_sweep watch_resumed",
+    "psf.sweep": "SweepCalibration calibrate_sweep finish_sweep watch_sweep",
     "psf.sweep_options": "AxialSweep LateralSweep PointSweep VolumeSweep",
     "psf.sweep_plan": "SweepExposures check_sweep expose_sweep sweep_plan",
     "psf.sweep_procedure": "SweepProcedure",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -36,8 +36,9 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
-from instrument.runs.finish import CtrlC
+from instrument.runs.finish import ctrl_c_remembered
 from instrument.runs.runner import RunStatus
+from instrument.runs.writer import free_name
 from recon import Reconstruction, reconstruct
 from recon.base.declare import option
 from recon.optics.scene import Scene, picture
@@ -158,24 +159,16 @@ def read_picture() -> npt.NDArray[np.float32]:
 def new_folder(parent: Path) -> Path:
     """Make a folder ``demo-DATE-TIME`` in ``parent``, which is made as well where missing.
 
-    Raises
-    ------
-    FileError
-        When it cannot be made.
+    Raises FileError when it cannot be made.
     """
-    name = f"demo-{datetime.now(UTC):%Y-%m-%d-%H%M%S}"
-    for suffix in ("", *(f"-{n}" for n in range(2, 100))):
-        folder = parent / f"{name}{suffix}"
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            if not parent.is_dir():
-                raise FileError(parent, "is no folder.", "Name a folder with --out.") from None
-            continue
-        except OSError as error:
-            raise FileError(folder, f"cannot be made: {error.strerror or error}.") from error
-        return folder
-    raise FileError(parent / name, "and 98 more of the same second exist already.")
+    if parent.exists() and not parent.is_dir():
+        raise FileError(parent, "is no folder.", "Name a folder with --out.")
+    folder = free_name(parent, f"demo-{datetime.now(UTC):%Y-%m-%d-%H%M%S}")
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise FileError(folder, f"cannot be made: {error.strerror or error}.") from error
+    return folder
 
 
 class Journal:
@@ -195,7 +188,7 @@ class Journal:
     def note(self, **entries: Any) -> None:
         """Add entries (JSON-compatible) and write the file."""
         self._record |= entries
-        self._write()
+        write_text(self.path, json.dumps(self._record | {"seconds": self.seconds}, indent=1) + "\n")
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -207,15 +200,12 @@ class Journal:
         finally:
             self.seconds[name] = round(time.perf_counter() - started, 2)
 
-    def _write(self) -> None:
-        write_text(self.path, json.dumps(self._record | {"seconds": self.seconds}, indent=1) + "\n")
-
 
 class _Stages(Listener):
     """Times the demo's stages, and hands on how each goes; Ctrl-C ends it at any of these moments."""
 
-    def __init__(self, journal: Journal, listener: Listener, ctrl_c: CtrlC) -> None:
-        self._journal, self._listener, self._ctrl_c = journal, listener, ctrl_c
+    def __init__(self, journal: Journal, listener: Listener, check: Callable[[], None]) -> None:
+        self._journal, self._listener, self._check = journal, listener, check
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -223,10 +213,10 @@ class _Stages(Listener):
         with self._journal.stage(name):
             self._listener.step(name)
             yield
-            self._ctrl_c.check()
+            self._check()
 
     def share(self, done: float, total: float, *, at_most: bool = False) -> None:
-        self._ctrl_c.check()
+        self._check()
         self._listener.share(done, total, at_most=at_most)
 
     def frame(self, status: RunStatus) -> None:
@@ -245,28 +235,18 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """What the demo made and how good it is.
-
-    Attributes
-    ----------
-    folder : Path
-    measured : Measured
-    reconstruction : Reconstruction
-    comparison : Comparison
-        Of the reconstruction with the ground truth, inside the picture on the screen.
-    seconds : dict
-        Seconds of each stage.
-    files : dict
-        What it is, and where.
-    """
+    """What the demo made and how good it is."""
 
     folder: Path
     settings: DemoSettings
     measured: Measured
     reconstruction: Reconstruction
     comparison: Comparison
+    """Of the reconstruction with the ground truth, inside the picture on the screen."""
     seconds: dict[str, float]
+    """Seconds of each stage."""
     files: dict[str, Path]
+    """What it is, and where."""
 
 
 def run_demo(
@@ -277,20 +257,16 @@ def run_demo(
     Its ``demo.json`` always says how far it came: ``state`` is ``running``, ``completed``, ``failed`` or
     ``aborted``. On every way out the light is off and the stage stands.
 
-    Raises
-    ------
-    BenchError, DeviceError, OSError
-        What made it fail.
-    KeyboardInterrupt, SystemExit
-        After the bench was made safe and the run marked as aborted.
+    Raises what made it fail (BenchError, DeviceError, OSError); KeyboardInterrupt or SystemExit after the
+    bench was made safe and the run marked as aborted.
     """
     settings = settings or DemoSettings()
     place = new_folder(Path(folder))
     journal = Journal(place)
     try:
         journal.note(state="running")
-        with CtrlC() as ctrl_c:
-            return _run(place, listener or Listener(), settings, journal, ctrl_c)
+        with ctrl_c_remembered() as check:
+            return _run(place, listener or Listener(), settings, journal, check)
     except BaseException as error:
         aborted = isinstance(error, KeyboardInterrupt | SystemExit)
         journal.note(state="aborted" if aborted else "failed", error=str(error) or type(error).__name__)
@@ -299,9 +275,9 @@ def run_demo(
 
 
 def _run(
-    place: Path, listener: Listener, settings: DemoSettings, journal: Journal, ctrl_c: CtrlC
+    place: Path, listener: Listener, settings: DemoSettings, journal: Journal, check: Callable[[], None]
 ) -> DemoResult:
-    stages = _Stages(journal, listener, ctrl_c)
+    stages = _Stages(journal, listener, check)
     stage = stages.stage
     write_text(place / "bench.toml", settings.bench_toml())
     with stage("open the bench"):

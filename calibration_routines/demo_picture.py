@@ -41,19 +41,13 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """How close a picture is to the truth, inside a field.
-
-    Attributes
-    ----------
-    psnr_db, ssim : float
-        With the truth's maximum as peak.
-    scale : float
-        The one factor by which the picture was multiplied: least squares, no offset.
-    """
+    """How close a picture is to the truth, inside a field."""
 
     psnr_db: float
     ssim: float
+    """With the truth's maximum as peak."""
     scale: float
+    """The one factor by which the picture was multiplied: least squares, no offset."""
 
 
 def scene_field(

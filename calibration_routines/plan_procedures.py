@@ -77,7 +77,11 @@ class ResumeProcedure(Procedure):
             listener.step(found.label)
             control.follow(runner)
             found = runner.execute()
-        return finished(found, bench, control, listener) or run_outcome(found)
+        frames = run_outcome(found)
+        if found.condition is RunCondition.COMPLETED and lacks_result(self.run):
+            for words in frames.verdict:
+                listener.said(words)
+        return finished(found, bench, control, listener) or frames
 
 
 def routine_of(run: Path) -> Routine | None:
@@ -94,10 +98,7 @@ def lacks_result(run: Path) -> bool:
 def finished(run: Run, bench: Bench | None, control: RunControl, listener: Listener) -> Outcome | None:
     """Make the result of a routine's run that lacks it; None for every other run.
 
-    Raises
-    ------
-    RunEndedError
-        When the run is not complete.
+    Raises RunEndedError when the run is not complete.
     """
     routine = routine_of(run.path)
     if routine is None or routine.finish is None or not lacks_result(run.path):

@@ -44,12 +44,7 @@ class CalibrationError(BenchError):
 class RunEndedError(CalibrationError):
     """The run behind a calibration was ended before its last frame; its frames are kept.
 
-    Parameters
-    ----------
-    what : str
-        Begins the sentence: ``"The sweep"``.
-    remedy : str
-        What to do about it.
+    ``what`` begins the sentence ("The sweep"), ``remedy`` says what to do about it.
     """
 
     def __init__(self, what: str, run: Run, remedy: str = "") -> None:
@@ -110,60 +105,41 @@ class Checked:
 # What a procedure says ---------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """What a procedure will do, as far as that is known before it starts.
-
-    Attributes
-    ----------
-    reasons : tuple of str
-        What its numbers come from, in words.
-    plan : Plan or None
-        Of its frames, with the camera's present exposure; None where the next frame depends on the last one.
-    cost : PlanEstimate or None
-        Of the plan.
-    free_bytes : int or None
-        On the disk that the runs go to.
-    plan_lines : tuple of str
-        The plan in words where more is to be said than frames and seconds; exposures are only found at the
-        start (:meth:`Listener.planned`).
-    path : tuple of mapping
-        Where the source (``x_um``, ``y_um``, ``z_um``) or the stage goes, in the order of the visits.
-    """
+    """What a procedure will do, as far as that is known before it starts."""
 
     reasons: tuple[str, ...] = ()
+    """What its numbers come from, in words."""
     plan: Plan | None = None
+    """Of its frames, with the camera's present exposure; None where the next frame depends on the last
+    one."""
     cost: PlanEstimate | None = None
+    """Of the plan."""
     free_bytes: int | None = None
+    """On the disk that the runs go to."""
     plan_lines: tuple[str, ...] = ()
+    """The plan in words where more is to be said than frames and seconds; exposures are only found at the
+    start (:meth:`Listener.planned`)."""
     path: tuple[dict[str, float], ...] = ()
+    """Where the source (``x_um``, ``y_um``, ``z_um``) or the stage goes, in the order of the visits."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a procedure leaves.
-
-    Attributes
-    ----------
-    verdict : tuple of str
-        What was measured and how good it is, in sentences.
-    good : bool
-        Whether nothing was found wrong.
-    runs : tuple of Path
-        Folders of its runs.
-    calibration : Path or None
-        What a reconstruction or a hologram is given.
-    files : tuple of Path
-        What else was written: results, pictures.
-    result : object
-        What the routine returned: ``SweepCalibration``, ``AngularResponse``, ``DiffuserSurface``,
-        ``BeadCalibration``, ``SlmCalibration``, ``AlignmentReport`` or ``Run``.
-    """
+    """What a procedure leaves."""
 
     verdict: tuple[str, ...]
+    """What was measured and how good it is, in sentences."""
     good: bool
+    """Whether nothing was found wrong."""
     runs: tuple[Path, ...] = ()
+    """Folders of its runs."""
     calibration: Path | None = None
+    """What a reconstruction or a hologram is given."""
     files: tuple[Path, ...] = ()
+    """What else was written: results, pictures."""
     result: object = None
+    """What the routine returned: ``SweepCalibration``, ``AngularResponse``, ``DiffuserSurface``,
+    ``BeadCalibration``, ``SlmCalibration``, ``AlignmentReport`` or ``Run``."""
 
 
 class Listener:
@@ -211,10 +187,7 @@ class Procedure(ABC):
         folder : Path, optional
             Where runs go; the bench's data folder by default.
 
-        Raises
-        ------
-        SettingsError, PlanError, BenchError
-            When it cannot be done as asked.
+        Raises SettingsError, PlanError, BenchError when it cannot be done as asked.
         """
 
     def carry_out(
@@ -227,12 +200,8 @@ class Procedure(ABC):
     ) -> Outcome:
         """Check it, then do it; the light is off and nothing moves when this returns or raises.
 
-        Raises
-        ------
-        EndedEarlyError, RunEndedError
-            When it was aborted or stopped; what was taken is kept.
-        BenchError, DeviceError
-            When it cannot be done or a device fails.
+        Raises EndedEarlyError, RunEndedError when it was aborted or stopped (what was taken is kept);
+        BenchError, DeviceError when it cannot be done or a device fails.
         """
         self.outlook(bench, folder)
         control = control or RunControl()
@@ -246,20 +215,13 @@ class Procedure(ABC):
 
 @dataclass(frozen=True, slots=True)
 class Purpose(Generic[T]):
-    """What a run's frames are for: a record in its folder, of which its result is made, later too.
-
-    Attributes
-    ----------
-    kind : type
-        Dataclass of the record.
-    file, result : str
-        Names in the run's folder: of the record, and of the result once there is one.
-    format : RecordFormat
-    """
+    """What a run's frames are for: a record in its folder, of which its result is made, later too."""
 
     kind: type[T]
+    """Dataclass of the record."""
     file: str
     result: str
+    """Names in the run's folder: of the record, and of the result once there is one."""
     format: RecordFormat
 
     def is_of(self, run: Path | str) -> bool:
@@ -297,56 +259,38 @@ class Purpose(Generic[T]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Routine:
-    """A row of the registry: what ``calibrate`` and the window offer, from its options to its result.
-
-    Attributes
-    ----------
-    name : str
-        On the command line: ``diffuserbench calibrate NAME``.
-    title : str
-        In the window.
-    help : str
-        What it does, one sentence.
-    options : type
-        Frozen dataclass with declared fields (:mod:`recon.base.declare`); raises SettingsError for what makes
-        no sense together.
-    procedure : callable
-        Makes the procedure of such options: what plans (``outlook``) and runs (``carry_out``).
-    details : str
-        More about it, for the command's help.
-    needs : tuple of str
-        Devices that it needs besides the camera.
-    examples : tuple of str
-        Command lines.
-    start : callable, optional
-        Gives values for a form to begin with, by name, that follow from the bench.
-    purpose : Purpose, optional
-        Of runs that become results later, too.
-    finish : callable, optional
-        Makes the result of such a complete run: takes it, the bench for retakes (or None), control and
-        listener.
-    watch : callable, optional
-        Makes the runner of such a run that goes on look at its frames as from its beginning.
-    file : str
-        Where the command line writes the result when nothing else is said, of options with an ``out``.
-    command : str
-        The command that it is part of.
-    """
+    """A row of the registry: what ``calibrate`` and the window offer, from its options to its result."""
 
     name: str
+    """On the command line: ``diffuserbench calibrate NAME``."""
     title: str
+    """In the window."""
     help: str
+    """What it does, one sentence."""
     options: type[Any]
+    """Frozen dataclass with declared fields (:mod:`recon.base.declare`); raises SettingsError for what makes
+    no sense together."""
     procedure: Callable[[Any], Procedure]
+    """Makes the procedure of such options: what plans (``outlook``) and runs (``carry_out``)."""
     details: str = ""
+    """More about it, for the command's help."""
     needs: tuple[str, ...] = ()
+    """Devices that it needs besides the camera."""
     examples: tuple[str, ...] = ()
+    """Command lines."""
     start: Callable[[Bench], Mapping[str, Any]] | None = None
+    """Gives values for a form to begin with, by name, that follow from the bench."""
     purpose: Purpose[Any] | None = None
+    """Of runs that become results later, too."""
     finish: Callable[[Run, Bench | None, RunControl, Listener], Outcome] | None = None
+    """Makes the result of such a complete run: takes it, the bench for retakes (or None), control and
+    listener."""
     watch: Callable[[Bench, Runner, Listener], None] | None = None
+    """Makes the runner of such a run that goes on look at its frames as from its beginning."""
     file: str = ""
+    """Where the command line writes the result when nothing else is said, of options with an ``out``."""
     command: str = "calibrate"
+    """The command that it is part of."""
 
 
 _MODULES = (

@@ -105,6 +105,20 @@ class DisplayBench:
         self.bench.scene_on()
         return (self._snap() - self._dark[1]) / exposure
 
+    @property
+    def full_scale(self) -> int:
+        """The camera's largest count."""
+        return (1 << self.bench.camera.significant_bits) - 1
+
+    def exposure_ms(self, mean_per_ms: float) -> float:
+        """Return the exposure at which the mean, so many counts a millisecond, is a twelfth of full scale."""
+        return self.full_scale / (12 * mean_per_ms)
+
+    def across_px(self, display: Display) -> float:
+        """Return camera pixels across the display's field of view."""
+        pitch_um = self.bench.camera.pixel_pitch_um * self.bench.camera.binning
+        return display.wavelength_nm * display.focal_mm / display.mask_pitch_um / pitch_um
+
     def _snap(self) -> Array:
         self.frames += 1
         frame = np.asarray(self.bench.snap().image, np.float64)
@@ -125,12 +139,7 @@ def bring_mask(bench: Bench, place: Mapping[str, float]) -> None:
 
     An empty place moves nothing.
 
-    Raises
-    ------
-    BenchError
-        When there is a place and no stage.
-    DeviceError
-        When the stage refuses or fails.
+    Raises BenchError when there is a place and no stage; DeviceError when the stage refuses or fails.
     """
     if not place:
         return
@@ -144,23 +153,11 @@ def bring_mask(bench: Bench, place: Mapping[str, float]) -> None:
 def find_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:
     """Blank the SLM, register the camera by the mask's speckle, and learn how bright the mean intensity is.
 
-    Returns
-    -------
-    CameraMap
-    float
-        Counts a millisecond of the mean intensity.
-
-    Raises
-    ------
-    InputError
-        When the speckle is not recognised.
+    Returns that in counts a millisecond. Raises InputError when the speckle is not recognised.
     """
-    camera = io.bench.camera
-    pitch_um = camera.pixel_pitch_um * camera.binning
-    across = display.wavelength_nm * display.focal_mm / display.mask_pitch_um / pitch_um
     io.show(np.ones(display.slm_shape, complex))
-    frame = io.photograph(camera.exposure_ms)
-    found = register_camera(frame, display, across)
+    frame = io.photograph(io.bench.camera.exposure_ms)
+    found = register_camera(frame, display, io.across_px(display))
     return found, _inner_mean(frame, found)
 
 
@@ -172,8 +169,7 @@ def random_brightness(io: DisplayBench, display: Display, camera: CameraMap, mea
     """
     phases = np.random.default_rng(0).uniform(0, 2 * np.pi, display.slm_shape)
     io.show(np.exp(1j * phases))
-    full = (1 << io.bench.camera.significant_bits) - 1
-    return _inner_mean(io.photograph(full / (12 * mean_per_ms)), camera)
+    return _inner_mean(io.photograph(io.exposure_ms(mean_per_ms)), camera)
 
 
 def _inner_mean(frame: Array, camera: CameraMap) -> float:
@@ -204,28 +200,20 @@ def writable(bench: Bench, folder: Path | None, out: Path | None, label: str) ->
 
 @dataclass(frozen=True, slots=True)
 class SpotLook:
-    """One picture of spots: each a hypothesis, and how bright it turned out.
-
-    Attributes
-    ----------
-    frame : ndarray, float64, (height, width)
-        Camera counts a millisecond, background subtracted.
-    rows, columns : ndarray, float64, (n,)
-        Where the spots are looked for, camera pixels.
-    spots : tuple of Spot
-        Places in the field of view, and the poses they were computed for.
-    brightness : ndarray, float64, (n,)
-        In units of an ideal spot; for sections' spots all of their light, in arbitrary units.
-    of_whole_slm : bool
-        Whether each spot is made by the whole SLM, not by a section of it.
-    """
+    """One picture of spots: each a hypothesis, and how bright it turned out."""
 
     frame: Array
+    """Float64, (height, width): camera counts a millisecond, background subtracted."""
     rows: Array
     columns: Array
+    """Float64, (n,): where the spots are looked for, camera pixels."""
     spots: tuple[Spot, ...]
+    """Places in the field of view, and the poses they were computed for."""
     brightness: Array
+    """Float64, (n,): in units of an ideal spot; for sections' spots all of their light, in arbitrary
+    units."""
     of_whole_slm: bool
+    """Whether each spot is made by the whole SLM, not by a section of it."""
 
 
 class SpotCamera:
@@ -260,19 +248,14 @@ class SpotCamera:
         self._on_look = on_look
         self._seed = 0
         self._brightness_known = False
-        camera = io.bench.camera
-        pitch_um = camera.pixel_pitch_um * camera.binning
-        self._across = display.wavelength_nm * display.focal_mm / display.mask_pitch_um / pitch_um
+        self._across = io.across_px(display)
 
     def register(self) -> None:
         """Find the camera by the mask's speckle; needed before the first measurement and after a rotation.
 
         The first time a frame of random phases tells how bright the mean intensity is.
 
-        Raises
-        ------
-        InputError
-            When the speckle is not recognised.
+        Raises InputError when the speckle is not recognised.
         """
         self._before_frame()
         self.camera, blank_per_ms = find_camera(self.io, self.display)
@@ -370,9 +353,8 @@ class SpotCamera:
         self._before_frame()
         self.io.show(slm)
         # An ideal spot's brightest pixel would reach two thirds of full scale.
-        full = (1 << self.io.bench.camera.significant_bits) - 1
         peak = ideal * self._spot_area() * self._captured((0, 0), lobes)
-        frame = self.io.photograph(0.66 * full / (max(peak, 30.0) * self.mean_per_ms))
+        frame = self.io.photograph(0.66 * self.io.full_scale / (max(peak, 30.0) * self.mean_per_ms))
         y = np.array([spot.row / shape[0] for spot in spots])
         x = np.array([spot.column / shape[1] for spot in spots])
         rows, columns = self.camera.pixels(y, x)

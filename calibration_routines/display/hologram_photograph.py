@@ -31,62 +31,41 @@ _ITERATIONS = 15  # between two photographs
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """A photographed hologram.
-
-    Attributes
-    ----------
-    seen : ndarray, float64, (height, width)
-        Low-passed picture over the field of view, the axis in the middle, in units of the target's white.
-    wanted : ndarray, float64
-        The target on the same grid, low-passed.
-    scores : Scores
-    saturated_fraction : float
-        Of the photograph's pixels.
-    """
+    """A photographed hologram."""
 
     seen: npt.NDArray[np.float64]
+    """(height, width): low-passed picture over the field of view, the axis in the middle, in units
+    of the target's white."""
     wanted: npt.NDArray[np.float64]
+    """The target on the same grid, low-passed."""
     scores: Scores
     saturated_fraction: float
+    """Of the photograph's pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
-    """The best hologram found.
-
-    Attributes
-    ----------
-    slm : ndarray, complex64, (1, height, width)
-    first, best : Capture
-        Of the hologram given and of the best one; the same where nothing was gained.
-    psnr_db : tuple of float
-        Captured, round by round; the first is the hologram given.
-    """
+    """The best hologram found."""
 
     slm: npt.NDArray[np.complex64]
+    """(1, height, width)."""
     first: Capture
     best: Capture
+    """Of the hologram given and of the best one; the same where nothing was gained."""
     psnr_db: tuple[float, ...]
+    """Captured, round by round; the first is the hologram given."""
 
 
 @dataclass(frozen=True, slots=True)
 class HologramCamera:
-    """The bench's camera on a display whose picture is known where it lies on the sensor.
-
-    Attributes
-    ----------
-    io : DisplayBench
-    display : Display
-        With the mask's displacement where it is known.
-    camera : CameraMap
-    mean_per_ms : float
-        Counts a millisecond of the mean intensity, from the registration.
-    """
+    """The bench's camera on a display whose picture is known where it lies on the sensor."""
 
     io: DisplayBench
     display: Display
+    """With the mask's displacement where it is known."""
     camera: CameraMap
     mean_per_ms: float
+    """Counts a millisecond of the mean intensity, from the registration."""
 
     @classmethod
     def registered(cls, io: DisplayBench, display: Display) -> HologramCamera:
@@ -96,22 +75,17 @@ class HologramCamera:
     def capture(self, fields: Sequence[Array], target: Target, *, average: int = 1) -> Capture:
         """Show SLM fields one after the other, add their photographs, and compare with the target.
 
-        Parameters
-        ----------
-        fields : sequence of ndarray, complex, (height, width)
-            Time-multiplexed frames.
-        average : int
-            Photographs of each frame.
+        The fields, complex (height, width), are time-multiplexed frames; each is photographed ``average``
+        times.
         """
         io, display = self.io, self.display
-        full = (1 << io.bench.camera.significant_bits) - 1
-        exposure_ms = full / (12 * self.mean_per_ms)
+        exposure_ms = io.exposure_ms(self.mean_per_ms)
         total = np.zeros(io.bench.camera.image_shape)
         for field in fields:
             io.show(field)
             for _ in range(average):
                 total += io.photograph(exposure_ms)
-        ceiling = 0.98 * full / io.bench.camera.exposure_ms * len(fields) * average
+        ceiling = 0.98 * io.full_scale / io.bench.camera.exposure_ms * len(fields) * average
         shape = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
         picture = np.fft.ifftshift(self.camera.resample(total, shape))
         seen = np.fft.fftshift(low_pass(picture, display.slm_shape))
@@ -176,24 +150,15 @@ def wanted_picture(target: Target, display: Display) -> tuple[npt.NDArray[np.flo
 
 @dataclass(frozen=True, slots=True)
 class Photographed:
-    """What the camera saw of a hologram.
-
-    Attributes
-    ----------
-    capture : Capture
-        Of the pattern given, or of the best one where it was refined.
-    refined : Refinement or None
-    camera_residual_px : float
-        Of the camera's registration.
-    background_estimated : bool
-        Rather than measured with the laser off.
-    simulated : bool
-    """
+    """What the camera saw of a hologram."""
 
     capture: Capture
+    """Of the pattern given, or of the best one where it was refined."""
     refined: Refinement | None
     camera_residual_px: float
+    """Of the camera's registration."""
     background_estimated: bool
+    """Rather than measured with the laser off."""
     simulated: bool
 
 
@@ -227,22 +192,11 @@ def photograph_hologram(
 ) -> Photographed:
     """Register the camera by the mask's speckle, photograph a hologram, and compare it with its target.
 
-    Parameters
-    ----------
-    fields : sequence of ndarray, complex, (height, width)
-        Time-multiplexed frames; one where it is to be refined.
-    display : Display
-        With the mask's displacement where it is known.
-    options : CaptureOptions, optional
-    progress : callable, optional
-        ``progress(round, psnr_db)``.
+    ``fields``, complex (height, width), are time-multiplexed frames; one where it is to be refined. The
+    display has the mask's displacement where it is known; ``progress(round, psnr_db)`` is called when
+    refining.
 
-    Raises
-    ------
-    InputError
-        When the speckle is not recognised.
-    DeviceError
-        When a device fails.
+    Raises InputError when the speckle is not recognised; DeviceError when a device fails.
     """
     options = options or CaptureOptions()
     seen = HologramCamera.registered(io, display)

@@ -60,53 +60,36 @@ Array = npt.NDArray[Any]
 
 @dataclass(slots=True)
 class AlignmentReport:
-    """What was found.
-
-    Attributes
-    ----------
-    pose : Pose
-        What is left, with the stage where it ended; holograms are to be computed with it.
-    error : ndarray, float64, (8,)
-        Standard uncertainty of each parameter.
-    rest : ndarray, float64, (rows, columns, 2)
-        Smooth displacement beyond the pose's, on the nodes of :meth:`Pose.displacement`, mask pixels.
-    efficiency : float
-        Brightness of spots at the pose over the model's ideal (the display's DC term taken off).
-    psnr_lost_db : float
-        What a hologram computed with the result is expected to lose to what remains unknown or cannot be
-        modelled: uncertainties, distance, tilts.
-    repeatability_db : float
-        What a hologram would lose to the difference between two visits of the same place; nan where the
-        stage was not moved.
-    found_at : Pose
-        What was found before the stage moved.
-    directions : dict of axis name to 1 or -1
-        As tested; -1 goes against its name.
-    frames : int
-    mask_shape : (int, int)
-        Of the mask, in its pixels.
-    camera : CameraMap
-    brightness_per_ms : float
-        Camera counts a millisecond for the mean intensity.
-    log : list of str
-    efficiencies : list of (int, float)
-        Frames taken and efficiency after each step.
-    """
+    """What was found."""
 
     pose: Pose
+    """What is left, with the stage where it ended; holograms are to be computed with it."""
     error: npt.NDArray[np.float64]
+    """(8,): standard uncertainty of each parameter."""
     rest: npt.NDArray[np.float64]
+    """(rows, columns, 2): smooth displacement beyond the pose's, on the nodes of
+    :meth:`Pose.displacement`, mask pixels."""
     efficiency: float
+    """Brightness of spots at the pose over the model's ideal (the display's DC term taken off)."""
     psnr_lost_db: float
+    """What a hologram computed with the result is expected to lose to what remains unknown or cannot be
+    modelled: uncertainties, distance, tilts."""
     repeatability_db: float
+    """What a hologram would lose to the difference between two visits of the same place; nan where the stage
+    was not moved."""
     found_at: Pose
+    """What was found before the stage moved."""
     directions: dict[str, int]
+    """As tested; -1 goes against its name."""
     frames: int
     mask_shape: tuple[int, int]
+    """Of the mask, in its pixels."""
     camera: CameraMap
     brightness_per_ms: float
+    """Camera counts a millisecond for the mean intensity."""
     log: list[str] = field(default_factory=list)
     efficiencies: list[tuple[int, float]] = field(default_factory=list)
+    """Frames taken and efficiency after each step."""
 
     def displacement(self, mask_shape: tuple[int, int]) -> npt.NDArray[np.float64]:
         """Return the displacement field for :class:`recon.holography.Display`."""
@@ -114,14 +97,10 @@ class AlignmentReport:
 
 
 class MaskAlignment:
-    """Runs the procedure on an open bench.
+    """Runs the procedure on an open bench; what is known of the display's displacement is not used.
 
-    Parameters
-    ----------
-    display : Display
-        What is known of the display; its displacement is not used.
-    listener : Listener, optional
-        What is found is said to it, and every picture of spots shown; may raise to end the alignment.
+    What is found is said to the listener, and every picture of spots shown; it may raise to end the
+    alignment.
     """
 
     def __init__(
@@ -141,12 +120,9 @@ class MaskAlignment:
     def run(self) -> AlignmentReport:
         """Align; returns what was found and leaves the stage at the best pose.
 
-        Raises
-        ------
-        AlignmentFailedError
-            When the pose was not found or too many frames would be needed. The stage is back where it was.
-        DeviceError
-            When a device fails or a move is refused; the stage stays where it is.
+        Raises AlignmentFailedError when the pose was not found or too many frames would be needed, with
+        the stage back where it was; DeviceError when a device fails or a move is refused, with the stage
+        where that left it.
         """
         stage = self.io.bench.stage
         start = stage.commanded_position() if stage is not None else {}

@@ -97,14 +97,9 @@ class AlignmentSettings(Checked):
 
 
 class AlignmentSession:
-    """One alignment in progress.
+    """One alignment in progress; what is known of the display's displacement is not used.
 
-    Parameters
-    ----------
-    display : Display
-        What is known of the display; its displacement is not used.
-    listener : Listener
-        What is found is said to it, and every picture of spots shown.
+    What is found is said to the listener, and every picture of spots shown to it.
     """
 
     def __init__(
@@ -156,20 +151,13 @@ class AlignmentSession:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A pose as measured.
-
-    Attributes
-    ----------
-    pose : Pose
-    error : ndarray, float64, (8,)
-        Standard uncertainty of each parameter.
-    efficiency : float
-        Brightness of spots at the pose that was probed last, over the model's ideal.
-    """
+    """A pose as measured."""
 
     pose: Pose
     error: npt.NDArray[np.float64]
+    """(8,): standard uncertainty of each parameter."""
     efficiency: float
+    """Brightness of spots at the pose that was probed last, over the model's ideal."""
 
 
 def refine_pose(
@@ -177,10 +165,7 @@ def refine_pose(
 ) -> Measured:
     """Step to the best pose: ``quick`` steps of one picture each, then one by all pictures together.
 
-    Raises
-    ------
-    AlignmentFailedError
-        When spots stay below ``floor`` of the ideal.
+    Raises AlignmentFailedError when spots stay below ``floor`` of the ideal.
     """
     tilt = session.settings.tilt_mrad
     prior = np.array([np.inf] * 6 + [tilt, tilt])
@@ -204,10 +189,7 @@ def measure_sections(session: AlignmentSession, pose: Pose) -> tuple[SmoothField
 
     One picture with widely spaced hypotheses, one closer, then several about what was found.
 
-    Raises
-    ------
-    InputError
-        When spots of too few sections are seen.
+    Raises InputError when spots of too few sections are seen.
     """
     settings, k = session.settings, session.display.factor
     sections = Sections(session.display.slm_shape, settings.division.shape)

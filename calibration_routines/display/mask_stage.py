@@ -64,16 +64,9 @@ class PlacementCost:
     ) -> float:
         """Return what a hologram computed with a result loses to what remains, on average.
 
-        Depth and tilts are there and not modelled; they and the displacement are off by their uncertainty.
-
-        Parameters
-        ----------
-        deep_error : ndarray, (3,)
-            Uncertainty of depth, pitch and yaw.
-        rest : ndarray, (rows, columns, 2)
-            Displacement beyond the pose's.
-        modes : ndarray, (modes, rows, columns, 2)
-            Errors of the displacement, one standard deviation each.
+        Depth and tilts are there and not modelled; they (by ``deep_error``, (3,): depth, pitch, yaw) and the
+        displacement are off by their uncertainty. ``rest``, (rows, columns, 2), is the displacement beyond
+        the pose's; ``modes``, (modes, rows, columns, 2), are its errors, one standard deviation each.
         """
         hologram = self._compute(pose, rest)
         flat = pose.with_(z_um=0.0, pitch_mrad=0.0, yaw_mrad=0.0)
@@ -110,13 +103,7 @@ that exchanged axes do not pass. Tilts of a few milliradians are not felt by spo
 
 
 class MaskStage:
-    """Moves the mask on an open bench; every place is approached from below on every axis.
-
-    Parameters
-    ----------
-    stage : Stage
-        Homed.
-    """
+    """Moves the mask on an open, homed stage; every place is approached from below on every axis."""
 
     def __init__(self, session: AlignmentSession, stage: Stage) -> None:
         self.session = session
@@ -143,24 +130,11 @@ class MaskStage:
     def test(self, at: Measured, pictures: int = 2) -> tuple[Measured, Pose]:
         """Find out which way the axes go by a small move of all of them, and how well the stage comes back.
 
-        Parameters
-        ----------
-        at : Measured
-            Where the mask is now.
-        pictures : int
-            For each of the measurements after the moves.
+        Takes so many ``pictures`` for each of the measurements after the moves. Returns where the mask is,
+        back at its place, and by how much that differs from before: repeatability of stage and measurement
+        together.
 
-        Returns
-        -------
-        Measured
-            Where the mask is, back at its place.
-        Pose
-            By how much that differs from before: repeatability of stage and measurement together.
-
-        Raises
-        ------
-        AlignmentFailedError
-            When an axis did not do what it was asked for.
+        Raises AlignmentFailedError when an axis did not do what it was asked for.
         """
         session, here = self.session, self.position
         steps = self._test_move(at.pose)

@@ -37,24 +37,15 @@ _FLATNESS_FRAMES = 22
 
 @dataclass(frozen=True, slots=True)
 class SlmCalibration:
-    """What was measured.
-
-    Attributes
-    ----------
-    correction : SlmCorrection
-    levels : ndarray, int, (n,)
-        Grey levels measured.
-    phases_rad : ndarray, float64, (n,)
-        Their phases.
-    flatness_rms_rad : float or None
-        Of the flatness error found; None when it was not measured.
-    frames : int
-    """
+    """What was measured."""
 
     correction: SlmCorrection
     levels: npt.NDArray[np.int64]
+    """(n,): grey levels measured."""
     phases_rad: npt.NDArray[np.float64]
+    """(n,): their phases."""
     flatness_rms_rad: float | None
+    """Of the flatness error found; None when it was not measured."""
     frames: int
 
 
@@ -63,10 +54,7 @@ def measure_look_up_table(io: DisplayBench, *, n_levels: int = 33, seed: int = 0
 
     Needs no alignment and no model: see :func:`recon.holography.slm_response.phases_from_frames`.
 
-    Raises
-    ------
-    InputError
-        When the pictures do not change as interference does.
+    Raises InputError when the pictures do not change as interference does.
     """
     levels = np.unique(np.linspace(0, 255, n_levels).round().astype(int))
     height, width = io.slm.shape
@@ -108,10 +96,7 @@ def measure_flatness(
     pictures : int
         In the last of four steps.
 
-    Raises
-    ------
-    BenchError
-        When the spots are too weak: the mask is not aligned.
+    Raises BenchError when the spots are too weak: the mask is not aligned.
     """
     io.correction = table.correction
     eye = SpotCamera(io, display)
@@ -147,11 +132,10 @@ def _exposure_ms(io: DisplayBench) -> float:
     camera = io.bench.camera
     io.show_levels(np.zeros(io.slm.shape, np.uint8))
     first = io.photograph(camera.exposure_ms)
-    full = (1 << camera.significant_bits) - 1
     lit = float(np.mean(first[first > np.median(first) / 4]))
     if lit <= 0:
         raise BenchError(f"{camera.name}: it is dark. Check that the laser shines and the exposure.")
-    return full / (12 * lit)
+    return io.exposure_ms(lit)
 
 
 # Procedure -------------------------------------------------------------------------------------------

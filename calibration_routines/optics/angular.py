@@ -37,7 +37,7 @@ from calibration_routines.procedure import (
     outlook_of,
 )
 from calibration_routines.psf.analysis import DarkModel, dark_model, drift_of, light_of
-from calibration_routines.psf.sampling import Position, source_limits
+from calibration_routines.psf.sampling import Position, known, source_limits
 from calibration_routines.psf.stage_fit import Drift
 from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import PSF, REFERENCE, check_sweep, expose_sweep, sweep_plan
@@ -139,10 +139,7 @@ def farthest_um(bench: Bench, largest_deg: float) -> float:
 
     The farther the source, the narrower the range of angles within the aperture.
 
-    Raises
-    ------
-    BenchError
-        When there is no stage, or even its nearest distance is too far for the angle.
+    Raises BenchError when there is no stage, or even its nearest distance is too far for the angle.
     """
     reach, (low, high) = _reach(bench)
     z_um = min(_REACH_MARGIN * reach / float(np.tan(np.deg2rad(largest_deg))), high)
@@ -157,12 +154,8 @@ def farthest_um(bench: Bench, largest_deg: float) -> float:
 def check_angular(bench: Bench, sweep: AngularSweep, folder: Path | None = None) -> Plan:
     """Refuse what is out of the stage's reach or does not fit the disk, before anything moves; the plan.
 
-    Raises
-    ------
-    BenchError
-        When the stage does not reach so far; says which angle it reaches from there.
-    PlanError
-        When something else of the plan cannot be done.
+    Raises BenchError when the stage does not reach so far (which angle it reaches is said); PlanError when
+    something else of the plan cannot be done.
     """
     reach, (low, high) = _reach(bench)
     z_um = sweep.distance_um
@@ -218,15 +211,12 @@ ANGULAR = Purpose(
 def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: Listener) -> Outcome:
     """Compute the response from a complete run, and save it with its picture in its folder.
 
-    Raises
-    ------
-    CalibrationError
-        When too little can be seen.
+    Raises CalibrationError when too little can be seen.
     """
     listener.step("analysing")
     record = ANGULAR.read(run.path)
     points, dark = record.sweep.points(), dark_model(run)
-    pitch_um, distance_mm = _needed(record.geometry)
+    pitch_um, distance_mm = _optics(record.geometry)
     drift = drift_of(run, points, dark)
     response = analyse_angular(
         _images(run, points, dark, drift),
@@ -250,14 +240,9 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     )
 
 
-def _needed(geometry: Geometry) -> tuple[float, float]:
+def _optics(geometry: Geometry) -> list[float]:
     """Return pixel pitch and the diffuser's distance; BenchError where they are not known."""
-    if geometry.diffuser_distance_mm is None or geometry.pixel_pitch_um is None:
-        raise BenchError(
-            "The angles on the sensor follow from diffuser_distance_mm and pixel_pitch_um: give them in "
-            "[geometry] of bench.toml."
-        )
-    return geometry.pixel_pitch_um, geometry.diffuser_distance_mm
+    return known(geometry, "pixel_pitch_um", "diffuser_distance_mm", what="The angles on the sensor follow")
 
 
 # Frames to light ---------------------------------------------------------------------------------------
@@ -292,7 +277,7 @@ class AngularProcedure(Procedure):
         """Hold every place against the stage's limits."""
         sweep = self.sweep.planned(bench)
         points = sweep.points()
-        _needed(bench.geometry)
+        _optics(bench.geometry)
         plan = check_angular(bench, sweep, folder or bench.config.data_folder)
         reason = (
             f"{len(points.points_um)} places at z = {sweep.distance_um / 1e3:.4g} mm, up to "

@@ -41,21 +41,14 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Response along one axis.
-
-    Attributes
-    ----------
-    angles_deg : tuple of float
-        Ascending, of both signs: where the light comes from.
-    response : tuple of float
-        Relative to the axis.
-    seen : tuple of float
-        Part of the pattern that the sensor still showed.
-    """
+    """Response along one axis."""
 
     angles_deg: tuple[float, ...]
+    """Ascending, of both signs: where the light comes from."""
     response: tuple[float, ...]
+    """Relative to the axis."""
     seen: tuple[float, ...]
+    """Part of the pattern that the sensor still showed."""
 
     def cut_offs_deg(self, level: float = CUT_OFF) -> tuple[float | None, float | None]:
         """Return where the response falls to ``level`` on the negative and the positive side; None: nowhere.
@@ -103,20 +96,12 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class AngularResponse:
-    """Response of the sensor to light from the side.
-
-    Attributes
-    ----------
-    along_x, along_y : Curve
-    findings : tuple of str
-        What is to be doubted; empty when all went well.
-    bench : str
-    simulated : bool
-    """
+    """Response of the sensor to light from the side."""
 
     along_x: Curve
     along_y: Curve
     findings: tuple[str, ...] = ()
+    """What is to be doubted; empty when all went well."""
     bench: str = ""
     simulated: bool = False
 
@@ -160,10 +145,7 @@ def save_response(response: AngularResponse, file: Path) -> Path:
 def load_response(file: Path | str) -> AngularResponse:
     """Read what :func:`save_response` wrote.
 
-    Raises
-    ------
-    FileError
-        When the file cannot be read or is something else.
+    Raises FileError when the file cannot be read or is something else.
     """
     data = _RESPONSE.read(Path(file))
     with _RESPONSE.damaged(Path(file)):
@@ -195,10 +177,7 @@ def analyse_angular(
     findings, bench, simulated
         Kept with the result.
 
-    Raises
-    ------
-    CalibrationError
-        When fewer than three angles along x or y could be measured.
+    Raises CalibrationError when fewer than three angles along x or y could be measured.
     """
     axis_image = np.asarray(images[0], np.float64)
     axis_bare = axis_image / _geometric(points_um[0], axis_image.shape, pitch_um, distance_um, emission)
@@ -305,11 +284,9 @@ def response_lines(response: AngularResponse) -> list[str]:
 
 def response_figure(response: AngularResponse) -> Figure:
     """Draw the response along x and y with the cut-off angles."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for name, curve, colour in zip("xy", (response.along_x, response.along_y), _COLOURS, strict=True):
         cut_off = curve.cut_off_deg

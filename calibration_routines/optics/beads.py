@@ -26,6 +26,7 @@ from calibration_routines.procedure import (
 )
 from calibration_routines.psf.analysis import binned
 from calibration_routines.psf.exposure import expose_scene
+from calibration_routines.psf.sampling import known
 from instrument.bench.bench import Bench
 from instrument.files.atomic import require_new
 from instrument.files.calibration_file import save_calibration
@@ -58,6 +59,7 @@ class SlideChanger(Protocol):
 
 
 _SOLVER = BlindSettings()
+_DEFLECTION_DEG = 1.0  # by which the diffuser bends light, for the window
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,17 +179,10 @@ def photograph_slides(
 ) -> Floats:
     """Photograph a slide of beads several times, moved in between by the simulated world or the operator.
 
-    Returns
-    -------
-    ndarray, float32, (n_images, height, width)
-        Dark frame subtracted, colours averaged, binned.
+    Returns float32, (n_images, height, width): dark frame subtracted, colours averaged, binned.
 
-    Raises
-    ------
-    OperatorNeededError
-        When the slide has to be moved by hand and nobody can be asked.
-    CalibrationError
-        When an image saturates.
+    Raises OperatorNeededError when the slide has to be moved by hand and nobody can be asked;
+    CalibrationError when an image saturates.
     """
     changer = next((part for part in bench.shared.values() if isinstance(part, SlideChanger)), None)
     ask = bench.ask
@@ -222,9 +217,8 @@ def photograph_slides(
                 f"Photograph {number + 1} saturates in {taken.saturated_pixels} pixels: dim the light or "
                 "spread the beads, and start again."
             )
-        light = taken.measurement
-        images.append(light if light.ndim == 2 else light.mean(axis=-1))
-    return np.stack(images).astype(np.float32)
+        images.append(taken.measurement)
+    return mean_images(images)
 
 
 def calibrate_beads(
@@ -235,22 +229,12 @@ def calibrate_beads(
     provenance: dict[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> BeadCalibration:
-    """Recover a calibration from bead images.
+    """Recover a calibration from bead images, (n_images, height, width), dark frame subtracted.
 
-    Parameters
-    ----------
-    images : ndarray, float32, (n_images, height, width)
-        Dark frame subtracted.
-    geometry : Geometry
-        Of the images' pixels. ``diffuser_distance_mm`` and ``pixel_pitch_um`` place the PSFs;
-        ``aperture_mm`` gives the window where none is named.
+    ``geometry`` is that of the images' pixels: ``diffuser_distance_mm`` and ``pixel_pitch_um`` place the
+    PSFs, ``aperture_mm`` gives the window where none is named.
 
-    Raises
-    ------
-    BenchError
-        When the geometry lacks what is needed.
-    InputError
-        When the images cannot be solved.
+    Raises BenchError when the geometry lacks what is needed; InputError when the images cannot be solved.
     """
     pitch_um, distance_mm = needed_geometry(geometry)
     window = window_for(slides, geometry, (images.shape[1], images.shape[2]))
@@ -280,65 +264,47 @@ def calibrate_beads(
     return BeadCalibration(calibration, result)
 
 
-def needed_geometry(geometry: Geometry) -> tuple[float, float]:
-    """Return ``pixel_pitch_um`` and ``diffuser_distance_mm``.
-
-    Raises
-    ------
-    BenchError
-        When one is not known.
-    """
-    pitch_um, distance_mm = geometry.pixel_pitch_um, geometry.diffuser_distance_mm
-    if pitch_um is None or distance_mm is None:
-        raise BenchError(
-            "Where the PSFs belong follows from pixel_pitch_um and diffuser_distance_mm: give them in "
-            "[geometry] of bench.toml (or --pixel-um and --distance-mm with files)."
-        )
-    return pitch_um, distance_mm
+def needed_geometry(geometry: Geometry) -> list[float]:
+    """Return ``pixel_pitch_um`` and ``diffuser_distance_mm``; BenchError when one is not known."""
+    return known(
+        geometry,
+        "pixel_pitch_um",
+        "diffuser_distance_mm",
+        what="Where the PSFs belong follows",
+        otherwise=" (or --pixel-um and --distance-mm with files)",
+    )
 
 
 def window_for(slides: BeadSlides, geometry: Geometry, shape: tuple[int, int]) -> tuple[int, int]:
     """Return height and width in which a PSF is looked for, at most the images' ``shape``.
 
-    Raises
-    ------
-    BenchError
-        When it neither is given nor follows from the geometry.
+    Unless given, the aperture's shadow at the slides' depth, and what is bent beyond it. Raises BenchError
+    where the aperture, the distance d or the pitch are not known for that.
     """
-    height, width = slides.window_px.shape if slides.window_px else window_of(geometry, slides.z_um)
-    return min(height, shape[0]), min(width, shape[1])
-
-
-def window_of(geometry: Geometry, z_um: float, deflection_deg: float = 1.0) -> tuple[int, int]:
-    """Return the pixels that hold a PSF: the aperture's shadow at a depth, and what is bent beyond it.
-
-    Raises
-    ------
-    BenchError
-        When the aperture, the distance d or the pitch are not known.
-    """
-    aperture_mm, distance_mm = geometry.aperture_mm, geometry.diffuser_distance_mm
-    pitch_um = geometry.pixel_pitch_um
-    if aperture_mm is None or distance_mm is None or pitch_um is None:
-        raise BenchError(
-            "How large the pattern is follows from aperture_mm, diffuser_distance_mm and pixel_pitch_um: "
-            "give them in [geometry] of bench.toml, or the window with --window."
+    if slides.window_px is not None:
+        window = slides.window_px.shape
+    else:
+        aperture_mm, distance_mm, pitch_um = known(
+            geometry,
+            "aperture_mm",
+            "diffuser_distance_mm",
+            "pixel_pitch_um",
+            what="How large the pattern is follows",
+            otherwise=", or the window with --window",
         )
-    bent_um = 2e3 * distance_mm * np.tan(np.deg2rad(deflection_deg))
-    height, width = (
-        int((1e3 * side * (1 + 1e3 * distance_mm / z_um) + bent_um) / pitch_um) // 2 * 2 + 1
-        for side in aperture_mm
-    )
-    return height, width
+        bent_um = 2e3 * distance_mm * np.tan(np.deg2rad(_DEFLECTION_DEG))
+        height, width = (
+            int((1e3 * side * (1 + 1e3 * distance_mm / slides.z_um) + bent_um) / pitch_um) // 2 * 2 + 1
+            for side in aperture_mm
+        )
+        window = height, width
+    return min(window[0], shape[0]), min(window[1], shape[1])
 
 
 def mean_images(frames: Sequence[npt.NDArray[Any]]) -> Floats:
     """Stack grey or colour images of one shape as float32, colours averaged.
 
-    Raises
-    ------
-    BenchError
-        When shapes differ.
+    Raises BenchError when shapes differ.
     """
     grey = [image if image.ndim == 2 else image.mean(axis=-1) for image in frames]
     shapes = {image.shape for image in grey}
@@ -393,10 +359,7 @@ class BeadProcedure(Procedure):
 def psf_lines(slides: BeadSlides, geometry: Geometry, shape: tuple[int, ...]) -> tuple[str, ...]:
     """Return which PSFs will be recovered from images of a shape, in words.
 
-    Raises
-    ------
-    BenchError
-        When they cannot be, because the optics are not known.
+    Raises BenchError when they cannot be, because the optics are not known.
     """
     needed_geometry(geometry)
     height, width = window_for(slides, geometry, (shape[0], shape[1]))

@@ -87,26 +87,17 @@ class DpcSetup(Checked):
 
 @dataclass(frozen=True)
 class DiffuserSurface:
-    """What was measured.
-
-    Attributes
-    ----------
-    height_um : ndarray, float32, (height, width)
-        Relative to the plane that fits best.
-    phase_rad : ndarray, float32, (height, width)
-    pitch_um : float
-        In the sample.
-    slope_deg, deflection_deg : ndarray, float64, (height, width)
-        Magnitudes of the surface's slope, and of a normal ray's deflection.
-    bench : str
-    simulated : bool
-    """
+    """What was measured."""
 
     height_um: Image
+    """(height, width): relative to the plane that fits best."""
     phase_rad: Image
+    """(height, width)."""
     pitch_um: float
+    """In the sample."""
     slope_deg: npt.NDArray[np.float64]
     deflection_deg: npt.NDArray[np.float64]
+    """(height, width): magnitudes of the surface's slope, and of a normal ray's deflection."""
     bench: str = ""
     simulated: bool = False
 
@@ -134,10 +125,7 @@ def half_width_deg(deflection_deg: npt.NDArray[np.float64]) -> float:
 def dpc_plan(array: LedArray, setup: DpcSetup, exposure_ms: float) -> Plan:
     """Return the plan: dark frames, then the four halves.
 
-    Raises
-    ------
-    BenchError
-        When the array does not reach beyond the objective's aperture.
+    Raises BenchError when the array does not reach beyond the objective's aperture.
     """
     na, rgb = _illumination_na(array, setup), _rgb(setup)
     lights = [Light.of(HalfCircle(side, na).on(array, rgb)) for side in SIDES]
@@ -181,10 +169,7 @@ _RESULT = RecordFormat("diffuserbench dpc", "diffuser's surface")
 def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: Listener) -> Outcome:
     """Compute the surface from a complete run, and save it with its picture in its folder.
 
-    Raises
-    ------
-    CalibrationError
-        When a half saturates.
+    Raises CalibrationError when a half saturates.
     """
     listener.step("analysing")
     record = DPC.read(run.path)
@@ -220,10 +205,7 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
 def dpc_optics(bench: Bench, setup: DpcSetup) -> DpcOptics:
     """Return the optics that the phase is computed with.
 
-    Raises
-    ------
-    BenchError
-        As :func:`dpc_plan`.
+    Raises BenchError as :func:`dpc_plan`.
     """
     array = _array(bench)
     sines = array.led_na
@@ -239,19 +221,15 @@ def dpc_optics(bench: Bench, setup: DpcSetup) -> DpcOptics:
 
 
 def _illumination_na(array: LedArray, setup: DpcSetup) -> float:
-    wanted = OVERFILL * setup.objective_na
     radius = np.hypot(array.led_na[:, 0], array.led_na[:, 1])
-    if not (
-        np.count_nonzero(radius <= setup.objective_na) >= LEAST_LEDS
-        and radius.max() > 1.1 * setup.objective_na
-    ):
+    inside = np.count_nonzero(radius <= setup.objective_na)
+    if inside < LEAST_LEDS or radius.max() <= 1.1 * setup.objective_na:
         raise BenchError(
-            f"The LED array reaches an aperture of {radius.max():.3g} with "
-            f"{np.count_nonzero(radius <= setup.objective_na)} LEDs inside the objective's "
-            f"{setup.objective_na:g}; wanted are {LEAST_LEDS} inside or more, and a tenth beyond. Change "
-            "the array's distance, or the objective."
+            f"The LED array reaches an aperture of {radius.max():.3g} with {inside} LEDs inside the "
+            f"objective's {setup.objective_na:g}; wanted are {LEAST_LEDS} inside or more, and a tenth "
+            "beyond. Change the array's distance, or the objective."
         )
-    return float(min(wanted, radius.max() * (1 + 1e-9)))
+    return float(min(OVERFILL * setup.objective_na, radius.max() * (1 + 1e-9)))
 
 
 def _array(bench: Bench) -> LedArray:
@@ -324,11 +302,9 @@ def surface_line(surface: DiffuserSurface) -> str:
 
 def surface_figure(surface: DiffuserSurface) -> Figure:
     """Draw a diffuser's height, a cut, and histograms of slope and deflection (Kuo 2020, Fig. A.1)."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 6), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.2, 1), height_ratios=(1.6, 1))
     height, width = (n * surface.pitch_um for n in surface.height_um.shape)
     axes = figure.add_subplot(grid[0, 0])
@@ -337,27 +313,19 @@ def surface_figure(surface: DiffuserSurface) -> Figure:
     axes.set(xlabel="x in the sample, µm", ylabel="y, µm", title="Height above the best plane")
     figure.colorbar(shown, ax=axes, label="height, µm")
     axes = figure.add_subplot(grid[1, 0])
-    row = surface.height_um[surface.height_um.shape[0] // 2]
-    axes.plot((np.arange(len(row)) + 0.5) * surface.pitch_um, row, color=_COLOURS[0])
+    cut = surface.height_um[surface.height_um.shape[0] // 2]
+    axes.plot((np.arange(len(cut)) + 0.5) * surface.pitch_um, cut, color=_COLOURS[0])
     axes.set(xlabel="x in the sample, µm", ylabel="height, µm", title="Along the dashed line")
     figures = surface.figures
-    for place, values, colour, title in (
-        (
-            grid[0, 1],
-            surface.slope_deg,
-            _COLOURS[0],
-            f"Slope: mean {figures['slope_mean_deg']:.2f}°",
-        ),
-        (
-            grid[1, 1],
-            surface.deflection_deg,
-            _COLOURS[1],
-            f"Deflection: half width {figures['deflection_hwhm_deg']:.2f}°, largest "
-            f"{figures['deflection_largest_deg']:.2f}°",
-        ),
-    ):
-        axes = figure.add_subplot(place)
-        axes.hist(values.ravel(), bins=80, color=colour, density=True)
+    slope = f"Slope: mean {figures['slope_mean_deg']:.2f}°"
+    deflection = (
+        f"Deflection: half width {figures['deflection_hwhm_deg']:.2f}°, largest "
+        f"{figures['deflection_largest_deg']:.2f}°"
+    )
+    shown_of = {slope: surface.slope_deg, deflection: surface.deflection_deg}
+    for row, (title, values) in enumerate(shown_of.items()):
+        axes = figure.add_subplot(grid[row, 1])
+        axes.hist(values.ravel(), bins=80, color=_COLOURS[row], density=True)
         axes.set(xlabel=f"{title.split(':')[0].lower()}, degrees", ylabel="density, 1/degree", title=title)
     figure.suptitle(f"Diffuser by differential phase contrast, {surface.bench}", fontsize=10)
     return figure

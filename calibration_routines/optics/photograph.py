@@ -45,25 +45,17 @@ PHOTOGRAPH_FILE = "photograph.tif"
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """A measurement of a scene.
-
-    Attributes
-    ----------
-    measurement : ndarray, float32, (height, width) or (height, width, 3)
-        Mean of the frames minus the mean dark frame, counts; hot pixels replaced by their neighbours' median,
-        then binned. Negative values are kept: they balance the noise.
-    raw : ndarray, uint8 or uint16
-        The first frame as the camera gave it.
-    exposure_ms : float
-    saturated_pixels : int
-        Pixels at full scale in any frame, hot ones excepted.
-    run : Run
-    """
+    """A measurement of a scene."""
 
     measurement: npt.NDArray[np.float32]
+    """(height, width) or (height, width, 3): mean of the frames minus the mean dark frame, counts;
+    hot pixels replaced by their neighbours' median, then binned. Negative values are kept: they balance the
+    noise."""
     raw: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+    """Uint8 or uint16: the first frame as the camera gave it."""
     exposure_ms: float
     saturated_pixels: int
+    """Pixels at full scale in any frame, hot ones excepted."""
     run: Run
 
 
@@ -93,8 +85,6 @@ def photograph(
 
     Parameters
     ----------
-    bench : Bench
-        Open.
     exposure_ms : float, optional
         By default what :func:`~calibration_routines.expose_scene` finds.
     folder : path, optional
@@ -105,14 +95,9 @@ def photograph(
         Software binning, on top of the camera's; the same as the calibration's.
     control : RunControl, optional
         To pause, abort or stop the run from another thread.
-    listener : Listener, optional
 
-    Raises
-    ------
-    PlanError, DeviceError, RunError
-        See :func:`instrument.runs.acquire.acquire`.
-    CalibrationError
-        When the run was ended before its last frame.
+    Raises as :func:`instrument.runs.acquire.acquire`, and CalibrationError when the run was ended before its
+    last frame.
     """
     control, listener = control or RunControl(), listener or Listener()
     if exposure_ms is None:
@@ -142,21 +127,15 @@ class FieldResponse:
     """Light received relative to the axis: ``exp(-(a tan_x^2 + b tan_y^2))``.
 
     A Gaussian in the tangents describes obliquity and pixel response to second order in the angle.
-
-    Attributes
-    ----------
-    along_x, along_y : float
-        ``a`` and ``b``.
-    largest_tangent : float
-        Half the measured field; beyond it the response is a guess.
-    misfit : float
-        Largest relative departure of the measurements from the fit.
     """
 
     along_x: float
     along_y: float
+    """``a`` and ``b``."""
     largest_tangent: float
+    """Half the measured field; beyond it the response is a guess."""
     misfit: float
+    """Largest relative departure of the measurements from the fit."""
 
     def __call__(
         self, tan_y: npt.NDArray[np.floating], tan_x: npt.NDArray[np.floating]
@@ -187,19 +166,10 @@ class FieldResponse:
 def fit_field_response(
     sources_um: Sequence[tuple[float, float, float]], light: Sequence[float]
 ) -> FieldResponse:
-    """Fit the response to the total light of sources of equal intensity at one depth.
+    """Fit the response to the total light of sources of equal intensity at one depth, counts above dark.
 
-    Parameters
-    ----------
-    sources_um : sequence of (x, y, z)
-        At least three, off axis in x and in y.
-    light : sequence of float
-        Total counts above dark for each.
-
-    Raises
-    ------
-    CalibrationError
-        When the places do not determine the fit or a source was not seen.
+    They are at least three, off axis in x and in y. Raises CalibrationError when the places do not determine
+    the fit or a source was not seen.
     """
     x, y, z = np.array(sources_um, np.float64).T
     counts = np.array(light, np.float64)
@@ -245,14 +215,9 @@ def measure_field_response(
         Where the run's folder is made; the bench's data folder by default.
     average : int
         Frames a place.
-    listener : Listener, optional
 
-    Raises
-    ------
-    PlanError
-        When a place is out of reach; nothing moved.
-    CalibrationError
-        When the sensor's edge cuts the pattern at one of the places, or the run ended early.
+    Raises PlanError when a place is out of reach (nothing moved); CalibrationError when the sensor's edge
+    cuts the pattern at one of the places, or the run ended early.
     """
     half_y, half_x = half_field_um
     places = (

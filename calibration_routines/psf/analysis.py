@@ -32,30 +32,21 @@ _NOISE_PX = 250_000
 
 @dataclass(frozen=True, slots=True)
 class PlaneFrames:
-    """The raw frames of one point of a sweep.
-
-    Attributes
-    ----------
-    source_um : (x, y, z)
-        Where the stage said the source was.
-    exposure_ms : float
-    frames : ndarray, uint8 or uint16, (n_frames, height, width) or (n_frames, height, width, 3)
-        All of the same light.
-    full_scale : int
-        The largest count the camera can report.
-    off_axis : bool
-        Whether another point of the same depth is nearer to the axis: the sensor's edge may cut the pattern.
-    brightness : float
-        The source's, relative to its brightness at the sweep's first visit to the reference: taken out of the
-        PSF.
-    """
+    """The raw frames of one point of a sweep."""
 
     source_um: tuple[float, float, float]
+    """(x, y, z): where the stage said the source was."""
     exposure_ms: float
     frames: Counts
+    """Uint8 or uint16, (n_frames, height, width) or (n_frames, height, width, 3): all of the same light."""
     full_scale: int
+    """The largest count the camera can report."""
     off_axis: bool = False
+    """Whether another point of the same depth is nearer to the axis: the sensor's edge may cut the
+    pattern."""
     brightness: float = 1.0
+    """The source's, relative to its brightness at the sweep's first visit to the reference: taken out of the
+    PSF."""
 
 
 class DarkModel:
@@ -92,19 +83,14 @@ class DarkModel:
 
 @dataclass(frozen=True, slots=True)
 class SweepAnalysis:
-    """PSFs with what was found out about them, sorted as the planes came.
-
-    Attributes
-    ----------
-    psfs : ndarray, float32, (n_planes, n_channels, height, width)
-        Non-negative, in counts at ``reference_exposure_ms``, so that planes compare in brightness.
-    background : ndarray, float32, (n_channels, height, width)
-        What was subtracted at the reference exposure, mean over the planes: dark frame and stray light.
-    quality : tuple of PsfQuality
-    """
+    """PSFs with what was found out about them, sorted as the planes came."""
 
     psfs: Float
+    """(n_planes, n_channels, height, width): non-negative, in counts at ``reference_exposure_ms``,
+    so that planes compare in brightness."""
     background: Float
+    """(n_channels, height, width): what was subtracted at the reference exposure, mean over the
+    planes: dark frame and stray light."""
     quality: tuple[PsfQuality, ...]
     reference_exposure_ms: float
     stages: tuple[StageFit, ...] = ()
@@ -132,10 +118,7 @@ def analyse_sweep(
     binning : int
         Blocks of ``binning x binning`` pixels are averaged, after hot pixels were replaced.
 
-    Raises
-    ------
-    ValueError
-        When there is no plane, or the frames' shapes differ.
+    Raises ValueError when there is no plane, or the frames' shapes differ.
     """
     psfs: list[Float] = []
     quality: list[PsfQuality] = []
@@ -146,14 +129,7 @@ def analyse_sweep(
         scale = np.float32(reference_ms / plane.exposure_ms / plane.brightness)
         light = block_mean(channels_first(plane_light(plane, dark)), binning)
         cleaned, stray = remove_low_frequencies(light, dct_order)
-        measured = measure_psf(
-            light - stray,
-            z_um=plane.source_um[2],
-            noise=noise_of_mean(plane.frames) / binning,
-            saturated_pixels=saturated_pixels(plane, dark.hot),
-            may_be_clipped=plane.off_axis,
-        )
-        quality.append(replace(measured, x_um=plane.source_um[0], y_um=plane.source_um[1]))
+        quality.append(measure_point(plane, light - stray, dark, binning))
         psfs.append(cleaned * scale)
         removed = channels_first(replace_hot(dark.at(reference_ms), dark.hot))
         background = block_mean(removed, binning) + stray * scale
@@ -171,13 +147,24 @@ def analyse_sweep(
     )
 
 
+def measure_point(plane: PlaneFrames, light: Float, dark: DarkModel, binning: int) -> PsfQuality:
+    """Measure a point's PSF alone, from its light (n_channels, height, width) and its frames."""
+    x_um, y_um, z_um = plane.source_um
+    ever = (plane.frames >= plane.full_scale).any(axis=0)
+    measured = measure_psf(
+        light,
+        z_um=z_um,
+        noise=noise_of_mean(plane.frames) / binning,
+        saturated_pixels=int(np.count_nonzero(ever & ~dark.hot)),
+        may_be_clipped=plane.off_axis,
+    )
+    return replace(measured, x_um=x_um, y_um=y_um)
+
+
 def plane_light(plane: PlaneFrames, dark: DarkModel) -> Float:
     """Return the mean of a point's frames without dark frame and hot pixels, float32 counts.
 
-    Raises
-    ------
-    ValueError
-        When the dark frames have another shape.
+    Raises ValueError when the dark frames have another shape.
     """
     dark_frame = dark.at(plane.exposure_ms)
     if dark_frame.shape != plane.frames.shape[1:]:
@@ -191,10 +178,7 @@ def plane_light(plane: PlaneFrames, dark: DarkModel) -> Float:
 def replace_hot(image: Float, hot: npt.NDArray[np.bool_]) -> Float:
     """Replace hot pixels by the median of the 3 x 3 pixels around them.
 
-    Parameters
-    ----------
-    image : ndarray, float32, (height, width) or (height, width, 3)
-    hot : ndarray of bool, shape of ``image``
+    Image and mask are (height, width) or (height, width, 3).
     """
     if not hot.any():
         return image
@@ -228,12 +212,6 @@ def noise_of_mean(frames: Counts) -> float:
     # contain the pattern itself, which makes this an upper bound
     step = np.diff(frames[0].astype(np.float32), axis=1)
     return 1.4826 / 2**0.5 * float(np.median(np.abs(step - np.median(step))))
-
-
-def saturated_pixels(plane: PlaneFrames, hot: npt.NDArray[np.bool_]) -> int:
-    """Count the pixels at full scale in any of a point's frames, hot ones excepted."""
-    ever = (plane.frames >= plane.full_scale).any(axis=0)
-    return int(np.count_nonzero(ever & ~hot))
 
 
 FEATURE_PX = 2.0

@@ -114,18 +114,9 @@ def hot_pixels(dark: Counts, full_scale: int) -> npt.NDArray[np.bool_]:
     """Find the pixels that are bright without light.
 
     A pixel is hot when it stands above the dark frame's median by more than 8 standard deviations of its
-    noise (estimated robustly from the median absolute deviation) and by more than 1 % of full scale.
-
-    Parameters
-    ----------
-    dark : ndarray, uint8 or uint16, (height, width) or (height, width, 3)
-        A frame taken without light, with about the exposure that will be used (dark current grows with it).
-    full_scale : int
-        The largest count the camera can report.
-
-    Returns
-    -------
-    ndarray, bool, shape of ``dark``
+    noise (estimated robustly from the median absolute deviation) and by more than 1 % of full scale, the
+    largest count the camera can report. ``dark``, (height, width) or (height, width, 3), was taken with about
+    the exposure that will be used, as dark current grows with it. Returns a mask of its shape.
     """
     median = float(np.median(dark))
     sigma = 1.4826 * float(np.median(np.abs(dark.astype(np.float32) - median)))
@@ -171,10 +162,7 @@ def auto_expose(
     AutoExposure
         ``usable`` says whether a PSF can be taken; ``message`` says why not, and what to do.
 
-    Raises
-    ------
-    ValueError
-        When the fractions make no sense or ``hot`` does not fit the frames.
+    Raises ValueError when the fractions make no sense or ``hot`` does not fit the frames.
     """
     if not 0.0 < target <= ceiling < 1.0:
         raise ValueError(f"0 < target <= ceiling < 1 must hold, not target={target}, ceiling={ceiling}.")
@@ -223,10 +211,7 @@ def measure_exposure(
 ) -> ExposureTrial:
     """Judge one frame: its percentile, its brightest pixel and its saturated pixels, hot ones excepted.
 
-    Raises
-    ------
-    ValueError
-        When ``hot`` does not have the frame's shape.
+    Raises ValueError when ``hot`` does not have the frame's shape.
     """
     counts = frame.image
     if hot is not None:
@@ -267,23 +252,12 @@ def expose_light(
 ) -> AutoExposure:
     """Auto-expose a light on the bench, all else dark, and leave it lit; a dark frame shows hot pixels.
 
-    Parameters
-    ----------
-    light_on : callable
-        Lights what is to be exposed.
-    target : float
-        As in :func:`auto_expose`.
-    dimmest : float
-        Level, as a fraction of full scale, that the longest exposure must reach.
-    looks : int
-        Dark frames at most: another one where the exposure became much longer than that of the last.
+    ``light_on`` lights it, ``target`` is as in :func:`auto_expose`, ``dimmest`` the level, as a fraction of
+    full scale, that the longest exposure must reach. There are up to ``looks`` dark frames: another one where
+    the exposure became much longer than that of the last.
 
-    Raises
-    ------
-    TooDarkError
-        When the longest exposure does not reach ``dimmest``.
-    CalibrationError
-        When the light saturates at the shortest exposure, or flickers; the text says what to do.
+    Raises TooDarkError when the longest exposure does not reach ``dimmest``; CalibrationError when the light
+    saturates at the shortest exposure, or flickers; the text says what to do.
     """
     camera = bench.camera
     for _ in range(looks):

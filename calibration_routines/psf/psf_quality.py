@@ -44,10 +44,7 @@ def remove_low_frequencies(
     background : ndarray, float32, shape of ``image``
         What the removed coefficients stand for; may be negative where the PSF's own low frequencies were cut.
 
-    Raises
-    ------
-    ValueError
-        When ``order`` is negative or larger than the image.
+    Raises ValueError when ``order`` is negative or larger than the image.
     """
     height, width = image.shape[-2:]
     if not 0 <= order <= min(height, width):
@@ -186,20 +183,11 @@ def measure_psf(
 
 
 def judge_sweep(planes: Sequence[PsfQuality], diffuser_distance_um: float | None) -> tuple[PsfQuality, ...]:
-    """Judge each plane of an axial sweep against the others.
+    """Judge each plane of an axial sweep, in any order of depth, against the others.
 
-    Parameters
-    ----------
-    planes : sequence of PsfQuality
-        In any order of depth.
-    diffuser_distance_um : float or None
-        Distance from diffuser to sensor; None leaves the paraxial law unchecked, monotony is still checked.
-
-    Returns
-    -------
-    tuple of PsfQuality
-        The same planes with ``scale_error``, ``step_px`` and the findings that follow from them. Steps need
-        at least four planes, a scale at least two; with fewer there is nothing to compare with.
+    Returns the same planes with ``scale_error``, ``step_px`` and the findings that follow from them. Steps
+    need at least four planes, a scale at least two; with fewer there is nothing to compare with. Where the
+    distance from diffuser to sensor is None, the paraxial law stays unchecked, monotony is still checked.
     """
     judged = list(planes)
     lit = [i for i, plane in enumerate(planes) if plane.radius_px > 0]
@@ -218,18 +206,10 @@ def judge_sweep(planes: Sequence[PsfQuality], diffuser_distance_um: float | None
 def judge_next(
     before: Sequence[PsfQuality], plane: PsfQuality, diffuser_distance_um: float | None
 ) -> PsfQuality:
-    """Judge a plane of an axial sweep against the good ones taken before it.
+    """Judge a plane of an axial sweep, just taken, against the good ones taken before it.
 
     Its place is held against the line through at least three of them, its support's size against at least
-    two: with fewer, a wrong one could be any of them.
-
-    Parameters
-    ----------
-    before : sequence of PsfQuality
-    plane : PsfQuality
-        Just taken.
-    diffuser_distance_um : float or None
-        As :func:`judge_sweep`.
+    two: with fewer, a wrong one could be any of them. The distance is as in :func:`judge_sweep`.
     """
     if not plane.radius_px > 0:
         return plane
@@ -265,17 +245,10 @@ def _with_scale_error(plane: PsfQuality, error: float) -> PsfQuality:
 
 
 def temporal_noise(frames: npt.NDArray[np.floating] | npt.NDArray[np.unsignedinteger]) -> float:
-    """Estimate the noise of one pixel of the average of ``frames``, counts.
+    """Estimate the noise of one pixel of the average of ``frames``, (n_frames, ...), counts.
 
-    Parameters
-    ----------
-    frames : ndarray, (n_frames, ...)
-        At least two frames of the same, unchanged light.
-
-    Returns
-    -------
-    float
-        Root of the mean variance over the brightest tenth of the pixels (the PSF), over ``n_frames``.
+    They are at least two, of the same, unchanged light. It is the root of the mean variance over the
+    brightest tenth of the pixels (the PSF), over ``n_frames``.
     """
     if len(frames) < 2:
         raise ValueError("Noise needs at least two frames of the same light.")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -92,10 +93,7 @@ def axial_planes(
     wavelength_nm : float, optional
         For Eq. 5.10; the geometry's by default.
 
-    Raises
-    ------
-    BenchError
-        When what is needed is not known.
+    Raises BenchError when what is needed is not known.
     """
     if not 0 < z_min_um < z_max_um:
         raise BenchError(
@@ -130,6 +128,15 @@ def axial_planes(
     )
 
 
+def known(geometry: Geometry, *names: str, what: str, otherwise: str = "") -> list[Any]:
+    """Return numbers of the optics by name; BenchError, which begins with ``what``, where one is unknown."""
+    values = [getattr(geometry, name) for name in names]
+    if None in values:
+        listed = " and ".join([", ".join(names[:-1]), names[-1]])
+        raise BenchError(f"{what} from {listed}: give them in [geometry] of bench.toml{otherwise}.")
+    return values
+
+
 MOST_POINTS_A_SIDE = 41
 """More points along one axis at one depth are a mistake, or need --spacing."""
 _REACH_MARGIN = 0.98  # of the stage's travel
@@ -137,21 +144,14 @@ _REACH_MARGIN = 0.98  # of the stage's travel
 
 @dataclass(frozen=True, slots=True)
 class GridSweep:
-    """The points of a sweep and why they lie where they do.
-
-    Attributes
-    ----------
-    points_um : tuple of (x, y, z)
-        Nearest depth first; within a depth row by row, every other row backwards.
-    reasons : tuple of str
-        What the numbers come from, in words.
-    shapes : tuple of (int, int)
-        Points along y and x at each depth.
-    """
+    """The points of a sweep and why they lie where they do."""
 
     points_um: tuple[Position, ...]
+    """Nearest depth first; within a depth row by row, every other row backwards."""
     reasons: tuple[str, ...]
+    """What the numbers come from, in words."""
     shapes: tuple[tuple[int, int], ...]
+    """Points along y and x at each depth."""
 
 
 def grid_sweep(
@@ -181,11 +181,8 @@ def grid_sweep(
     x_um, y_um : float
         The grid's centre.
 
-    Raises
-    ------
-    BenchError
-        When a number makes no sense, the geometry is not known, there is no stage, or the grid would be too
-        large.
+    Raises BenchError when a number makes no sense, the geometry is not known, there is no stage, or the grid
+    would be too large.
     """
     _check_numbers(depths_um, half_field_um, spacing_um, (x_um, y_um))
     points: list[Position] = []
@@ -251,15 +248,14 @@ def _half_field(
             raise BenchError("Half the field's height and width must not be negative.")
         words = f"+-{asked_um[1] / 1e3:.3g} x +-{asked_um[0] / 1e3:.3g} mm (x, y), as asked"
         return asked_um, words
-    geometry = bench.geometry
-    if geometry.diffuser_distance_mm is None or geometry.pixel_pitch_um is None:
-        raise BenchError(
-            "How large the field is follows from diffuser_distance_mm and pixel_pitch_um: give them in "
-            "[geometry] of bench.toml, or give the field."
-        )
-    height, width = bench.camera.frame_shape[:2]
-    magnification = 1e3 * geometry.diffuser_distance_mm / z_um
-    seen = tuple(n * geometry.pixel_pitch_um / 2 / magnification for n in (height, width))
+    d_mm, pitch_um = known(
+        bench.geometry,
+        "diffuser_distance_mm",
+        "pixel_pitch_um",
+        what="How large the field is follows",
+        otherwise=", or give the field",
+    )
+    seen = tuple(n * pitch_um / 2 / (1e3 * d_mm / z_um) for n in bench.camera.frame_shape[:2])
     reach = _reach(bench, centre_um)
     half = (min(seen[0], reach[0]), min(seen[1], reach[1]))
     limited = " as far as the stage reaches," if half != seen else ""
@@ -289,12 +285,14 @@ def _planes_by_edge(z_min_um: float, z_max_um: float, geometry: Geometry) -> int
     (from the scaling ``1 + d/z``), which may be one feature of the PSF at most: the constant of Kuo 2020,
     Eq. 4.7. The PSF's smallest features are about two pixels (Sec. 4.3).
     """
-    aperture_mm, d_mm, pitch_um = geometry.aperture_mm, geometry.diffuser_distance_mm, geometry.pixel_pitch_um
-    if aperture_mm is None or d_mm is None or pitch_um is None:
-        raise BenchError(
-            "How many planes are needed follows from aperture_mm, diffuser_distance_mm and pixel_pitch_um: "
-            "give them in [geometry] of bench.toml, or give the number of planes."
-        )
+    aperture_mm, d_mm, pitch_um = known(
+        geometry,
+        "aperture_mm",
+        "diffuser_distance_mm",
+        "pixel_pitch_um",
+        what="How many planes are needed follows",
+        otherwise=", or give the number of planes",
+    )
     travel_px = 1e6 * max(aperture_mm) / 2 * d_mm * (1 / z_min_um - 1 / z_max_um) / pitch_um
     return 1 + int(np.ceil(travel_px / FEATURE_PX - 1e-9))
 
@@ -311,10 +309,7 @@ def source_limits(bench: Bench) -> dict[str, tuple[float, float]]:
 def require_reach(bench: Bench, places: Mapping[str, tuple[int, float]]) -> None:
     """Refuse settings that put the source beyond the stage's travel.
 
-    Parameters
-    ----------
-    places : mapping
-        Setting's name to axis (0: x, 1: y, 2: z) and place, micrometres from the diffuser's centre.
+    ``places`` maps a setting's name to axis (0: x, 1: y, 2: z) and micrometres from the diffuser's centre.
     """
     limits, problems = source_limits(bench), []  # no stage, no limits: what needs one says so
     for name, (axis, place_um) in places.items():

@@ -44,24 +44,16 @@ LARGEST_PX = 500_000
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """The reference point's visits, each against the first.
-
-    Attributes
-    ----------
-    before_point : tuple of int
-        Points of the sweep that had been taken before each visit.
-    brightness : tuple of float
-        Light received, relative to the first visit.
-    shift_px : tuple of float
-        Distance of the pattern from its place at the first visit, pixels of the PSFs.
-    findings : tuple of str
-        Empty when the source stayed what it was.
-    """
+    """The reference point's visits, each against the first."""
 
     before_point: tuple[int, ...]
+    """Points of the sweep that had been taken before each visit."""
     brightness: tuple[float, ...]
+    """Light received, relative to the first visit."""
     shift_px: tuple[float, ...]
+    """Distance of the pattern from its place at the first visit, pixels of the PSFs."""
     findings: tuple[str, ...]
+    """Empty when the source stayed what it was."""
     seconds: tuple[float, ...]
     """When each visit was, from the first."""
 
@@ -130,12 +122,8 @@ def judge_visit(
 ) -> tuple[str, ...]:
     """Return what changed between two visits, in words.
 
-    Parameters
-    ----------
-    brightness, shift_px : (float, float)
-        At the earlier and at the later visit, relative to the first of all.
-    points : (int, int)
-        Points of the sweep that had been taken before each.
+    Each pair is of the earlier and of the later visit: brightness and shift relative to the first visit of
+    all, and how many of the sweep's points had been taken before.
     """
     findings = []
     where = f"between points {points[0] + 1} and {points[1]}"
@@ -167,31 +155,20 @@ _FAR_PROMINENCE = 3.0  # a pattern found elsewhere must stand out more: few spot
 
 @dataclass(frozen=True, slots=True)
 class StageFit:
-    """Measured shifts of one depth against what the stage said.
-
-    Attributes
-    ----------
-    z_um : float
-    points : int
-        Whose shift could be measured.
-    gain_error : float or None
-        Measured shift per micrometre over ``d / z / pitch``, minus one; None where d is not known.
-    rotation_mrad : float
-        Of the stage's axes against the sensor's.
-    anisotropy : float
-        Difference of the gains along x and y over their mean.
-    residual_median_px, residual_95_px : float
-        Of the points about the linear map.
-    findings : tuple of str
-    """
+    """Measured shifts of one depth against what the stage said."""
 
     z_um: float
     points: int
+    """Whose shift could be measured."""
     gain_error: float | None
+    """Measured shift per micrometre over ``d / z / pitch``, minus one; None where d is not known."""
     rotation_mrad: float
+    """Of the stage's axes against the sensor's."""
     anisotropy: float
+    """Difference of the gains along x and y over their mean."""
     residual_median_px: float
     residual_95_px: float
+    """Of the points about the linear map."""
     findings: tuple[str, ...] = ()
 
 

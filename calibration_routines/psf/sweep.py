@@ -33,7 +33,7 @@ from calibration_routines.psf.analysis import (
 from calibration_routines.psf.psf_quality import PsfQuality, place_of
 from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.stage_fit import Drift, StageFit
-from calibration_routines.psf.sweep_options import AskedSweep
+from calibration_routines.psf.sweep_options import AskedSweep, PointSweep
 from calibration_routines.psf.sweep_plan import (
     PSF,
     REFERENCE,
@@ -55,7 +55,7 @@ from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError
 from instrument.files.record import plain, value_of
 from instrument.plan import Step
-from instrument.runs.acquire import acquire, prepare
+from instrument.runs.acquire import acquire
 from instrument.runs.run import Run
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import Runner
@@ -66,31 +66,20 @@ _INTERRUPTIONS = (KeyboardInterrupt, SystemExit, EndedEarlyError)
 
 @dataclass(frozen=True, slots=True)
 class SweepCalibration:
-    """A finished sweep.
-
-    Attributes
-    ----------
-    calibration : Calibration
-    path : Path
-        The calibration's folder, inside the first run's folder.
-    quality : tuple of PsfQuality
-        One a PSF.
-    runs : tuple of Run
-        The sweep, and one more for each round of retakes.
-    exposures : SweepExposures
-    stages : tuple of StageFit
-        For each depth with several points: measured shifts against the stage's.
-    drift : Drift or None
-        The source at the reference point; None for a sweep too short to have one.
-    """
+    """A finished sweep."""
 
     calibration: Calibration
     path: Path
+    """The calibration's folder, inside the first run's folder."""
     quality: tuple[PsfQuality, ...]
+    """One a PSF."""
     runs: tuple[Run, ...]
+    """The sweep, and one more for each round of retakes."""
     exposures: SweepExposures
     stages: tuple[StageFit, ...] = ()
+    """For each depth with several points: measured shifts against the stage's."""
     drift: Drift | None = None
+    """The source at the reference point; None for a sweep too short to have one."""
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -115,30 +104,19 @@ def calibrate_sweep(
     ----------
     bench : Bench
         Open, its stage homed.
-    sweep : AxialSweep, LateralSweep, VolumeSweep or PointSweep
     folder : path, optional
         Where the run's folder is made; the bench's data folder by default.
     exposures : SweepExposures, optional
         From :func:`~calibration_routines.expose_sweep`, which is called when None.
     control : RunControl, optional
-        To pause, abort or stop it from another thread; it follows the sweep's run, and that of each round of
-        retakes after it.
+        Pauses, aborts or stops it from another thread, in the sweep's run and in each round of retakes.
     listener : Listener, optional
         Its ``event`` is called with a :class:`~calibration_routines.PointTaken` as soon as a PSF has been
         taken and judged, and with a :class:`~calibration_routines.SourceVisit` after each visit to the
         reference point, in the thread that sweeps.
 
-    Returns
-    -------
-    SweepCalibration
-        ``findings`` is empty when every PSF is good.
-
-    Raises
-    ------
-    PlanError, SettingsError
-        When the sweep leaves the limits of the bench or the disk; nothing moved.
-    CalibrationError
-        When no exposure is usable, or the run was ended before its last frame.
+    Raises PlanError, SettingsError when the sweep leaves the limits of the bench or the disk (nothing moved);
+    CalibrationError when no exposure is usable, or the run was ended before its last frame.
     """
     control, listener = control or RunControl(), listener or Listener()
     where = Path(folder) if folder is not None else None
@@ -157,28 +135,14 @@ def calibrate_sweep(
     listener.step("sweeping")
     record = SweepRecord(points, exposures, bench.geometry, bench.label, bool(bench.simulated_kinds))
     runner = SWEEP.prepare(bench, plan, where, record, control, listener)
-    watch = SweepWatch(points, bench.geometry)
-    watch.on_event, watch.take_again = listener.event, _retaker(bench, record, runner.path)
-    runner.on_frame = watch.see
+    watch_sweep(bench, runner, listener)
     return _finished(runner.execute(), record, bench, control, listener)
 
 
-def watch_resumed(bench: Bench, runner: Runner, listener: Listener) -> None:
-    """Let a sweep's run that goes on be watched as from its beginning: what it has is looked at first.
+def watch_sweep(bench: Bench, runner: Runner, listener: Listener) -> None:
+    """Let a sweep's run, not yet begun, be watched; what one that goes on has already is looked at first.
 
-    Parameters
-    ----------
-    bench : Bench
-        Open.
-    runner : Runner
-        From :func:`~instrument.runs.acquire.prepare_resume`, not yet begun.
-    listener : Listener
-        Its ``event`` is not called for what was taken before.
-
-    Raises
-    ------
-    CalibrationError
-        When the run is no sweep.
+    The listener's ``event`` is not called for that. Raises CalibrationError when the run is no sweep.
     """
     record = SWEEP.read(runner.path)
     watch = SweepWatch(record.sweep, record.geometry)
@@ -199,21 +163,10 @@ def finish_sweep(
 ) -> SweepCalibration:
     """Make the calibration of a sweep's complete run, e.g. of one that was resumed.
 
-    Parameters
-    ----------
-    run : path
-        The run's folder.
-    bench : Bench, optional
-        For retakes; without one, PSFs that need them are only flagged.
-    control, listener : optional
-        As :func:`calibrate_sweep`.
+    Without a ``bench``, for retakes, PSFs that need them are only flagged.
 
-    Raises
-    ------
-    CalibrationError
-        When the run is no sweep or is not complete.
-    CalibrationFileError
-        When it has its calibration already.
+    Raises CalibrationError when the run is no sweep or is not complete; CalibrationFileError when it has its
+    calibration already.
     """
     record = SWEEP.read(Path(run))
     return _finished(Run.open(Path(run)), record, bench, control or RunControl(), listener or Listener())
@@ -277,10 +230,9 @@ class _TakenSweep:
 
     def take_again(self, bench: Bench, points: list[tuple[Position, float]]) -> None:
         """Take points again in a run beside the sweep's."""
-        plan, folder = retake_plan(self.sweep, points), self.run.path.parent
-        runner = prepare(bench, plan, folder, on_progress=self.listener.frame, control=self.control)
-        retake = _complete(runner.execute())
-        add_retakes(self.run.path, [point for point, _ in points], retake.path.name)
+        retake = _taken_again(
+            bench, self.sweep, self.run.path, points, on_progress=self.listener.frame, control=self.control
+        )
         for point, _ in points:
             self._took(point, retake)
 
@@ -405,13 +357,20 @@ def read_retakes(run: Path) -> list[Retake]:
         ) from error
 
 
+def _taken_again(
+    bench: Bench, sweep: PointSweep, path: Path, points: list[tuple[Position, float]], **how: Any
+) -> Run:
+    """Take points of the sweep in ``path`` again, each with its exposure, in a run beside it."""
+    retake = _complete(acquire(bench, retake_plan(sweep, points), path.parent, **how))
+    add_retakes(path, [point for point, _ in points], retake.path.name)
+    return retake
+
+
 def _retaker(bench: Bench, record: SweepRecord, path: Path) -> TakeAgain:
     """Return what takes a point again between two points of the sweep in ``path``, as a run beside it."""
 
     def take_again(point: Position, exposure_ms: float) -> list[Snapshot]:
-        plan = retake_plan(record.sweep, [(point, exposure_ms)])
-        retake = _complete(acquire(bench, plan, path.parent))
-        add_retakes(path, [point], retake.path.name)
+        retake = _taken_again(bench, record.sweep, path, [(point, exposure_ms)])
         return [_stored(retake, step.index) for step in retake.steps(PSF)]
 
     return take_again

@@ -41,10 +41,8 @@ class AskedSweep(Protocol):
     def planned(self, bench: Bench) -> PlannedSweep:
         """Return the sweep that the bench should do; nothing moves.
 
-        Raises
-        ------
-        SettingsError, BenchError
-            When it leaves the stage's travel or what would be needed is not known of the bench.
+        Raises SettingsError, BenchError when it leaves the stage's travel or what would be needed is not
+        known of the bench.
         """
 
 
@@ -281,10 +279,7 @@ class AxialSweep(Taking, _Lateral, _Depths):
     def z_um(self) -> tuple[float, ...]:
         """Depths of the planes, nearest first, evenly spaced in 1/z (Kuo 2020, Eq. 4.7).
 
-        Raises
-        ------
-        SettingsError
-            When the number of planes was left to the optics.
+        Raises SettingsError when the number of planes was left to the optics.
         """
         planes = 1 if self.far_um == self.z_min_um else self.planes
         if planes is None:

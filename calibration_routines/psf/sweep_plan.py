@@ -30,10 +30,7 @@ LEAST_SIDE_PX = 16
 def check_image_settings(sweep: PointSweep, frame_shape: Sequence[int]) -> None:
     """Refuse a binning or a number of DCT coefficients that leaves nothing of frames of this shape.
 
-    Raises
-    ------
-    SettingsError
-        Naming the largest values that fit.
+    Raises SettingsError, which names the largest values that fit.
     """
     height, width = frame_shape[:2]
     binning = max(sweep.binning, 1)  # automatic: known only once there are frames
@@ -57,12 +54,7 @@ def sweep_plan(sweep: PointSweep, exposures_ms: Sequence[float]) -> Plan:
     """Return the plan: dark frames at the shortest and longest exposure, then every point in order.
 
     The reference point is visited before the first point, after every ``reference_every``, and after the
-    last, with its own exposure.
-
-    Parameters
-    ----------
-    exposures_ms : sequence of float
-        One a point.
+    last, with its own exposure. ``exposures_ms`` has one a point.
     """
     points_um = sweep.points_um
     if len(exposures_ms) != len(points_um):
@@ -96,12 +88,8 @@ def check_sweep(bench: Bench, sweep: PointSweep, folder: Path | None = None) -> 
     ones. The stage need not be homed yet: limits hold all the same, and the sweep itself is checked
     again.
 
-    Raises
-    ------
-    PlanError
-        Naming every step that cannot be done.
-    SettingsError
-        When binning or DCT order do not fit the camera's frames.
+    Raises PlanError, which names every step that cannot be done, or SettingsError when binning or DCT order
+    do not fit the camera's frames.
     """
     check_image_settings(sweep, bench.camera.frame_shape)
     present_ms, (shortest_ms, longest_ms) = bench.camera.exposure_ms, bench.camera.exposure_limits_ms
@@ -196,21 +184,16 @@ def expose_sweep(bench: Bench, sweep: PointSweep, *, control: RunControl | None 
     line in logarithms. Where a depth has points off the axis, one of them about two thirds out is asked as
     well: the logarithm of a Gaussian response goes with the square of the tangent. Ends with the light off.
 
-    Raises
-    ------
-    CalibrationError
-        When a PSF saturates at the shortest exposure, stays too dark at the longest, or flickers.
-    EndedEarlyError
-        When it was ended through ``control``.
+    Raises CalibrationError when a PSF saturates at the shortest exposure, stays too dark at the longest, or
+    flickers; EndedEarlyError when it was ended through ``control``.
     """
-    depths = sweep.depths_um
+    control, depths = control or RunControl(), sweep.depths_um
     asked = sorted({depths[0], depths[len(depths) // 2], depths[-1]})
     found: list[tuple[float, AutoExposure]] = []
     slopes: list[float] = []
     try:
         for z_um in asked:
-            if control is not None:
-                control.check()
+            control.check()
             axis = sweep.axis_point(z_um)
             if not sweep.by_hand:
                 bench.place_source(*axis)
@@ -229,13 +212,10 @@ def expose_sweep(bench: Bench, sweep: PointSweep, *, control: RunControl | None 
     return SweepExposures(tuple(exposures), tuple(found))
 
 
-def _slope(
-    bench: Bench, sweep: PointSweep, axis: Position, on_axis_ms: float, control: RunControl | None
-) -> float:
+def _slope(bench: Bench, sweep: PointSweep, axis: Position, on_axis_ms: float, control: RunControl) -> float:
     """Return how the logarithm of the exposure grows with the squared tangent; 0 where no place tells."""
     for beside in _beside(sweep, axis):
-        if control is not None:
-            control.check()
+        control.check()
         bench.place_source(*beside)
         try:
             dimmer = expose_source(bench, target=sweep.target)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine, outlook_of
 from calibration_routines.psf.psf_quality import place_of
 from calibration_routines.psf.sampling import reachable_depths_um
-from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep, finish_sweep, watch_resumed
+from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep, finish_sweep, watch_sweep
 from calibration_routines.psf.sweep_options import AskedSweep, AxialSweep, LateralSweep, VolumeSweep
 from calibration_routines.psf.sweep_plan import SWEEP, SweepExposures, check_sweep, plan_lines
 from calibration_routines.psf.sweep_watch import SourceVisit, SweepEvent
@@ -148,8 +149,11 @@ def _depths(bench: Bench) -> dict[str, float]:
     return {"z_min_um": near_um, "z_max_um": far_um, "z_um": far_um}
 
 
+_sweep = partial(
+    Routine, procedure=SweepProcedure, purpose=SWEEP, finish=_finish, watch=watch_sweep, start=_depths
+)
 ROUTINES = (
-    Routine(
+    _sweep(
         name="axial",
         title="Axial sweep",
         help="Move the point source along the axis and measure one PSF a plane.",
@@ -157,18 +161,13 @@ ROUTINES = (
         "takes dark frames, sweeps, judges every PSF in words, takes bad planes again, and saves "
         "the calibration in the run's folder. Ends with the light off.",
         options=AxialSweep,
-        procedure=SweepProcedure,
-        purpose=SWEEP,
-        finish=_finish,
-        watch=watch_resumed,
         examples=(
             "diffuserbench calibrate axial --z-min 100 --z-max 300 --planes 12",
             "diffuserbench calibrate axial --z-min 300          one PSF, 300 mm in front of the diffuser",
             "diffuserbench calibrate axial --z-min 100 --z-max 300 --dry-run",
         ),
-        start=_depths,
     ),
-    Routine(
+    _sweep(
         name="lateral",
         title="Lateral sweep",
         help="Move the point source over a grid at one depth and measure a PSF at each point.",
@@ -176,36 +175,26 @@ ROUTINES = (
         "local, lowrank or auto. Each pattern's shift is measured and held against the stage; a "
         "reference point is visited again and again to tell whether the source drifts.",
         options=LateralSweep,
-        procedure=SweepProcedure,
-        purpose=SWEEP,
-        finish=_finish,
-        watch=watch_resumed,
         needs=("stage",),
         examples=(
             "diffuserbench calibrate lateral --z 300 --dry-run          the grid, and why",
             "diffuserbench calibrate lateral --z 1.7 --fall-off-deg 13 --half-field-x 1.2 --half-field-y 0.8",
             "diffuserbench calibrate lateral --z 300 --spacing 40",
         ),
-        start=_depths,
     ),
-    Routine(
+    _sweep(
         name="volume",
         title="Volume sweep",
         help="Move the point source over a grid at each of several depths, evenly spaced in 1/z.",
         details="As lateral, plane after plane. The number of planes and of points follows from the optics"
         " unless given.",
         options=VolumeSweep,
-        procedure=SweepProcedure,
-        purpose=SWEEP,
-        finish=_finish,
-        watch=watch_resumed,
         needs=("stage",),
         examples=(
             "diffuserbench calibrate volume --z-min 100 --z-max 300 --dry-run",
             "diffuserbench calibrate volume --z-min 1.7 --z-max 3 --lenslet 250 --wavelength 520 "
             "--fall-off-deg 13",
         ),
-        start=_depths,
     ),
 )
 """Rows of :data:`calibration_routines.procedure.routines`."""

@@ -21,15 +21,13 @@ from calibration_routines.psf.analysis import (
     DarkModel,
     PlaneFrames,
     channels_first,
-    noise_of_mean,
+    measure_point,
     plane_light,
-    saturated_pixels,
 )
 from calibration_routines.psf.psf_quality import (
     MAX_STEP_PX,
     PsfQuality,
     judge_next,
-    measure_psf,
     with_finding,
 )
 from calibration_routines.psf.sampling import Position
@@ -57,55 +55,37 @@ _SLACK = MAX_GAIN_ERROR + 1e-3 * MAX_ROTATION_MRAD  # of a shift: what a wrong d
 
 @dataclass(frozen=True, slots=True)
 class PointTaken:
-    """A PSF has been taken and judged.
-
-    Attributes
-    ----------
-    number, total : int
-        Which point of the sweep, from 1, and how many there are.
-    take : int
-        1, and more for what was taken again.
-    quality : PsfQuality
-        So far: lengths in pixels of the PSFs; the whole sweep may tell more when it is over.
-    exposure_ms : float
-    retaking : bool
-        Whether it is taken again at once.
-    image : ndarray, float32, (height, width)
-        The PSF without its dark frame, counts, colours averaged, binned to half a megapixel at most.
-    """
+    """A PSF has been taken and judged."""
 
     number: int
     total: int
+    """Which point of the sweep, from 1, and how many there are."""
     take: int
+    """1, and more for what was taken again."""
     quality: PsfQuality
+    """So far: lengths in pixels of the PSFs; the whole sweep may tell more when it is over."""
     exposure_ms: float
     retaking: bool
+    """Whether it is taken again at once."""
     image: Float
+    """(height, width): the PSF without its dark frame, counts, colours averaged, binned to half a
+    megapixel at most."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceVisit:
-    """The source has been at the reference point again.
-
-    Attributes
-    ----------
-    number : int
-        From 1, the first, which the others are held against.
-    before_point : int
-        Points of the sweep that had been taken before.
-    brightness : float
-        Light received, relative to the first visit.
-    shift_px : float
-        Distance of the pattern from its place at the first visit, pixels of the camera.
-    findings : tuple of str
-        What changed since the visit before; empty when the source stayed what it was.
-    """
+    """The source has been at the reference point again."""
 
     number: int
+    """From 1, the first, which the others are held against."""
     before_point: int
+    """Points of the sweep that had been taken before."""
     brightness: float
+    """Light received, relative to the first visit."""
     shift_px: float
+    """Distance of the pattern from its place at the first visit, pixels of the camera."""
     findings: tuple[str, ...]
+    """What changed since the visit before; empty when the source stayed what it was."""
 
 
 SweepEvent = PointTaken | SourceVisit
@@ -115,19 +95,10 @@ TakeAgain = Callable[[Position, float], list[Snapshot]]
 
 
 class SweepWatch:
-    """Sees a sweep's photographs one by one and judges its points.
+    """Sees a sweep's photographs one by one and judges its points; ``geometry``: of the camera's pixels.
 
-    Parameters
-    ----------
-    geometry : Geometry
-        Of the camera's pixels.
-
-    Attributes
-    ----------
-    on_event : callable or None
-        Called with a :class:`PointTaken` or :class:`SourceVisit` in the thread that executes.
-    take_again : callable or None
-        None: points that need it are only reported.
+    What is seen goes to ``on_event``, in the thread that executes; without ``take_again`` points that need it
+    are only reported.
     """
 
     def __init__(
@@ -207,18 +178,9 @@ class SweepWatch:
         frame_shape = plane.frames.shape[1:3]
         factor = max(1, frame_shape[0] // image.shape[0])
         binning = max(1, self._sweep.binning)
-        x_um, y_um, z_um = plane.source_um
-        found = measure_psf(
-            image[np.newaxis],
-            z_um=z_um,
-            noise=noise_of_mean(plane.frames) / binning,
-            saturated_pixels=saturated_pixels(plane, self._dark_model(plane.full_scale).hot),
-            may_be_clipped=plane.off_axis,
-        )
+        found = measure_point(plane, image[np.newaxis], self._dark_model(plane.full_scale), binning)
         found = replace(
             found,
-            x_um=x_um,
-            y_um=y_um,
             centroid_px=(found.centroid_px[0] * factor / binning, found.centroid_px[1] * factor / binning),
             radius_px=found.radius_px * factor / binning,
         )

@@ -259,7 +259,7 @@ class SimulatedCamera(SimulatedCameraSettings):
         scale = float(self.world.options.noise)
         if scale <= 0:
             return None
-        counts_per_electron = self.gain * self._full_scale / self._spec.full_well_e
+        counts_per_electron = self._gain * self._full_scale / self._spec.full_well_e
         read = scale * self._spec.read_noise_e * self._binning * counts_per_electron
         return CameraNoise(float(np.hypot(read, 12**-0.5)), scale**2 * counts_per_electron)
 

@@ -7,7 +7,8 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from drivers.camera import Camera, Roi, TriggerMode
+from drivers.camera import Roi
+from drivers.common.camera_settings import KeptSettings
 from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError
 from drivers.simulated.surroundings import SimulatedDevice, Surroundings
@@ -44,14 +45,18 @@ class CameraOptions(DriverOptions):
     )
 
 
-class SimulatedCameraSettings(SimulatedDevice, Camera):
-    """The part of the simulated camera that takes no images."""
+class SimulatedCameraSettings(SimulatedDevice, KeptSettings):
+    """The part of the simulated camera that takes no images.
+
+    Its plug pulled and put back, it goes on as it was; opened anew, it has its own default settings.
+    """
 
     kind = "camera"
     Shared: ClassVar[type[Surroundings]] = SimulatedWorld
     Options = CameraOptions
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
+        super().__init__()
         self._join(shared)
         self.options = options = CameraOptions.of(options)
         self._spec = self.world.sensor
@@ -65,7 +70,8 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
         self._binning = 1
         self._pixel_format = self.pixel_formats[0]
         self._black_fraction = self._spec.black_level
-        self._trigger_mode: TriggerMode = "free_run"
+        self._trigger_mode = "free_run"
+        self._remembered.clear()
 
     def _model(self) -> str:
         return self._spec.name + (" Color" if self.options.color else "")
@@ -94,58 +100,34 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
 
     # Settings ---
     @property
-    def exposure_ms(self) -> float:
-        """Exposure time."""
-        return self._exposure_ms
-
-    @property
     def exposure_limits_ms(self) -> tuple[float, float]:
         """Shortest and longest exposure."""
         return self._spec.exposure_limits_ms
 
-    def set_exposure_ms(self, exposure_ms: float) -> float:
-        """Set the exposure; it counts whole microseconds."""
+    def _write_exposure(self, exposure_ms: float) -> float:
         self._require()
-        self._require_within(
-            exposure_ms, self.exposure_limits_ms, f"cannot expose {exposure_ms:g} ms.", "Its exposure", " ms"
-        )
-        self._exposure_ms = round(exposure_ms * 1e3) / 1e3
-        return self._exposure_ms
-
-    @property
-    def gain(self) -> float:
-        """Electronic gain factor."""
-        return self._gain
+        return round(exposure_ms * 1e3) / 1e3  # it counts whole microseconds
 
     @property
     def gain_limits(self) -> tuple[float, float]:
         """Smallest and largest gain factor."""
         return GAIN_LIMITS
 
-    def set_gain(self, gain: float) -> float:
-        """Set the gain factor; it has steps of 0.01."""
+    def _write_gain(self, gain: float) -> float:
         self._require()
-        self._require_within(gain, GAIN_LIMITS, f"has no gain {gain:g}.", "Its gain")
-        self._gain = round(gain, 2)
-        return self._gain
+        return round(gain, 2)
 
     @property
     def black_level(self) -> float:
         """Offset in counts of the present pixel format."""
         return self._black_fraction * self._full_scale
 
-    def set_black_level(self, black_level: float) -> float:
-        """Set the offset, up to an eighth of full scale."""
-        self._require_idle("black level")
-        limits = (0.0, self._full_scale / 8)
-        self._require_within(black_level, limits, f"has no black level {black_level:g}.", "It", " counts")
-        self._black_fraction = black_level / self._full_scale
-        return self.black_level
-
     @property
-    def roi(self) -> Roi:
-        """Region of interest in sensor pixels."""
-        return self._roi
+    def _black_limits(self) -> tuple[float, float]:
+        return 0.0, self._full_scale / 8
+
+    def _write_black(self, black_level: float) -> None:
+        self._black_fraction = black_level / self._full_scale
 
     def set_roi(self, roi: Roi | None) -> Roi:
         """Set the region of interest; its borders fall on multiples of 4 pixels inside the one asked for."""
@@ -205,18 +187,6 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
     @property
     def _full_scale(self) -> int:
         return (1 << self.significant_bits) - 1
-
-    @property
-    def trigger_mode(self) -> TriggerMode:
-        """What starts an exposure."""
-        return self._trigger_mode
-
-    def set_trigger_mode(self, mode: TriggerMode) -> TriggerMode:
-        """Choose what starts an exposure; nothing is wired to the hardware trigger."""
-        self._require_idle("trigger mode")
-        self._require_offered("trigger mode", mode, ("free_run", "software"))
-        self._trigger_mode = mode
-        return mode
 
     def _require_idle(self, what: str) -> None:
         self._require()

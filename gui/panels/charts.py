@@ -21,7 +21,7 @@ from gui.widgets.building import button, cell, choice, fill, in_row, label, offe
 from gui.widgets.dialogues import choose_path
 from gui.widgets.plots import curve_colour, curve_pen, dots, plot_widget
 from gui.widgets.stability_view import StabilityView
-from instrument.evaluation.chart import point_of, read_chart, subject_of
+from instrument.evaluation.chart import ChartData, read_chart, subject_of
 from instrument.files.errors import FileError
 from instrument.files.stability_file import read_stability
 from recon.base.declare import Imports, expression
@@ -59,9 +59,9 @@ class ChartsPanel(Panel):
         job.succeeded.connect(lambda record: self._opened(path, record))
         return job
 
-    def _opened(self, path: Path, record: dict[str, Any]) -> None:
+    def _opened(self, path: Path, record: dict[str, Any] | ChartData) -> None:
         self.accepted()
-        if "maps" in record:
+        if not isinstance(record, ChartData):
             self.maps_path = path
             said = f"{path.name}, made {record['utc']} by {record['program']} (SIMULATED scenes)"
             self._headings[self.stability] = (said, f"{path}\n{record['command']}")
@@ -69,14 +69,14 @@ class ChartsPanel(Panel):
             self.tabs.setCurrentWidget(self.stability)
         else:
             self.chart_path = path
-            about = record["about"]
-            said = f"{subject_of(record['kind'], about)}{' (SIMULATED)' if about.get('simulated') else ''}"
-            left_out = [f"{name}: {why}" for name, why in record.get("failed", {}).items()]
-            left_out += [f"{name}: no time" for name in record.get("missing", ())]
+            about = record.about
+            said = f"{subject_of(record.kind_name, about)}{' (SIMULATED)' if about.get('simulated') else ''}"
+            left_out = [f"{name}: {why}" for name, why in record.failed.items()]
+            left_out += [f"{name}: no time" for name in record.missing]
             if left_out:
                 said += f"; {len(left_out)} settings could not be run or had no time"
             self._headings[self.chart] = (said, "\n".join([str(path), *left_out]))
-            self.chart.show_points([point_of(p) for p in record["points"]], record["kind"])
+            self.chart.show_points(record.points, record.kind_name)
             self.tabs.setCurrentWidget(self.chart)
         self._show_heading()
 
@@ -94,10 +94,10 @@ class ChartsPanel(Panel):
         """Return lines that draw the map that is shown, or read the chart."""
         if self.tabs.currentWidget() is self.chart and self.chart_path is not None:
             imports = Imports({("instrument.evaluation.chart", "read_chart")})
-            key = repr(self.chart.key)
+            key = self.chart.key
             lines = [
-                f"points = read_chart({expression(self.chart_path, imports)})['points']",
-                f"ranked = sorted((p for p in points if p[{key}] is not None), key=lambda p: p[{key}])",
+                f"points = read_chart({expression(self.chart_path, imports)}).points",
+                f"ranked = sorted((p for p in points if p.{key} == p.{key}), key=lambda p: p.{key})",
             ]
         else:
             imports = Imports(
@@ -115,7 +115,7 @@ class ChartsPanel(Panel):
         return "\n".join([*imports.lines(), "", *lines, ""])
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> dict[str, Any] | ChartData:
     """Read stability maps, or a chart; FileError where it is neither."""
     try:
         return read_stability(path)

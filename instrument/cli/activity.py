@@ -14,7 +14,7 @@ from instrument.cli.options import Only
 from instrument.files.errors import BenchError, FileError
 from instrument.files.volumes import is_zarr_name
 from instrument.reconstruction.activity import ActivitySettings, find_activity, write_activity
-from instrument.reconstruction.options import InputOptions, SourceOptions
+from instrument.reconstruction.options import InputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.video_files import VideoPictures
 from instrument.runs.run import STATE
 from recon.base.declare import option
@@ -129,9 +129,9 @@ def _video(
         calibration=source.calibration,
         inputs=inputs,
         options=scene,
-        warm_iterations=WARM_ITERATIONS,
+        video=VideoOptions(warm_iterations=WARM_ITERATIONS),
     )
-    reconstruct_to_video(request, workers=None, scheduler=None, force=files.force)
+    reconstruct_to_video(request, force=files.force)
     return opened(request.out)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import fields, replace
@@ -25,16 +26,30 @@ from calibration_routines.optics.beads import (
     psf_lines,
     save_beads,
 )
-from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, routines
+from calibration_routines.plan_procedures import run_outcome
+from calibration_routines.procedure import (
+    Listener,
+    Outcome,
+    Outlook,
+    Procedure,
+    Routine,
+    RunEndedError,
+    routines,
+)
 from calibration_routines.psf.sweep_plan import SweepExposures
 from calibration_routines.psf.sweep_procedure import event_lines, event_note, exposure_lines
 from calibration_routines.psf.sweep_watch import SweepEvent
+from instrument.bench.bench import Bench
+from instrument.bench.safety import StepsFailedError
 from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.cli.options import Given
-from instrument.cli.progress import progress_bar
-from instrument.files.errors import BenchError
+from instrument.cli.progress import keys, progress_bar
+from instrument.files.errors import BenchError, duration, size
 from instrument.files.images import read_image
-from instrument.runs.runner import RunStatus
+from instrument.runs.acquire import free_bytes
+from instrument.runs.run import Run, RunCondition
+from instrument.runs.run_control import RunControl
+from instrument.runs.runner import RunState, RunStatus
 from recon.types import Geometry
 
 RunFolder = Annotated[
@@ -174,7 +189,7 @@ class TerminalListener(Listener):
             scale = 100 if total == 1 else 1  # a fraction is shown in parts of a hundred
             bar.update(task, completed=round(scale * done), total=scale * total)
             if at_most:
-                bar.update(task, note="at most")
+                self.note("at most")
 
     def exposures(self, found: SweepExposures) -> None:
         """Print them."""
@@ -198,12 +213,69 @@ class TerminalListener(Listener):
 
     def event(self, event: SweepEvent) -> None:
         """Show the newest PSF's figures beside the bar, and print what is wrong above it."""
-        console = self._console
+        self.note(event_note(event))
+        print_lines(self._console if self._bar is None else self._bar[0].console, event_lines(event))
+
+    def note(self, words: str) -> None:
+        """Show words beside the bar."""
         if self._bar is not None:
             bar, task = self._bar
-            bar.update(task, note=event_note(event))
-            console = bar.console
-        print_lines(console, event_lines(event))
+            bar.update(task, note=words)
+
+
+class _RunListener(TerminalListener):
+    """Shows how the frames of a plan go on: their rate, the free disk, what is wrong; says what is found."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(Console(stderr=True))
+        self._folder, self._free, self._free_at_s = folder, 0, 0.0
+        self.seconds = 0.0
+        """Since the run was started or resumed."""
+
+    def said(self, words: str) -> None:
+        """Print it."""
+        self.print(words.splitlines())
+
+    def frame(self, status: RunStatus) -> None:
+        """Advance the bar, with a note beside it."""
+        super().frame(status)
+        self.seconds = status.seconds
+        if time.monotonic() - self._free_at_s > 1:
+            self._free_at_s, self._free = time.monotonic(), free_bytes(self._folder)
+        rate = status.done_here / status.seconds if status.seconds else 0.0
+        words = [f"{rate:.1f}/s", f"{size(self._free)} free"]
+        words += [f"DROPPED {status.dropped}"] if status.dropped else []
+        words += [f"SATURATED {status.saturated_fraction:.2%}"] if status.saturated_fraction else []
+        if status.state is RunState.PAUSED:
+            words = ["PAUSED, light off: p goes on, q ends"]
+        self.note("  ".join(words))
+
+
+def carry_out_run(procedure: Procedure, bench: Bench, folder: Path) -> None:
+    """Carry out a plan, or a run that goes on, with keys; say how it ended and what to do next."""
+    control = RunControl()
+
+    def toggle() -> None:
+        control.resume() if control.is_pausing else control.pause()
+
+    def stop() -> None:
+        try:
+            control.stop()
+        except StepsFailedError as failure:
+            typer.echo(str(failure), err=True)
+
+    with (
+        _RunListener(folder) as listener,
+        keys({"p": toggle, "q": control.abort, "s": stop}),
+    ):
+        try:
+            done = procedure.carry_out(bench, folder, control=control, listener=listener)
+        except RunEndedError as ended:
+            done = run_outcome(ended.run)
+    print_outcome(Console(), done)
+    if isinstance(done.result, Run) and done.result.condition is not RunCondition.COMPLETED:
+        typer.echo(f"Go on with: diffuserbench resume {done.result.path}")
+    typer.echo(f"{duration(listener.seconds)}. Light off, nothing moving: {bench.label}", err=True)
 
 
 def print_lines(console: Console, lines: Sequence[str]) -> None:

@@ -95,7 +95,6 @@ def _photograph(asked: _Asked) -> None:
             f"{' and '.join(flags)}: for a PSF image (--psf); a calibration's PSFs were judged when they "
             "were measured. Leave it out."
         )
-    _require_auto(asked)
     outputs = Outputs.named(output.out or _PICTURE, output.figure, volume=is_volume)
     reconstruct_photograph(request, outputs, output)
 
@@ -119,14 +118,10 @@ def _video(asked: _Asked, run: Path | None) -> None:
         calibration=source.calibration,
         inputs=asked.inputs,
         options=asked.options,
+        video=video,
         rotate_deg=int(output.rotate_deg),
-        fps=video.fps,
-        film=video.film,
-        block=video.block,
-        over_time=video.over_time,
-        warm_iterations=video.warm_iterations,
     )
-    reconstruct_to_video(request, workers=video.workers, scheduler=video.scheduler, force=output.force)
+    reconstruct_to_video(request, force=output.force)
 
 
 def _patterned(asked: _Asked, run: Path | None, sheet: Path) -> None:
@@ -148,16 +143,3 @@ def _patterned(asked: _Asked, run: Path | None, sheet: Path) -> None:
         options=asked.options,
     )
     reconstruct_patterns(request, Outputs.named(output.out or _PICTURE), output)
-
-
-def _require_auto(asked: _Asked) -> None:
-    """Refuse what is about auto's choices where nothing is left to choose."""
-    model, overrides = asked.options.model, asked.options.choose
-    if asked.output.explain and model != "auto":
-        raise BenchError(
-            f"--explain says what --model auto chooses; --model {model} leaves nothing to choose."
-        )
-    if overrides is not None and model != "auto":
-        raise BenchError(
-            f"--choose overrules what --model auto chooses; it does not go with --model {model}."
-        )

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -12,22 +11,17 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from instrument.bench.bench import Bench
 from instrument.bench.config_file import load_config
-from instrument.bench.safety import StepsFailedError
 from instrument.cli.app import App, BenchOption, RunFolder, examples, open_and_say
 from instrument.cli.options import Given
-from instrument.cli.progress import keys, one_task
-from instrument.files.errors import FileError, duration, size
+from instrument.cli.progress import one_task
+from instrument.files.errors import FileError
 from instrument.files.volumes import is_zarr_name, uneven_steps
-from instrument.plan import Plan, check
 from instrument.plan.model import load_plan
-from instrument.runs.acquire import abilities_of, free_bytes, prepare, prepare_resume
 from instrument.runs.export import export as export_run
 from instrument.runs.inspection import run_paths, summary
 from instrument.runs.inspection import verify as verify_run
 from instrument.runs.run import BENCH_TOML, FinishReason, Run, RunCondition
-from instrument.runs.runner import Runner, RunState, RunStatus
 from instrument.runs.writer import RunWriter
 from recon.base.declare import option
 
@@ -204,78 +198,12 @@ def run(
     The bench is checked first; a stage that is not homed is homed. Whatever happens, the light ends off and
     nothing moves; diffuserbench resume goes on with a run that did not end.
     """
+    from calibration_routines.plan_procedures import PlanProcedure
+    from instrument.cli.calibrate import carry_out_run
+
     plan = load_plan(file)
     with open_and_say(bench) as opened:
-        folder = files.out or opened.config.data_folder
-        check(plan, replace(abilities_of(opened, folder), stage_homed=True))
-        home_if_needed(opened, plan)
-        runner = prepare(opened, plan, folder)
-        carry_out(opened, runner)
-
-
-def home_if_needed(bench: Bench, plan: Plan) -> None:
-    """Home the stage when the plan places anything and the stage has no reference yet."""
-    moves = any(part.positions is not None for part in plan.parts)
-    if moves and bench.stage is not None and not bench.stage.is_homed:
-        typer.echo("Homing the stage.", err=True)
-        bench.stage.home()
-
-
-def carry_out(bench: Bench, runner: Runner) -> Run:
-    """Execute a runner with a progress bar and keys, and say how it ended and what to do next."""
-    free_at_s, free = 0.0, 0
-    with one_task("Frames", runner.status.total) as advance:
-
-        def report(status: RunStatus) -> None:
-            nonlocal free_at_s, free
-            if time.monotonic() - free_at_s > 1:
-                free_at_s, free = time.monotonic(), free_bytes(runner.path)
-            advance(status.done, note=_note(status, free))
-
-        runner.on_progress = report
-
-        def toggle() -> None:
-            runner.resume() if runner.is_pausing else runner.pause()
-
-        def stop() -> None:
-            try:
-                runner.stop()
-            except StepsFailedError as failure:
-                typer.echo(str(failure), err=True)
-
-        with keys({"p": toggle, "q": runner.abort, "s": stop}):
-            run = runner.execute()
-    _last_words(bench, run, runner.status)
-    return run
-
-
-def _note(status: RunStatus, free: int) -> str:
-    if status.state is RunState.PAUSED:
-        return "PAUSED, light off: p goes on, q ends"
-    rate = status.done_here / status.seconds if status.seconds else 0.0
-    words = [f"{rate:.1f}/s", f"{size(free)} free"]
-    words += [f"DROPPED {status.dropped}"] if status.dropped else []
-    words += [f"SATURATED {status.saturated_fraction:.2%}"] if status.saturated_fraction else []
-    return "  ".join(words)
-
-
-def _last_words(bench: Bench, run: Run, status: RunStatus) -> None:
-    mark = " SIMULATED" if run.is_simulated else ""
-    typer.echo(
-        f"{run.condition}: {len(run.records)} of {run.n_frames} frames in {duration(status.seconds)}{mark}"
-    )
-    if status.dropped:
-        typer.echo(f"Warning: the camera dropped {status.dropped} frames between these.", err=True)
-    saturated = [i for i, record in run.records.items() if record.metadata.saturated_fraction > 0]
-    if saturated:
-        typer.echo(
-            f"Warning: {len(saturated)} frames have saturated pixels, the first is frame {saturated[0]}.",
-            err=True,
-        )
-    typer.echo(f"Run: {run.path}")
-    if run.condition is not RunCondition.COMPLETED:
-        typer.echo(f"Go on with: diffuserbench resume {run.path}")
-    typer.echo(f"Light off, nothing moving: {bench.label}", err=True)
+        carry_out_run(PlanProcedure(plan), opened, files.out or opened.config.data_folder)
 
 
 @resume_app.command(
@@ -292,40 +220,22 @@ def resume(
     cut off is closed, so that it reads as what it is. A sweep of calibrate becomes its calibration when its
     last frame is there, a run of calibrate angular or dpc its response or surface.
     """
-    from calibration_routines.plan_procedures import routine_of
-    from instrument.cli.calibrate import TerminalListener
+    from calibration_routines.plan_procedures import ResumeProcedure, finished
+    from instrument.cli.calibrate import TerminalListener, carry_out_run, print_outcome
+    from instrument.runs.run_control import RunControl
 
     found = Run.open(run)
     if found.plan is None:
         _close_recording(found)
-        return
-    if found.condition is RunCondition.COMPLETED and not found.missing():
+    elif found.condition is RunCondition.COMPLETED and not found.missing():
         typer.echo(f"{run}: complete already, {found.n_frames} frames. diffuserbench verify reads them all.")
-        _finish(found, None)
-        return
-    with open_and_say(bench or run / BENCH_TOML) as opened:
-        home_if_needed(opened, found.plan)
-        with one_task("Verifying") as advance:
-            runner, findings = prepare_resume(opened, run, on_verify=advance)
-        typer.echo(f"Found {findings}", err=True)
-        routine = routine_of(run)
-        if routine is not None and routine.watch is not None:
-            routine.watch(opened, runner, TerminalListener(Console(stderr=True)))
-        done = carry_out(opened, runner)
-        if done.condition is RunCondition.COMPLETED:
-            _finish(done, opened)
-
-
-def _finish(run: Run, bench: Bench | None) -> None:
-    """Make the result of a routine's complete run that has none yet, with retakes where there is a bench."""
-    from calibration_routines.plan_procedures import finished
-    from instrument.cli.calibrate import TerminalListener, print_outcome
-    from instrument.runs.run_control import RunControl
-
-    with TerminalListener() as listener:
-        outcome = finished(run, bench, RunControl(), listener)
-    if outcome is not None:
-        print_outcome(Console(), outcome)
+        with TerminalListener() as listener:
+            outcome = finished(found, None, RunControl(), listener)
+        if outcome is not None:
+            print_outcome(Console(), outcome)
+    else:
+        with open_and_say(bench or run / BENCH_TOML) as opened:
+            carry_out_run(ResumeProcedure(run), opened, run)
 
 
 def _close_recording(run: Run) -> None:

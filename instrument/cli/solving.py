@@ -166,11 +166,10 @@ def _end(result: Reconstruction, what: str) -> None:
         raise typer.Exit(130)
 
 
-def reconstruct_to_video(
-    request: VideoRequest, *, workers: int | None, scheduler: str | None, force: bool
-) -> None:
+def reconstruct_to_video(request: VideoRequest, *, force: bool) -> None:
     """Prepare or take up again, solve with a progress bar, finish; exit code 130 where interrupted."""
-    require_crew(workers=workers, scheduler=scheduler)  # before anything is written
+    video = request.video
+    require_crew(workers=video.workers, scheduler=video.scheduler)  # before anything is written
     prepared = prepare_video(request, force=force)
     for name, text in prepared.notes.items():
         typer.echo(f"{name:<12}{text}")
@@ -189,7 +188,7 @@ def reconstruct_to_video(
     if prepared.resumed:
         typer.echo(f"{'Resumed':<12}{_frames_done(prepared)} frames are done already")
     began_s, before = time.monotonic(), _frames_done(prepared)
-    complete = _solve(prepared, workers, scheduler)
+    complete = _solve(prepared)
     seconds, done = time.monotonic() - began_s, _frames_done(prepared)
     if done > before:
         typer.echo(
@@ -211,7 +210,7 @@ def reconstruct_to_video(
     typer.echo(f"{'Wrote':<12}{', '.join(map(str, finish_video(prepared)))}")
 
 
-def _solve(prepared: PreparedVideo, workers: int | None, scheduler: str | None) -> bool:
+def _solve(prepared: PreparedVideo) -> bool:
     total = len(prepared.job.plan.frames)
     before = _frames_done(prepared)
     began_s = time.monotonic()
@@ -224,7 +223,7 @@ def _solve(prepared: PreparedVideo, workers: int | None, scheduler: str | None) 
             rate = (done - before) / max(time.monotonic() - began_s, 1e-9)
             advance(done, note=f"{rate:.1f} frames/s")
 
-        return solve_video(prepared, on_progress, cancel, workers=workers, scheduler=scheduler)
+        return solve_video(prepared, on_progress, cancel)
 
 
 def _frames_done(prepared: PreparedVideo) -> int:

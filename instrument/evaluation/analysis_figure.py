@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from instrument.files.figures import ACCENT, INK, mark_simulated, style
 from recon.analysis import Analysis
 from recon.analysis.gram import ConditionCurve
 from recon.analysis.points import PointTrial
@@ -17,10 +18,7 @@ if TYPE_CHECKING:
 
     Panel = Callable[[Axes], None]
 
-_INK = "#22303c"
-_FAINT = "#8496a5"
 _QUIET = "#52667a"
-_ACCENT = "#d1495b"
 _COLUMNS = 3
 _WIDTH_IN, _HEAD_IN, _ROW_IN, _FOOT_IN, _NOTE_IN = 15.5, 1.35, 3.35, 0.3, 0.185
 _COLORS = ("#00798c", "#d1495b", "#edae49", "#30638e", "#6a4c93")
@@ -40,7 +38,6 @@ def draw_analysis(analysis: Analysis, title: str, subtitle: str = "", *, simulat
     simulated : bool
         Whether the calibration came from the simulated bench, which the page then says.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     panels = _panels(analysis)
@@ -50,7 +47,6 @@ def draw_analysis(analysis: Analysis, title: str, subtitle: str = "", *, simulat
     notes_in = _NOTE_IN * note_rows + (0.35 if note_rows else 0.0)
     height_in = _HEAD_IN + _ROW_IN * rows + notes_in + _FOOT_IN
     figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=110, facecolor="white")
-    FigureCanvasAgg(figure)
     top, bottom = 1 - _HEAD_IN / height_in, (_FOOT_IN + notes_in + 0.35) / height_in
     sides: dict[str, Any] = {"left": 0.05, "right": 0.715, "top": top, "bottom": bottom}
     grid = figure.add_gridspec(rows, _COLUMNS, **sides, hspace=0.44, wspace=0.27)
@@ -58,19 +54,17 @@ def draw_analysis(analysis: Analysis, title: str, subtitle: str = "", *, simulat
         axes = figure.add_subplot(grid[divmod(number, _COLUMNS)])
         draw(axes)
         axes.set_title(
-            f"({chr(97 + number)}) {axes.get_title(loc='left')}", fontsize=12, color=_INK, loc="left", pad=6
+            f"({chr(97 + number)}) {axes.get_title(loc='left')}", fontsize=12, color=INK, loc="left", pad=6
         )
     _facts(figure, analysis, 0.745, top, height_in)
     y = (_FOOT_IN + notes_in - 0.15) / height_in
     for x, lines in zip((0.05, 0.53), columns, strict=True):
         for row, line in enumerate(lines):
-            figure.text(x, y - row * _NOTE_IN / height_in, line, fontsize=9, color=_INK, va="top")
-    figure.text(0.05, 1 - 0.42 / height_in, title, fontsize=18, color=_INK, weight="bold", va="center")
-    figure.text(0.05, 1 - 0.78 / height_in, subtitle, fontsize=10.5, color=_INK, va="center")
+            figure.text(x, y - row * _NOTE_IN / height_in, line, fontsize=9, color=INK, va="top")
+    figure.text(0.05, 1 - 0.42 / height_in, title, fontsize=18, color=INK, weight="bold", va="center")
+    figure.text(0.05, 1 - 0.78 / height_in, subtitle, fontsize=10.5, color=INK, va="center")
     if simulated:
-        box: dict[str, Any] = {"boxstyle": "round,pad=0.35", "facecolor": _ACCENT, "edgecolor": "none"}
-        bold: dict[str, Any] = {"fontsize": 14, "weight": "bold", "color": "white"}
-        figure.text(0.985, 1 - 0.45 / height_in, "SIMULATED", ha="right", va="center", bbox=box, **bold)
+        mark_simulated(figure, 1 - 0.45 / height_in)
     return figure
 
 
@@ -179,17 +173,6 @@ def _shown(trials: Sequence[PointTrial]) -> PointTrial | None:
     return next((t for t in trials if t.resolved), trials[-1] if trials else None)
 
 
-def _style(axes: Axes, title: str, x: str = "", y: str = "") -> None:
-    axes.set_title(title, fontsize=11.5, color=_INK, loc="left", pad=5)
-    axes.set_xlabel(x, fontsize=10, color=_INK)
-    axes.set_ylabel(y, fontsize=10, color=_INK)
-    axes.tick_params(labelsize=9, colors=_INK, length=2)
-    axes.grid(True, color="#e3e8ec", linewidth=0.7)
-    for name, spine in axes.spines.items():
-        spine.set_visible(name in ("left", "bottom"))
-        spine.set_edgecolor(_FAINT)
-
-
 def _note(
     axes: Axes, text: str, at: tuple[float, float], color: str, offset: tuple[float, float], **how: Any
 ) -> None:
@@ -206,7 +189,7 @@ def _psf(axes: Axes, a: Analysis) -> None:
         extent=(-half_x, half_x, half_y, -half_y),
         interpolation="antialiased",
     )
-    _style(axes, f"PSF at {a.z_um / 1e3:.3g} mm", "x on the sensor, mm", "y, mm")
+    style(axes, f"PSF at {a.z_um / 1e3:.3g} mm", "x on the sensor, mm", "y, mm")
     axes.grid(False)
 
 
@@ -214,14 +197,14 @@ def _autocorrelation(axes: Axes, a: Analysis) -> None:
     shown = min(len(a.autocorrelation), max(12, int(8 * a.lateral.mean_px)))
     axes.plot(np.arange(shown), a.autocorrelation[:shown], color=_COLORS[0], linewidth=1.8)
     for level, resolution, color in (
-        (0.7, a.lateral.half_width_px[1], _ACCENT),
+        (0.7, a.lateral.half_width_px[1], ACCENT),
         (0.8, a.lateral_inner.half_width_px[1], _COLORS[2]),
     ):
         axes.plot([0, resolution, resolution], [level, level, 0], color=color, linewidth=1, linestyle="--")
         _note(axes, f"{level:g} at {resolution:.2f} px", (resolution, level), color, (4, 2))
     axes.set_xlim(0, shown - 1)
     axes.set_ylim(0, 1.02)
-    _style(axes, "Autocorrelation", "shift, pixels (along x)", "inner product")
+    style(axes, "Autocorrelation", "shift, pixels (along x)", "inner product")
 
 
 def _depth_of_field(axes: Axes, a: Analysis) -> None:
@@ -229,11 +212,11 @@ def _depth_of_field(axes: Axes, a: Analysis) -> None:
     z = np.geomspace(min(0.02 * hyperfocal, 0.5 * a.z_um), 0.97 * hyperfocal, 200)
     reach = [sum(a.axial.depth_of_field_um(float(v))) for v in z]
     axes.loglog(z / 1e3, np.array(reach) / 1e3, color=_COLORS[0], linewidth=1.8)
-    axes.axvline(hyperfocal / 1e3, color=_ACCENT, linestyle=":", linewidth=1.5)
+    axes.axvline(hyperfocal / 1e3, color=ACCENT, linestyle=":", linewidth=1.5)
     place = (hyperfocal / 1e3, reach[len(reach) // 2] / 1e3)
     aside: dict[str, Any] = {"rotation": 90, "ha": "right", "va": "center"}
-    _note(axes, f"hyperfocal {_mm(hyperfocal)}", place, _ACCENT, (-2, 0), **aside)
-    _style(axes, "Depth of field", "depth, mm", "depth of field, mm")
+    _note(axes, f"hyperfocal {_mm(hyperfocal)}", place, ACCENT, (-2, 0), **aside)
+    style(axes, "Depth of field", "depth, mm", "depth of field, mm")
 
 
 def _depth(axes: Axes, a: Analysis) -> None:
@@ -244,7 +227,7 @@ def _depth(axes: Axes, a: Analysis) -> None:
     place = (float(a.depth.z_um[0]) / 1e3, level)
     _note(axes, "nearest with farthest, at any shift", place, _COLORS[2], (2, 3))
     axes.set_ylim(0, 1.03)
-    _style(axes, f"Similarity to the PSF at {a.depth.middle_um / 1e3:.3g} mm", "depth, mm", "inner product")
+    style(axes, f"Similarity to the PSF at {a.depth.middle_um / 1e3:.3g} mm", "depth, mm", "inner product")
 
 
 def _field(axes: Axes, a: Analysis) -> None:
@@ -252,10 +235,10 @@ def _field(axes: Axes, a: Analysis) -> None:
     axes.plot(
         angles, [p.similarity for p in a.field], "o", color=_COLORS[0], markersize=4, label="inner product"
     )
-    axes.plot(angles, [p.spot for p in a.field], "s", color=_ACCENT, markersize=4, label="spot size / axis")
+    axes.plot(angles, [p.spot for p in a.field], "s", color=ACCENT, markersize=4, label="spot size / axis")
     axes.legend(fontsize=9, frameon=False)
     axes.set_ylim(bottom=0)
-    _style(axes, "Across the field, against the central PSF", "angle, degrees")
+    style(axes, "Across the field, against the central PSF", "angle, degrees")
 
 
 def _condition(axes: Axes, curves: Sequence[ConditionCurve]) -> None:
@@ -266,15 +249,15 @@ def _condition(axes: Axes, curves: Sequence[ConditionCurve]) -> None:
     for curve in curves:
         color = _COLORS[counts.index(curve.count) % len(_COLORS)]
         named: dict[str, Any] = {"label": f"{curve.count} in {curve.direction}", "color": color}
-        style = f"o{styles[curve.direction]}"
-        axes.semilogy(curve.separations, curve.values, style, markersize=3, linewidth=1.3, **named)
+        line = f"o{styles[curve.direction]}"
+        axes.semilogy(curve.separations, curve.values, line, markersize=3, linewidth=1.3, **named)
     axes.legend(fontsize=8.5, frameon=False, ncols=2)
     # Plain numbers: the range is often less than a decade, where powers of ten say little.
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("{x:g}")
     axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 3.0, 5.0)))
-    _style(axes, "Local condition number", "separation, voxels", "condition number")
-    axes.tick_params(which="minor", labelsize=9, colors=_INK, length=2)
+    style(axes, "Local condition number", "separation, voxels", "condition number")
+    axes.tick_params(which="minor", labelsize=9, colors=INK, length=2)
 
 
 def _profile(axes: Axes, trial: PointTrial, title: str, unit: str, axis: int) -> None:
@@ -285,7 +268,7 @@ def _profile(axes: Axes, trial: PointTrial, title: str, unit: str, axis: int) ->
     reach = 2.5 * separation + 2
     axes.set_xlim(-reach, reach)
     verdict = f"dip {trial.dip:.0%}" if trial.resolved else "not resolved"
-    _style(axes, f"{title}: {separation:.3g} {unit}, {verdict}", unit, "brightness found")
+    style(axes, f"{title}: {separation:.3g} {unit}, {verdict}", unit, "brightness found")
 
 
 def _sixteen(axes: Axes, trial: PointTrial, a: Analysis) -> None:
@@ -301,7 +284,7 @@ def _sixteen(axes: Axes, trial: PointTrial, a: Analysis) -> None:
     axes.set_xlim(-reach, reach)
     factor = a.points.sixteen_factor if a.points is not None else None
     verdict = f"resolved at {factor:.2g} x" if factor is not None else "not resolved"
-    _style(axes, f"16 points: {verdict}", "pixels", "planes")
+    style(axes, f"16 points: {verdict}", "pixels", "planes")
     axes.grid(False)
 
 
@@ -316,7 +299,7 @@ def _voxels(axes: Axes, a: Analysis) -> None:
         axes.plot(
             [share * tangent * z[0], share * tangent * z[-1]], [z[0], z[-1]], color=_COLORS[0], linewidth=0.5
         )
-    _style(axes, f"Voxel grid to scale: {len(z)} plane{'s' if len(z) > 1 else ''}", "x, mm", "z, mm")
+    style(axes, f"Voxel grid to scale: {len(z)} plane{'s' if len(z) > 1 else ''}", "x, mm", "z, mm")
     axes.grid(False)
     if len(z) > 1:
         axes.set_aspect("equal", adjustable="datalim")
@@ -333,5 +316,5 @@ def _facts(figure: Figure, a: Analysis, x: float, top: float, height_in: float) 
             figure.text(x, y, name.strip(), fontsize=9.5, color=_QUIET, va="top")
             y -= 0.19 / height_in
         for line in textwrap.wrap(value, 46):
-            figure.text(x, y, line, fontsize=10.5, color=_INK, va="top")
+            figure.text(x, y, line, fontsize=10.5, color=INK, va="top")
             y -= 0.2 / height_in

@@ -67,6 +67,9 @@ def photographs(size: int, path: Path, advance: Advance, *, budget_s: float = np
 
     They are kept as they are taken, and are the same however often that was interrupted.
 
+    Raises OutOfTimeError when the time was not enough: the next call goes on. Raises FileError when the file
+    holds something else.
+
     Parameters
     ----------
     size : int
@@ -77,13 +80,6 @@ def photographs(size: int, path: Path, advance: Advance, *, budget_s: float = np
         Called with how many photographs are done, and how many there are.
     budget_s : float
         Seconds after which no other photograph is begun; one is taken in any case.
-
-    Raises
-    ------
-    OutOfTimeError
-        When the time was not enough: the next call goes on.
-    FileError
-        When the file holds something else.
     """
     bench = _Bench(size)
     shots = _shots(bench)

@@ -54,25 +54,18 @@ _PRELOADED = [
 
 @dataclass(frozen=True)
 class ChartData:
-    """What a chart holds.
-
-    Attributes
-    ----------
-    kind_name : str
-        Of :data:`recon.evaluation.scored.KINDS`.
-    about : mapping
-        What was charted, JSON-compatible.
-    failed : mapping of str to str
-        Settings that could not be run, and why.
-    missing : tuple of str
-        Settings for which there was no time, or not enough: their points, if any, end before the last count.
-    """
+    """What a chart holds."""
 
     kind_name: KindName
+    """Of :data:`recon.evaluation.scored.KINDS`."""
     about: Mapping[str, Any]
+    """What was charted, JSON-compatible."""
     points: tuple[Point, ...]
     failed: Mapping[str, str]
+    """Settings that could not be run, and why."""
     missing: tuple[str, ...]
+    """Settings for which there was no time, or not enough: their points, if any, end before the last
+    count."""
 
     @property
     def kind(self) -> Kind:
@@ -170,20 +163,10 @@ def subject_of(kind: str, about: Mapping[str, Any]) -> str:
 
 
 # Reading --------------------------------------------------------------------------------------------
-def read_chart(path: Path, remedy: str = "Make it with diffuserbench chart.") -> dict[str, Any]:
-    """Read what ``diffuserbench chart`` wrote.
+def read_chart(path: Path, remedy: str = "Make it with diffuserbench chart.") -> ChartData:
+    """Read what ``diffuserbench chart`` wrote; settings get the names that they have now.
 
-    Returns
-    -------
-    dict
-        ``kind`` (of :data:`recon.evaluation.scored.KINDS`), ``about`` (what was charted), ``points`` (the
-        fields of :class:`recon.evaluation.scored.Point`; None where one is not known), ``failed`` (settings
-        and why), ``missing`` (settings without time). Settings have the names that they have now.
-
-    Raises
-    ------
-    FileError
-        When it is no such file, or of another version.
+    Raises FileError when it is no such file, or of another version.
     """
     try:
         record = json.loads(path.read_text("utf-8"))
@@ -195,16 +178,23 @@ def read_chart(path: Path, remedy: str = "Make it with diffuserbench chart.") ->
         raise FileError(
             path, f"has version {record['schema']}; this program reads {SCHEMA}.", "Make it again."
         )
-    kind = record.setdefault("kind", "reconstruction")
+    kind = record.get("kind", "reconstruction")
     if kind not in KINDS:
         raise FileError(path, f"charts {kind!r}; known are {', '.join(KINDS)}.", remedy)
-    record = {"failed": {}, "missing": [], **record}
-    if kind == "reconstruction":
-        for point in record["points"]:
-            point |= {key: _renamed(point[key]) for key in ("setting", "family") if key in point}
-        record["failed"] = {_renamed(name): why for name, why in record["failed"].items()}
-        record["missing"] = [_renamed(name) for name in record["missing"]]
-    return record
+    now: Callable[[str], str] = _renamed if kind == "reconstruction" else str
+    try:
+        points = tuple(_point_of(point, now) for point in record["points"])
+    except TypeError as error:
+        raise FileError(path, f"is no chart of this program ({error}).", remedy) from error
+    failed = {now(name): why for name, why in record.get("failed", {}).items()}
+    return ChartData(kind, record["about"], points, failed, tuple(map(now, record.get("missing", ()))))
+
+
+def _point_of(record: Mapping[str, Any], now: Callable[[str], str]) -> Point:
+    """Return a point of a chart's record, whose settings are called ``now(name)``."""
+    values: dict[str, Any] = {k: float("nan") if v is None else v for k, v in record.items()}
+    values |= {key: now(values[key]) for key in ("setting", "family") if key in values}
+    return Point(**{**values, "held_out_parts": tuple(values.get("held_out_parts", ()))})
 
 
 def _is_chart(record: Any) -> bool:
@@ -344,14 +334,19 @@ def make_chart(
 
     The chart is written after each setting, so that an interrupted one goes on where it was.
 
-    Raises
-    ------
-    FileError
-        When ``path`` is the chart of another problem.
+    Raises FileError when ``path`` is the chart of another problem.
     """
-    key = problem.fingerprint()
-    points, failed, cut_off = _kept(path, key)
-    about = {**about, "fingerprint": key, "pixels": list(problem.pixels)}
+    about = {**about, "fingerprint": problem.fingerprint(), "pixels": list(problem.pixels)}
+    kept = ChartData(problem.kind, about, (), {}, ())
+    if path.exists():
+        kept = read_chart(path, "Name another folder with --out.")
+    if kept.about.get("fingerprint") != about["fingerprint"]:
+        raise FileError(
+            path,
+            "is a chart of something else: another picture, calibration, noise or version of the program.",
+            "Name another folder with --out.",
+        )
+    points, failed, cut_off = list(kept.points), dict(kept.failed), set(kept.missing)
     settings = problem.settings()
     begun = {p.setting for p in points}
     waiting = [s for s in settings if s.name not in begun | set(failed)]
@@ -378,27 +373,3 @@ def make_chart(
         data = ChartData(problem.kind, about, tuple(points), dict(failed), tuple(missing))
         write_text(path, json.dumps(data.to_json(), indent=1, allow_nan=False) + "\n")
     return data
-
-
-def _kept(path: Path, key: str) -> tuple[list[Point], dict[str, str], set[str]]:
-    """Return points, failures and the settings that are not finished, as a chart has them."""
-    if not path.exists():
-        return [], {}, set()
-    record = read_chart(path, "Name another folder with --out.")
-    if record["about"].get("fingerprint") != key:
-        raise FileError(
-            path,
-            "is a chart of something else: another picture, calibration, noise or version of the program.",
-            "Name another folder with --out.",
-        )
-    try:
-        points = [point_of(p) for p in record["points"]]
-    except TypeError as error:
-        raise FileError(path, f"is no chart of this program ({error}).", "Name another folder.") from error
-    return points, dict(record["failed"]), set(record["missing"])
-
-
-def point_of(record: dict[str, Any]) -> Point:
-    """Return a point of a chart's record."""
-    values: dict[str, Any] = {k: float("nan") if v is None else v for k, v in record.items()}
-    return Point(**{**values, "held_out_parts": tuple(values.get("held_out_parts", ()))})

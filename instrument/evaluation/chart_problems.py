@@ -30,10 +30,7 @@ EXPANSIONS = (4, 16)
 def problem_of_scene(family: str, size: int, seed: int) -> tuple[ChartProblem, dict[str, Any]]:
     """Return a test scene to chart on, and what to say of it.
 
-    Raises
-    ------
-    BenchError
-        When there is no such scene.
+    Raises BenchError when there is no such scene.
     """
     try:
         scene = make_scene(family, size=size, seed=seed, grid=3)  # type: ignore[arg-type]
@@ -69,10 +66,7 @@ def problem_of_calibrations(
 ) -> tuple[OwnCalibrationsProblem, dict[str, Any]]:
     """Return calibrations to compare on one photograph, by their folders, and what to say of them.
 
-    Raises
-    ------
-    BenchError
-        When they do not bring the photograph to the same pixels.
+    Raises BenchError when they do not bring the photograph to the same pixels.
     """
     own = []
     for folder, job in jobs.items():
@@ -129,6 +123,8 @@ def problem_of_pictures(
 ) -> tuple[HologramProblem, dict[str, Any]]:
     """Return pictures to chart holograms of, one a plane, and what to say of them.
 
+    Raises BenchError or FileError.
+
     Parameters
     ----------
     config : BenchConfig
@@ -141,10 +137,6 @@ def problem_of_pictures(
         Empty: the bench's own, and :data:`EXPANSIONS`.
     slm : (int, int), optional
         Rows and columns to compute for, on the bench's SLM's pitch. Default: the SLM's own.
-
-    Raises
-    ------
-    BenchError, FileError
     """
     depths = list(z_mm) if z_mm else [0.0] * len(pictures)
     if len(depths) != len(pictures) or (len(pictures) > 1 and not z_mm):

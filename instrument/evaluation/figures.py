@@ -13,20 +13,17 @@ import numpy as np
 
 from instrument.evaluation.chart import ChartData, colours_of, in_words, title_of
 from instrument.files.atomic import write_text
-from instrument.files.figures import save_figure
+from instrument.files.figures import ACCENT, INK, save_figure
 from recon.evaluation.scored import MEMORY, Axis, Kind, Point, is_known, pareto
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_INK = "#22303c"
-_BOUNDARY = "#d1495b"
-
 
 def chart_page(data: ChartData) -> str:
     """Return a page: points to hover over, families to switch off, axes to choose; the front by name."""
-    known = [k for k in data.kind.scores if any(getattr(p, k.key) == getattr(p, k.key) for p in data.points)]
+    known = [k for k in data.kind.scores if any(is_known(p, k.key) for p in data.points)]
     payload = json.dumps(
         {
             "points": [p.to_json() for p in data.points],
@@ -149,8 +146,6 @@ _NARROW = 3.0
 """Times the least value up to which an axis is linear, whatever it should be."""
 _MOST_NAMES = 12
 """Names of a front that fit beside a panel; of more, the cheapest are left out."""
-
-
 _SAME_PLACE = (0.02, 0.03)
 """Parts of a panel's width and height within which two labels would cover each other."""
 
@@ -294,14 +289,12 @@ def map_figure(record: Mapping[str, Any]) -> Figure:
     Severity is shown from blue (far from failing) over white (at the boundary) to brown (failed); each cell
     carries its error; the red line is the boundary, severity 1.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     methods = record["methods"]
     columns = min(len(methods), 3)
     rows = -(-len(methods) // columns)
     figure = Figure(figsize=(max(4.6 * columns + 0.9, 7.0), 3.5 * rows + 1.0), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis in axes[len(methods) :]:
         axis.set_axis_off()
@@ -311,8 +304,8 @@ def map_figure(record: Mapping[str, Any]) -> Figure:
     ]
     bar = figure.colorbar(images[0], ax=list(axes), shrink=0.8, ticks=[-1, 0, 1])
     bar.ax.set_yticklabels(["10 times\nbelow", "boundary", "10 times\nabove"], fontsize=8)
-    bar.set_label("severity", fontsize=9, color=_INK)
-    figure.suptitle(f"{record['title']} (SIMULATED)", fontsize=12, color=_INK, wrap=True)
+    bar.set_label("severity", fontsize=9, color=INK)
+    figure.suptitle(f"{record['title']} (SIMULATED)", fontsize=12, color=INK, wrap=True)
     return figure
 
 
@@ -321,28 +314,19 @@ def _draw_map(axes: Axes, name: str, method: Mapping[str, Any], record: Mapping[
     level = np.log10(np.maximum(severity, 1e-2))
     image = axes.imshow(level, origin="lower", aspect="auto", cmap="BrBG_r", vmin=-1, vmax=1)
     n_y, n_x = severity.shape
-    for iy in range(n_y):
-        for ix in range(n_x):
-            error = method["error"][iy][ix]
-            if error is not None:
-                dark = abs(level[iy, ix]) > 0.75
-                axes.text(
-                    ix,
-                    iy,
-                    f"{error:.2g}",
-                    ha="center",
-                    va="center",
-                    fontsize=7,
-                    color="white" if dark else _INK,
-                )
+    for iy, ix in np.ndindex(n_y, n_x):
+        error = method["error"][iy][ix]
+        if error is not None:
+            colour = "white" if abs(level[iy, ix]) > 0.75 else INK
+            axes.text(ix, iy, f"{error:.2g}", ha="center", va="center", fontsize=7, color=colour)
     if n_x > 1 and n_y > 1 and np.isfinite(level).all() and level.min() < 0 <= level.max():
-        axes.contour(level, levels=[0.0], colors=[_BOUNDARY], linewidths=2.2)
+        axes.contour(level, levels=[0.0], colors=[ACCENT], linewidths=2.2)
     for which, count in (("x", n_x), ("y", n_y)):
         about = record[which]
         getattr(axes, f"set_{which}ticks")(range(count))
         getattr(axes, f"set_{which}ticklabels")(ticks_of(about), fontsize=8)
-        getattr(axes, f"set_{which}label")(label_of(about), fontsize=9, color=_INK)
-    axes.set_title(f"{name} (numbers: {record['error']})", fontsize=10, color=_INK, loc="left")
+        getattr(axes, f"set_{which}label")(label_of(about), fontsize=9, color=INK)
+    axes.set_title(f"{name} (numbers: {record['error']})", fontsize=10, color=INK, loc="left")
     return image
 
 

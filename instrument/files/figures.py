@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 Image = npt.NDArray[np.floating]
 
-_INK = "#22303c"
-_FAINT = "#8496a5"
-_ACCENT = "#d1495b"
-_SECOND = "#00798c"
+INK = "#22303c"
+FAINT = "#8496a5"
+ACCENT = "#d1495b"
+SECOND = "#00798c"
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,24 +94,21 @@ def summary_figure(summary: Summary) -> Figure:
         for column, panel in enumerate(summary.sweep):
             _draw_panel(figure.add_subplot(strip[0, column]), panel, small=True)
         top = outer[1].get_position(figure).y1
-        figure.text(0.035, top + 0.028, summary.sweep_title, fontsize=13, color=_INK, va="bottom")
+        figure.text(0.035, top + 0.028, summary.sweep_title, fontsize=13, color=INK, va="bottom")
     bottom = outer[rows - 1].subgridspec(1, 2, width_ratios=[1.25, 1.0], wspace=0.12)
     _draw_convergence(figure.add_subplot(bottom[0, 0]), summary.convergence)
     _draw_facts(figure.add_subplot(bottom[0, 1]), summary.lines)
-    figure.text(0.035, 0.955, summary.title, fontsize=17, color=_INK, weight="bold", va="center")
+    figure.text(0.035, 0.955, summary.title, fontsize=17, color=INK, weight="bold", va="center")
     if summary.simulated:
-        figure.text(
-            0.985,
-            0.955,
-            "SIMULATED",
-            fontsize=14,
-            weight="bold",
-            color="white",
-            ha="right",
-            va="center",
-            bbox={"boxstyle": "round,pad=0.35", "facecolor": _ACCENT, "edgecolor": "none"},
-        )
+        mark_simulated(figure, 0.955)
     return figure
+
+
+def mark_simulated(figure: Figure, y: float) -> None:
+    """Write SIMULATED at a figure's right side, ``y`` from its bottom."""
+    box: dict[str, Any] = {"boxstyle": "round,pad=0.35", "facecolor": ACCENT, "edgecolor": "none"}
+    bold: dict[str, Any] = {"fontsize": 14, "weight": "bold", "color": "white"}
+    figure.text(0.985, y, "SIMULATED", ha="right", va="center", bbox=box, **bold)
 
 
 def save_figure(figure: Figure, path: Path | str) -> Path:
@@ -134,11 +131,11 @@ def _draw_panel(axes: Axes, panel: Panel, *, small: bool = False) -> None:
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():
-        spine.set_edgecolor(_FAINT)
+        spine.set_edgecolor(FAINT)
         spine.set_linewidth(0.6)
-    axes.set_title(panel.title, fontsize=9 if small else 13, color=_INK, loc="left", pad=3 if small else 5)
+    axes.set_title(panel.title, fontsize=9 if small else 13, color=INK, loc="left", pad=3 if small else 5)
     if panel.caption:
-        axes.set_xlabel(panel.caption, fontsize=8 if small else 10, color=_FAINT, loc="left", labelpad=4)
+        axes.set_xlabel(panel.caption, fontsize=8 if small else 10, color=FAINT, loc="left", labelpad=4)
     if panel.pixel_mm is not None:
         _draw_scale_bar(axes, panel.image.shape[1], panel.image.shape[0], panel.pixel_mm)
 
@@ -160,16 +157,16 @@ def _round_length(length: float) -> float:
 
 def _draw_convergence(axes: Axes, convergence: Convergence) -> None:
     seconds, values = np.asarray(convergence.seconds), np.asarray(convergence.values)
-    axes.plot(seconds, values, color=_SECOND, linewidth=2)
+    axes.plot(seconds, values, color=SECOND, linewidth=2)
     if len(seconds):
-        axes.plot(seconds[-1:], values[-1:], "o", color=_ACCENT, markersize=6)
+        axes.plot(seconds[-1:], values[-1:], "o", color=ACCENT, markersize=6)
         axes.annotate(
             convergence.reached,
             (seconds[-1], values[-1]),
             xytext=(-6, 9),
             textcoords="offset points",
             ha="right",
-            color=_ACCENT,
+            color=ACCENT,
             fontsize=11,
             weight="bold",
         )
@@ -177,13 +174,19 @@ def _draw_convergence(axes: Axes, convergence: Convergence) -> None:
         axes.set_xlim(left=0.0)
     if convergence.log:
         axes.set_yscale("log")
-    axes.set_xlabel(convergence.x_label, fontsize=10, color=_INK)
-    axes.set_title(convergence.label, fontsize=13, color=_INK, loc="left", pad=5)
-    axes.grid(True, color="#e3e8ec", linewidth=0.8)
-    axes.tick_params(labelsize=9, colors=_INK, length=0)
+    style(axes, convergence.label, convergence.x_label, title_size=13)
+
+
+def style(axes: Axes, title: str, x: str = "", y: str = "", *, title_size: float = 11.5) -> None:
+    """Name a plot and its axes, and give it a faint grid and no box."""
+    axes.set_title(title, fontsize=title_size, color=INK, loc="left", pad=5)
+    axes.set_xlabel(x, fontsize=10, color=INK)
+    axes.set_ylabel(y, fontsize=10, color=INK)
+    axes.tick_params(labelsize=9, colors=INK, length=2)
+    axes.grid(True, color="#e3e8ec", linewidth=0.7)
     for name, spine in axes.spines.items():
         spine.set_visible(name in ("left", "bottom"))
-        spine.set_edgecolor(_FAINT)
+        spine.set_edgecolor(FAINT)
 
 
 def _draw_facts(axes: Axes, lines: Sequence[tuple[str, str]]) -> None:
@@ -191,5 +194,5 @@ def _draw_facts(axes: Axes, lines: Sequence[tuple[str, str]]) -> None:
     step = 1.0 / max(len(lines), 8)
     for index, (name, value) in enumerate(lines):
         y = 1.0 - (index + 0.4) * step
-        axes.text(0.0, y, name, transform=axes.transAxes, fontsize=10.5, color=_FAINT, va="center")
-        axes.text(0.34, y, value, transform=axes.transAxes, fontsize=10.5, color=_INK, va="center")
+        axes.text(0.0, y, name, transform=axes.transAxes, fontsize=10.5, color=FAINT, va="center")
+        axes.text(0.34, y, value, transform=axes.transAxes, fontsize=10.5, color=INK, va="center")

@@ -16,7 +16,7 @@ from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
 from instrument.files.record import Fields, RecordFormat
 from recon.verdict.cases import OF_VOLUMES
-from recon.verdict.map import Cell, Size, Stress, StressMap, boundary, severity_grid
+from recon.verdict.map import Cell, Size, Stress, StressMap, boundary
 
 
 def _named(method: str) -> str:
@@ -106,16 +106,17 @@ def map_record(stress: StressMap, size: Size, cells: Sequence[Cell]) -> dict[str
     """Return a map as ``stability.json`` has it (docs/reference/stability-json.md)."""
     x, y = stress.x.at(size), stress.y.at(size)
     methods: dict[str, Any] = {}
+    places = _grid(x, y, lambda k: k)
     for method in stress.methods:
         mine = {(c.iy, c.ix): c for c in cells if c.method == method}
         if not mine:
             continue
-        grid = severity_grid(list(cells), method, (len(y), len(x)))
+        severity = [[mine[k].severity if k in mine else np.nan for k in row] for row in places]
         methods[method] = {
             "error": _grid(x, y, lambda k, mine=mine: _maybe(mine, k, "error")),
             "severity": _grid(x, y, lambda k, mine=mine: _maybe(mine, k, "severity")),
             "failure": _grid(x, y, lambda k, mine=mine: _failure(mine, k)),
-            "boundary": boundary(x, y, grid, logarithmic=stress.x.logarithmic),
+            "boundary": boundary(x, y, np.array(severity), logarithmic=stress.x.logarithmic),
             "evidence": [
                 {"ix": c.ix, "iy": c.iy, **{k: _short(v) for k, v in e.items()}}
                 for c in mine.values()

@@ -7,14 +7,14 @@ calibrations too. Of an opened volume nothing is read that is not looked at.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import whole_folder
+from instrument.files.atomic import whole_file, whole_folder
 from instrument.files.errors import FileError
 
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ def uneven_steps(z_um: npt.NDArray[np.float64]) -> str:
 
 SUFFIXES = (".ome.zarr", ".zarr")
 """Names that ask for OME-Zarr."""
+_BIG_TIFF_BYTES = 4_000_000_000
 _SMALLEST_LEVEL = 128
 """Levels are halved laterally until the longer side is at most this many pixels."""
 
@@ -55,6 +56,12 @@ _SMALLEST_LEVEL = 128
 def is_zarr_name(path: Path) -> bool:
     """Whether a name asks for OME-Zarr."""
     return path.name.lower().endswith(SUFFIXES)
+
+
+def stem_of(path: Path) -> str:
+    """Return a name without its suffix, of which ``.ome.zarr`` is one."""
+    suffix = next((s for s in SUFFIXES if path.name.lower().endswith(s)), path.suffix)
+    return path.name[: len(path.name) - len(suffix)]
 
 
 def write_volume_zarr(
@@ -94,9 +101,9 @@ def write_volume_zarr(
             )
             levels.append(step)
         group.attrs["ome"] = ome_attributes(
-            path.name, names, _steps(grid), levels=levels, more={"type": "local mean"}
+            path.name, names, _voxel_um(grid), levels=levels, more={"type": "local mean"}
         )
-        planes = {"z_um": _known(grid.z_um), "pitch_um": _known(grid.pitch_um)}
+        planes = {"z_um": known(grid.z_um), "pitch_um": known(grid.pitch_um)}
         group.attrs["diffuserbench"] = attributes | planes
 
 
@@ -114,16 +121,38 @@ def _levels(
     return levels
 
 
-def _steps(grid: Grid) -> dict[str, float | None]:
-    """Return the middle plane's voxel size; None where it is not known."""
+def write_volume_tiff(
+    path: Path, planes: Iterable[npt.NDArray[np.float32]], shape: tuple[int, ...], grid: Grid
+) -> None:
+    """Write a volume as OME-TIFF, ``ZYX`` or ``ZCYX``, whole or not at all, with one plane in memory.
+
+    ``planes`` are (height, width) or (height, width, n_channels), ``shape`` is that of all with n_z in front.
+    The voxel size is that of the middle plane, where it is known.
+
+    Raises FileError or OSError when it cannot be written.
+    """
+    import tifffile
+
+    colour = len(shape) == 4
+    pages = (page for plane in planes for page in (np.moveaxis(plane, -1, 0) if colour else plane[None]))
+    sizes = {f"PhysicalSize{axis.upper()}": size for axis, size in _voxel_um(grid).items()}
+    metadata = {"axes": "ZCYX" if colour else "ZYX", **sizes, **{f"{name}Unit": "µm" for name in sizes}}
+    stored = (shape[0], shape[3], *shape[1:3]) if colour else shape
+    big = 4 * int(np.prod(shape)) > _BIG_TIFF_BYTES
+    with whole_file(path) as temporary, tifffile.TiffWriter(temporary, ome=True, bigtiff=big) as tiff:
+        tiff.write(pages, shape=stored, dtype=np.float32, photometric="minisblack", metadata=metadata)
+
+
+def _voxel_um(grid: Grid) -> dict[str, float]:
+    """Return the middle plane's voxel size; nothing where it is not known."""
     if not (np.isfinite(grid.pitch_um).all() and np.isfinite(grid.spacing_um).all()):
         return {}
-    middle = len(grid.z_um) // 2
-    pitch = float(grid.pitch_um[middle])
-    return {"z": float(grid.spacing_um[middle]), "y": pitch, "x": pitch}
+    pitch = float(grid.pitch_um[len(grid.z_um) // 2])
+    return {"z": middle_step_um(grid.z_um), "y": pitch, "x": pitch}
 
 
-def _known(values: npt.NDArray[np.float64]) -> list[float] | None:
+def known(values: npt.NDArray[np.float64]) -> list[float] | None:
+    """Return numbers as JSON can hold them; None where one of them is not known."""
     return [float(v) for v in values] if np.isfinite(values).all() else None
 
 

@@ -30,28 +30,19 @@ _KEPT = 300
 
 @dataclass(frozen=True, slots=True)
 class LiveResult:
-    """A picture of the live view.
-
-    Attributes
-    ----------
-    picture : LivePicture
-        With its quality in figures and words.
-    metadata : FrameMetadata
-        Of the frame it was made of (the newest one, where several were averaged).
-    latency_ms : float
-        From the frame's arrival at the host to the picture. Of a picture refined while no newer frame came:
-        how old the frame is.
-    passed_over : int
-        Frames that came and were not reconstructed since the result before.
-    refined : bool
-        Whether the same frame had a picture before this one.
-    """
+    """A picture of the live view."""
 
     picture: LivePicture
+    """With its quality in figures and words."""
     metadata: FrameMetadata
+    """Of the frame it was made of (the newest one, where several were averaged)."""
     latency_ms: float
+    """From the frame's arrival at the host to the picture. Of a picture refined while no newer frame came:
+    how old the frame is."""
     passed_over: int
+    """Frames that came and were not reconstructed since the result before."""
     refined: bool
+    """Whether the same frame had a picture before this one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,28 +50,20 @@ class LiveStatus:
     """How the live view does, over its last few hundred pictures; NaN before there are any.
 
     The first picture, during which the machine is timed, does not count.
-
-    Attributes
-    ----------
-    pictures_per_s : float
-        Pictures of new frames.
-    latency_median_ms, latency_p99_ms : float
-        From a frame's arrival at the host to its picture.
-    pictures, passed_over : int
-        Frames with a picture, and those without, since the start.
-    quality : str
-        Of the newest picture, in words; empty before the first.
-    warnings : tuple of str
-        What is doubtful about the calibration, and what pictures had to do without since.
     """
 
     pictures_per_s: float
+    """Pictures of new frames."""
     latency_median_ms: float
     latency_p99_ms: float
+    """``latency_median_ms`` and ``latency_p99_ms``: from a frame's arrival at the host to its picture."""
     pictures: int
     passed_over: int
+    """``pictures`` and ``passed_over``: frames with a picture, and those without, since the start."""
     quality: str
+    """Of the newest picture, in words; empty before the first."""
     warnings: tuple[str, ...]
+    """What is doubtful about the calibration, and what pictures had to do without since."""
 
 
 class LiveView:
@@ -131,10 +114,7 @@ class LiveView:
     def close(self) -> None:
         """End the view; the stream too, if the view started it. Closing twice does nothing.
 
-        Raises
-        ------
-        DeviceError, InputError
-            What ended the view before.
+        Raises DeviceError or InputError: what ended the view before.
         """
         self.end()
         if self._thread is not None:
@@ -176,10 +156,7 @@ class LiveView:
     def wait_newer(self, than: LiveResult | None, timeout_s: float) -> LiveResult | None:
         """Return the newest picture as soon as it is another than ``than``; None when none came in time.
 
-        Raises
-        ------
-        DeviceError, InputError
-            When the camera failed, or its frames do not fit the calibration.
+        Raises DeviceError or InputError when the camera failed, or its frames do not fit the calibration.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._newest is not than or not self.is_running, timeout_s)
@@ -283,6 +260,8 @@ def live_view(
             for result in live:
                 show(result.picture.image, result.picture.quality)
 
+    Raises FileError or InputError when the calibration or an option cannot be used.
+
     Parameters
     ----------
     bench : Bench
@@ -293,11 +272,6 @@ def live_view(
         As of :class:`recon.streams.live.LiveReconstructor`.
     n_buffers : int
         Frames that the camera's ring holds.
-
-    Raises
-    ------
-    FileError, InputError
-        When the calibration or an option cannot be used.
     """
     if not isinstance(calibration, Calibration):
         calibration = load_calibration(find_calibration(Path(calibration)))

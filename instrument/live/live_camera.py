@@ -21,20 +21,15 @@ _RATE_WINDOW_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class LiveCameraStatus:
-    """How the camera is doing.
-
-    Attributes
-    ----------
-    frames_per_s : float
-        Of the camera, over the last two seconds; zero before the second frame.
-    acquired, dropped : int
-        Frames that came, and that the device or its driver lost, since the view was started first.
-    """
+    """How the camera is doing."""
 
     running: bool
     frames_per_s: float
+    """Of the camera, over the last two seconds; zero before the second frame."""
     acquired: int
     dropped: int
+    """``acquired`` and ``dropped``: frames that came, and that the device or its driver lost, since the view
+    was started first."""
 
 
 class LiveCamera:
@@ -54,10 +49,7 @@ class LiveCamera:
     def start(self) -> None:
         """Start the camera's sequence; does nothing where it runs.
 
-        Raises
-        ------
-        DeviceError
-            When the camera refuses or is gone.
+        Raises DeviceError when the camera refuses or is gone.
         """
         with self._changing:
             if self.is_running:

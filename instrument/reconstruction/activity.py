@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import whole_file, write_text
+from instrument.files.atomic import whole_file, write_json, write_text
 from instrument.files.errors import BenchError, FileError
+from instrument.files.images import write_mp4
 from instrument.files.record import plain
 from instrument.reconstruction.video_files import (
     DEFAULT_FPS,
     VideoPictures,
     create_output,
     levels_of,
-    write_mp4,
 )
 from recon.base.declare import option
 from recon.streams.activity import (
@@ -165,10 +165,10 @@ def write_activity(
     made = [folder / name for name in ("traces.csv", "regions.csv", "activity.png", "dff.ome.zarr")]
     write_text(made[0], _traces_csv(activity, video))
     write_text(made[1], _regions_csv(activity))
-    simulated = bool(video.attributes.get("diffuserbench", {}).get("simulated"))
+    origin = video.attributes.get("diffuserbench", {})
+    simulated = bool(origin.get("simulated"))
     with whole_file(made[2]) as temporary:
         write_activity_figure(temporary, activity, simulated=simulated)
-    origin = video.attributes.get("diffuserbench", {})
     create_output(
         made[3],
         len(video),
@@ -183,24 +183,17 @@ def write_activity(
     film = folder / "activity.mp4"
     write_mp4(film, red_over_grey(activity), 1 / video.period_s if video.period_s else DEFAULT_FPS)
     record = folder / "activity.json"
-    write_text(
-        record,
-        json.dumps(
-            plain(
-                {
-                    "video": str(video.path.resolve()),
-                    "settings": asdict(settings),
-                    "simulated": simulated,
-                    "frames": len(activity.indices),
-                    "regions": len(activity.regions),
-                    "largest_motion_px": activity.motion.largest_px,
-                    "faded": activity.faded,
-                    "software": origin.get("software"),
-                }
-            ),
-            indent=1,
-        ),
-    )
+    found = {
+        "video": str(video.path.resolve()),
+        "settings": asdict(settings),
+        "simulated": simulated,
+        "frames": len(activity.indices),
+        "regions": len(activity.regions),
+        "largest_motion_px": activity.motion.largest_px,
+        "faded": activity.faded,
+        "software": origin.get("software"),
+    }
+    write_json(record, plain(found))
     return [*made, film, record]
 
 
@@ -260,30 +253,23 @@ def red_over_grey(activity: Activity) -> Any:
 
 
 def _traces_csv(activity: Activity, video: VideoPictures) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     time = "time_s" if video.period_s else "frame_number"
-    writer.writerow(["frame", time, *(f"region_{n}_dff" for n in range(len(activity.regions)))])
-    for place, index in enumerate(activity.indices):
-        values = (f"{value:.5f}" for value in activity.traces[:, place])
-        writer.writerow([index, f"{activity.times_s[place]:.6g}", *values])
-    return text.getvalue()
+    header = ["frame", time, *(f"region_{n}_dff" for n in range(len(activity.regions)))]
+    frames = zip(activity.indices, activity.times_s, activity.traces.T, strict=True)
+    return _csv(header, ([i, f"{at:.6g}", *(f"{value:.5f}" for value in dff)] for i, at, dff in frames))
 
 
 def _regions_csv(activity: Activity) -> str:
+    header = ["region", "row", "column", "pixels", "local_correlation", "largest_dff"]
+    rows = (
+        [n, *(f"{at:.2f}" for at in region.centre), len(region.rows), f"{region.correlation:.3f}",
+         f"{trace.max():.4f}"]
+        for n, (region, trace) in enumerate(zip(activity.regions, activity.traces, strict=True))
+    )  # fmt: skip
+    return _csv(header, rows)
+
+
+def _csv(header: list[str], rows: Iterable[list[object]]) -> str:
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["region", "row", "column", "pixels", "local_correlation", "largest_dff"])
-    for number, (region, trace) in enumerate(zip(activity.regions, activity.traces, strict=True)):
-        row, column = region.centre
-        writer.writerow(
-            [
-                number,
-                f"{row:.2f}",
-                f"{column:.2f}",
-                len(region.rows),
-                f"{region.correlation:.3f}",
-                f"{trace.max():.4f}",
-            ]
-        )
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
     return text.getvalue()

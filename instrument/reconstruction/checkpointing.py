@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import check_writable, whole_file, write_text
+from instrument.files.atomic import check_writable, whole_file, write_json
 from instrument.files.errors import BenchError, FileError
 from instrument.files.record import plain
 from instrument.reconstruction.job import Job
@@ -56,6 +56,7 @@ def checkpoint_for(
     require_kept(request)
     problem = {
         "program": f"diffuserbench {version('diffuserbench')}",
+        "format": FORMAT,
         "measurement": digest(job.measurement),
         "psfs": digest(job.calibration.psfs),
         "psf positions": digest(job.calibration.source_positions_um),
@@ -79,6 +80,11 @@ def settle_checkpoint(
         return told
     if keeper.resumed_from:
         told["Went on"] = f"from iteration {keeper.resumed_from} in {keeper.folder}"
+    if keeper.left_aside:
+        told["Begun anew"] = (
+            f"{', '.join(keeper.left_aside)} in {keeper.folder} is of an older version, or of another "
+            "choice of auto, and was not gone on with"
+        )
     if all(reason in _FINISHED for reason in reasons):
         keeper.remove()
         told["Checkpoint"] = "removed: the work has come to its end"
@@ -88,6 +94,8 @@ def settle_checkpoint(
 
 
 PROBLEM = "problem.json"
+FORMAT = 2
+"""Of solvers' states: another one's are refused, as those kept before there was a number."""
 _STATE = "state/"
 EVERY_S = 60.0
 """Seconds between two writings: the most that a kill costs, and rare enough to cost little itself."""
@@ -106,6 +114,11 @@ class CheckpointFolder:
         What decides the result, JSON-compatible: a folder kept for something else is refused.
     every_s : float
         Least time between two writings of a part.
+
+    Attributes
+    ----------
+    left_aside : tuple of str
+        Files of work that is not gone on with: of an older version, or of another choice of ``auto``.
     """
 
     def __init__(self, folder: Path, problem: Mapping[str, Any], *, every_s: float = EVERY_S) -> None:
@@ -113,6 +126,8 @@ class CheckpointFolder:
         self._every_s = every_s
         self._written = time.monotonic()
         self._resumed: dict[str, int] = {}
+        self._kept = False
+        self.left_aside: tuple[str, ...] = ()
         problem = plain(dict(problem))
         if folder.exists() and not folder.is_dir():
             raise FileError(
@@ -125,7 +140,7 @@ class CheckpointFolder:
         else:
             check_writable(folder)
             folder.mkdir(exist_ok=True)
-            write_text(folder / PROBLEM, json.dumps(problem, indent=1, sort_keys=True) + "\n")
+            write_json(folder / PROBLEM, problem)
 
     @property
     def resumed_from(self) -> int:
@@ -136,12 +151,20 @@ class CheckpointFolder:
         """Restore what was kept of a part, if anything, and return its history so far."""
         path = self._path(part)
         if not path.is_file():
+            if not self._resumed and not self._kept:
+                self.left_aside = tuple(sorted(other.name for other in self.folder.glob("*.npz")))
             return ()
         try:
             with np.load(path, allow_pickle=False) as kept:
                 records = tuple(_record(row) for row in kept["history"])
                 solver.restore(_state(kept))
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except KeyError as error:
+            raise FileError(
+                path,
+                f"was kept by another version of the program, or of another solver: it has no {error}.",
+                f"Delete {self.folder} to start over.",
+            ) from None
+        except (OSError, ValueError, zipfile.BadZipFile) as error:
             raise FileError(
                 path, f"cannot be read as a checkpoint ({error}).", "Delete it to start over."
             ) from None
@@ -157,7 +180,7 @@ class CheckpointFolder:
         state = {f"{_STATE}{name}": value for name, value in _flat(solver.checkpoint(copy=False)).items()}
         with whole_file(self._path(part)) as temporary:
             np.savez(temporary, history=np.array([astuple(r) for r in history]), **state)
-        self._written = time.monotonic()
+        self._written, self._kept = time.monotonic(), True
 
     def remove(self) -> None:
         """Delete the folder: there is nothing left to go on with."""
@@ -172,6 +195,12 @@ class CheckpointFolder:
             kept = json.loads(path.read_text())
         except (OSError, ValueError) as error:
             raise FileError(path, f"cannot be read ({error}).", "Name another folder.") from None
+        if not isinstance(kept, dict) or kept.get("format") != problem.get("format"):
+            raise FileError(
+                self.folder,
+                "was kept by another version of the program, which this one cannot go on from.",
+                "Name another folder, or delete this one to start over.",
+            )
         for name in sorted({*problem, *kept}):
             if problem.get(name) != kept.get(name):
                 raise FileError(
@@ -215,7 +244,9 @@ class _Lazy(dict[str, Any]):
         self._kept = kept
 
     def __missing__(self, name: str) -> Any:
-        return _value(self._kept[f"{_STATE}{name}"])
+        if (stored := f"{_STATE}{name}") not in self._kept.files:
+            raise KeyError(name)
+        return _value(self._kept[stored])
 
 
 def _state(kept: Any) -> dict[str, Any]:

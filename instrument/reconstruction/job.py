@@ -213,7 +213,7 @@ def job_with(
         calibration = in_colour(calibration, pattern, match)
     return Job(
         measurement,
-        _reduced_calibration(calibration, crop, factor),
+        reduced_calibration(calibration, crop, factor),
         {
             "Calibration": f"{folder}: {len(calibration.psfs)} PSFs of {shape[0]} x {shape[1]}",
             "Image": describe(image)
@@ -278,7 +278,8 @@ def _matching_binning(image: ImageFile, shape: tuple[int, ...], folder: Path) ->
     return int(factor)
 
 
-def _reduced_calibration(calibration: Calibration, crop: Crop | None, factor: int) -> Calibration:
+def reduced_calibration(calibration: Calibration, crop: Crop | None, factor: int) -> Calibration:
+    """Return a calibration whose PSFs are cut and binned as a photograph is, without a background."""
     if crop is None and factor == 1:
         return calibration
     psfs = np.stack(

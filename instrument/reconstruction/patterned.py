@@ -16,7 +16,7 @@ import numpy.typing as npt
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.plan.model import DARK, PATTERN
-from instrument.reconstruction.job import Job, find_calibration
+from instrument.reconstruction.job import Job, find_calibration, reduced_calibration
 from instrument.reconstruction.preparation import reduce
 from instrument.reconstruction.request import refocused
 from instrument.runs.run import Run
@@ -175,11 +175,8 @@ def _as_grey(images: npt.NDArray[Any]) -> Floats:
 
 def _grey(calibration: Calibration, binning: int) -> Calibration:
     """Return the calibration with grey PSFs on binned pixels."""
-    psfs = calibration.psfs.mean(axis=1, keepdims=True)
-    pitch = calibration.geometry.pixel_pitch_um
-    geometry = replace(calibration.geometry, pixel_pitch_um=None if pitch is None else pitch * binning)
-    binned = np.stack([reduce(psf[0], 0.0, None, binning) for psf in psfs])[:, None]
-    return replace(calibration, psfs=binned, background=None, geometry=geometry)
+    grey = replace(calibration, psfs=calibration.psfs.mean(axis=1, keepdims=True), background=None)
+    return reduced_calibration(grey, None, binning)
 
 
 def _require_same_plan(run: Run, sheet: Run) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -13,12 +11,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import check_writable, whole_file, write_text
+from instrument.files.atomic import check_writable, write_json
 from instrument.files.errors import FileError
 from instrument.files.figures import save_figure
 from instrument.files.images import write_image
 from instrument.files.record import plain
-from instrument.files.volumes import is_zarr_name, middle_step_um, uneven_steps, write_volume_zarr
+from instrument.files.volumes import (
+    is_zarr_name,
+    known,
+    stem_of,
+    uneven_steps,
+    write_volume_tiff,
+    write_volume_zarr,
+)
 from instrument.reconstruction.job import Job
 from recon.reconstruction.result import Grid, Reconstruction
 
@@ -45,9 +50,7 @@ class Outputs:
         Raises FileError.
         """
         if volume and is_zarr_name(out):
-            stem = out.name.lower().removesuffix(".zarr").removesuffix(".ome")
-            stem = out.name[: len(stem)]
-            if not stem:
+            if not (stem := stem_of(out)):
                 raise FileError(out, "has no name before its suffix.", "Call it volume.ome.zarr, say.")
             return cls(out, out.with_name(f"{stem}.png"), out.with_name(f"{stem}.json"))
         if out.suffix.lower() not in (".tif", ".tiff"):
@@ -103,7 +106,7 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
         "rotated_deg": rotate_deg,
         "preview": {"white": white, "white_percentile": WHITE_PERCENTILE, "black": 0.0},
     }
-    _write_record(outputs.record, record)
+    write_json(outputs.record, record)
 
 
 def picture_grid(grid: Grid) -> dict[str, Any]:
@@ -159,10 +162,6 @@ def reconstruction_record(result: Reconstruction, job: Job, *, volume: bool) -> 
     return written
 
 
-def _write_record(path: Path, record: Mapping[str, Any]) -> None:
-    write_text(path, json.dumps(record, indent=1, allow_nan=False) + "\n")
-
-
 def _of_picture(result: Reconstruction) -> dict[str, Any]:
     return {
         "stop_reason": str(result.stop_reason),
@@ -180,8 +179,8 @@ def _of_volume(result: Reconstruction) -> dict[str, Any]:
         "grid": {
             "shape": grid.shape,
             "centre": grid.centre,
-            "z_um": _known(grid.z_um),
-            "pitch_um": _known(grid.pitch_um),
+            "z_um": known(grid.z_um),
+            "pitch_um": known(grid.pitch_um),
         },
         "histories": [[asdict(entry) for entry in history] for history in result.histories],
     }
@@ -201,33 +200,6 @@ def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
         about = {"simulated": job.simulated, "record": outputs.record.name}
         write_volume_zarr(outputs.image, result.volume, result.grid, about)
     else:
-        _write_tiff(outputs.image, result)
+        write_volume_tiff(outputs.image, result.volume, result.volume.shape, result.grid)
     save_figure(volume_figure(result, simulated=job.simulated), outputs.preview)
-    _write_record(outputs.record, reconstruction_record(result, job, volume=True))
-
-
-def _write_tiff(path: Path, result: Reconstruction) -> None:
-    import tifffile
-
-    volume = result.volume if result.volume.ndim == 3 else np.moveaxis(result.volume, -1, 1)
-    metadata = {"axes": "ZYX" if result.volume.ndim == 3 else "ZCYX", **voxel_size(result.grid)}
-    with whole_file(path) as temporary:
-        tifffile.imwrite(temporary, volume, ome=True, metadata=metadata, photometric="minisblack")
-
-
-def _known(values: np.ndarray[Any, Any]) -> list[float] | None:
-    return [float(v) for v in values] if np.isfinite(values).all() else None
-
-
-def voxel_size(grid: Grid) -> dict[str, Any]:
-    """Return OME's one voxel size, the middle plane's; nothing where it is not known."""
-    if not (np.isfinite(grid.pitch_um).all() and np.isfinite(grid.spacing_um).all()):
-        return {}
-    middle = len(grid.z_um) // 2
-    sizes = {
-        "X": float(grid.pitch_um[middle]),
-        "Y": float(grid.pitch_um[middle]),
-        "Z": middle_step_um(grid.z_um),
-    }
-    lengths = {f"PhysicalSize{axis}": value for axis, value in sizes.items()}
-    return lengths | {f"PhysicalSize{axis}Unit": "µm" for axis in sizes}
+    write_json(outputs.record, reconstruction_record(result, job, volume=True))

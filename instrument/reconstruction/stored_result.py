@@ -19,9 +19,11 @@ from instrument.files.volumes import (
     VolumeSource,
     is_zarr_name,
     open_volume,
+    stem_of,
+    write_volume_tiff,
     write_volume_zarr,
 )
-from instrument.reconstruction.result_file import preview, voxel_size
+from instrument.reconstruction.result_file import preview
 from recon.reconstruction.result import Grid
 from recon.solvers.base import IterationRecord
 from recon.verdict.judge import Region
@@ -183,12 +185,7 @@ def open_result(path: Path | str) -> StoredResult:
 
 def record_file(path: Path) -> Path:
     """Return the JSON file that goes with a picture or volume."""
-    stem = path.name
-    for suffix in (".ome.zarr", ".zarr", path.suffix):
-        if suffix and stem.lower().endswith(suffix.lower()):
-            stem = stem[: -len(suffix)]
-            break
-    return path.with_name(f"{stem}.json")
+    return path.with_name(f"{stem_of(path)}.json")
 
 
 def _data_file(path: Path) -> Path:
@@ -299,7 +296,6 @@ def free_result(folder: Path, stem: str, suffix: str) -> Path:
 Advance = Callable[[int, int], object]
 PICTURE_SUFFIXES = (".tif", ".tiff", ".npy", ".png")
 VOLUME_SUFFIXES = (".tif", ".tiff", ".npy", ".ome.zarr", ".zarr")
-_BIG_TIFF_BYTES = 4_000_000_000
 
 
 def export_result(
@@ -344,7 +340,9 @@ def export_result(
     elif target.suffix.lower() == ".npy":
         _to_npy(result.volume, target, advance)
     else:
-        _to_tiff(result, result.volume, target, advance)
+        source = result.volume
+        planes = _planes(source, advance)
+        write_volume_tiff(target, planes, _full_shape(source), _grid_of(result, source))
 
 
 def _planes(source: VolumeSource, advance: Advance | None) -> Iterator[npt.NDArray[np.float32]]:
@@ -380,25 +378,3 @@ def _grid_of(result: StoredResult, source: VolumeSource) -> Grid:
     unknown = np.full(source.shape[0], np.nan)
     z_um, pitch_um = result.planes_um or (unknown, unknown)
     return Grid(source.shape, (source.shape[1] // 2, source.shape[2] // 2), z_um, pitch_um)
-
-
-def _to_tiff(result: StoredResult, source: VolumeSource, target: Path, advance: Advance | None) -> None:
-    import tifffile
-
-    n_z, height, width = source.shape
-    colour = source.n_channels > 1
-    shape = (n_z, source.n_channels, height, width) if colour else source.shape
-    metadata = {"axes": "ZCYX" if colour else "ZYX", **voxel_size(_grid_of(result, source))}
-
-    def pages() -> Iterator[npt.NDArray[np.float32]]:
-        for plane in _planes(source, advance):
-            if colour:
-                yield from np.moveaxis(plane, -1, 0)
-            else:
-                yield plane
-
-    with (
-        whole_file(target) as temporary,
-        tifffile.TiffWriter(temporary, ome=True, bigtiff=source.n_bytes > _BIG_TIFF_BYTES) as tiff,
-    ):
-        tiff.write(pages(), shape=shape, dtype=np.float32, photometric="minisblack", metadata=metadata)

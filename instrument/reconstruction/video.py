@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 import tempfile
 import threading
@@ -15,24 +14,23 @@ from typing import Any
 
 import numpy as np
 
-from instrument.files.atomic import write_text
+from instrument.files.atomic import write_json
 from instrument.files.errors import BenchError, FileError
+from instrument.files.images import as_shown, write_mp4
 from instrument.files.record import plain
-from instrument.files.volumes import is_zarr_name
+from instrument.files.volumes import is_zarr_name, stem_of
 from instrument.reconstruction.job import Job, Reduction
-from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.options import InputOptions, VideoOptions
 from instrument.reconstruction.preparation import Crop
 from instrument.reconstruction.request import PictureRequest
 from instrument.reconstruction.video_files import (
     DEFAULT_FPS,
     SAMPLES,
     VideoPictures,
-    as_shown,
     create_output,
     has_light,
     levels_of,
     require_video,
-    write_mp4,
 )
 from instrument.reconstruction.video_job import VideoJob, VideoPlan
 from instrument.reconstruction.video_work import BlockReport, CancelledError, cluster, in_process, on_cluster
@@ -41,8 +39,8 @@ from recon.base.declare import inapplicable
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
-from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, OverTimeName, require_joint
-from recon.streams.video import BLOCK, COLD_ITERATIONS, WARM_ITERATIONS, VideoSolver, stream_problem
+from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, require_joint
+from recon.streams.video import BLOCK, COLD_ITERATIONS, VideoSolver, stream_problem
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,32 +59,19 @@ class VideoRequest:
     options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
     """As for a picture; ``iterations`` are those of a block's first frame. Stopping by time or tolerance
     would make pictures depend on the machine: they do not apply."""
-    warm_iterations: int = WARM_ITERATIONS
-    """Of the frames after a block's first."""
-    block: int | None = None
-    """Frames a block; None: 32, with a prior over time 16."""
-    over_time: OverTimeName | None = None
-    """A prior that joins the frames of a block (:mod:`recon.streams.joint`); then every frame has the
-    ``iterations``, 60 by default."""
+    video: VideoOptions = field(default_factory=VideoOptions)
+    """With a prior over time every frame has the ``iterations``, 60 by default."""
     rotate_deg: int = 0
-    fps: float | None = None
-    """Of the film; None: the recording's own rate, else 25."""
-    film: bool = True
-    """Whether to write the MP4."""
 
     @property
     def film_path(self) -> Path:
         """The MP4."""
-        return self._beside(".mp4")
+        return self.out.with_name(f"{stem_of(self.out)}.mp4")
 
     @property
     def record_path(self) -> Path:
         """The JSON with settings and origin."""
-        return self._beside(".json")
-
-    def _beside(self, suffix: str) -> Path:
-        stem = self.out.name.lower().removesuffix(".zarr").removesuffix(".ome")
-        return self.out.with_name(self.out.name[: len(stem)] + suffix)
+        return self.out.with_name(f"{stem_of(self.out)}.json")
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +117,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         picture.calibration,
         replace(options, iterations=None),
     )
-    if request.over_time is not None:
+    if request.video.over_time is not None:
         require_joint(problem)
     if problem.n_planes > 1:
         raise BenchError("A video's file holds pictures: say which depth with --z-mm.")
@@ -141,15 +126,15 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         rows, columns = reduction.crop.slices(_binned_shape(run, frames[0], reduction.first_binning))
         crop = Crop(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
         reduction = replace(reduction, crop=crop)
-    usual = COLD_ITERATIONS if request.over_time is None else JOINT_ITERATIONS
+    usual = COLD_ITERATIONS if request.video.over_time is None else JOINT_ITERATIONS
     plan = VideoPlan(
         run=str(run.path.resolve()),
         frames=frames,
         n_frames=run.n_frames,
-        block=request.block or (BLOCK if request.over_time is None else JOINT_BLOCK),
+        block=request.video.block or (BLOCK if request.video.over_time is None else JOINT_BLOCK),
         cold_iterations=options.iterations or usual,
-        warm_iterations=request.warm_iterations,
-        over_time=request.over_time,
+        warm_iterations=request.video.warm_iterations,
+        over_time=request.video.over_time,
         rotate_deg=request.rotate_deg,
         picture_shape=picture.measurement.shape,
         settings=_settings(request, picture, problem, reduction),
@@ -174,11 +159,8 @@ def solve_video(
     prepared: PreparedVideo,
     on_progress: Callable[[BlockReport], object],
     cancel: threading.Event,
-    *,
-    workers: int | None = None,
-    scheduler: str | None = None,
 ) -> bool:
-    """Solve what is left: in this process, on ``workers`` processes, or on a scheduler's cluster.
+    """Solve what is left, as the options say: in this process, on processes here, or on a cluster.
 
     Raises BenchError when there is no Dask or no scheduler; FileError or OSError when a frame cannot be read
     or a picture written.
@@ -189,12 +171,12 @@ def solve_video(
         False when cancelled; what is on the disk stays, and the same request goes on with the rest.
     """
     job, output = prepared.job, prepared.request.out.resolve()
-    folder = job.folder.resolve()
+    folder, video = job.folder.resolve(), prepared.request.video
     try:
-        if workers is None and scheduler is None:
+        if video.workers is None and video.scheduler is None:
             in_process(folder, output, prepared.left, on_progress, cancel)
         else:
-            with cluster(workers=workers, scheduler=scheduler) as client:
+            with cluster(workers=video.workers, scheduler=video.scheduler) as client:
                 on_cluster(client, folder, output, prepared.left, on_progress, cancel)
     except CancelledError:
         return False
@@ -209,16 +191,16 @@ def finish_video(prepared: PreparedVideo) -> list[Path]:
     request, plan = prepared.request, prepared.job.plan
     pictures = VideoPictures(request.out)
     written = [request.out]
-    if request.film:
+    if request.video.film:
         chosen = np.unique(np.linspace(0, len(plan.frames) - 1, SAMPLES).round().astype(int))
         black, white = levels_of(pictures.read(plan.frames[i]) for i in chosen)
-        fps = request.fps or (1 / pictures.period_s if pictures.period_s else DEFAULT_FPS)
+        fps = request.video.fps or (1 / pictures.period_s if pictures.period_s else DEFAULT_FPS)
         shown = (as_shown(pictures.read(index), black, white) for index in plan.frames)
         write_mp4(request.film_path, shown, fps)
         written.append(request.film_path)
     unlit = prepared.job.unlit()
     record = {**plain(plan.settings), "frames": len(plan.frames), "run": plan.run, "frames_unlit": unlit}
-    write_text(request.record_path, json.dumps(record, indent=1, sort_keys=True))
+    write_json(request.record_path, record)
     prepared.job.remove()
     return [*written, request.record_path]
 
@@ -313,7 +295,7 @@ def _job(request: VideoRequest, plan: VideoPlan, force: bool) -> tuple[VideoJob 
                 "Give the same as then to go on with it, or --force to begin anew.",
             )
         raise FileError(request.out, "exists.", "Choose another name with --out, or --force to replace it.")
-    beside = (request.film_path, request.record_path) if request.film else (request.record_path,)
+    beside = (request.film_path, request.record_path) if request.video.film else (request.record_path,)
     for other in () if force else beside:
         if other.exists():
             raise FileError(

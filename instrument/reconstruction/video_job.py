@@ -27,6 +27,7 @@ import numpy.typing as npt
 from instrument.files.atomic import sync_folder, whole_file
 from instrument.files.errors import FileError
 from instrument.files.record import RecordFormat, plain
+from instrument.files.volumes import stem_of
 from instrument.reconstruction.job import Reduction
 from instrument.reconstruction.preparation import Crop
 from recon.base.declare import record
@@ -85,7 +86,7 @@ class VideoJob:
     @staticmethod
     def folder_of(output: Path) -> Path:
         """Return where the job for an output lies."""
-        return output.with_name(f".{output.name.removesuffix('.zarr').removesuffix('.ome')}.job")
+        return output.with_name(f".{stem_of(output)}.job")
 
     @classmethod
     def create(cls, output: Path, plan: VideoPlan, problem: Problem, reduction: Reduction) -> VideoJob:

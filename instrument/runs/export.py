@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import tifffile
@@ -16,7 +15,7 @@ import tifffile
 from instrument.bench.photograph import Progress
 from instrument.files.atomic import check_writable, require_new, whole_file
 from instrument.files.errors import BenchError, FileError
-from instrument.files.images import write_image
+from instrument.files.images import as_shown, write_image, write_mp4
 from instrument.runs.run import Run, RunError
 
 Image = npt.NDArray[Any]
@@ -180,17 +179,6 @@ def _mp4(
 ) -> None:
     if frames_per_s is None:
         frames_per_s = 1 / run.frame_period_s if run.frame_period_s else 10.0
-    height, width = run.array.frame_shape[:2]
-    # Coders of video want even sides.
-    height, width = height // 2 * 2, width // 2 * 2
-    bits = next(iter(run.records.values())).metadata.significant_bits
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), frames_per_s, (width, height))
-    if not writer.isOpened():
-        raise FileError(path, "this OpenCV cannot write MP4.", "Export to .tif or PNG instead.")
-    try:
-        for image in images:
-            scaled = np.clip(image[:height, :width].astype(np.float32) * (255 / ((1 << bits) - 1)), 0, 255)
-            shown = np.rint(scaled).astype(np.uint8)
-            writer.write(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR) if shown.ndim == 2 else shown[..., ::-1])
-    finally:
-        writer.release()
+    full_scale = (1 << next(iter(run.records.values())).metadata.significant_bits) - 1
+    shown = (as_shown(image.astype(np.float32), 0, full_scale) for image in images)
+    write_mp4(path, shown, frames_per_s, codec="mp4v")

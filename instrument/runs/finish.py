@@ -8,7 +8,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
-from typing import Any, Self
+from typing import Any
 
 from instrument.bench.bench import Bench
 from instrument.bench.safety import StepsFailedError, try_all
@@ -19,41 +19,37 @@ HELD_SIGNALS = 2
 """Signals that are held; the next one goes through, for the case that a device hangs."""
 
 
-class CtrlC:
-    """While its context lasts, remembers that Ctrl-C was pressed.
+@contextlib.contextmanager
+def ctrl_c_remembered() -> Iterator[Callable[[], None]]:
+    """Remember that Ctrl-C was pressed while the block runs; gives what raises it again, between steps.
 
     Python raises KeyboardInterrupt wherever the main thread happens to be. Inside a callback from foreign
     code (a kernel being compiled, a library's clean-up) the exception is printed and dropped there, and the
-    program goes on as if nothing had been pressed. ``check``, called between steps, raises it again.
+    program goes on as if nothing had been pressed.
 
     Does nothing outside the main thread, where no signal arrives.
     """
+    pressed = threading.Event()
+    before: Any = signal.getsignal(signal.SIGINT)
 
-    def __init__(self) -> None:
-        self.pressed = False
-        self._previous: Any = None
+    def note(number: int, frame: FrameType | None) -> None:
+        pressed.set()
+        if callable(before):
+            before(number, frame)
 
-    def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
-            self._previous = signal.getsignal(signal.SIGINT)
-            signal.signal(signal.SIGINT, self._note)
-        return self
-
-    def __exit__(self, _type: object, exc: BaseException | None, _traceback: object) -> None:
-        if self._previous is not None:
-            signal.signal(signal.SIGINT, self._previous)
-        if exc is None:
-            self.check()
-
-    def check(self) -> None:
-        """Raise KeyboardInterrupt if Ctrl-C was pressed."""
-        if self.pressed:
+    def check() -> None:
+        if pressed.is_set():
             raise KeyboardInterrupt
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self.pressed = True
-        if callable(self._previous):
-            self._previous(number, frame)
+    in_main = threading.current_thread() is threading.main_thread()
+    if in_main:
+        signal.signal(signal.SIGINT, note)
+    try:
+        yield check
+    finally:
+        if in_main and before is not None:
+            signal.signal(signal.SIGINT, before)
+    check()
 
 
 class Held:

@@ -41,55 +41,38 @@ _SAME_PITCH = 1e-3  # relative: pitches of one camera are equal but for how they
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What became of one PSF.
-
-    Attributes
-    ----------
-    rows, columns : float
-        By how much the pattern moved, pixels.
-    scale : float
-        Size of the new pattern over that of the old one.
-    rotation_deg : float or None
-        From the image's right towards its bottom; None where too few parts of the pattern were recognised.
-    as_is, aligned : float
-        Inner product at the best whole-pixel shift, and after shift, scale and rotation are undone.
-    spot : float
-        Spot size of the new camera with the old PSF over that with its own.
-    edge_px : float
-        How far scale and rotation move the pattern's edge.
-    brightness : float
-        Light of the new PSF over the old, at equal exposure where both calibrations know theirs.
-    """
+    """What became of one PSF."""
 
     z_um: float
     rows: float
     columns: float
+    """``rows`` and ``columns``: by how much the pattern moved, pixels."""
     scale: float
+    """Size of the new pattern over that of the old one."""
     rotation_deg: float | None
+    """From the image's right towards its bottom; None where too few parts of the pattern were recognised."""
     as_is: float
     aligned: float
+    """``as_is`` and ``aligned``: inner product at the best whole-pixel shift, and after shift, scale and
+    rotation are undone."""
     spot: float
+    """Spot size of the new camera with the old PSF over that with its own."""
     edge_px: float
+    """How far scale and rotation move the pattern's edge."""
     brightness: float
+    """Light of the new PSF over the old, at equal exposure where both calibrations know theirs."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two calibrations compared.
-
-    Attributes
-    ----------
-    changes : tuple of Change
-        At up to three depths of the new calibration.
-    due : bool
-        Whether to calibrate again (to use the new calibration instead of the old).
-    reasons : tuple of str
-        Why, or why not, in sentences.
-    """
+    """Two calibrations compared."""
 
     changes: tuple[Change, ...]
+    """At up to three depths of the new calibration."""
     due: bool
+    """Whether to calibrate again (to use the new calibration instead of the old)."""
     reasons: tuple[str, ...]
+    """Why, or why not, in sentences."""
 
 
 def _size(calibration: Calibration) -> str:
@@ -118,10 +101,7 @@ def compare(old: Calibration, new: Calibration) -> Comparison:
     Depths that the old one does not have are refocused. Shift alone moves pictures without blurring them; it
     counts when it differs between depths, or for the position in space.
 
-    Raises
-    ------
-    InputError
-        When the PSFs differ in size, or depths are not known.
+    Raises InputError when the PSFs differ in size, or depths are not known.
     """
     _refuse_other_cameras(old, new)
     depths, planes = central_psfs(new)

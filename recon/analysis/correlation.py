@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from recon.base import fft
 from recon.camera.camera_model import members_of_depths
-from recon.camera.refocus import rescaled
-from recon.camera.registration import register
+from recon.camera.registration import register, rescaled
 from recon.errors import InputError
 from recon.types import Calibration
 
@@ -39,15 +38,10 @@ def similarity(first: Array, second: Array) -> float:
 
 @dataclass(frozen=True)
 class Correlation:
-    """Inner products of two images at every shift in whole pixels.
-
-    Attributes
-    ----------
-    values : ndarray, float64, (2 height - 1, 2 width - 1)
-        Divided by both norms: 1 is identity. The middle is no shift.
-    """
+    """Inner products of two images at every shift in whole pixels."""
 
     values: Floats
+    """(2 height - 1, 2 width - 1): divided by both norms: 1 is identity. The middle is no shift."""
 
     @property
     def peak(self) -> tuple[int, int]:
@@ -173,21 +167,14 @@ def _crossing(cut: Floats, level: float) -> float:
 # Across the field -----------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class FieldOfView:
-    """Half the angle of view along one axis, degrees, and what limits it.
-
-    Attributes
-    ----------
-    half_deg : float
-        ``beta + min(alpha_c, atan((l + w) / d))``.
-    geometric_deg : float
-        ``atan((l + w) / d)``: beyond it no light reaches the sensor.
-    cutoff_deg : float or None
-        ``alpha_c``: the pixels' response is down to 20 %; None where it was not measured.
-    """
+    """Half the angle of view along one axis, degrees, and what limits it."""
 
     half_deg: float
+    """``beta + min(alpha_c, atan((l + w) / d))``."""
     geometric_deg: float
+    """``atan((l + w) / d)``: beyond it no light reaches the sensor."""
     cutoff_deg: float | None
+    """``alpha_c``: the pixels' response is down to 20 %; None where it was not measured."""
 
     @property
     def limited_by(self) -> str:
@@ -228,25 +215,18 @@ def field_of_view(
 
 @dataclass(frozen=True, slots=True)
 class FieldPoint:
-    """One PSF of the field compared with the central one of its depth (Figs. 5.1d and 5.1e).
-
-    Attributes
-    ----------
-    angle_deg : float
-        Between the directions of both sources.
-    similarity : float
-        Inner product after registration between pixels, over those that both show.
-    spot : float
-        Width of the cross-correlation over that of the central PSF's autocorrelation: the size of the spot
-        that the convolution model makes of a point there.
-    """
+    """One PSF of the field compared with the central one of its depth (Figs. 5.1d and 5.1e)."""
 
     x_um: float
     y_um: float
     z_um: float
     angle_deg: float
+    """Between the directions of both sources."""
     similarity: float
+    """Inner product after registration between pixels, over those that both show."""
     spot: float
+    """Width of the cross-correlation over that of the central PSF's autocorrelation: the size of the spot
+    that the convolution model makes of a point there."""
 
 
 def across_field(calibration: Calibration) -> tuple[FieldPoint, ...]:

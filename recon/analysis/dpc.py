@@ -34,22 +34,16 @@ _LINES = 48  # across the pupil, for the transfer function
 
 @dataclass(frozen=True, slots=True)
 class DpcOptics:
-    """The microscope.
-
-    Attributes
-    ----------
-    pitch_um : float
-        Of the pixels, in the object.
-    lit_share : float
-        Of the LEDs inside the objective's aperture, how many belong to a half: those on the line between the
-        halves are dark in both, and miss in the sum that the difference is divided by.
-    """
+    """The microscope."""
 
     pitch_um: float
+    """Of the pixels, in the object."""
     wavelength_nm: float
     objective_na: float
     illumination_na: float
     lit_share: float = 1.0
+    """Of the LEDs inside the objective's aperture, how many belong to a half: those on the line between the
+    halves are dark in both, and miss in the sum that the difference is divided by."""
 
     def __post_init__(self) -> None:
         if not (self.pitch_um > 0 and self.wavelength_nm > 0 and 0 < self.objective_na < 1):
@@ -73,6 +67,8 @@ def phase_from_halves(
 
     Halves of unequal brightness look like a tilted sample; the tilt is taken off.
 
+    Raises InputError when a half is missing, shapes differ, or there is no light.
+
     Parameters
     ----------
     halves : mapping of str to array, (height, width)
@@ -82,11 +78,6 @@ def phase_from_halves(
         Weight of the phase's curvature (in units of the aperture) against the data: keeps the finest
         structure, which the pupil hardly passes, from drowning in noise; what is ten times as coarse as the
         aperture resolves loses 0.06 % by default.
-
-    Raises
-    ------
-    InputError
-        When a half is missing, shapes differ, or there is no light.
     """
     images = {}
     for side in SIDES:

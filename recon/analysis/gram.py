@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -56,20 +57,18 @@ def group(direction: Direction, count: int, separation: int, *, first_plane: int
     first_plane : int
         Nearest plane of the group.
     """
-    if direction == "x":
-        start = -separation * (count - 1) // 2
-        return tuple(Voxel(first_plane, 0, start + separation * k) for k in range(count))
-    if direction == "z":
-        return tuple(Voxel(first_plane + separation * k) for k in range(count))
+    n_z, n_x = _sides(direction, count)
+    start = -separation * (n_x - 1) // 2
+    places = product(range(n_z), range(n_x))
+    return tuple(Voxel(first_plane + separation * j, 0, start + separation * i) for j, i in places)
+
+
+def _sides(direction: Direction, count: int) -> tuple[int, int]:
+    """Return how many voxels a group has along depth and along the columns."""
     side = round(count**0.5)
-    if side * side != count:
+    if direction == "xz" and side * side != count:
         raise InputError(f"A group in x and z is a square: 4, 9, 16, ... sources, not {count}.")
-    start = -separation * (side - 1) // 2
-    return tuple(
-        Voxel(first_plane + separation * j, 0, start + separation * i)
-        for j in range(side)
-        for i in range(side)
-    )
+    return {"x": (1, count), "z": (count, 1), "xz": (side, side)}[direction]
 
 
 def gram_matrix(planes: Array, voxels: Sequence[Voxel]) -> Floats:
@@ -124,10 +123,9 @@ def condition_curve(
 ) -> ConditionCurve:
     """Compute one curve of Fig. 4.5; separations for which there are too few planes are left out."""
     kept, values = [], []
-    side = round(count**0.5) if direction == "xz" else count
+    n_z, n_x = _sides(direction, count)
     for separation in separations:
-        depth = separation * (side - 1) + 1 if direction != "x" else 1
-        reach = separation * (side - 1) + 1 if direction != "z" else 1
+        depth, reach = (separation * (n - 1) + 1 for n in (n_z, n_x))
         if depth > len(planes) or reach > planes.shape[2] // 2:
             continue
         voxels = group(direction, count, separation, first_plane=(len(planes) - depth) // 2)

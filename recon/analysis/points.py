@@ -42,15 +42,7 @@ FACTORS = (1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.4, 2.8, 3.4)
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Noise of the test images.
-
-    Attributes
-    ----------
-    electrons : float
-        At the brightest pixel of the image.
-    read_e : float
-        Read noise.
-    """
+    """Noise of the test images."""
 
     electrons: float = option(
         10_000.0, help="Electrons at the brightest pixel of the tests' images.", least=1, group="Point tests"
@@ -74,22 +66,15 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class PointTrial:
-    """One image of points, reconstructed.
-
-    Attributes
-    ----------
-    separation_px, separation_planes : float
-        Between neighbours.
-    dip : float
-        The smallest dip between any two neighbours, of all draws.
-    map : ndarray, (n_z, width)
-        The reconstruction of the last draw, summed over rows.
-    """
+    """One image of points, reconstructed."""
 
     separation_px: float
     separation_planes: float
+    """``separation_px`` and ``separation_planes``: between neighbours."""
     dip: float
+    """The smallest dip between any two neighbours, of all draws."""
     map: Floats
+    """(n_z, width): the reconstruction of the last draw, summed over rows."""
 
     @property
     def resolved(self) -> bool:
@@ -206,26 +191,18 @@ def _dip(seen: Floats, first: npt.NDArray[np.int_], second: npt.NDArray[np.int_]
 # The tests of a calibration -------------------------------------------------------------------------
 @dataclass(frozen=True)
 class PointTests:
-    """What was resolved.
-
-    Attributes
-    ----------
-    lateral_px : float or None
-        Two points across: smallest resolved separation on the sensor; None where none tried was resolved.
-    axial_per_um : float or None
-        Two points along the axis: difference in 1/z.
-    sixteen_factor : float or None
-        By how much both separations had to grow for 4 x 4 points in x and z: the dissertation's 1.7.
-    lateral, axial, sixteen : tuple of PointTrial
-        Every trial made.
-    """
+    """What was resolved."""
 
     lateral_px: float | None
+    """Two points across: smallest resolved separation on the sensor; None where none tried was resolved."""
     axial_per_um: float | None
+    """Two points along the axis: difference in 1/z."""
     sixteen_factor: float | None
+    """By how much both separations had to grow for 4 x 4 points in x and z: the dissertation's 1.7."""
     lateral: tuple[PointTrial, ...]
     axial: tuple[PointTrial, ...]
     sixteen: tuple[PointTrial, ...]
+    """``lateral``, ``axial`` and ``sixteen``: every trial made."""
     notes: tuple[str, ...]
 
 
@@ -275,16 +252,16 @@ def point_tests(
         return make(columns, 1 / at)
 
     on_progress(0.1)
-    across = WindowProblem(planes[len(planes) // 2][None], HALF_WINDOW)
     middle = len(planes) // 2
+    across = WindowProblem(planes[middle][None], HALF_WINDOW)
 
-    def on_axis_plane(columns: float, _s: float) -> Array:
+    def in_plane(columns: float, _s: float) -> Array:
         return point(columns, middle)
 
-    def try_lateral(px: float) -> PointTrial:
-        return try_points(across, on_axis_plane, PointGrid(2, separation_px=px), noise)
-
-    lateral, found = smallest_resolved(try_lateral, [v for v in LATERAL_PX if v >= 0.7 * lateral_px])
+    lateral, found = smallest_resolved(
+        lambda px: try_points(across, in_plane, PointGrid(2, separation_px=px), noise),
+        [v for v in LATERAL_PX if v >= 0.7 * lateral_px],
+    )
     if found is None:
         notes.append("No two points across the axis were resolved at any separation tried.")
     on_progress(0.3)

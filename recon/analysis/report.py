@@ -74,26 +74,11 @@ def _cutoff(typed: str) -> tuple[float, float]:
 class AnalysisSettings:
     """What the calibration itself does not tell.
 
-    Attributes
-    ----------
-    z_um : float or None
-        Depth at which resolution is stated and tested; default the middle of the calibrated range in 1/z, or
-        a nearer one where the tests along the axis would not fit.
-    deflection_deg : float
-        Largest deflection by the diffuser, ``beta`` (dissertation: 0.5 degrees).
-    cutoff_deg : (float, float) or None
-        Angle at which the sensor's response is down to 20 %, along y and x; None where not known.
-    fall_off : callable, optional
-        The sensor's response as a function of the tangents along y and x, for the lateral sampling.
-    fall_off_deg : float or None
-        Standard deviation of the sensor's angular response, as a Gaussian, for the lateral sampling where
-        ``fall_off`` is not given; default from ``cutoff_deg`` where known.
-    lenslet_um, wavelength_nm : float or None
-        Of a microlens diffuser, for the axial sampling of Eq. 5.10.
-    points : bool
-        Whether to run the point tests, which take most of the time.
-    noise : Noise
-        Of the point tests' images.
+    Resolution is stated and tested at ``z_um``: without it in the middle of the calibrated range in 1/z, or
+    nearer where the tests along the axis, which take most of the time, would not fit. ``deflection_deg`` is
+    the ``beta`` of Kuo 2020; ``cutoff_deg`` is along y and x. The lateral sampling follows from ``fall_off``,
+    the sensor's response as a function of the tangents along y and x, else from a Gaussian of
+    ``fall_off_deg``; the axial one (Eq. 5.10) from a microlens diffuser's ``lenslet_um`` and the wavelength.
     """
 
     z_um: float | None = option(
@@ -148,13 +133,6 @@ class Analysis:
 
     Lengths in micrometres, angles in degrees; ``None`` where the calibration cannot tell, with the reason in
     ``notes``.
-
-    Attributes
-    ----------
-    psf : ndarray, (height, width)
-        The central PSF at ``z_um``, as it was analysed (cut to its light, channels averaged).
-    autocorrelation : ndarray
-        Its cut along the columns, from the peak.
     """
 
     z_um: float
@@ -162,7 +140,10 @@ class Analysis:
     distance_um: float
     sensor_shape: tuple[int, int]
     psf: Array
+    """(height, width): the central PSF at ``z_um``, as it was analysed (cut to its light, channels
+    averaged)."""
     autocorrelation: Floats
+    """Its cut along the columns, from the peak."""
     support_px: tuple[float, float]
     lateral: LateralResolution
     lateral_inner: LateralResolution
@@ -206,6 +187,8 @@ def analyse(
 ) -> Analysis:
     """Analyse a calibration.
 
+    Raises InputError when the geometry or the depths are unknown.
+
     Parameters
     ----------
     calibration : Calibration
@@ -213,11 +196,6 @@ def analyse(
     settings : AnalysisSettings, optional
     on_progress : callable, optional
         Called with what is being done and the share done.
-
-    Raises
-    ------
-    InputError
-        When the geometry or the depths are unknown.
     """
     settings = settings or AnalysisSettings()
     on_progress = on_progress or (lambda _what, _share: None)
@@ -344,15 +322,14 @@ def _depth_to_analyse(depths: Floats, planes: Array, distance_um: float, notes: 
 
 def _geometry(calibration: Calibration) -> tuple[float, float]:
     geometry = calibration.geometry
-    missing = [n for n in ("pixel_pitch_um", "diffuser_distance_mm") if getattr(geometry, n) is None]
-    if missing:
+    pitch_um, distance_mm = geometry.pixel_pitch_um, geometry.diffuser_distance_mm
+    if pitch_um is None or distance_mm is None:
+        missing = [n for n in ("pixel_pitch_um", "diffuser_distance_mm") if getattr(geometry, n) is None]
         raise InputError(
             f"The calibration does not say its {' and '.join(missing)}, which the analysis needs: "
             "give them in [geometry] of bench.toml and calibrate again."
         )
-    assert geometry.pixel_pitch_um is not None
-    assert geometry.diffuser_distance_mm is not None
-    return geometry.pixel_pitch_um, 1e3 * geometry.diffuser_distance_mm
+    return pitch_um, 1e3 * distance_mm
 
 
 def _cut_to_light(calibration: Calibration) -> tuple[Calibration, tuple[int, int]]:

@@ -30,27 +30,19 @@ CUT_PX = 40
 
 @dataclass(frozen=True)
 class DepthSimilarity:
-    """PSFs of different depths compared.
-
-    Attributes
-    ----------
-    z_um : ndarray, (n_z,)
-        Ascending.
-    middle_um : float
-        Depth of the PSF that the others are compared with.
-    to_middle : ndarray, (n_z,)
-        Inner product with the middle PSF, both on the axis (Fig. A.3b).
-    near_cut, far_cut, cross_cut : ndarray, (2 CUT_PX + 1,)
-        Cuts along the columns through the peaks of both autocorrelations and of the cross-correlation of the
-        nearest and the farthest PSF (Fig. A.3a).
-    """
+    """PSFs of different depths compared."""
 
     z_um: Floats
+    """(n_z,): ascending."""
     middle_um: float
+    """Depth of the PSF that the others are compared with."""
     to_middle: Floats
+    """(n_z,): inner product with the middle PSF, both on the axis (Fig. A.3b)."""
     near_cut: Floats
     far_cut: Floats
     cross_cut: Floats
+    """``near_cut``, ``far_cut`` and ``cross_cut``: (2 CUT_PX + 1,): cuts along the columns through the peaks
+    of both autocorrelations and of the cross-correlation of the nearest and the farthest PSF (Fig. A.3a)."""
 
 
 def across_depth(depths_um: Floats, planes: Array) -> DepthSimilarity:
@@ -123,27 +115,18 @@ def axial_spacing_per_um(lenslet_um: float, wavelength_um: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class VoxelGrid:
-    """A grid that samples the resolution twice: fine where the camera is sharp, coarse where it is not.
-
-    Attributes
-    ----------
-    binning : int
-        Sensor pixels to bin so that two binned pixels are one resolved step, at least 1.
-    lateral_px : float
-        Voxel size on the sensor, in the calibration's pixels (equal to ``binning``).
-    z_um : tuple of float
-        Depth planes, nearest first: evenly spaced in 1/z (Eq. 4.7).
-    lateral_um : tuple of float
-        Voxel size at each plane, in the object.
-    complete : bool
-        False where more than :data:`MOST_PLANES` would be needed and the list was cut.
-    """
+    """A grid that samples the resolution twice: fine where the camera is sharp, coarse where it is not."""
 
     binning: int
+    """Sensor pixels to bin so that two binned pixels are one resolved step, at least 1."""
     lateral_px: float
+    """Voxel size on the sensor, in the calibration's pixels (equal to ``binning``)."""
     z_um: tuple[float, ...]
+    """Depth planes, nearest first: evenly spaced in 1/z (Eq. 4.7)."""
     lateral_um: tuple[float, ...]
+    """Voxel size at each plane, in the object."""
     complete: bool = True
+    """False where more than :data:`MOST_PLANES` would be needed and the list was cut."""
 
 
 def voxel_grid(
@@ -183,18 +166,12 @@ def voxel_grid(
 
 @dataclass(frozen=True, slots=True)
 class LateralResolution:
-    """The smallest lateral step that changes the PSF enough, from its autocorrelation.
-
-    Attributes
-    ----------
-    level : float
-        Autocorrelation taken for resolved: 0.7 (sec. 3.2) or 0.8 (sec. 6.4).
-    half_width_px : (float, float)
-        Shift on the sensor along rows (y) and columns (x).
-    """
+    """The smallest lateral step that changes the PSF enough, from its autocorrelation."""
 
     level: float
+    """Autocorrelation taken for resolved: 0.7 (sec. 3.2) or 0.8 (sec. 6.4)."""
     half_width_px: tuple[float, float]
+    """Shift on the sensor along rows (y) and columns (x)."""
 
     @property
     def mean_px(self) -> float:
@@ -223,18 +200,13 @@ class AxialResolution:
     Two depths are told apart when the pattern of one is so much larger that its inner product with the other
     is down to ``level``. The scale between them is ``(1 + d/z1) / (1 + d/z2)``, so they differ by a constant
     ``c = 1/z1 - 1/z2 = (scale - 1) (1 + d/z) / d`` where ``scale`` was found on a PSF taken at ``z``.
-
-    Attributes
-    ----------
-    scale : float
-        Enlargement at which the PSF is only ``level`` similar to itself.
-    step_per_um : float
-        The constant ``c`` of Eq. 4.7, per micrometre.
     """
 
     level: float
     scale: float
+    """Enlargement at which the PSF is only ``level`` similar to itself."""
     step_per_um: float
+    """The constant ``c`` of Eq. 4.7, per micrometre."""
 
     @property
     def hyperfocal_um(self) -> float:

@@ -444,7 +444,4 @@ def expression(
 
 def _is_default(f: dataclasses.Field[Any], value: Any) -> bool:
     made = f.default_factory() if f.default_factory is not dataclasses.MISSING else f.default
-    try:
-        return value is made or bool(value == made)
-    except ValueError:  # arrays
-        return False
+    return value is made or _same(value, made)

@@ -17,24 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.namespace import namespace_of
-from recon.base.threads import get_threads, in_blocks, set_threads
-
-__all__ = [
-    "complex_dtype",
-    "dct",
-    "ensure_compiled",
-    "fast_length",
-    "fast_shape",
-    "get_threads",
-    "idct",
-    "irfft",
-    "irfft_strip",
-    "multiply",
-    "rfft",
-    "rfft_strip",
-    "set_threads",
-    "spectrum_shape",
-]
+from recon.base.threads import get_threads, in_blocks
 
 RealArray = npt.NDArray[Any]
 ComplexArray = npt.NDArray[Any]

@@ -140,24 +140,10 @@ def _product_tile(H: Any, X: Any, out: Any) -> None:
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
-def _add_product_tile(H: Any, X: Any, total: Any) -> None:
-    for y in range(total.shape[0]):
-        for i in range(total.shape[1]):
-            total[y, i] += H[y, i] * X[y, i]
-
-
-@njit(nogil=True, cache=True, fastmath=FAST)
 def _add_tile(X: Any, out: Any) -> None:
     for y in range(out.shape[0]):
         for i in range(out.shape[1]):
             out[y, i] += X[y, i]
-
-
-@njit(nogil=True, cache=True, fastmath=FAST)
-def _conjugate_product_tile(H: Any, E: Any, out: Any) -> None:
-    for y in range(out.shape[0]):
-        for i in range(out.shape[1]):
-            out[y, i] = np.conj(H[y, i]) * E[y, i]
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
@@ -204,7 +190,7 @@ def columns_forward(
                 if m == m0:
                     _product_tile(H[t, h0 : h0 + length], x, sums)
                 else:
-                    _add_product_tile(H[t, h0 : h0 + length], x, sums)
+                    add_product(sums, H[t, h0 : h0 + length], x)
             c2c(sums, sums, FIRST_AXIS, False, 1.0 / length, 1)
             _add_tile(sums[local : local + count], S[t, sensor : sensor + count])
 
@@ -226,7 +212,7 @@ def columns_adjoint(
             c2c(d, d, FIRST_AXIS, True, 1.0, 1)
             for m in range(m0, m1):
                 mask, w0, n, h0 = members[m]
-                _conjugate_product_tile(H[t, h0 : h0 + length], d, x)
+                conjugate_product(H[t, h0 : h0 + length], d, x)
                 c2c(x, x, FIRST_AXIS, False, 1.0 / length, 1)
                 _add_weighted_tile(x, weights[w0 : w0 + n], R[mask, t, at : at + n])
 

@@ -152,6 +152,19 @@ class Composition(LinearOperator):
         return self.outer.norm_bound * self.inner.norm_bound
 
 
+class Projection(LinearOperator):
+    """An orthogonal projection, which is its own adjoint and of norm one."""
+
+    def adjoint(self, y: Array, out: Array | None = None) -> Array:
+        """Project."""
+        return self.forward(y, out)
+
+    @property
+    def norm_bound(self) -> float:
+        """One."""
+        return 1.0
+
+
 class Adjoint(LinearOperator):
     """``A^H``."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -191,11 +191,7 @@ class OfferedCamera:
     refuses: Callable[[Depths], str | None] = lambda _: None
 
 
-def _none() -> Iterable[OfferedCamera]:
-    return ()
-
-
-CAMERAS: Registry[OfferedCamera] = Registry("camera model", "diffuserbench.cameras", _none)
+CAMERAS: Registry[OfferedCamera] = Registry("camera model", "diffuserbench.cameras", tuple)
 """Camera models of others. The project's own three share their PSFs' preparation: :data:`MODELS`."""
 
 

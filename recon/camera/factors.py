@@ -13,12 +13,12 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.base import Array, Composition, LinearOperator
+from recon.camera.base import Array, Composition, LinearOperator, Projection
 from recon.camera.convolution import Convolution
 from recon.errors import InputError, StructureError
 
 
-class Erasures(LinearOperator):
+class Erasures(Projection):
     """Set the pixels that carry no information to zero: dead, saturated, deliberately not read.
 
     Parameters
@@ -44,15 +44,6 @@ class Erasures(LinearOperator):
         """Zero the pixels that are not valid."""
         result: Array = np.multiply(x, self.valid, out=out, dtype=self.dtype)
         return result
-
-    def adjoint(self, y: Array, out: Array | None = None) -> Array:
-        """Do the same: the operator is its own adjoint."""
-        return self.forward(y, out)
-
-    @property
-    def norm_bound(self) -> float:
-        """One: pixels are kept or dropped."""
-        return 1.0
 
 
 @dataclass(frozen=True)
@@ -150,7 +141,7 @@ _SAMPLES = 6
 """Points at which non-negativity is asked for, for each frequency along an axis."""
 
 
-class BackgroundRemoval(LinearOperator):
+class BackgroundRemoval(Projection):
     """Projection of data onto what low DCT frequencies cannot explain; its own adjoint.
 
     Kuo 2020, Eqs. 6.1 and 6.2, solves ``min_{y, g} 1/2 ||b - (A y + g)||^2 + prior(y)`` for a background
@@ -207,11 +198,16 @@ class BackgroundRemoval(LinearOperator):
         """Return the smooth part of ``y`` on all pixels: the least-squares fit to the valid ones."""
         fitted = np.empty(self.range_shape, self.dtype)
         for channel, image in enumerate(y):
-            masked = image if self._valid is None else image * self._valid[channel]
-            coefficients = self._rows @ masked.astype(np.float64) @ self._columns.T
+            coefficients = self._coefficients(image, channel)
             best = (self._inverse[channel] @ coefficients.ravel()).reshape(coefficients.shape)
             fitted[channel] = self._rows.T @ best @ self._columns
         return fitted
+
+    def _coefficients(self, image: Array, channel: int) -> Array:
+        """Return the cosines' sums over the valid pixels of a channel, (ny, nx)."""
+        masked = image if self._valid is None else image * self._valid[channel]
+        coefficients: Array = self._rows @ masked.astype(np.float64) @ self._columns.T
+        return coefficients
 
     def non_negative(self, y: Array) -> Array:
         """Return the smooth image nearest to ``y`` on the valid pixels that is nowhere negative.
@@ -229,8 +225,7 @@ class BackgroundRemoval(LinearOperator):
         samples = np.einsum("ay,bx->yxab", rows, columns).reshape(-1, len(rows) * len(columns))
         fitted = np.empty(self.range_shape, self.dtype)
         for channel, image in enumerate(y):
-            masked = image if self._valid is None else image * self._valid[channel]
-            wanted = (self._rows @ masked.astype(np.float64) @ self._columns.T).ravel()
+            wanted = self._coefficients(image, channel).ravel()
             values, vectors = np.linalg.eigh(self._inverse[channel])
             root = (vectors * np.sqrt(np.maximum(values, 0))).T
             scale = max(float(np.abs(root @ wanted).max()), 1e-30)
@@ -248,15 +243,6 @@ class BackgroundRemoval(LinearOperator):
         if self._valid is not None:
             out *= self._valid
         return out
-
-    def adjoint(self, y: Array, out: Array | None = None) -> Array:
-        """Do the same: an orthogonal projection."""
-        return self.forward(y, out)
-
-    @property
-    def norm_bound(self) -> float:
-        """One, as for every orthogonal projection."""
-        return 1.0
 
 
 def _cosines(count: int, length: int) -> npt.NDArray[np.float64]:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera.camera_model import members_of_depths
-from recon.camera.registration import displacement
+from recon.camera.registration import displacement, moved, rescaled
 from recon.errors import InputError
 from recon.types import Calibration
 
@@ -84,41 +84,6 @@ class Refocused:
 def paraxial_scale(z_from_um: float, z_to_um: float, distance_um: float) -> float:
     """Return by how much a pattern grows from one depth to another: ``(1 + d/z_to) / (1 + d/z_from)``."""
     return (1 + distance_um / z_to_um) / (1 + distance_um / z_from_um)
-
-
-def rescaled(
-    image: Array, s: float, *, centre: tuple[float, float] | None = None, shift: tuple[float, float] = (0, 0)
-) -> Floats:
-    """Return ``image(c + s (v - c - shift))``: shrunk ``s`` times about a point, then moved.
-
-    Cubic splines; where the image shrinks, a Gaussian first takes out what the new pixels cannot hold. Zero
-    beyond the border, and no negative value that the image did not have.
-
-    Parameters
-    ----------
-    image : ndarray, (..., height, width)
-    s : float
-        Above 1 shrinks the pattern, below 1 enlarges it.
-    centre : (float, float), optional
-        ``(row, column)`` that stays; default the geometric centre.
-    shift : (float, float)
-        Rows and columns by which the result is moved.
-    """
-    from scipy import ndimage
-
-    if not 0 < s < np.inf:
-        raise InputError(f"A scale is a positive number, not {s}.")
-    height, width = image.shape[-2:]
-    middle = ((height - 1) / 2, (width - 1) / 2) if centre is None else centre
-    offset = [c - s * (c + by) for c, by in zip(middle, shift, strict=True)]
-    blur = 0.5 * np.sqrt(max(s * s - 1, 0.0))
-    planes = np.asarray(image, np.float32).reshape(-1, height, width)
-    result = np.empty_like(planes)
-    for plane, out in zip(planes, result, strict=True):
-        source = ndimage.gaussian_filter(plane, blur) if blur > 0.1 else plane
-        ndimage.affine_transform(source, [s, s], offset, output=out, order=3)
-        np.clip(out, min(float(plane.min()), 0.0), None, out=out)
-    return result.reshape(image.shape)
 
 
 def refocus_psf(psf: Array, z_from_um: float, z_to_um: float, distance_um: float) -> Floats:
@@ -258,7 +223,7 @@ def _mixed(
     rows, columns = displacement(scaled[1].mean(axis=0), scaled[0].mean(axis=0))
     if rows or columns:
         scaled = [
-            rescaled(psf, 1.0, shift=(part * rows, part * columns))
+            moved(psf, part * rows, part * columns)
             for psf, part in zip(scaled, (share, share - 1), strict=True)
         ]
     if _likeness(*scaled) < LEAST_LIKENESS:
@@ -290,8 +255,7 @@ def _expected_similarity(
         rest = np.arange(len(depths)) != k
         predicted, used, _ = _mixed(depths[rest], psfs[rest], float(depths[k]), distance_um)
         rows, columns = displacement(psfs[k].mean(axis=0), predicted.mean(axis=0))
-        moved = rescaled(predicted, 1.0, shift=(rows, columns))
-        likeness = _likeness(moved, psfs[k])
+        likeness = _likeness(moved(predicted, rows, columns), psfs[k])
         gap = min(abs(1 / depths[rest][j] - 1 / depths[k]) for j in used)
         missed.append((1 - likeness) * (wanted / gap) ** 2)
     return float(np.clip(1 - np.mean(missed), 0.0, 1.0))

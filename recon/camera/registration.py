@@ -94,7 +94,7 @@ def register(
             raise InputError(f"The {name} to register is constant: there is no pattern in it.")
     if scale is None:
         scale = _find_scale(first, second)
-    resized = first if scale == 1 else scaled(first, 1 / scale)
+    resized = first if scale == 1 else rescaled(first, scale) * np.float32(scale**2)
     window = None if near is None else (near[0] / scale, near[1] / scale, within_px / scale)
     peak = _Correlation(_fine(resized), _fine(second)).peak(window)
     # In the shrunken (or enlarged) image one pixel is ``scale`` pixels of the PSF.
@@ -111,7 +111,7 @@ def aligned(psf: Array, registration: Registration) -> Array:
     """
     values = np.asarray(psf, np.float32)
     if registration.scale != 1:
-        values = scaled(values, 1 / registration.scale)
+        values = rescaled(values, registration.scale) * np.float32(registration.scale**2)
     by = -registration.rows / registration.scale, -registration.columns / registration.scale
     return moved(values, *by)
 
@@ -128,26 +128,34 @@ def expected_shift(
     return -y * distance_um / z / pitch_um, -x * distance_um / z / pitch_um
 
 
-def scaled(image: Array, factor: float) -> Array:
-    """Return ``image`` (..., height, width) enlarged by ``factor`` about its centre, light preserved.
+def rescaled(image: Array, s: float, *, centre: tuple[float, float] | None = None) -> Array:
+    """Return ``image(c + s (v - c))``: shrunk ``s`` times about a point.
 
-    Cubic splines; when shrinking, blurred first to what the coarser pixels can hold. Values are divided by
-    ``factor^2``: the same light on a larger area.
+    Cubic splines; where the image shrinks, a Gaussian first takes out what the new pixels cannot hold. Zero
+    beyond the border, and no negative value that the image did not have. Light falls as ``1 / s^2``.
+
+    Parameters
+    ----------
+    image : ndarray, (..., height, width)
+    s : float
+        Above 1 shrinks the pattern, below 1 enlarges it.
+    centre : (float, float), optional
+        ``(row, column)`` that stays; default the geometric centre.
     """
     from scipy import ndimage
 
-    values = np.asarray(image, np.float32)
-    height, width = values.shape[-2:]
-    centre = np.array([(height - 1) / 2, (width - 1) / 2])
-    result = np.empty_like(values)
-    blur = 0.5 * np.sqrt(max(factor**-2 - 1, 0.0))
-    for index in np.ndindex(values.shape[:-2]):
-        plane = ndimage.gaussian_filter(values[index], blur) if blur > 0 else values[index]
-        result[index] = ndimage.affine_transform(
-            plane, np.full(2, 1 / factor), centre * (1 - 1 / factor), order=3, mode="constant"
-        )
-    result /= np.float32(factor**2)
-    return np.maximum(result, 0) if values.min() >= 0 else result
+    if not 0 < s < np.inf:
+        raise InputError(f"A scale is a positive number, not {s}.")
+    height, width = image.shape[-2:]
+    middle = ((height - 1) / 2, (width - 1) / 2) if centre is None else centre
+    blur = 0.5 * np.sqrt(max(s * s - 1, 0.0))
+    planes = np.asarray(image, np.float32).reshape(-1, height, width)
+    result = np.empty_like(planes)
+    for plane, out in zip(planes, result, strict=True):
+        source = ndimage.gaussian_filter(plane, blur) if blur > 0.1 else plane
+        ndimage.affine_transform(source, [s, s], [c - s * c for c in middle], output=out, order=3)
+        np.clip(out, min(float(plane.min()), 0.0), None, out=out)
+    return result.reshape(image.shape)
 
 
 def displacement(psf: Array, reference: Array) -> tuple[int, int]:
@@ -304,7 +312,7 @@ def _find_scale(first: Array, second: Array) -> float:
     while True:
         a, b = (_blocks(image, factor) for image in (first, second))
         fine = _fine(b)
-        heights = [_Correlation(_fine(scaled(a, float(np.exp(-s)))), fine).height for s in tried]
+        heights = [_Correlation(_fine(rescaled(a, float(np.exp(s)))), fine).height for s in tried]
         best = int(np.argmax(heights))
         if factor == 1:
             break

@@ -210,21 +210,15 @@ def _offset(corner: tuple[int, int], field: FieldOfPsfs) -> tuple[int, int]:
 def cut_to_support(psfs: Array, threshold: float = 1e-6) -> tuple[Array, tuple[int, int]]:
     """Cut PSFs (..., height, width) to the rectangle that holds all but ``threshold`` of their maximum."""
     bright = np.abs(psfs).max(axis=tuple(range(psfs.ndim - 2)))
-    level = threshold * float(bright.max())
-    windows = []
-    for axis in (1, 0):
-        used = np.flatnonzero(bright.max(axis=axis) > level)
-        windows.append(slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 1))
-    return psfs[..., windows[0], windows[1]], (windows[0].start, windows[1].start)
+    used = bright > threshold * float(bright.max())
+    rows, columns = bounding_window(used) if used.any() else (slice(0, 1), slice(0, 1))
+    return psfs[..., rows, columns], (rows.start, columns.start)
 
 
 def bounding_window(mask: Mask) -> Window:
     """Return the smallest window that holds all of a mask, which must not be empty."""
-    cut = []
-    for axis in (1, 0):
-        used = np.flatnonzero(mask.any(axis=axis))
-        cut.append(slice(int(used[0]), int(used[-1]) + 1))
-    return cut[0], cut[1]
+    rows, columns = (np.asarray(mask.any(axis=axis)) for axis in (1, 0))
+    return _span(rows), _span(columns)
 
 
 def within(mask: Mask, window: Window) -> Window | None:

@@ -23,6 +23,7 @@ from recon.blind import BlindSettings, calibrate_from_beads
 from recon.blind.points import support_of
 from recon.camera.registration import displacement
 from recon.errors import InputError
+from recon.evaluation.scene import make_scene
 from recon.evaluation.scored import Aside, Curve, Point
 from recon.evaluation.trial import Subject, Turn, in_turns
 from recon.reconstruction.reconstruct import reconstruct
@@ -43,68 +44,48 @@ _SEARCH = 3
 
 @dataclass(frozen=True)
 class Photographed:
-    """A scene's photograph and what is true.
-
-    Attributes
-    ----------
-    image : ndarray, float32, (height, width)
-    truth : ndarray, float32, (FINE * height, FINE * width)
-        Light from all depths that reaches the sensor; the axis in the middle.
-    """
+    """A scene's photograph and what is true."""
 
     name: SceneName
     image: Floats
+    """(height, width)."""
     truth: Floats
+    """(FINE * height, FINE * width): light from all depths that reaches the sensor; the axis in the
+    middle."""
 
 
 @dataclass(frozen=True)
 class Photographs:
-    """What a bench photographed; all of (height, width), float32, background removed, noise kept.
-
-    Attributes
-    ----------
-    psfs : ndarray, (n, height, width)
-        Of the point source at ``places``, one photograph each; several of the same place differ in noise.
-    places : ndarray, float64, (n, 3)
-        Row and column from the axis in object pixels, and depth in micrometres.
-    slides : ndarray, (m, height, width)
-        Of beads at unknown places in depth ``z_um``.
-    z_um : float
-        Depth of the flat picture, of the slides, and of calibrations of one depth.
-    window_px : int
-        Side of the square that holds a PSF of ``z_um``; odd.
-    reach : float
-        Part of the sensor's sides that scenes, grids and beads cover.
-    """
+    """What a bench photographed; all of (height, width), float32, background removed, noise kept."""
 
     psfs: Floats
+    """(n, height, width): of the point source at ``places``, one photograph each; several of the same place
+    differ in noise."""
     places: npt.NDArray[np.float64]
+    """(n, 3): row and column from the axis in object pixels, and depth in micrometres."""
     slides: Floats
+    """(m, height, width): of beads at unknown places in depth ``z_um``."""
     scenes: tuple[Photographed, ...]
     z_um: float
+    """Depth of the flat picture, of the slides, and of calibrations of one depth."""
     geometry: Geometry
     window_px: int
+    """Side of the square that holds a PSF of ``z_um``; odd."""
     reach: float
+    """Part of the sensor's sides that scenes, grids and beads cover."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSetting:
-    """One way to calibrate.
-
-    Attributes
-    ----------
-    grid : int
-        Points along each side of the field; 1: on the axis.
-    averaged : int
-        Photographs a place, whose mean is taken.
-    slides : int
-        Of beads, for a blind calibration, which photographs no point; else 0.
-    """
+    """One way to calibrate."""
 
     grid: int = 1
+    """Points along each side of the field; 1: on the axis."""
     depths: int = 1
     averaged: int = 1
+    """Photographs a place, whose mean is taken."""
     slides: int = 0
+    """Of beads, for a blind calibration, which photographs no point; else 0."""
 
     @property
     def images(self) -> int:
@@ -201,20 +182,11 @@ class CalibrationProblem(Subject[CalibrationSetting]):
         return reconstructed, scored
 
     def warm_up(self, setting: CalibrationSetting) -> None:
-        """Reconstruct from noise, in small."""
-        rng = np.random.default_rng(0)
-        size, few = 24, CalibrationSetting(min(setting.grid, 3), min(setting.depths, 3))
-        centre = np.zeros((size, size), np.float32)
-        centre[size // 2 - 2 : size // 2 + 3, size // 2 - 2 : size // 2 + 3] = rng.random((5, 5))
-        places = _square(3 if setting.slides else few.grid)
-        positions = [(1e2 * x, 1e2 * y, 1e3 * (z + 1)) for z in range(few.depths) for x, y in places]
-        calibration = Calibration(
-            np.repeat(centre[None, None], len(positions), axis=0),
-            np.array(positions),
-            geometry=replace(self.photographs.geometry, diffuser_distance_mm=1.0),
-        )
+        """Reconstruct a small scene of the same sort."""
+        grid = 3 if setting.slides else min(setting.grid, 3)
+        scene = make_scene("beads", size=24, grid=grid, depths=min(setting.depths, 3))
         for prior in ("tv", "l1"):
-            _reconstructed(rng.random((size, size)), calibration, setting, prior, iterations=2)
+            _reconstructed(scene.measurement, scene.calibration, setting, prior, iterations=2)
 
     def _identity(self) -> Iterator[str | Array]:
         p = self.photographs
@@ -357,7 +329,3 @@ def _smooth(image: Array) -> Array:
 
 def _every(values: npt.NDArray[np.float64], count: int, middle: float) -> npt.NDArray[np.float64]:
     return np.array([middle]) if count == 1 else values[:: (len(values) - 1) // (count - 1)]
-
-
-def _square(side: int) -> list[tuple[int, int]]:
-    return [(x, y) for y in range(-(side // 2), side // 2 + 1) for x in range(-(side // 2), side // 2 + 1)]

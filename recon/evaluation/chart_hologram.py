@@ -34,25 +34,17 @@ COUNTS = (1, 3, 5, 10, 20, 40, 80, 160)
 
 @dataclass(frozen=True, slots=True)
 class HologramSetting:
-    """One way to compute a hologram.
-
-    Attributes
-    ----------
-    expansion : int
-        Étendue expansion q.
-    method : str
-        As :func:`recon.holography.compute_hologram`.
-    loss : str
-        Of :data:`recon.holography.losses.LOSSES`; the one-step method has none: ``"frequency"`` stands
-        for that.
-    frames : int
-        Shown one after the other.
-    """
+    """One way to compute a hologram."""
 
     expansion: int
+    """Étendue expansion q."""
     method: Method = "lbfgs"
+    """As :func:`recon.holography.compute_hologram`."""
     loss: str = "frequency"
+    """Of :data:`recon.holography.losses.LOSSES`; the one-step method has none: ``"frequency"`` stands for
+    that."""
     frames: int = 1
+    """Shown one after the other."""
 
     @property
     def family(self) -> str:
@@ -76,27 +68,19 @@ class HologramSetting:
 
 @dataclass(frozen=True)
 class HologramProblem(Subject[HologramSetting]):
-    """A picture and the displays that shall show it.
-
-    Attributes
-    ----------
-    displays : tuple of Display
-        One an expansion.
-    targets : tuple of tuple of Target
-        For each display, one a plane.
-    weights : ndarray
-        Of the losses that take them.
-    seed : int
-        Of the random start.
-    """
+    """A picture and the displays that shall show it."""
 
     kind = "hologram"
 
     displays: tuple[Display, ...]
+    """One an expansion."""
     targets: tuple[tuple[Target, ...], ...]
+    """For each display, one a plane."""
     frames: tuple[int, ...] = (1, 2, 3)
     weights: Array = field(default_factory=lambda: foveal_weights((256, 256)))
+    """Of the losses that take them."""
     seed: int = 0
+    """Of the random start."""
 
     def __post_init__(self) -> None:
         factors = [d.expansion for d in self.displays]

@@ -59,17 +59,14 @@ class Score:
 def score(found: npt.NDArray[Any], truth: npt.NDArray[Any], *, volume: bool | None = None) -> Score:
     """Judge a reconstruction.
 
+    Raises InputError when the shapes differ.
+
     Parameters
     ----------
     found, truth : ndarray
         Pictures (height, width[, n_channels]), or volumes (n_z, height, width[, n_channels]) of one shape.
     volume : bool, optional
         Whether the first axis is depth; default: 3 axes of which the last is longer than 4, or 4 axes.
-
-    Raises
-    ------
-    InputError
-        When the shapes differ.
     """
     if found.shape != truth.shape:
         raise InputError(f"The reconstruction is {found.shape} and the truth {truth.shape}.")

@@ -43,28 +43,19 @@ COUNTS = (3, 5, 10, 20, 40, 80, 160, 320)
 
 @dataclass(frozen=True, eq=False)
 class ChartProblem(Subject[Setting]):
-    """What is reconstructed over and over.
-
-    Attributes
-    ----------
-    measurement : ndarray, (height, width)
-        One channel, counts, background subtracted.
-    volume : bool
-        Whether all depths take part; else the calibration holds one depth.
-    erasures : ndarray of bool or None
-    noise : NoiseModel, float or None
-    truth : ndarray or None
-        (height, width), or (n_z, height, width).
-    """
+    """What is reconstructed over and over."""
 
     kind = "reconstruction"
 
     measurement: npt.NDArray[np.float32]
+    """(height, width): one channel, counts, background subtracted."""
     calibration: Calibration
     volume: bool
+    """Whether all depths take part; else the calibration holds one depth."""
     erasures: npt.NDArray[np.bool_] | None = None
     noise: NoiseModel | float | None = None
     truth: npt.NDArray[np.float32] | None = None
+    """(height, width), or (n_z, height, width)."""
 
     @classmethod
     def of_scene(cls, scene: TestScene) -> ChartProblem:

@@ -72,35 +72,24 @@ def _cast(image, points, facets, optics):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class LensletCamera:
-    """Diffuser and sensor.
-
-    Attributes
-    ----------
-    shape : (int, int)
-        ``(height, width)`` of the sensor in pixels; pixel ``(height // 2, width // 2)`` lies on the axis.
-    pitch_um, distance_um : float
-        Of the pixels, and from the diffuser to the sensor.
-    facets : ndarray, float64, (n, 5)
-        ``y, x`` in the diffuser's plane (micrometres), deflection in tangents along y and x, transmitted
-        share of the light.
-    facet_um : float
-        Diameter of a lenslet; 0 for facets that only deflect.
-    focus_um : float
-        Depth whose image is sharpest.
-    aberration : float
-        Relative increase of a lenslet's power with the squared tangent of the angle of incidence.
-    fall_off_deg : float
-        Standard deviation of the pixels' Gaussian angular response; infinite for none (Kuo 2020, Eq. 5.1).
-    """
+    """Diffuser and sensor."""
 
     shape: tuple[int, int]
+    """``(height, width)`` of the sensor in pixels; pixel ``(height // 2, width // 2)`` lies on the axis."""
     pitch_um: float
     distance_um: float
+    """``pitch_um`` and ``distance_um``: of the pixels, and from the diffuser to the sensor."""
     facets: Floats
+    """(n, 5): ``y, x`` in the diffuser's plane (micrometres), deflection in tangents along y and x,
+    transmitted share of the light."""
     facet_um: float
+    """Diameter of a lenslet; 0 for facets that only deflect."""
     focus_um: float
+    """Depth whose image is sharpest."""
     aberration: float = 0.0
+    """Relative increase of a lenslet's power with the squared tangent of the angle of incidence."""
     fall_off_deg: float = np.inf
+    """Standard deviation of the pixels' Gaussian angular response; infinite for none (Kuo 2020, Eq. 5.1)."""
     dispersion: float = 0.0
     """Relative change of power and deflection from green to blue, and its negative to red."""
     spot_px: float = SPOT_PX

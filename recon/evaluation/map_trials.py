@@ -199,20 +199,14 @@ FLASHES = f"{POINTS} points, {FRAMES['full']} frames, flashes of {FLASH} in {SHA
 
 @dataclass(frozen=True)
 class Video:
-    """Frames of points that drift and flash.
-
-    Attributes
-    ----------
-    psf : ndarray, (height, width)
-    frames : ndarray, float32, (n_frames, height, width)
-        Photo-electrons.
-    truth : ndarray, (n_frames, height, width)
-        The points' light, blurred by one pixel.
-    """
+    """Frames of points that drift and flash."""
 
     psf: Array
+    """(height, width)."""
     frames: Array
+    """float32, (n_frames, height, width): photo-electrons."""
     truth: Array
+    """(n_frames, height, width): the points' light, blurred by one pixel."""
 
 
 @lru_cache(maxsize=2)

@@ -171,6 +171,16 @@ def _of_scene(
     return StressMap("", title, question, x, y, methods, trial, base=f"{base} {chosen}")
 
 
+def _of_video(what: str, title: str, question: str, x: Stress) -> StressMap:
+    trial, name, error = partial(over_time, what), f"over-time-{what}", "NRMSE, change in %"
+    return StressMap(name, title, question, x, LIGHT_OF_VIDEO, tuple(OVER_TIME), trial, error, FLASHES)
+
+
+def _of_mask(kind: str, title: str, question: str, axes: tuple[Stress, Stress]) -> StressMap:
+    trial, name = partial(misplaced, kind), f"mask-{kind}"
+    return StressMap(name, title, question, *axes, tuple(HOLOGRAMS), trial, "PSNR (dB)")
+
+
 def _too_large(x: float, y: float, _pixels: int) -> Mapping[str, Any]:
     # The PSF's size goes as 1 + d / z; the scene's place in depth is what makes it too large.
     place = 0.5 - x / 100 * (1 + MEAN_INVERSE) / INVERSE_RANGE
@@ -344,47 +354,29 @@ _OTHERS = (
         ("admm tv", "admm-sensor tv", "fista tv", *_TV_L1),
         partial(penalties, PICTURE),
     ),
-    StressMap(
-        "over-time-motion",
+    _of_video(
+        "motion",
         "Priors over time: motion and light",
         "How fast may points of a video move before a prior over time does more harm than good?",
         MOTION,
-        LIGHT_OF_VIDEO,
-        tuple(OVER_TIME),
-        partial(over_time, "motion"),
-        error="NRMSE, change in %",
-        base=FLASHES,
     ),
-    StressMap(
-        "over-time-activity",
+    _of_video(
+        "activity",
         "Priors over time: activity and light",
         "How many of the points may change from frame to frame?",
         ACTIVE,
-        LIGHT_OF_VIDEO,
-        tuple(OVER_TIME),
-        partial(over_time, "activity"),
-        error="NRMSE, change in %",
-        base=FLASHES,
     ),
-    StressMap(
-        "mask-moved",
+    _of_mask(
+        "moved",
         "Misaligned mask of a holographic display: shift and rotation",
         "How exactly must the mask lie where the hologram believes it?",
-        MASK_SHIFT,
-        ROLL,
-        tuple(HOLOGRAMS),
-        partial(misplaced, "moved"),
-        error="PSNR (dB)",
+        (MASK_SHIFT, ROLL),
     ),
-    StressMap(
-        "mask-defocus",
+    _of_mask(
+        "defocus",
         "Misaligned mask of a holographic display: defocus and distortion",
         "How exactly must the mask's distance and the relay's distortion be known?",
-        DEFOCUS,
-        DISTORTION,
-        tuple(HOLOGRAMS),
-        partial(misplaced, "focus"),
-        error="PSNR (dB)",
+        (DEFOCUS, DISTORTION),
     ),
 )
 

@@ -28,48 +28,36 @@ from recon.reconstruction.reconstruct import reconstruct
 from recon.reconstruction.result import Reconstruction
 from recon.types import Calibration
 
+Members = npt.NDArray[np.intp]
 _SCENES: dict[str, str] = {"tv": "as an extended scene (tv)", "l1": "as a sparse scene (l1)"}
 """What a photograph is of is for its owner to say: both fronts are drawn."""
 
 
 @dataclass(frozen=True)
 class OwnCalibration:
-    """A calibration, and the photograph that it is tried on.
-
-    Attributes
-    ----------
-    label : str
-        Different for each.
-    problem : ChartProblem
-        The same photograph for all; the calibration of this one.
-    photographs : float
-        How many were taken for each of its PSFs; of a blind one: for all of them together, over their number.
-    whole : bool
-        Whether it can only be had as a whole: a blind one.
-    """
+    """A calibration, and the photograph that it is tried on."""
 
     label: str
+    """Different for each."""
     problem: ChartProblem
+    """The same photograph for all; the calibration of this one."""
     photographs: float = 1.0
+    """How many were taken for each of its PSFs; of a blind one: for all of them together, over their
+    number."""
     whole: bool = False
+    """Whether it can only be had as a whole: a blind one."""
 
 
 @dataclass(frozen=True, slots=True)
 class OwnSetting:
-    """A part of a calibration.
-
-    Attributes
-    ----------
-    members : tuple of int
-        Its PSFs.
-    images : int
-        Photographs.
-    """
+    """A part of a calibration."""
 
     label: str
     part: str
     members: tuple[int, ...]
+    """Its PSFs."""
     images: int
+    """Photographs."""
     model: ModelName
 
     @property
@@ -165,7 +153,7 @@ def _parts(own: OwnCalibration) -> list[OwnSetting]:
     parts: dict[tuple[int, ...], str] = {}
     middle = len(depths) // 2
     thinned = [depths, depths[::2], depths[middle : middle + 1]]
-    choosers: tuple[Callable[[npt.NDArray[np.intp]], Any], ...] = (
+    choosers: tuple[Callable[[Members], Any], ...] = (
         lambda group: group,
         partial(_every_second, calibration),
         lambda group: [calibration.nearest_to_axis(group)],
@@ -188,8 +176,8 @@ def _parts(own: OwnCalibration) -> list[OwnSetting]:
 
 
 def _which(
-    chosen: list[npt.NDArray[np.intp]],
-    depths: list[npt.NDArray[np.intp]],
+    chosen: list[Members],
+    depths: list[Members],
     positions: npt.NDArray[np.float64],
 ) -> str:
     """Say at which of several depths; of a single one its number too: z may be unknown, or the steps fine."""
@@ -202,7 +190,7 @@ def _which(
     return f" at depth {number} of {len(depths)}" + (f" (z {z_mm:.4g} mm)" if np.isfinite(z_mm) else "")
 
 
-def _every_second(calibration: Calibration, group: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+def _every_second(calibration: Calibration, group: Members) -> Members:
     """Return every second point of a grid of 5 x 5 or more, with its corners; else all."""
     places = calibration.source_positions_um[group][:, 1::-1]
     if len(group) < 25 or not np.isfinite(places).all():

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from recon.base.noise import NoiseModel
 from recon.errors import InputError
 from recon.evaluation import content
-from recon.evaluation.lenslets import SPOT_PX, LensletCamera, Optics, build_camera
+from recon.evaluation.lenslets import SPOT_PX, Floats, LensletCamera, Optics, build_camera
 from recon.types import Calibration, Geometry
 
 Family = Literal["dense-picture", "sparse-picture", "beads", "dense-volume", "microscope"]
@@ -21,83 +21,61 @@ PICTURES = ("dense-picture", "sparse-picture")
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """A test scene in numbers. ``make_scene(spec)`` gives the same arrays at any time.
-
-    Attributes
-    ----------
-    family : str
-        One of :data:`FAMILIES`.
-    size : int or (int, int)
-        Pixels of the sensor.
-    seed : int
-        Of scene, diffuser and noise.
-    density : float
-        Leaves, strokes, blobs or beads, relative to the family's default.
-    field : float
-        Extent of a picture relative to the sensor's: above 1 light comes from beyond it.
-    depths : int
-        Calibrated planes, evenly spaced in 1/z from ``z_far`` to ``z_near``; 1 for pictures.
-    z_near, z_far : float
-        Depths relative to the distance of diffuser and sensor. Pictures stand at their harmonic mean.
-    layers : tuple of float
-        Range of the depth that holds anything, from 0 (``z_far``) to 1 (``z_near``).
-    optics : str
-        ``"random"`` or ``"regular"`` lenslets, or a ``"smooth"`` diffuser.
-    fall_off_deg, aberration, dispersion, spot_px : float
-        As :class:`~recon.evaluation.lenslets.LensletCamera`.
-    channels : int
-        1 or 3.
-    colourful : bool
-        Whether the three channels of the scene differ.
-    photons : float
-        Photo-electrons at the brightest pixel.
-    background : float
-        Smooth stray light, relative to the mean of the scene's.
-    saturation : float or None
-        Counts at which pixels saturate, relative to the brightest one without noise.
-    erased : float
-        Share of the pixels that is not read.
-    grid : int
-        Calibration points along each side of the field: 1 is the axis alone.
-    grid_field : float
-        Extent of the calibration grid relative to the field that is opposite to the sensor.
-    calibration_photons : float
-        Photo-electrons at the brightest pixel of a PSF on the axis at the nearest depth (read noise as in the
-        measurement), averages included. PSFs at other places are taken with the same exposure.
-    drift_px, drift_scale, drift_deg : float
-        How the diffuser moved after the calibration: shift along both axes, relative scale, rotation.
-    depth_error : float
-        By how much the calibration's depths are wrong, relatively.
-    """
+    """A test scene in numbers. ``make_scene(spec)`` gives the same arrays at any time."""
 
     family: Family
+    """One of :data:`FAMILIES`."""
     size: int | tuple[int, int] = 64
+    """Pixels of the sensor."""
     seed: int = 0
+    """Of scene, diffuser and noise."""
     density: float = 1.0
+    """Leaves, strokes, blobs or beads, relative to the family's default."""
     field: float = 0.9
+    """Extent of a picture relative to the sensor's: above 1 light comes from beyond it."""
     depths: int = 1
+    """Calibrated planes, evenly spaced in 1/z from ``z_far`` to ``z_near``; 1 for pictures."""
     z_near: float = 4.0
     z_far: float = 12.0
+    """``z_near`` and ``z_far``: depths relative to the distance of diffuser and sensor. Pictures stand at
+    their harmonic mean."""
     layers: tuple[float, float] = (0.0, 1.0)
+    """Range of the depth that holds anything, from 0 (``z_far``) to 1 (``z_near``)."""
     optics: Optics = "random"
+    """``"random"`` or ``"regular"`` lenslets, or a ``"smooth"`` diffuser."""
     fall_off_deg: float = np.inf
     aberration: float = 0.0
     dispersion: float = 0.0
     spot_px: float = SPOT_PX
+    """``fall_off_deg``, ``aberration``, ``dispersion`` and ``spot_px``: as
+    :class:`~recon.evaluation.lenslets.LensletCamera`."""
     channels: int = 1
+    """1 or 3."""
     colourful: bool = False
+    """Whether the three channels of the scene differ."""
     photons: float = 4000.0
+    """Photo-electrons at the brightest pixel."""
     read_noise_e: float = 2.0
     background: float = 0.0
+    """Smooth stray light, relative to the mean of the scene's."""
     saturation: float | None = None
+    """Counts at which pixels saturate, relative to the brightest one without noise."""
     erased: float = 0.0
+    """Share of the pixels that is not read."""
     grid: int = 1
+    """Calibration points along each side of the field: 1 is the axis alone."""
     grid_field: float = 0.9
+    """Extent of the calibration grid relative to the field that is opposite to the sensor."""
     calibration_photons: float = 2e4
+    """Photo-electrons at the brightest pixel of a PSF on the axis at the nearest depth (read noise as in the
+    measurement), averages included. PSFs at other places are taken with the same exposure."""
     drift_px: float = 0.0
     drift_scale: float = 0.0
     drift_deg: float = 0.0
+    """``drift_px``, ``drift_scale`` and ``drift_deg``: how the diffuser moved after the calibration: shift
+    along both axes, relative scale, rotation."""
     depth_error: float = 0.0
+    """By how much the calibration's depths are wrong, relatively."""
 
     def __post_init__(self) -> None:
         if self.family not in FAMILIES:
@@ -143,43 +121,31 @@ def spec_of(family: Family, **changes: Any) -> SceneSpec:
 
 @dataclass(frozen=True)
 class TestScene:
-    """A measurement with all that is known about it.
-
-    Attributes
-    ----------
-    measurement : ndarray, float32, (height, width) or (height, width, 3)
-        Counts, one a photo-electron; 0 where erased.
-    calibration : Calibration
-        With noise, at ``depths`` times ``grid`` squared places.
-    truth : ndarray, float32
-        (height, width) or (n_z, height, width) with the calibration's depths, and channels last where there
-        are some: in units in which ``measurement = sum PSF * truth`` with the PSFs as calibrated.
-    erasures : ndarray of bool, (height, width), or None
-        True where a pixel was not read.
-    noise : NoiseModel
-        The sensor's.
-    background : ndarray, float32, as ``measurement``
-        The true stray light, counts.
-    camera : LensletCamera
-        As it was when the measurement was taken.
-    points : ndarray, float64, (n, 4)
-        ``x, y, z`` in micrometres and power.
-    """
+    """A measurement with all that is known about it."""
 
     __test__ = False  # not a pytest class, whatever its name
 
     spec: SceneSpec
     measurement: npt.NDArray[np.float32]
+    """(height, width) or (height, width, 3): counts, one a photo-electron; 0 where erased."""
     calibration: Calibration
+    """With noise, at ``depths`` times ``grid`` squared places."""
     truth: npt.NDArray[np.float32]
+    """(height, width) or (n_z, height, width) with the calibration's depths, and channels last where there
+    are some: in units in which ``measurement = sum PSF * truth`` with the PSFs as calibrated."""
     erasures: npt.NDArray[np.bool_] | None
+    """(height, width): true where a pixel was not read."""
     noise: NoiseModel
+    """The sensor's."""
     background: npt.NDArray[np.float32]
+    """as ``measurement``: the true stray light, counts."""
     camera: LensletCamera
-    points: npt.NDArray[np.float64]
+    """As it was when the measurement was taken."""
+    points: Floats
+    """(n, 4): ``x, y, z`` in micrometres and power."""
 
     @property
-    def z_um(self) -> npt.NDArray[np.float64]:
+    def z_um(self) -> Floats:
         """Depths of the calibrated planes, the nearest first."""
         return np.unique(self.calibration.source_positions_um[:, 2])
 
@@ -187,15 +153,12 @@ class TestScene:
 def make_scene(spec: SceneSpec | Family, **changes: Any) -> TestScene:
     """Render a scene: a spec, or a family's default with some numbers changed.
 
+    Raises InputError when a number is not known or impossible.
+
     Returns
     -------
     TestScene
         The same for the same numbers, whatever else was rendered.
-
-    Raises
-    ------
-    InputError
-        When a number is not known or impossible.
     """
     spec = replace(spec, **changes) if isinstance(spec, SceneSpec) else spec_of(spec, **changes)
     seeds = np.random.SeedSequence(spec.seed).spawn(4)
@@ -247,7 +210,7 @@ def make_scene(spec: SceneSpec | Family, **changes: Any) -> TestScene:
 
 
 # Pieces ------------------------------------------------------------------------------------------------
-def _places(spec: SceneSpec, rng: np.random.Generator) -> npt.NDArray[np.float64]:
+def _places(spec: SceneSpec, rng: np.random.Generator) -> Floats:
     """Rows, columns (picture pixels from the axis), places in depth and brightness, (n, 4)."""
     side = max(spec.shape)
     if spec.is_picture:
@@ -271,9 +234,7 @@ def _places(spec: SceneSpec, rng: np.random.Generator) -> npt.NDArray[np.float64
     return places
 
 
-def _tints(
-    spec: SceneSpec, places: npt.NDArray[np.float64], rng: np.random.Generator
-) -> npt.NDArray[np.float64]:
+def _tints(spec: SceneSpec, places: Floats, rng: np.random.Generator) -> Floats:
     """Brightness of every point in every channel, relative to its own, (n, channels)."""
     if spec.channels == 1 or not spec.colourful:
         return np.ones((len(places), spec.channels))
@@ -284,32 +245,30 @@ def _tints(
     return np.asarray(colours[nearest])
 
 
-def _channels(spec: SceneSpec, tints: npt.NDArray[np.float64]) -> list[tuple[int, npt.NDArray[np.float64]]]:
+def _channels(spec: SceneSpec, tints: Floats) -> list[tuple[int, Floats]]:
     """Return the camera's colours, each with every point's tint in it."""
     return [(1, tints[:, 0])] if spec.channels == 1 else [(c, tints[:, c]) for c in range(3)]
 
 
-def _points(
-    spec: SceneSpec, places: npt.NDArray[np.float64], camera: LensletCamera
-) -> npt.NDArray[np.float64]:
+def _points(spec: SceneSpec, places: Floats, camera: LensletCamera) -> Floats:
     """``x, y, z`` and power of every point, (n, 4)."""
     z = _depth_um(spec, places[:, 2], camera.distance_um)
     to_scene = -camera.pitch_um * z / camera.distance_um
     return np.column_stack([places[:, 1] * to_scene, places[:, 0] * to_scene, z, places[:, 3]])
 
 
-def _depth_um(spec: SceneSpec, place: npt.ArrayLike, distance_um: float) -> npt.NDArray[np.float64]:
+def _depth_um(spec: SceneSpec, place: npt.ArrayLike, distance_um: float) -> Floats:
     """Depth of a place between far (0) and near (1), even in 1/z."""
     inverse = 1 / spec.z_far + np.asarray(place) * (1 / spec.z_near - 1 / spec.z_far)
     return distance_um / inverse
 
 
-def _plane_places(spec: SceneSpec) -> npt.NDArray[np.float64]:
+def _plane_places(spec: SceneSpec) -> Floats:
     """Places of the calibrated planes, the nearest first."""
     return np.linspace(1.0, 0.0, spec.depths) if spec.depths > 1 else np.array([0.5])
 
 
-def _stray_light(spec: SceneSpec, rng: np.random.Generator) -> npt.NDArray[np.float64]:
+def _stray_light(spec: SceneSpec, rng: np.random.Generator) -> Floats:
     """Smooth light of mean ``spec.background``: a slope and a broad hill."""
     y, x = (np.linspace(-1, 1, n) for n in spec.shape)
     slope, place = rng.uniform(-0.3, 0.3, 2), rng.uniform(-0.5, 0.5, 2)
@@ -353,9 +312,7 @@ def _calibrate(spec: SceneSpec, camera: LensletCamera, rng: np.random.Generator)
     return calibration, unit
 
 
-def _on_grid(
-    spec: SceneSpec, places: npt.NDArray[np.float64], tint: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+def _on_grid(spec: SceneSpec, places: Floats, tint: Floats) -> Floats:
     """Brightness of every pixel or voxel.
 
     In a volume every point's light is shared by its eight nearest voxels; a picture's points lie so densely
@@ -372,9 +329,7 @@ def _on_grid(
     return shared((spec.depths, height, width), np.column_stack([depth, row, column]), light)
 
 
-def shared(
-    shape: tuple[int, ...], places: npt.NDArray[np.float64], light: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+def shared(shape: tuple[int, ...], places: Floats, light: Floats) -> Floats:
     """Return points (n, n_axes) on a grid, each shared by its nearest cells, two along each axis."""
     grid = np.zeros(shape)
     corner = np.floor(places).astype(int)
@@ -384,12 +339,12 @@ def shared(
     return grid
 
 
-def _drop(grid: npt.NDArray[np.float64], cells: npt.NDArray[np.int_], light: npt.NDArray[np.float64]) -> None:
+def _drop(grid: Floats, cells: npt.NDArray[np.int_], light: Floats) -> None:
     """Add light to cells, (n, n_axes); what falls outside is lost."""
     inside = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
     np.add.at(grid, tuple(cells[inside].T), light[inside])
 
 
-def _flat(array: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+def _flat(array: Floats) -> npt.NDArray[np.float32]:
     """Channels last, left out where there is one."""
     return np.ascontiguousarray(array[..., 0] if array.shape[-1] == 1 else array, np.float32)

@@ -77,23 +77,16 @@ LEFT_OUT, SUBTRACTED = ", left out", ", subtracted"
 
 @dataclass(frozen=True)
 class Options:
-    """What the reconstruction is told besides the method.
-
-    Attributes
-    ----------
-    model : str, optional
-        Default: local convolution where there are several PSFs a depth, one convolution where there is one. A
-        map shows what one model does, so it leaves no choice to ``"auto"`` unless it says so.
-    subtract_background : bool
-        Give the true background, as a user who photographed it would.
-    estimate_background : bool or None
-        Of a volume; None as the model says.
-    """
+    """What the reconstruction is told besides the method."""
 
     model: ModelName | None = None
+    """Default: local convolution where there are several PSFs a depth, one convolution where there is one. A
+    map shows what one model does, so it leaves no choice to ``"auto"`` unless it says so."""
     leave_out_saturated: bool = False
     subtract_background: bool = True
+    """Give the true background, as a user who photographed it would."""
     estimate_background: bool | None = False
+    """Of a volume; None as the model says."""
 
 
 @lru_cache(maxsize=4)

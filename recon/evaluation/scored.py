@@ -64,22 +64,15 @@ def nothing_aside() -> AbstractContextManager[object]:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """Something that a point has a number of.
-
-    Attributes
-    ----------
-    key : str
-        The attribute of :class:`Point`.
-    words : str
-        With the unit.
-    logarithmic : bool
-        Whether it is drawn so.
-    """
+    """Something that a point has a number of."""
 
     key: str
+    """The attribute of :class:`Point`."""
     words: str
+    """With the unit."""
     more_is_better: bool = False
     logarithmic: bool = False
+    """Whether it is drawn so."""
 
 
 SECONDS = Axis("seconds", "time of the solver (s)", logarithmic=True)
@@ -95,19 +88,13 @@ KindName = Literal["reconstruction", "hologram", "calibration"]
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """What is charted.
-
-    Attributes
-    ----------
-    costs : tuple of Axis
-        The first is the one that fronts are made of.
-    scores : tuple of Axis
-        The first that is known of any point is the one that fronts are made of.
-    """
+    """What is charted."""
 
     name: KindName
     costs: tuple[Axis, ...]
+    """The first is the one that fronts are made of."""
     scores: tuple[Axis, ...]
+    """The first that is known of any point is the one that fronts are made of."""
 
     def score_of(self, points: Iterable[Point]) -> Axis:
         """Return the first score that some point has."""
@@ -145,56 +132,39 @@ KINDS: dict[str, Kind] = {
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One score of one setting; NaN is what was not measured or makes no sense.
-
-    Attributes
-    ----------
-    setting : str
-        Its name.
-    iterations : int
-        0 for one-shot methods.
-    seconds : float
-        Wall time of the solver up to here.
-    residual : float
-        Norm of the residual over that of the noise, on the pixels that were used, as ``held_out``.
-    held_out : float
-        Root mean square error of the predicted held-out blocks' means, in units of these means' noise,
-        as :mod:`recon.evaluation.chart_judge` has it; the blocks are those of the coarsest binning.
-    psnr_db, ssim, nrmse : float
-        Against the truth.
-    peak_mib : float
-        Memory at the run's peak beyond what the process took before it.
-    middle_psnr_db, middle_ssim : float
-        Of the middle quarter of a hologram's field.
-    images : float
-        Photographs that a calibration took.
-    family : str
-        Settings of one family share a colour.
-    group : str
-        Only settings of one group compete.
-    binning : float
-        Of the pixels that were computed with.
-    held_out_parts : tuple of float
-        Mean squares of the errors on held-out pixels, each by itself and not in blocks, apart for parts of
-        them that all settings of one binning share.
-    """
+    """One score of one setting; NaN is what was not measured or makes no sense."""
 
     setting: str
+    """Its name."""
     iterations: int
+    """0 for one-shot methods."""
     seconds: float
+    """Wall time of the solver up to here."""
     residual: float = NAN
+    """Norm of the residual over that of the noise, on the pixels that were used, as ``held_out``."""
     held_out: float = NAN
+    """Root mean square error of the predicted held-out blocks' means, in units of these means' noise, as
+    :mod:`recon.evaluation.chart_judge` has it; the blocks are those of the coarsest binning."""
     psnr_db: float = NAN
     ssim: float = NAN
     nrmse: float = NAN
+    """``psnr_db``, ``ssim`` and ``nrmse``: against the truth."""
     peak_mib: float = NAN
+    """Memory at the run's peak beyond what the process took before it."""
     middle_psnr_db: float = NAN
     middle_ssim: float = NAN
+    """``middle_psnr_db`` and ``middle_ssim``: of the middle quarter of a hologram's field."""
     images: float = NAN
+    """Photographs that a calibration took."""
     family: str = ""
+    """Settings of one family share a colour."""
     group: str = ""
+    """Only settings of one group compete."""
     binning: float = NAN
+    """Of the pixels that were computed with."""
     held_out_parts: tuple[float, ...] = ()
+    """Mean squares of the errors on held-out pixels, each by itself and not in blocks, apart for parts of
+    them that all settings of one binning share."""
 
     def to_json(self) -> dict[str, Any]:
         """Return it with None for what is not known."""
@@ -209,25 +179,18 @@ def is_known(point: Point, key: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """One setting's scores.
-
-    Attributes
-    ----------
-    finished : bool
-        False where the time limit cut the run off: given longer, it would go on.
-    """
+    """One setting's scores."""
 
     points: tuple[Point, ...]
     finished: bool
+    """False where the time limit cut the run off: given longer, it would go on."""
 
 
-def pareto(points: Iterable[Point], score: Axis | str, cost: Axis = SECONDS) -> list[Point]:
+def pareto(points: Iterable[Point], score: Axis, cost: Axis = SECONDS) -> list[Point]:
     """Return the points that no other is both cheaper and better than, the cheapest first, without groups.
 
     Points that lack one of the two numbers do not compete.
     """
-    if isinstance(score, str):
-        score = next(s for kind in KINDS.values() for s in kind.scores if s.key == score)
     sign = 1.0 if score.more_is_better else -1.0
     known = [p for p in points if is_known(p, score.key) and is_known(p, cost.key)]
     front: list[Point] = []

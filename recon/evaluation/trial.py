@@ -60,10 +60,7 @@ class Setting:
 
         A camera model between them counts instead of ``model``; " of volumes" changes nothing.
 
-        Raises
-        ------
-        InputError
-            When there is no such solver or prior.
+        Raises InputError when there is no such solver or prior.
         """
         solver, *rest = method.removesuffix(OF_VOLUMES).split(" ")
         offered = SOLVERS.named(solver)
@@ -186,6 +183,8 @@ class Subject(ABC, Generic[S]):
     ) -> Curve:
         """Run one of its settings, scoring ``aside``.
 
+        Raises InputError when the setting does not apply: it would be run as another one, or not at all.
+
         Parameters
         ----------
         setting
@@ -196,11 +195,6 @@ class Subject(ABC, Generic[S]):
             In which points are scored.
         **how
             What else this subject's runs can be told: ``counts``, the iterations to score at, ascending.
-
-        Raises
-        ------
-        InputError
-            When the setting does not apply: it would be run as another one, or not at all.
         """
         if setting not in self.settings():
             raise InputError(f"The setting '{setting.name}' does not apply to this {self.kind}.")

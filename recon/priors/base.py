@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from copy import copy
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +39,12 @@ class Prior(ABC):
     @abstractmethod
     def prox(self, x: Array, step: float) -> Array:
         """Return ``argmin_p  step * value(p) + 1/2 ||p - x||^2``. ``x`` is left as it is."""
+
+    def for_a_run(self) -> Self:
+        """Return the prior with a memory of its own: what a prox keeps belongs to one run."""
+        own = copy(self)
+        own.memory = None
+        return own
 
     def terms(self) -> tuple[Prior, ...]:
         """Return the summands; a simple prior is its own only one."""
@@ -89,6 +96,13 @@ class Sum(Prior):
         )
 
 
+def require_weight(weight: float) -> float:
+    """Return a prior's weight; raises ValueError for a negative one."""
+    if not weight >= 0:
+        raise ValueError(f"A prior's weight must not be negative; got {weight}.")
+    return float(weight)
+
+
 class Separable(Prior):
     """``weight * sum |x|`` for ``lower <= x <= upper``, infinite elsewhere.
 
@@ -97,11 +111,9 @@ class Separable(Prior):
     """
 
     def __init__(self, weight: float = 0.0, lower: float = -np.inf, upper: float = np.inf) -> None:
-        if not weight >= 0:
-            raise ValueError(f"A prior's weight must not be negative; got {weight}.")
         if not lower <= upper:
             raise ValueError(f"The box's lower limit {lower:g} is above its upper limit {upper:g}.")
-        self.weight = float(weight)
+        self.weight = require_weight(weight)
         self.lower = float(lower)
         self.upper = float(upper)
 

@@ -13,10 +13,6 @@ from recon.priors.base import L1, NonNegativity, Prior, Zero
 from recon.priors.total_variation import HaarTotalVariation, TotalVariation
 
 
-def _nothing(_: object) -> str | None:
-    return None
-
-
 @dataclass(frozen=True)
 class NamedPrior:
     """A prior to choose.
@@ -45,7 +41,7 @@ class NamedPrior:
     kind: Literal["tv", "l1"] = "tv"
     weighted: bool = True
     pictures_only: bool = False
-    accepts: Callable[[object], str | None] = _nothing
+    accepts: Callable[[object], str | None] = lambda _: None
 
     def __call__(self, weight: float) -> Prior:
         """Return the prior of a weight.

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.camera.base import Array, LinearOperator
-from recon.priors.base import Prior, Separable, Zero
+from recon.priors.base import Prior, Separable, Zero, require_weight
 
 
 class Differences(LinearOperator):
@@ -87,7 +87,29 @@ def _parts(axis: int) -> tuple[Any, Any, Any, Any]:
     return tuple((..., part, *rest) for part in (slice(0, 1), slice(-1, None), slice(0, -1), slice(1, None)))  # type: ignore[return-value]
 
 
-class TotalVariation(Prior):
+class _WithSeparable(Prior):
+    """A prior whose prox takes in that of a separable one, so that their sum is such a prior again."""
+
+    separable: Separable
+
+    def terms(self) -> tuple[Prior, ...]:
+        """Return the prior on its own and the separable part."""
+        return (self.with_separable(Zero()), self.separable)
+
+    def joined(self, other: Prior) -> Prior | None:
+        """Return the sum with a separable prior."""
+        if not isinstance(other, Separable):
+            return None
+        return self.with_separable(self.separable.with_separable(other))
+
+    def with_separable(self, separable: Separable) -> Self:
+        """Return the same prior with another separable part."""
+        other = self.for_a_run()
+        other.separable = separable
+        return other
+
+
+class TotalVariation(_WithSeparable):
     """``weight * sum ||differences||`` plus an optional separable prior (Kuo 2020, Eq. 4.5).
 
     Parameters
@@ -119,9 +141,7 @@ class TotalVariation(Prior):
         tolerance: float = 1e-6,
         max_inner: int = 200,
     ) -> None:
-        if not weight >= 0:
-            raise ValueError(f"A prior's weight must not be negative; got {weight}.")
-        self.weight = float(weight)
+        self.weight = require_weight(weight)
         self.isotropic = isotropic
         self.axis_weights = np.asarray(axis_weights, np.float64)
         self.wrap = wrap
@@ -135,28 +155,6 @@ class TotalVariation(Prior):
     ) -> TotalVariation:
         """Return that of (..., n_z, height, width): periodic in the plane, as the FFT is, not in depth."""
         return cls(weight, isotropic=isotropic, axis_weights=axis_weights, wrap=(False, True, True))
-
-    def terms(self) -> tuple[Prior, ...]:
-        """Return the total variation on its own and the separable part."""
-        return (self.with_separable(Zero()), self.separable)
-
-    def joined(self, other: Prior) -> Prior | None:
-        """Return the sum with a separable prior."""
-        if not isinstance(other, Separable):
-            return None
-        return self.with_separable(self.separable.with_separable(other))
-
-    def with_separable(self, separable: Separable) -> TotalVariation:
-        """Return the same total variation with another separable part."""
-        return TotalVariation(
-            self.weight,
-            isotropic=self.isotropic,
-            axis_weights=self.axis_weights,
-            wrap=self.wrap,
-            separable=separable,
-            tolerance=self.tolerance,
-            max_inner=self.max_inner,
-        )
 
     def differences(self, x: Array) -> Differences:
         """Return the difference operator for objects like ``x``."""
@@ -224,7 +222,7 @@ class TotalVariation(Prior):
         return np.clip(d, -1, 1)
 
 
-class HaarTotalVariation(Prior):
+class HaarTotalVariation(_WithSeparable):
     """Anisotropic total variation with the prox of Kuo 2020, A.1: soft-threshold the Haar differences.
 
     Sum and difference of each neighbouring pair make the transform invertible (Eqs. A.1, A.2); every axis
@@ -236,25 +234,9 @@ class HaarTotalVariation(Prior):
     exact = False
 
     def __init__(self, weight: float, *, n_axes: int = 2, separable: Separable | None = None) -> None:
-        if not weight >= 0:
-            raise ValueError(f"A prior's weight must not be negative; got {weight}.")
-        self.weight = float(weight)
+        self.weight = require_weight(weight)
         self.n_axes = n_axes
         self.separable = separable or Zero()
-
-    def terms(self) -> tuple[Prior, ...]:
-        """Return the Haar total variation on its own and the separable part."""
-        return (self.with_separable(Zero()), self.separable)
-
-    def joined(self, other: Prior) -> Prior | None:
-        """Return the sum with a separable prior."""
-        if not isinstance(other, Separable):
-            return None
-        return self.with_separable(self.separable.with_separable(other))
-
-    def with_separable(self, separable: Separable) -> HaarTotalVariation:
-        """Return the same total variation with another separable part."""
-        return HaarTotalVariation(self.weight, n_axes=self.n_axes, separable=separable)
 
     def value(self, x: Array) -> float:
         """Return ``weight`` times the anisotropic total variation (wrapped), plus the separable part."""

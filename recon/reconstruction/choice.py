@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -34,10 +34,6 @@ class Option:
     value: str
     time: float
     error_db: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Return it, JSON-compatible."""
-        return {"value": self.value, "time": _known(self.time), "error_db": _known(self.error_db)}
 
     def __str__(self) -> str:
         """Say it in words."""
@@ -142,37 +138,29 @@ class Choice:
 
     def to_json(self) -> dict[str, Any]:
         """Return all of it, JSON-compatible (numbers that are not known are None)."""
-        return {
-            "model": self.model,
-            "planes": list(self.planes),
-            "n_planes": self.n_planes,
-            "planes_between": list(self.between),
-            "binning": self.binning,
-            "channels_merged": self.merged,
-            "background": self.background,
-            "precision": self.precision,
-            "psf_window": list(self.psf_window),
-            "acceptance_px": self.acceptance_px,
-            "tolerance": self.tolerance,
-            "seconds": self.seconds,
-            "decisions": [
-                {
-                    "name": d.name,
-                    "value": d.value,
-                    "why": d.why,
-                    "error_db": _known(d.error_db),
-                    "one_step_up": d.up and d.up.to_json(),
-                    "one_step_down": d.down and d.down.to_json(),
-                    "overruled": d.overruled,
-                    "numbers": {k: _known(v) for k, v in d.numbers.items()},
-                }
-                for d in self.decisions
-            ],
-        }
+        recorded: dict[str, Any] = _recorded(self)
+        return recorded
 
 
-def _known(value: float) -> float | None:
-    return float(value) if value == value and abs(value) != float("inf") else None
+_RECORDED = {
+    "between": "planes_between",
+    "merged": "channels_merged",
+    "up": "one_step_up",
+    "down": "one_step_down",
+}
+"""Fields that are recorded under another name."""
+
+
+def _recorded(value: Any) -> Any:
+    if is_dataclass(value):
+        return {_RECORDED.get(f.name, f.name): _recorded(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {name: _recorded(one) for name, one in value.items()}
+    if isinstance(value, tuple):
+        return [_recorded(one) for one in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value
 
 
 ERROR_SCALE = 0.5

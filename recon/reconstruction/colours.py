@@ -112,22 +112,6 @@ def merged(
     )
 
 
-def merged_input(
-    data: Array, valid: Array, noise: Array, calibration: Calibration
-) -> tuple[Array, Array, Calibration, Colours]:
-    """Return data, valid pixels and calibration of one channel in the place of several, and their colours.
-
-    Raises
-    ------
-    InputError
-        Where there is one channel.
-    """
-    tint = colours(data, noise, valid, calibration.psfs)
-    if tint is None:
-        raise InputError("There is one channel: nothing can be merged.")
-    return (*merged(data, valid, calibration, tint), tint)
-
-
 def channels_of(
     data: Array, deviation: Array, valid: Array, psfs: Array, overrides: Overrides
 ) -> tuple[Decision, Colours | None]:

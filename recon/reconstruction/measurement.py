@@ -188,7 +188,9 @@ def depths_of(
     if options.z_um is None and len(members_of_depths(calibration.source_positions_um)) > 1:
         return calibration, sort_by_depth(calibration), []
     if options.model == "convolution":
-        psf, _ = select_psf(calibration, _asked(calibration, options.z_um))
+        z_um = calibration.source_positions_um[0, 2]  # of PSFs of one depth, theirs
+        asked = float(z_um) if options.z_um is None and np.isfinite(z_um) else options.z_um
+        psf, _ = select_psf(calibration, asked)
         same = next(k for k, own in enumerate(calibration.psfs) if np.shares_memory(own, psf))
         calibration = calibration.part(slice(same, same + 1))
         return calibration, sort_by_depth(calibration), []
@@ -239,9 +241,3 @@ def _doubt(channel: int, values: Array) -> str:
 
 def _size(channels: Array) -> str:
     return f"{channels.shape[1]} x {channels.shape[2]}"
-
-
-def _asked(calibration: Calibration, z_um: float | None) -> float | None:
-    """Return the depth to look for: of PSFs of one depth, theirs."""
-    z = calibration.source_positions_um[:, 2]
-    return float(z[0]) if z_um is None and np.isfinite(z[0]) else z_um

@@ -26,48 +26,26 @@ BACKGROUND_FREQUENCIES = (5, 5)
 """Lowest DCT frequencies that belong to the background (Kuo 2020, sec. 6.2)."""
 
 
-class OfOnePlane(LinearOperator):
-    """An operator whose object is (n_channels, height, width) as one of (n_channels, 1, height, width)."""
+class Reshaped(LinearOperator):
+    """An operator whose object has another shape of as many values: a picture as a volume of one plane."""
 
-    def __init__(self, picture: LinearOperator) -> None:
-        channels, *shape = picture.domain_shape
-        super().__init__((channels, 1, *shape), picture.range_shape, picture.dtype)
-        self.picture = picture
-
-    def forward(self, x: Array, out: Array | None = None) -> Array:
-        """Return what the sensor sees of ``x``."""
-        return self.picture.forward(x[:, 0], out)
-
-    def adjoint(self, y: Array, out: Array | None = None) -> Array:
-        """Return the adjoint's picture as a volume of one plane."""
-        return self.picture.adjoint(y, None if out is None else out[:, 0])[:, None]
-
-    @property
-    def norm_bound(self) -> float:
-        """That of the picture's operator."""
-        return self.picture.norm_bound
-
-
-class AsPicture(LinearOperator):
-    """An operator whose object is (n_channels, 1, height, width) as one of (n_channels, height, width)."""
-
-    def __init__(self, volume: LinearOperator) -> None:
-        channels, _, *shape = volume.domain_shape
-        super().__init__((channels, *shape), volume.range_shape, volume.dtype)
-        self.volume = volume
+    def __init__(self, own: LinearOperator, domain_shape: tuple[int, ...]) -> None:
+        super().__init__(domain_shape, own.range_shape, own.dtype)
+        self.own = own
 
     def forward(self, x: Array, out: Array | None = None) -> Array:
         """Return what the sensor sees of ``x``."""
-        return self.volume.forward(x[:, None], out)
+        return self.own.forward(x.reshape(self.own.domain_shape), out)
 
     def adjoint(self, y: Array, out: Array | None = None) -> Array:
-        """Return the adjoint's only plane."""
-        return self.volume.adjoint(y, None if out is None else out[:, None])[:, 0]
+        """Return the adjoint's object."""
+        inside = None if out is None else out.reshape(self.own.domain_shape)
+        return self.own.adjoint(y, inside).reshape(self.domain_shape)
 
     @property
     def norm_bound(self) -> float:
-        """That of the volume's operator."""
-        return self.volume.norm_bound
+        """That of the operator itself."""
+        return self.own.norm_bound
 
 
 class Part:
@@ -128,26 +106,35 @@ class Part:
         return slice(None) if self.problem.patterned else self.channels
 
     def _make_camera(self) -> LinearOperator:
-        problem = self.problem
-        psfs = problem.levelled[0].central
-        own = self.channels if psfs.shape[1] > 1 else slice(0, 1)
-        energy = problem.energy[self.channels if len(problem.energy) > 1 else slice(0, 1)]
+        problem, depths = self.problem, self.problem.levelled[0]
         if problem.together:
             plane = Convolution(
-                psfs[0, own] / energy[:, None, None],
+                self._own(depths.central)[0] / self._energy[:, None, None],
                 problem.sensor_shape,
                 n_channels=self.channels.stop - self.channels.start,
                 dtype=self.dtype,
             )
             self._require_memory(plane)
-            return OfOnePlane(plane)
+            channels, *shape = plane.domain_shape
+            return Reshaped(plane, (channels, 1, *shape))
         if problem.model in CAMERAS:
             return CAMERAS[problem.model].make(self.central, problem.depths)
-        scale = np.float32(1 / float(energy[0]))
         if not problem.varies:
-            return self._convolution(psfs[:, own] * scale)
-        fields = [FieldOfPsfs(f.psfs[:, own] * scale, f.points) for f in problem.levelled[0].fields]
-        return self._varying(fields)
+            return self._convolution(self._scaled(depths.central))
+        return self._varying([FieldOfPsfs(self._scaled(f.psfs), f.points) for f in depths.fields])
+
+    def _own(self, psfs: Array) -> Array:
+        """Return these channels of PSFs (n, 1 or n_channels, height, width)."""
+        return psfs[:, self.channels] if psfs.shape[1] > 1 else psfs
+
+    @property
+    def _energy(self) -> Array:
+        """What these channels' PSFs are divided by."""
+        energy = self.problem.energy
+        return energy[self.channels] if len(energy) > 1 else energy
+
+    def _scaled(self, psfs: Array) -> Array:
+        return self._own(psfs) * np.float32(1 / float(self._energy[0]))
 
     def _require_memory(self, plane: Convolution) -> None:
         """Refuse a picture that a given limit has no room for."""
@@ -208,11 +195,8 @@ class Part:
     @cached_property
     def central(self) -> Convolution:
         """The camera with each depth's central PSF everywhere: varying ones are preconditioned by it."""
-        problem = self.problem
-        psfs = problem.levelled[0].central
-        own = self.channels if psfs.shape[1] > 1 else slice(0, 1)
-        scale = np.float32(1 / float(problem.energy[0]))
-        return Convolution(psfs[:, own] * scale, problem.sensor_shape, dtype=self.dtype)
+        psfs = self._scaled(self.problem.levelled[0].central)
+        return Convolution(psfs, self.problem.sensor_shape, dtype=self.dtype)
 
     def memory_used(self) -> str | None:
         """Say what was planned, and what had to go to disk; None where nothing was."""
@@ -241,7 +225,10 @@ class Part:
     def picture_operator(self) -> LinearOperator:
         """The same of one plane for solvers of pictures, whose objects are (n_channels, height, width)."""
         camera = self.camera
-        return self._with_data(camera.picture if isinstance(camera, OfOnePlane) else AsPicture(camera))
+        if isinstance(camera, Reshaped):
+            return self._with_data(camera.own)
+        channels, _, *shape = camera.domain_shape
+        return self._with_data(Reshaped(camera, (channels, *shape)))
 
     def _with_data(self, operator: LinearOperator) -> LinearOperator:
         if not self.valid.all():

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.analysis.correlation import similarity
 from recon.camera.camera_model import Depths, members_of_depths
 from recon.camera.refocus import refocus
 from recon.errors import InputError
@@ -174,14 +175,14 @@ def between_of(
         if overrides.between:
             raise InputError(f"Planes cannot be added between depths (between=on): {why}.")
         return (), Decision("between", "no planes", why, overruled=asked)
-    alike = {k: likeness(depths.central[k], depths.central[k + 1]) for k in gaps}
+    alike = {k: similarity(depths.central[k], depths.central[k + 1]) for k in gaps}
     worst = min(gaps, key=alike.__getitem__)
     unlike = tuple(k for k in gaps if alike[k] < UNLIKE)
     numbers = {"least_likeness": alike[worst]}
     why = f"PSFs of neighbouring depths agree to {alike[worst]:.2f} or more ({UNLIKE:g} is enough)"
     told = True
     if unlike or overrides.between:
-        made = refocus(calibration, middle(depths, worst))
+        made = refocus(calibration, middle(depths.z_um, worst))
         expected = made.expected_similarity
         told = expected is not None and expected >= MADE_ALIKE
         numbers["expected_likeness"] = float("nan") if expected is None else expected
@@ -202,15 +203,9 @@ def between_of(
     return (), Decision("between", "no planes", why, loss if told else 0.0, up, None, asked, numbers)
 
 
-def likeness(first: Array, second: Array) -> float:
-    """Return the inner product of two images of unit energy."""
-    a, b = (np.asarray(image, np.float64).ravel() for image in (first, second))
-    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300))
-
-
-def middle(depths: Depths, k: int) -> float:
+def middle(depths_um: Array, k: int) -> float:
     """Return the depth half way, in 1/z, between two neighbours, micrometres."""
-    return float(2 / (1 / depths.z_um[k] + 1 / depths.z_um[k + 1]))
+    return float(2 / (1 / depths_um[k] + 1 / depths_um[k + 1]))
 
 
 def with_planes_between(calibration: Calibration, depths_um: Array, between: tuple[int, ...]) -> Calibration:
@@ -222,7 +217,7 @@ def with_planes_between(calibration: Calibration, depths_um: Array, between: tup
         psfs.append(psf)
         positions.append(position)
         if k in between:
-            made = refocus(calibration, float(2 / (1 / depths_um[k] + 1 / depths_um[k + 1])))
+            made = refocus(calibration, middle(depths_um, k))
             psfs.append(made.psf)
             positions.append(np.array([*made.source_um, made.z_um]))
     return replace(calibration, psfs=np.stack(psfs), source_positions_um=np.stack(positions))

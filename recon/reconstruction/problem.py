@@ -23,7 +23,7 @@ from recon.reconstruction.measurement import (
     require_same_pixels,
 )
 from recon.reconstruction.options import Precision, ReconstructionOptions
-from recon.reconstruction.result import Grid, Reconstruction, grid_of, window_of
+from recon.reconstruction.result import Grid, Reconstruction, window_of
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver, solver_for
 from recon.reconstruction.weights import CameraClass, name_of, require_prior
 from recon.types import Calibration
@@ -311,20 +311,27 @@ class Problem:
     @property
     def window(self) -> tuple[slice, slice]:
         """Part of the operator's grid that is returned."""
-        return window_of(self.options.field, self.sensor_shape, self._psf_shape)[0]
+        return self._placed[0]
 
     @property
-    def _psf_shape(self) -> tuple[int, int]:
-        return self.depths.central.shape[2], self.depths.central.shape[3]
+    def _placed(self) -> tuple[tuple[slice, slice], tuple[int, int]]:
+        height, width = self.depths.central.shape[2:]
+        return window_of(self.options.field, self.sensor_shape, (height, width))
 
     @property
     def grid(self) -> Grid:
         """Where the voxels of the result lie."""
-        window, centre = window_of(self.options.field, self.sensor_shape, self._psf_shape)
+        (rows, columns), centre = self._placed
         z_um = self.depths.z_um
         if self.n_planes == 1 and self.options.z_um is not None:
             z_um = np.array([float(self.options.z_um)])
-        return grid_of(self.calibration, z_um, window, centre)
+        geometry = self.calibration.geometry
+        pitch, distance = geometry.pixel_pitch_um, geometry.diffuser_distance_mm
+        pitches = np.full(len(z_um), np.nan)
+        if pitch is not None and distance:
+            pitches = pitch * z_um / (1000 * distance)
+        shape = (len(z_um), rows.stop - rows.start, columns.stop - columns.start)
+        return Grid(shape, centre, z_um, pitches, pitch)
 
     @property
     def axis_weights(self) -> Array:

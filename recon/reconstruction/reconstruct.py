@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from recon.base.declare import with_overrides
@@ -16,7 +15,6 @@ from recon.camera.camera_model import CAMERAS
 from recon.priors import PRIORS
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
@@ -108,11 +106,8 @@ def judged(result: Reconstruction, problem: Problem, *, started: bool = False) -
     started : bool
         Whether it was started from another result.
     """
-    if result.basis is not None:
-        problem, small = result.basis
-        verdict, said = _verdict(small, problem, started=started)
-    else:
-        verdict, said = _verdict(result, problem, started=started)
+    problem, small = result.basis or (problem, result)
+    verdict, said = _verdict(small, problem, started=started)
     return replace(result, verdict=verdict, warnings=(*result.warnings, *said), basis=None)
 
 
@@ -135,6 +130,8 @@ def _verdict(
         foreign.append("patterned light")
     if foreign:
         return None, (f"Not judged: there are no known cases of {' and '.join(foreign)}.",)
+    if not problem.options.judged and not result.history:
+        return None, ("Not judged: it was solved with judged=False.",)
     try:
         picture = problem.n_planes == 1
         # One plane is a picture: it fails as pictures do, by a wrong depth for one.
@@ -142,7 +139,7 @@ def _verdict(
             observations(problem.measurement.image, problem.data, problem.valid, problem.noise),
             result.volume,
             problem.depths.central,
-            _residuals(result, problem),
+            list(result.residuals),
             max(
                 unsettled_by(h, r, problem.stop_tolerance, started=started)
                 for h, r in zip(result.histories, result.stop_reasons, strict=True)
@@ -152,13 +149,3 @@ def _verdict(
         return verdict_on(evidence, method_name(result.solver, result.prior, volume=not picture)), ()
     except Exception as error:  # noqa: BLE001 - the result may be hours of work: it is worth more than this
         return None, (not_judged(error),)
-
-
-def _residuals(result: Reconstruction, problem: Problem) -> list[float]:
-    if result.history:
-        return [history[-1].data_residual for history in result.histories]
-    # A solution in one step fits whatever there is, with negative light where the model is wrong.
-    assert result.state is not None
-    part = Part(problem, parts_of(problem)[0])
-    possible = np.maximum(result.state / problem.image_scale, 0).astype(part.dtype)
-    return [float(np.linalg.norm(part.operator.forward(possible) - part.data))]

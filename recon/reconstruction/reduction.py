@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +16,7 @@ from recon.camera.camera_model import Extent, members_of_depths
 from recon.camera.field_registration import NOT_ON_AXIS
 from recon.errors import InputError
 from recon.reconstruction.choice import Choice
-from recon.reconstruction.colours import Colours, merged_input
+from recon.reconstruction.colours import Colours, colours, merged
 from recon.reconstruction.measurement import Measurement, Noise, central
 from recon.reconstruction.planes import put_back, with_planes_between
 from recon.reconstruction.problem import Problem
@@ -47,20 +48,20 @@ class Reduction:
 
     def picture(self, image: Array) -> Floats:
         """Bring a plane (height, width[, n_channels]) back."""
-        if self.choice.binning > 1:
-            channels_first = image if image.ndim == 2 else np.moveaxis(image, -1, 0)
-            larger = enlarged(channels_first, self.choice.binning, self.given.sensor_shape)
-            image = larger if image.ndim == 2 else np.moveaxis(larger, 0, -1)
-        whole = image if self.tint is None else self.tint.spread(image)
-        return np.ascontiguousarray(whole)
+        image = self._larger(image)
+        return np.ascontiguousarray(image if self.tint is None else self.tint.spread(image))
+
+    def _larger(self, image: Array) -> Array:
+        """Return a plane (height, width[, n_channels]) on the given pixels."""
+        factor, shape = self.choice.binning, self.given.sensor_shape
+        return image if factor == 1 else _channels_first(image, 2, lambda c: enlarged(c, factor, shape))
 
     def volume(self, planes: Array) -> Floats:
         """Bring a volume (n_z, height, width[, n_channels]) back; depths that were left out are empty."""
-        places = places_of(self.choice)
         if self.choice.n_planes == 1:
             return self.picture(planes[0])[None]
         whole = np.zeros((self.choice.n_planes, *self.picture(planes[0]).shape), np.float32)
-        for at, plane in zip(places, planes, strict=True):
+        for at, plane in zip(places_of(self.choice), planes, strict=True):
             picture, below = self.picture(plane), int(at)
             if at == below:
                 whole[below] += picture
@@ -70,14 +71,63 @@ class Reduction:
 
     def background(self, image: Array) -> Floats:
         """Bring a background (height, width[, n_channels]) back: counts a pixel, not light to be shared."""
-        factor = self.choice.binning
-        if factor > 1:
-            channels_first = image if image.ndim == 2 else np.moveaxis(image, -1, 0)
-            larger = enlarged(channels_first, factor, self.given.sensor_shape) * factor**2
-            image = larger if image.ndim == 2 else np.moveaxis(larger, 0, -1)
+        larger: Floats = self._larger(image) * self.choice.binning**2
+        return larger if self.tint is None else larger[..., None] * self.tint.scene.astype(np.float32)
+
+    def with_planes(self, result: Reconstruction, rounds: int) -> Problem | None:
+        """Return the problem with planes that what a result leaves of the data shows light in; else None."""
+        overrides = self.given.options.choose
+        if rounds >= MORE_ROUNDS or (overrides is not None and overrides.planes is not None):
+            return None
+        signs = result.provenance.get("light_in_planes_left_out", [])
+        more = put_back(self.choice, signs, everything=rounds == MORE_ROUNDS - 1)
+        return None if more is None else reduced(more, self.given)
+
+    def back(self, small: Reconstruction, problem: Problem) -> Reconstruction:
+        """Return the smaller problem's result as one of the given pixels and depths."""
+        choice, places, background = self.choice, places_of(self.choice), small.background
+        return replace(
+            small,
+            volume=self.volume(small.volume),
+            grid=self.given.grid,
+            background=None if background is None else self.background(background),
+            choice=choice,
+            empty_planes=tuple(
+                replace(e, planes=_empty(choice, [places[z] for z in e.planes])) for e in small.empty_planes
+            ),
+            # Only a state on the measurement's own pixels and channels can start another run.
+            state=small.state if self.on_own_pixels else None,
+            provenance={**small.provenance, "auto": choice.to_json(), "options": record(self.given.options)},
+            basis=(problem, small),
+        )
+
+    @property
+    def on_own_pixels(self) -> bool:
+        """Whether pixels and channels are the measurement's own."""
+        return self.choice.binning == 1 and not self.choice.merged
+
+    def start(self, before: Reconstruction) -> Reconstruction:
+        """Return a reconstruction to start from on the smaller problem's pixels, depths and channels."""
+        choice, given, volume = self.choice, self.given, before.volume
+        expected = (*given.grid.shape, *(() if given.flat else (given.n_channels,)))
+        if volume.shape != expected:
+            raise InputError(
+                f"The volume to start from is {volume.shape}; this measurement needs {expected}."
+            )
         if self.tint is not None:
-            image = image[..., None] * self.tint.scene.astype(np.float32)
-        return image
+            tints = self.tint.spread(np.ones(()))
+            volume = (volume @ tints) / float(tints @ tints)
+        if (factor := choice.binning) > 1:
+            volume = _channels_first(volume, 3, lambda v: block_mean(v, factor, about_axis=True) * factor**2)
+        # Light of planes between is on the calibrated ones: there it begins.
+        planes = [volume[int(at)] if at == int(at) else np.zeros_like(volume[0]) for at in places_of(choice)]
+        state = before.state if self.on_own_pixels else None
+        return replace(before, volume=np.stack(planes).astype(np.float32), state=state)
+
+
+def _channels_first(image: Array, axes: int, change: Callable[[Array], Array]) -> Array:
+    """Change an image of so many axes; where it has channels after them, with these first."""
+    return change(image) if image.ndim == axes else np.moveaxis(change(np.moveaxis(image, -1, 0)), 0, -1)
 
 
 def reduced(choice: Choice, problem: Problem) -> Problem:
@@ -90,7 +140,9 @@ def reduced(choice: Choice, problem: Problem) -> Problem:
     if choice.merged:
         deviation = measurement.deviations(counts)
         # Noise of the sum of channels: their weights, and each its own.
-        data, valid, calibration, tint = merged_input(data, valid, deviation, calibration)
+        tint = colours(data, deviation, valid, calibration.psfs)
+        assert tint is not None
+        data, valid, calibration = merged(data, valid, calibration, tint)
         noise = None if noise is None else float(np.sqrt(np.sum((tint.weights * deviation) ** 2)))
         flat = True
     if choice.between:
@@ -139,63 +191,6 @@ def reduced(choice: Choice, problem: Problem) -> Problem:
         choice=choice,
         reduction=Reduction(problem, choice, tint),
     )
-
-
-def put_planes_back(problem: Problem, result: Reconstruction, rounds: int) -> Problem | None:
-    """Return the problem with planes that what is left of the data shows light in; None where none does."""
-    reduction = problem.reduction
-    assert reduction is not None
-    overrides = reduction.given.options.choose
-    if rounds >= MORE_ROUNDS or (overrides is not None and overrides.planes is not None):
-        return None
-    signs = result.provenance.get("light_in_planes_left_out", [])
-    more = put_back(reduction.choice, signs, everything=rounds == MORE_ROUNDS - 1)
-    return None if more is None else reduced(more, reduction.given)
-
-
-def bring_back(small: Reconstruction, problem: Problem) -> Reconstruction:
-    """Return a smaller problem's result as one of the given pixels and depths."""
-    reduction = problem.reduction
-    assert reduction is not None
-    choice, given = reduction.choice, reduction.given
-    places = places_of(choice)
-    background = small.background
-    return replace(
-        small,
-        volume=reduction.volume(small.volume),
-        grid=given.grid,
-        background=None if background is None else reduction.background(background),
-        choice=choice,
-        empty_planes=tuple(
-            replace(e, planes=_empty(choice, [places[z] for z in e.planes])) for e in small.empty_planes
-        ),
-        # Only a state on the measurement's own pixels and channels can start another run.
-        state=None if choice.binning > 1 or choice.merged else small.state,
-        provenance={**small.provenance, "auto": choice.to_json(), "options": record(given.options)},
-        basis=(problem, small),
-    )
-
-
-def reduced_start(problem: Problem, before: Reconstruction) -> Reconstruction:
-    """Return a reconstruction to start from on a smaller problem's pixels, depths and channels."""
-    reduction = problem.reduction
-    assert reduction is not None
-    choice, given = reduction.choice, reduction.given
-    volume = before.volume
-    expected = (*given.grid.shape, *(() if given.flat else (given.n_channels,)))
-    if volume.shape != expected:
-        raise InputError(f"The volume to start from is {volume.shape}; this measurement needs {expected}.")
-    if reduction.tint is not None:
-        colours = reduction.tint.spread(np.ones(()))
-        volume = (volume @ colours) / float(colours @ colours)
-    if choice.binning > 1:
-        first = volume if volume.ndim == 3 else np.moveaxis(volume, -1, 0)
-        first = block_mean(first, choice.binning, about_axis=True) * choice.binning**2
-        volume = first if volume.ndim == 3 else np.moveaxis(first, 0, -1)
-    # Light of planes between is on the calibrated ones: there it begins.
-    planes = [volume[int(at)] if at == int(at) else np.zeros_like(volume[0]) for at in places_of(choice)]
-    own = choice.binning == 1 and not choice.merged
-    return replace(before, volume=np.stack(planes).astype(np.float32), state=before.state if own else None)
 
 
 def on_blocks(data: Floats, valid: Array, noise: Noise, factor: int, *, flat: bool) -> Measurement:

@@ -13,7 +13,6 @@ from recon.camera.convolution import field_of
 from recon.reconstruction.options import Field
 from recon.solvers.base import IterationRecord, StopReason
 from recon.solvers.douglas_rachford import EmptyPlanes
-from recon.types import Calibration
 from recon.verdict.judge import Verdict
 
 if TYPE_CHECKING:
@@ -83,21 +82,6 @@ def window_of(
     return window, (row - top, column - left)
 
 
-def grid_of(
-    calibration: Calibration,
-    z_um: npt.NDArray[np.float64],
-    window: tuple[slice, slice],
-    centre: tuple[int, int],
-) -> Grid:
-    """Return where the voxels of depths ``z_um`` lie, micrometres."""
-    pitch, distance = calibration.geometry.pixel_pitch_um, calibration.geometry.diffuser_distance_mm
-    pitches = np.full(len(z_um), np.nan)
-    if pitch is not None and distance:
-        pitches = pitch * z_um / (1000 * distance)
-    shape = (len(z_um), window[0].stop - window[0].start, window[1].stop - window[1].start)
-    return Grid(shape, centre, z_um, pitches, pitch)
-
-
 @dataclass(frozen=True, slots=True)
 class Reconstruction:
     """A reconstructed picture or volume with all that is needed to judge it: a picture is one plane.
@@ -115,6 +99,9 @@ class Reconstruction:
         :func:`recon.solvers.wiener`); None where nothing is weighted. The largest of all channels.
     noise_norm : float
         Expected norm of the noise, in the units of the histories' residuals.
+    residuals : tuple of float
+        Norm of what is left of the data, one a run; of a solution in one step without its negative light,
+        and NaN with ``judged=False``: only a verdict asks for it.
     histories : tuple of tuple of IterationRecord
         One history a run: one, or one a channel; residuals in units of the noise' standard deviation. Empty
         ones for solvers in one step.
@@ -153,6 +140,7 @@ class Reconstruction:
     prior: str
     tau: float | None
     noise_norm: float
+    residuals: tuple[float, ...]
     histories: tuple[tuple[IterationRecord, ...], ...]
     stop_reasons: tuple[StopReason, ...]
     seconds: float

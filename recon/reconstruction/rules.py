@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR, TOLERATED, Depths, ModelName, choose_model
-from recon.camera.varying_psfs import FieldOfPsfs, principal_psfs
+from recon.camera.varying_psfs import principal_psfs
 from recon.reconstruction.choice import ERROR_SCALE, Decision, Option, left_out_db, loss_db
 from recon.reconstruction.options import Overrides
-from recon.reconstruction.probe import ACCEPTED, CoarsePass, acceptance_px, psf_window, resolution_px
+from recon.reconstruction.probe import (
+    ACCEPTED,
+    CameraCost,
+    CoarsePass,
+    acceptance_px,
+    psf_window,
+    resolution_px,
+)
 from recon.verdict.cases import shipped_maps
 from recon.verdict.map import PRECISION
 
@@ -31,9 +38,9 @@ def candidates(depths: Depths) -> tuple[ModelName, ...]:
 
 
 def model_of(
-    depths: Depths, overrides: Overrides, contrast: float | None, pixels: Callable[[ModelName], int]
-) -> tuple[ModelName, str, float]:
-    """Return the camera model, why, and by how much PSFs vary over the field.
+    depths: Depths, overrides: Overrides, contrast: float | None, costs: Mapping[ModelName, CameraCost]
+) -> tuple[ModelName, Decision]:
+    """Decide on the camera model, with its neighbours on the scale convolution, low-rank, local.
 
     Parameters
     ----------
@@ -42,71 +49,56 @@ def model_of(
     contrast : float or None
         Standard deviation of the data in units of its noise, of a volume with total variation; None: of
         anything else.
-    pixels : callable
-        Pixels that a model transforms in one forward and adjoint: its cost.
+    costs : mapping
+        Of every candidate.
     """
+    asked = overrides.model is not None
+    model, why = choose_model(depths, overrides.model or "auto")
     variation = depths.field_error if depths.varies else 0.0
-    if overrides.model is not None:
-        return choose_model(depths, overrides.model)[0], "as asked", variation
-    model, why = choose_model(depths, "auto")
-    if model == "convolution":
-        return model, why, variation
-    differ = f"PSFs differ by {variation:.1%} over the field"
-    if contrast is not None and contrast * variation <= HIDDEN and variation <= HIDDEN_VARIATION:
-        return (
-            "convolution",
-            f"{differ}; in data whose contrast is {contrast:.1f} times the noise that is "
-            f"{contrast * variation:.1f} times the noise, and up to {HIDDEN:g} is hidden in that of a volume",
-            variation,
-        )
-    rank = len(principal_psfs(_densest(depths), error=LOW_RANK_ERROR).components)
-    components = f"{differ}; {rank} component{'s' if rank > 1 else ''} tell all but {LOW_RANK_ERROR:.0%}"
-    share = pixels("lowrank") / max(pixels("local"), 1)
-    if share < 1:
-        return "lowrank", f"{components}, at {share:.2f} of the local model's transforms", variation
-    return "local", f"{components}, at {share:.2f} times the local model's transforms", variation
-
-
-def _densest(depths: Depths) -> FieldOfPsfs:
-    return max(depths.fields, key=lambda f: len(f.points))
-
-
-def model_decision(
-    model: ModelName,
-    why: str,
-    variation: float,
-    depths: Depths,
-    times: Mapping[ModelName, float],
-    overrides: Overrides,
-) -> Decision:
-    """Add the neighbours on the scale convolution, low-rank, local, and what was not judged."""
     scale = candidates(depths)
+    numbers = {"psf_variation": variation, "tolerated": TOLERATED}
+    if varying := len(scale) > 1 and model in scale:
+        low = principal_psfs(max(depths.fields, key=lambda f: len(f.points)), error=LOW_RANK_ERROR)
+        rank = len(low.components)
+    if asked:
+        why = "as asked"
+    elif model != "convolution":
+        differ = f"PSFs differ by {variation:.1%} over the field"
+        share = costs["lowrank"].fft_pixels / max(costs["local"].fft_pixels, 1)
+        components = f"{differ}; {rank} component{'s' if rank > 1 else ''} tell all but {LOW_RANK_ERROR:.0%}"
+        if contrast is not None and contrast * variation <= HIDDEN and variation <= HIDDEN_VARIATION:
+            model = "convolution"
+            why = (
+                f"{differ}; in data whose contrast is {contrast:.1f} times the noise that is "
+                f"{contrast * variation:.1f} times the noise, and up to {HIDDEN:g} is hidden in that of a "
+                "volume"
+            )
+        elif share < 1:
+            model, why = "lowrank", f"{components}, at {share:.2f} of the local model's transforms"
+        else:
+            model, why = "local", f"{components}, at {share:.2f} times the local model's transforms"
     unjudged = [name for name, offered in CAMERAS.items() if offered.refuses(depths) is None]
-    if unjudged and overrides.model is None:
+    if unjudged and not asked:
         why += (
             f"; left out: {', '.join(unjudged)}, of which nobody knows what it costs and gains "
             f"(--model {unjudged[0]} takes it)"
         )
-    numbers = {"psf_variation": variation, "tolerated": TOLERATED}
-    if len(scale) == 1 or model not in scale:
-        return Decision("model", model, why, numbers=numbers, overruled=overrides.model is not None)
-    low = principal_psfs(_densest(depths), error=LOW_RANK_ERROR)
-    numbers |= {"rank": float(len(low.components)), "rank_error": low.error}
+    if not varying:
+        return model, Decision("model", model, why, numbers=numbers, overruled=asked)
+    numbers |= {"rank": float(rank), "rank_error": low.error}
     loss = {"convolution": loss_db(variation), "lowrank": loss_db(low.error), "local": 0.0}
 
     def cost(m: ModelName) -> float:
-        kind = "convolution" if m == "convolution" else "varying"
-        applications = 1.0 if m == "convolution" else VARYING_COST
-        return times[m] * applications * USUAL_ITERATIONS[kind]
+        kind, applications = ("convolution", 1.0) if m == "convolution" else ("varying", VARYING_COST)
+        return costs[m].seconds * applications * USUAL_ITERATIONS[kind]
 
     def step(by: int) -> Option | None:
         place = scale.index(model) + by
         if not 0 <= place < len(scale):
             return None
-        other = scale[place]
-        return Option(other, cost(other) / cost(model), loss[other] - loss[model])
+        return Option(scale[place], cost(scale[place]) / cost(model), loss[scale[place]] - loss[model])
 
-    return Decision("model", model, why, loss[model], step(1), step(-1), overrides.model is not None, numbers)
+    return model, Decision("model", model, why, loss[model], step(1), step(-1), asked, numbers)
 
 
 LEAST_SIDE = 20
@@ -149,7 +141,7 @@ def binning_of(depths: Depths, overrides: Overrides, *, whole: bool) -> Decision
 
 
 def field_of(
-    depths: Depths, overrides: Overrides, model: ModelName, *, haze: bool
+    depths: Depths, overrides: Overrides, model: ModelName, *, haze: bool, plain: bool
 ) -> tuple[tuple[int, int], float | None, Decision]:
     """Decide how far from the axis the object is modelled.
 
@@ -162,6 +154,8 @@ def field_of(
     haze : bool
         Whether there may be smooth light that no background takes: the object beyond what the sensor accepts
         then does, and shutting it out would bring it into the picture (1.4 dB in one scene of a microscope).
+    plain : bool
+        Whether it is a picture through one PSF without a background, whose solver takes the whole field.
 
     Returns
     -------
@@ -172,10 +166,15 @@ def field_of(
     Decision
     """
     height, width = depths.central.shape[2:]
+    largest, overruled = f"{2 * height - 1} x {2 * width - 1}", overrides.field is not None
+    if plain:
+        why = "one convolution of a picture is quick on everything that can reach the sensor"
+        numbers = {"share_of_largest": 1.0}
+        whole = Decision("field", f"{largest} pixels", why, overruled=overruled, numbers=numbers)
+        return (height, width), None, whole
     asked = overrides.field == "all"
     window = (height, width) if asked else psf_window(depths)
     reach = None if asked else acceptance_px(depths)
-    full = (2 * height - 1) * (2 * width - 1)
     extent = (height + window[0] - 1, width + window[1] - 1)
     why = f"the PSFs' light lies within {window[0]} x {window[1]} of {height} x {width} pixels"
     if reach is not None and reach < 0.5 * float(np.hypot(*extent)):
@@ -189,25 +188,17 @@ def field_of(
     else:
         reach = None
     modelled = extent[0] * extent[1] if reach is None else min(np.pi * reach**2, extent[0] * extent[1])
-    share = modelled / full
-    up = None if share > 0.99 else Option(f"{2 * height - 1} x {2 * width - 1}", 1 / share, 0.0)
+    share = modelled / ((2 * height - 1) * (2 * width - 1))
+    up = None if share > 0.99 else Option(largest, 1 / share, 0.0)
     down = None
     if height * width < modelled:
-        down = Option(f"{height} x {width}", height * width / modelled, _beyond_db(depths, window))
+        # An even object beyond the sensor's own throws as much light onto the sensor as the part of the PSFs
+        # that this one throws beside it: light in the wrong place.
+        lost = float((window[0] / (2 * height) + window[1] / (2 * width)) / 2)
+        down = Option(f"{height} x {width}", height * width / modelled, left_out_db(lost))
     numbers = {"share_of_largest": share}
     value = f"{extent[0]} x {extent[1]} pixels" + ("" if reach is None else f", {reach:.0f} about the axis")
     return window, reach, Decision("field", value, why, 0.0, up, down, asked, numbers)
-
-
-def _beyond_db(depths: Depths, window: tuple[int, int]) -> float:
-    """Return what is lost where only the object opposite to the sensor is modelled.
-
-    An even object beyond it throws as much light onto the sensor as the part of the PSFs that the sensor's
-    own object throws beside it: light in the wrong place.
-    """
-    height, width = depths.central.shape[2:]
-    lost = (window[0] / (2 * height) + window[1] / (2 * width)) / 2
-    return left_out_db(float(lost))
 
 
 STRAY_SHARE = 0.2
@@ -309,30 +300,23 @@ def _change_db(light: SmoothLight, kind: Literal["tv", "l1"]) -> float:
     return -IDLE_BACKGROUND_DB[kind] if told is None or told < least else GAINED_DB[kind] * told
 
 
-def iterations_of(
-    model: ModelName, overrides: Overrides, *, picture: bool, merged: bool
-) -> tuple[float, Decision]:
-    """Say at what change an iteration to stop."""
-    kind = "convolution" if model == "convolution" else f"varying {'picture' if picture else 'volume'}"
-    if merged and kind == "varying picture":
-        kind = "merged"
-    tolerance = SETTLED[kind] if overrides.tolerance is None else overrides.tolerance
-    return tolerance, Decision(
+def iterations_of(tolerance: float, overrides: Overrides, *, plain: bool) -> Decision:
+    """Say why to stop at a change an iteration, with what stopping later and earlier would be.
+
+    The steps are rules of thumb of the scenes tuned on; ``plain`` as in :func:`field_of`.
+    """
+    asked = overrides.tolerance is not None
+    seen = "pictures were seen to be within 0.2 dB of the end there"
+    usual = "where this solver stops by default" if plain else seen
+    return Decision(
         "iterations",
         f"until they change by less than {tolerance:g}",
-        "as asked"
-        if overrides.tolerance is not None
-        else "pictures were seen to be within 0.2 dB of the end there",
-        0.0,
-        *steps_of_tolerance(tolerance),
-        overrides.tolerance is not None,
-        {"tolerance": tolerance},
+        "as asked" if asked else usual,
+        up=Option(f"until {tolerance / 10:g}", 3.0, 0.2),
+        down=Option(f"until {tolerance * 3:g}", 0.5, -0.5),
+        overruled=asked,
+        numbers={"tolerance": tolerance},
     )
-
-
-def steps_of_tolerance(tolerance: float) -> tuple[Option, Option]:
-    """Return what stopping later and earlier would be: rules of thumb of the scenes tuned on."""
-    return Option(f"until {tolerance / 10:g}", 3.0, 0.2), Option(f"until {tolerance * 3:g}", 0.5, -0.5)
 
 
 METHOD = "admm tv"

@@ -9,12 +9,11 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.blocks import block_mean
 from recon.camera.camera_model import ModelName
 from recon.errors import InputError
-from recon.reconstruction.choice import Choice, Decision
+from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import channels_of, merged
-from recon.reconstruction.measurement import Measurement, require_same_channels
+from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.planes import between_of, planes_of
 from recon.reconstruction.probe import (
@@ -25,8 +24,9 @@ from recon.reconstruction.probe import (
     coarse_passes,
 )
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.reduction import reduced, reduced_calibration
+from recon.reconstruction.reduction import on_blocks, reduced, reduced_calibration
 from recon.reconstruction.rules import (
+    SETTLED,
     USUAL_ITERATIONS,
     SmoothLight,
     background_of,
@@ -35,10 +35,8 @@ from recon.reconstruction.rules import (
     field_of,
     is_stray,
     iterations_of,
-    model_decision,
     model_of,
     precision_of,
-    steps_of_tolerance,
 )
 from recon.reconstruction.solvers import SOLVERS, require_solver
 from recon.reconstruction.weights import kind_of
@@ -91,14 +89,14 @@ def choice_for(problem: Problem) -> Choice:
     measurement, calibration = problem.measurement, problem.calibration
     counts = measurement.counts()
     data, valid = counts.data, counts.valid
-    require_same_channels(calibration.psfs, data)
     deviation = measurement.deviations(counts)
     merge, tint = channels_of(data, deviation, valid, calibration.psfs, overrides)
-    if tint is not None and merge.value == "merged":
+    one = merge.value == "merged"
+    if tint is not None and one:
         data, valid, calibration = merged(data, valid, calibration, tint)
     whole = bool(valid.all())
     depths = problem.depths
-    if tint is not None and merge.value == "merged" and problem.calibration.psfs.shape[1] > 1:
+    if one and problem.calibration.psfs.shape[1] > 1:
         depths = Problem.of(
             Measurement(data[0]), calibration, ReconstructionOptions(z_um=problem.options.z_um)
         ).depths
@@ -107,7 +105,7 @@ def choice_for(problem: Problem) -> Choice:
     picture = problem.n_planes == 1
     costs = {m: camera_cost(coarse[0], m) for m in candidates(depths)}
     contrast = None if kind == "l1" or picture else _contrast(data, valid, deviation)
-    model, why, variation = model_of(depths, overrides, contrast, lambda m: costs[m].fft_pixels)
+    model, by_model = model_of(depths, overrides, contrast, costs)
     # One convolution a depth: quick, and good enough to see where light is and whether there is stray light.
     sparse = coarse_passes(coarse, "l1", background=True)
     light = _smooth_light(coarse, sparse, kind, model)
@@ -119,29 +117,36 @@ def choice_for(problem: Problem) -> Choice:
     binning = binning_of(depths, overrides, whole=whole)
     # A background of a few numbers takes what light from beyond the field has of them, not all of it.
     haze = is_stray(light.share) and not given and not (estimated and kind == "l1")
-    window, reach, field = field_of(depths, overrides, model, haze=haze)
+    plain = picture and model == "convolution" and not estimated
+    window, reach, field = field_of(depths, overrides, model, haze=haze, plain=plain)
     usual = USUAL_ITERATIONS["convolution" if model == "convolution" else "varying"]
     side = max(data.shape[1:]) // int(binning.numbers["binning"])
     precise = precision_of(overrides, usual, side)
-    tolerance, end = iterations_of(model, overrides, picture=picture, merged=merge.value == "merged")
+    tolerance = overrides.tolerance
+    if tolerance is None and plain:
+        solved = replace(problem, model="convolution", smooth=False)
+        tolerance = solved.solver.tolerance_for(solved)
+    elif tolerance is None:
+        varying = "merged" if one and picture else f"varying {'picture' if picture else 'volume'}"
+        tolerance = SETTLED["convolution" if model == "convolution" else varying]
     decisions = (
-        model_decision(model, why, variation, depths, {m: c.seconds for m, c in costs.items()}, overrides),
+        by_model,
         dropped,
         *([added] if len(depths.z_um) > 1 else []),
         field,
         binning,
         merge,
         smooth,
-        end,
+        iterations_of(tolerance, overrides, plain=plain),
         precise,
     )
-    choice = Choice(
+    return Choice(
         model=model,
         planes=planes,
         n_planes=len(depths.z_um),
         between=between,
         binning=int(binning.numbers["binning"]),
-        merged=merge.value == "merged",
+        merged=one,
         background=estimated,
         precision="float64" if precise.value == "float64" else "float32",
         psf_window=window,
@@ -150,11 +155,8 @@ def choice_for(problem: Problem) -> Choice:
         decisions=tuple(
             replace(d, why=held[d.name], overruled=False) if d.name in held else d for d in decisions
         ),
-        seconds=0.0,
+        seconds=time.perf_counter() - began,
     )
-    if picture and model == "convolution" and not estimated:
-        choice = _plain(choice, problem, overrides)
-    return replace(choice, seconds=time.perf_counter() - began)
 
 
 def _settled(problem: Problem) -> Overrides:
@@ -209,24 +211,16 @@ def _held(problem: Problem, overrides: Overrides) -> tuple[Overrides, dict[str, 
 def _coarse(data: Array, valid: Array, calibration: Calibration, z_um: float | None) -> list[Problem]:
     """Return small copies of every channel."""
     # Erased pixels cannot be averaged with others: the coarse pass then has all pixels.
-    whole = bool(valid.all())
-    factor = max(1, max(data.shape[1:]) // COARSE_PX) if whole else 1
-    return [
-        Problem.of(
-            Measurement(
-                block_mean(data[c], factor, about_axis=True),
-                erasures=None if whole else ~np.asarray(valid[c], bool),
-            ),
-            reduced_calibration(_one_channel(calibration, c), factor, None),
-            ReconstructionOptions(z_um=z_um, estimate_background=False),
-        )
-        for c in range(len(data))
-    ]
-
-
-def _one_channel(calibration: Calibration, channel: int) -> Calibration:
-    own = channel if calibration.psfs.shape[1] > 1 else 0
-    return replace(calibration, psfs=calibration.psfs[:, own : own + 1], background=None)
+    factor = max(1, max(data.shape[1:]) // COARSE_PX) if valid.all() else 1
+    options = ReconstructionOptions(z_um=z_um, estimate_background=False)
+    several = calibration.psfs.shape[1] > 1
+    coarse = []
+    for c in range(len(data)):
+        own = calibration.psfs[:, c : c + 1] if several else calibration.psfs
+        small = reduced_calibration(replace(calibration, psfs=own, background=None), factor, None)
+        photograph = on_blocks(data[c : c + 1], valid[c : c + 1], None, factor, flat=True)
+        coarse.append(Problem.of(photograph, small, options))
+    return coarse
 
 
 def _contrast(data: Array, valid: Array, deviation: Array) -> float:
@@ -248,35 +242,3 @@ def _smooth_light(
         for b in (False, True)
     )
     return SmoothLight(share, dark, lit)
-
-
-def _plain(choice: Choice, problem: Problem, overrides: Overrides) -> Choice:
-    """Return the choice with what the solver of a plain picture does: the whole field, and its own end."""
-    height, width = problem.depths.central.shape[2:]
-    solved = replace(problem, model="convolution", smooth=False)
-    tolerance = solved.solver.tolerance_for(solved) if overrides.tolerance is None else overrides.tolerance
-    replaced = {
-        "field": Decision(
-            "field",
-            f"{2 * height - 1} x {2 * width - 1} pixels",
-            "one convolution of a picture is quick on everything that can reach the sensor",
-            overruled=overrides.field is not None,
-            numbers={"share_of_largest": 1.0},
-        ),
-        "iterations": Decision(
-            "iterations",
-            f"until they change by less than {tolerance:g}",
-            "as asked" if overrides.tolerance is not None else "where this solver stops by default",
-            0.0,
-            *steps_of_tolerance(tolerance),
-            overruled=overrides.tolerance is not None,
-            numbers={"tolerance": tolerance},
-        ),
-    }
-    return replace(
-        choice,
-        psf_window=(height, width),
-        acceptance_px=None,
-        tolerance=tolerance,
-        decisions=tuple(replaced.get(d.name, d) for d in choice.decisions),
-    )

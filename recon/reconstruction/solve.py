@@ -16,7 +16,7 @@ from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.planes import limit_of, signs_in_words, signs_of_light
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.reduction import bring_back, put_planes_back, reduced_start
+from recon.reconstruction.reduction import Reduction
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solvers import OfferedSolver
@@ -80,46 +80,41 @@ def solve(
         problem = _with_options(problem, options)
     if problem.model == "auto":
         problem = choose(problem)
-    if problem.reduction is None:
+    if (reduction := problem.reduction) is None:
         return _solve(problem, warm, on_progress, cancel, keeper, "")
     limit, spent, rounds = problem.options.time_s, 0.0, 0
-    best: tuple[Reconstruction, Problem] | None = None
+    best: tuple[Reconstruction, Problem, Reduction] | None = None
     while True:
         left = None if limit is None else limit - spent
         result = _solve(
             replace(problem, options=settled(problem.options, time_s=left)),
-            None if warm is None else reduced_start(problem, warm),
-            None if on_progress is None else _shown(problem, on_progress),
+            None if warm is None else reduction.start(warm),
+            None if on_progress is None else _shown(reduction, on_progress),
             cancel,
             keeper,
-            f"auto-{problem.reduction.choice.key}",
+            f"auto-{reduction.choice.key}",
         )
         spent += result.seconds
         lost = StopReason.NOT_FINITE in result.stop_reasons
-        if best is None or (
-            not lost and (not _cut_short(result) or _objective(result) < _objective(best[0]))
-        ):
-            best = result, problem
+        cut_short = {StopReason.TIME, StopReason.CANCELLED} & set(result.stop_reasons)
+        if best is None or (not lost and (not cut_short or _objective(result) < _objective(best[0]))):
+            best = result, problem, reduction
         if lost:
             break
-        more = put_planes_back(problem, result, rounds)
+        more = reduction.with_planes(result, rounds)
         out_of_time = limit is not None and spent >= limit
         if more is None or out_of_time or StopReason.CANCELLED in result.stop_reasons:
             break
-        problem, rounds = more, rounds + 1
-    whole = bring_back(*best)
+        assert more.reduction is not None
+        problem, reduction, rounds = more, more.reduction, rounds + 1
+    small, solved, reduction = best
+    whole = reduction.back(small, solved)
     return replace(whole, seconds=spent, stop_reasons=result.stop_reasons)
 
 
-def _shown(problem: Problem, on_progress: Progress) -> Progress:
+def _shown(reduction: Reduction, on_progress: Progress) -> Progress:
     """Return a callback of the smaller problem's iterations."""
-    reduction = problem.reduction
-    assert reduction is not None
     return lambda record, now: on_progress(record, lambda: reduction.volume(now()))
-
-
-def _cut_short(result: Reconstruction) -> bool:
-    return not {StopReason.TIME, StopReason.CANCELLED}.isdisjoint(result.stop_reasons)
 
 
 def _objective(result: Reconstruction) -> float:
@@ -140,6 +135,7 @@ class _Solved:
     signs: npt.NDArray[np.float64] | None
     memory: str | None
     noise_norm: float
+    residual: float
 
 
 def _solve(
@@ -151,7 +147,8 @@ def _solve(
     prefix: str,
 ) -> Reconstruction:
     offered = problem.solver
-    _require_tau(problem, offered)
+    if problem.options.tau is not None and not offered.one_step and not is_weighted(problem.prior_name):
+        raise InputError(f"The prior {problem.prior_name} has no weight: leave tau out.")
     channels = parts_of(problem)
     rules = rules_of(problem, offered, len(channels))
     found = []
@@ -217,12 +214,6 @@ def _with_options(problem: Problem, options: ReconstructionOptions) -> Problem:
     return replace(problem, options=options)
 
 
-def _require_tau(problem: Problem, offered: OfferedSolver) -> None:
-    if problem.options.tau is None or offered.one_step or is_weighted(problem.prior_name):
-        return
-    raise InputError(f"The prior {problem.prior_name} has no weight: leave tau out.")
-
-
 def _run(
     part: Part,
     offered: OfferedSolver,
@@ -249,7 +240,7 @@ def _run(
     keeper, name = kept
     outcome = solver.run(rules, callback=tell, cancel=cancel, keeper=keeper, part=name)
     smooth = part.background(part.lifted(outcome.solution)) if problem.smooth else None
-    if options.positive_background and smooth is not None and is_negative(smooth):
+    if options.positive_background and smooth is not None and smooth.min() < -SLIGHT:
         smooth = part.positive_background(part.lifted(outcome.solution))
         if may_go_on(outcome):
             first = replace(outcome, solution=np.empty(0))
@@ -279,7 +270,20 @@ def _run(
         signs=signs,
         memory=part.memory_used(),
         noise_norm=part.noise_norm,
+        residual=_residual(part, solution, smooth, outcome),
     )
+
+
+def _residual(part: Part, solution: Array, background: Array | None, outcome: Outcome) -> float:
+    """Return the norm of what a run leaves of the data, in units of the noise.
+
+    A solution in one step fits whatever there is, with negative light where the model is wrong: without it.
+    """
+    if outcome.history:
+        return outcome.history[-1].data_residual
+    if not part.problem.options.judged:
+        return float("nan")
+    return float(np.linalg.norm(part.residual(np.maximum(solution, 0), background)))
 
 
 def _state(part: Part, solution: Array) -> Array | None:
@@ -308,6 +312,7 @@ def _together(problem: Problem, offered: OfferedSolver, found: list[_Solved]) ->
         prior=problem.prior_name,
         tau=max(taus, default=None),
         noise_norm=found[0].noise_norm,
+        residuals=tuple(f.residual for f in found),
         histories=tuple(f.outcome.history for f in found),
         stop_reasons=tuple(f.outcome.stop_reason for f in found),
         seconds=sum(f.outcome.seconds for f in found),
@@ -338,11 +343,6 @@ def _stacked(images: list[Array], flat: bool) -> npt.NDArray[np.float32] | None:
         return None
     channels = np.concatenate(images).astype(np.float32)
     return channels[0] if flat else np.ascontiguousarray(np.moveaxis(channels, 0, -1))
-
-
-def is_negative(background: Array) -> bool:
-    """Whether a background (in noise deviations) is negative by more than can be overlooked."""
-    return bool(background.min() < -SLIGHT)
 
 
 def may_go_on(outcome: Outcome) -> bool:

@@ -7,10 +7,9 @@ user's own is registered with ``SOLVERS.register``, or as an entry point of the 
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,32 +17,11 @@ from recon.base.registry import Registry
 from recon.camera.base import Array, LinearOperator
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior
-from recon.solvers.base import Callback, Keeper, Outcome, StoppingRules
+from recon.solvers.base import IterationRecord, Outcome, Solver, StoppingRules, StopReason
 
 if TYPE_CHECKING:
     from recon.reconstruction.part import Part
     from recon.reconstruction.problem import Problem
-
-
-class Runs(Protocol):
-    """What a solver that was made does: as :class:`recon.solvers.base.Solver`."""
-
-    @property
-    def solution(self) -> Array:
-        """The present iterate."""
-        ...
-
-    def run(
-        self,
-        rules: StoppingRules | None = None,
-        *,
-        callback: Callback | None = None,
-        cancel: threading.Event | None = None,
-        keeper: Keeper | None = None,
-        part: str = "",
-    ) -> Outcome:
-        """Iterate until a rule fires."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +48,7 @@ class OfferedSolver:
 
     name: str
     help: str
-    make: Callable[[Part, Array | None], Runs]
+    make: Callable[[Part, Array | None], Solver]
     refuses: Callable[[Problem], str | None] = lambda _: None
     tolerance: float | Callable[[Problem], float] = 2e-3
     prior: str = "tv"
@@ -134,7 +112,7 @@ def _admm_refuses(problem: Problem) -> str | None:
     return _by_name(problem, volume_priors(), "for volumes, varying PSFs, backgrounds and a GPU")
 
 
-def _admm(part: Part, start: Array | None) -> Runs:
+def _admm(part: Part, start: Array | None) -> Solver:
     from recon.camera.convolution import Convolution
     from recon.solvers.admm import Admm
     from recon.solvers.splitting import Room, SensorData, Tuning
@@ -156,7 +134,7 @@ def _of_picture(start: Array | None) -> Array | None:
     return None if start is None else start[:, 0]
 
 
-def _varying_admm(part: Part, camera: LinearOperator, start: Array | None) -> Runs:
+def _varying_admm(part: Part, camera: LinearOperator, start: Array | None) -> Solver:
     from recon.solvers.operator_admm import OperatorAdmm
     from recon.solvers.splitting import SensorData
 
@@ -165,13 +143,13 @@ def _varying_admm(part: Part, camera: LinearOperator, start: Array | None) -> Ru
     return OperatorAdmm(camera, part.central, data, prior, initial=start)
 
 
-def _sensor_admm(part: Part, start: Array | None) -> Runs:
+def _sensor_admm(part: Part, start: Array | None) -> Solver:
     from recon.solvers.sensor_admm import SensorAdmm
 
     return SensorAdmm(part.picture_operator, part.data, part.prior, initial=_of_picture(start))
 
 
-def _fista(part: Part, start: Array | None) -> Runs:
+def _fista(part: Part, start: Array | None) -> Solver:
     from recon.solvers.fista import Fista
 
     return Fista(part.picture_operator, part.solved_data, part.prior, initial=_of_picture(start))
@@ -183,29 +161,31 @@ def _fista_refuses(problem: Problem) -> str | None:
     return "it is for one depth" if problem.n_planes > 1 else None
 
 
-class OneStep:
-    """A solver without iterations."""
+class OneStep(Solver):
+    """A solver without iterations: nothing is told, kept or cancelled on the way."""
 
     def __init__(self, solve: Callable[[], Outcome]) -> None:
+        super().__init__()
         self._solve = solve
-        self.solution = np.zeros(0)
+        self._outcome = Outcome(np.zeros(0), (), StopReason.ONE_STEP, 0.0)
 
-    def run(
-        self,
-        rules: StoppingRules | None = None,
-        *,
-        callback: Callback | None = None,
-        cancel: threading.Event | None = None,
-        keeper: Keeper | None = None,
-        part: str = "",
-    ) -> Outcome:
-        """Solve; nothing is told, kept or cancelled on the way."""
-        outcome = self._solve()
-        self.solution = outcome.solution
-        return outcome
+    @property
+    def solution(self) -> Array:
+        """The result, once it has run."""
+        return self._outcome.solution
+
+    def step(self) -> IterationRecord:
+        """Solve."""
+        self._outcome = self._solve()
+        return IterationRecord(1, self._outcome.seconds)
+
+    def run(self, rules: StoppingRules | None = None, **_: Any) -> Outcome:
+        """Solve, whatever the rules."""
+        self.step()
+        return self._outcome
 
 
-def _wiener(part: Part, _: Array | None) -> Runs:
+def _wiener(part: Part, _: Array | None) -> Solver:
     """Wiener's penalty takes the place of a prior; bounds are kept by clipping."""
     from recon.priors.base import Separable
     from recon.solvers.wiener import wiener

@@ -44,11 +44,7 @@ def _split_row(s: Any, x: Any, neighbour: Any, v: Any, w: Any, p: Any, st: Any) 
     """Advance one anisotropic difference's state; ``v = w (2 u - s)``."""
     relax, t, t_old, dual_scale = p[0], p[1], p[2], p[3]
     zero = relax - relax
-    tv = zero
-    primal = zero
-    dual = zero
-    kx = zero
-    y = zero
+    tv, primal, dual, kx, y = zero, zero, zero, zero, zero
     for i in range(s.shape[0]):
         d = w * (neighbour[i] - x[i])
         c = max(min(s[i], t_old), -t_old)
@@ -98,10 +94,7 @@ def _difference_row(x: Any, neighbour: Any, w: Any, out: Any) -> None:
 def _reflect_row(s: Any, v: Any, old: Any, k: Any, w: Any, st: Any) -> None:
     """Isotropic: ``v``, which holds the difference, becomes ``w (2 u - s)``."""
     zero = w - w
-    primal = zero
-    dual = zero
-    kx = zero
-    y = zero
+    primal, dual, kx, y = zero, zero, zero, zero
     for i in range(s.shape[0]):
         c = k[i] * s[i]
         e = s[i] - c
@@ -129,10 +122,7 @@ def _positive_row(s: Any, x: Any, r: Any, p: Any, st: Any) -> None:
     """Advance the state of non-negativity; add ``kappa (2 max(s, 0) - s)`` to ``r``."""
     relax, dual_scale, kappa = p[0], p[3], p[4]
     zero = relax - relax
-    primal = zero
-    dual = zero
-    xx = zero
-    y = zero
+    primal, dual, xx, y = zero, zero, zero, zero
     for i in range(s.shape[0]):
         u = max(s[i], zero)
         a = u + dual_scale * (s[i] - u) + relax * (x[i] - u)
@@ -210,23 +200,9 @@ def z_reflection(
 
 @njit(nogil=True, cache=True)
 def plane_sweep(
-    X: Any,
-    S: Any,
-    g: Any,
-    totals: Any,
-    group: Any,
-    w: Any,
-    p: Any,
-    isotropic: bool,
-    st: Any,
-    z0: int,
-    z1: int,
-    first: Any,
-    last: Any,
-    vz_before: Any,
-    planes: Any,
-    rows: Any,
-) -> None:
+    X: Any, S: Any, g: Any, totals: Any, group: Any, w: Any, p: Any, isotropic: bool, st: Any, z0: int,
+    z1: int, first: Any, last: Any, vz_before: Any, planes: Any, rows: Any,
+) -> None:  # fmt: skip
     """States, right-hand side, its transform and its sum with ``conj(g)``, for planes ``z0 <= z < z1``.
 
     ``X`` enters as the spectrum of the estimate and leaves as that of the right-hand side. ``first`` and
@@ -307,16 +283,9 @@ def solve_rows(
                 wb2 = w[b, 0] * w[b, 0] if z > 0 else zero
                 row = kappa + wz2 + wb2 + w[z, 1] * w[z, 1] * dy2[y]
                 _forward_tile(
-                    R[z, y, 2 * i0 : 2 * i1],
-                    R[b, y, 2 * i0 : 2 * i1],
-                    ratio[z, :n],
-                    ratio[b, :n],
-                    dx2[i0:i1],
-                    row,
-                    w[z, 2] * w[z, 2],
-                    wz2,
-                    wb2,
-                )
+                    R[z, y, 2 * i0 : 2 * i1], R[b, y, 2 * i0 : 2 * i1], ratio[z, :n], ratio[b, :n],
+                    dx2[i0:i1], row, w[z, 2] * w[z, 2], wz2, wb2,
+                )  # fmt: skip
             e = E[y, 2 * i0 : 2 * i1]
             for z in range(nz - 2, -1, -1):
                 _backward_tile(R[z, y, 2 * i0 : 2 * i1], R[z + 1, y, 2 * i0 : 2 * i1], ratio[z, :n])
@@ -355,12 +324,8 @@ def _update_plane(z: Any, d: Any, t: Any, relax: Any, step_scale: Any, positive:
     zero = t - t
     shift = relax / relax - step_scale
     for y in range(z.shape[0]):
-        a = z[y]
-        b = d[y]
-        l1 = zero
-        gap = zero
-        uu = zero
-        dd = zero
+        a, b = z[y], d[y]
+        l1, gap, uu, dd = zero, zero, zero, zero
         for i in range(a.shape[0]):
             scaled = step_scale * b[i]
             state = a[i] + shift * b[i]
@@ -398,8 +363,7 @@ def l1_solution_plane(z: Any, d: Any, t: Any, positive: bool) -> None:
     """``z <- prox(z + 2 d)`` for one plane."""
     zero = t - t
     for y in range(z.shape[0]):
-        a = z[y]
-        b = d[y]
+        a, b = z[y], d[y]
         for i in range(a.shape[0]):
             v = a[i] + b[i] + b[i]
             a[i] = max(v - t, zero) if positive else v - max(min(v, t), -t)

@@ -68,16 +68,9 @@ class Admm(PictureSplitting):
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
-        "_y",
-        "_tx",
-        "_ty",
-        "_t_w",
-        "_mu",
-        "_T",
-        "_Q",
-        "_t_v",
-        "_data_sums",
-    )
+        "_y", "_mu", "_splits.tx", "_splits.ty", "_splits.t_w",
+        "_split.T", "_split.Q", "_split.t", "_split.sums",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -94,8 +87,7 @@ class Admm(PictureSplitting):
         self.relax = relax
         penalties = penalties or Penalties()
         self._settles = penalties.differences is None
-        self._split = split = DataSplit(self._camera, valid, self._weight, penalties.data, self._y, relax)
-        self._T, self._Q, self._t_v, self._data_sums = split.T, split.Q, split.t, split.sums
+        self._split = DataSplit(self._camera, valid, self._weight, penalties.data, self._y, relax)
         power = float(np.mean(self._camera.power()))
         differences = 1.0 if penalties.differences is None else penalties.differences
         self._mu_data = penalties.data
@@ -119,7 +111,7 @@ class Admm(PictureSplitting):
         if self._settles and tv and self.iteration in SETTLING:
             self._settle_differences(tv.weight)
         # What is known of the iterate that the sweep is about to turn into a right-hand side.
-        data = self._data_sums.sum(axis=0)
+        data = self._split.sums.sum(axis=0)
         if self._splits.others:
             if self.iteration in SETTLING:
                 self._splits.set_penalties(self._mu)

@@ -8,10 +8,14 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
+
+from recon.base.namespace import Namespace, to_host
+from recon.priors.base import Prior
 
 
 class StopReason(enum.StrEnum):
@@ -148,14 +152,42 @@ class Keeper(Protocol):
         ...
 
 
+class KeptPart(Protocol):
+    """A part of a solver with a state of its own: a prior that was split off."""
+
+    kept: ClassVar[tuple[str, ...]]
+    """Names of the state's entries."""
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Return the state."""
+        ...
+
+    def restore(self, kept: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        ...
+
+
 class Solver(ABC):
     """An iterative solver of ``min_x 1/2 ||A x - b||^2 + prior(x)``.
 
     A subclass implements :meth:`step` and :attr:`solution`, and names in ``state_names`` the attributes that
-    make up its state; that is enough for :meth:`checkpoint` and :meth:`restore`.
+    make up its state ("part.name" for those of a part); that is enough for :meth:`checkpoint` and
+    :meth:`restore`, which see to what priors keep as well.
+
+    Attributes
+    ----------
+    xp : module
+        Whose arrays its own are: ``numpy`` or ``cupy``.
+    prior : Prior or None
+        A prior whose prox the solver itself takes.
+    splits : sequence of KeptPart
+        Priors that were split off.
     """
 
     state_names: ClassVar[tuple[str, ...]] = ()
+    xp: Namespace = np
+    prior: Prior | None = None
+    splits: Sequence[KeptPart] = ()
 
     def __init__(self) -> None:
         self.iteration = 0
@@ -251,19 +283,36 @@ class Solver(ABC):
         return self.solution.copy()
 
     def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
-        """Return the state: arrays and numbers by name, to be kept and given to :meth:`restore`.
+        """Return the state, in the host's memory: arrays and numbers by name, to be given to :meth:`restore`.
 
         Without ``copy`` the arrays are the solver's own, to be read before its next step.
         """
-        state = {name: getattr(self, name) for name in ("iteration", *self.state_names)}
-        return {k: v.copy() if copy and isinstance(v, np.ndarray) else v for k, v in state.items()}
+        state = {name: attrgetter(name)(self) for name in ("iteration", *self.state_names)}
+        if self.prior is not None:
+            state["prior"] = np.zeros(0) if self.prior.memory is None else self.prior.memory
+        for i, split in enumerate(self.splits):
+            state |= {f"prior_{i}_{name}": value for name, value in split.checkpoint().items()}
+        state = {name: to_host(v) if hasattr(v, "shape") else v for name, v in state.items()}
+        return {name: v.copy() if copy and isinstance(v, np.ndarray) else v for name, v in state.items()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint taken from a solver of the same problem."""
+        """Go on from a checkpoint of a solver of the same problem, whichever device it was taken on.
+
+        Raises
+        ------
+        KeyError
+            With the name of what the checkpoint does not have: another solver's, or another version's.
+        """
         for name in ("iteration", *self.state_names):
-            value = state[name]
-            present = getattr(self, name)
+            value, present = state[name], attrgetter(name)(self)
             if isinstance(present, np.ndarray):
                 present[...] = value
-            else:
-                setattr(self, name, value)
+                continue
+            owner, _, attribute = name.rpartition(".")
+            value = self.xp.asarray(value) if isinstance(value, np.ndarray) else value
+            setattr(attrgetter(owner)(self) if owner else self, attribute, value)
+        if self.prior is not None:
+            memory = state["prior"]
+            self.prior.memory = self.xp.array(memory) if memory.size else None
+        for i, split in enumerate(self.splits):
+            split.restore({name: state[f"prior_{i}_{name}"] for name in split.kept})

@@ -137,7 +137,7 @@ class DouglasRachford(VolumeSplitting):
         The planes left out at the end of a run, and whether they were rightly so.
     """
 
-    state_names: ClassVar[tuple[str, ...]] = ("z", "e", "gamma", "_used_gamma", "_tolerance")
+    state_names: ClassVar[tuple[str, ...]] = ("z", "e", "gamma", "_used_gamma", "system.tolerance")
 
     def __init__(
         self,
@@ -151,9 +151,7 @@ class DouglasRachford(VolumeSplitting):
     ) -> None:
         super().__init__(operator, data, tuning, room, 1.7)
         require_exact(*prior.terms())
-        # Its own: what a prox keeps from call to call belongs to this run.
-        self.prior = shallow_copy(prior)
-        self.prior.memory = None
+        self.prior: Prior = prior.for_a_run()
         self.weight = sum(term.weight for term in prior.terms() if isinstance(term, Separable))
         self.empty = EmptyPlanes()
         self.z = self.room.zeros(operator.domain_shape[1:], operator.dtype)
@@ -238,24 +236,8 @@ class DouglasRachford(VolumeSplitting):
             self.gamma *= float(np.clip(np.sqrt(size / dual), 0.2, 5.0))
         self.system.follow(gap)
         self._solve_data_term(self.system.from_spectrum(total))
-        return IterationRecord(
-            0,
-            0.0,
-            0.5 * residual**2 + float(value),
-            residual,
-            primal_residual=gap,
-            change=self.relaxation * gap,
-        )
-
-    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
-        """Return the state, with what the prior's prox keeps."""
-        memory = np.zeros(0) if self.prior.memory is None else to_host(self.prior.memory)
-        return {**super().checkpoint(copy=copy), "prior": memory.copy() if copy else memory}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint of a solver of the same problem, whichever device it was taken on."""
-        super().restore(state)
-        self.prior.memory = self.xp.array(state["prior"]) if state["prior"].size else None
+        objective, change = 0.5 * residual**2 + float(value), self.relaxation * gap
+        return IterationRecord(0, 0.0, objective, residual, primal_residual=gap, change=change)
 
 
 class SparseDouglasRachford(DouglasRachford):
@@ -265,7 +247,7 @@ class SparseDouglasRachford(DouglasRachford):
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
-        "z", "e", "gamma", "_used_gamma", "_tolerance", "_active", "_empty_for", "_patience",
+        *DouglasRachford.state_names, "watch.active", "watch.empty_for", "watch.patience",
     )  # fmt: skip
 
     @staticmethod
@@ -288,19 +270,6 @@ class SparseDouglasRachford(DouglasRachford):
         spectrum = fft.spectrum_shape(operator.grid_shape)
         self._totals = np.zeros((operator.groups.count, *spectrum), fft.complex_dtype(operator.dtype))
         self._regroup()
-
-    # The watch's arrays are part of the state.
-    @property
-    def _active(self) -> Array:
-        return self.watch.active
-
-    @property
-    def _empty_for(self) -> Array:
-        return self.watch.empty_for
-
-    @property
-    def _patience(self) -> Array:
-        return self.watch.patience
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint taken from a solver of the same problem."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from copy import copy as shallow_copy
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -59,9 +58,7 @@ class Fista(Solver):
         super().__init__()
         self.operator = operator
         self.data = np.asarray(data, operator.dtype)
-        # Its own: what a prox keeps from call to call belongs to this run.
-        self.prior = shallow_copy(prior)
-        self.prior.memory = None
+        self.prior: Prior = prior.for_a_run()
         self.restart = restart
         self.accelerate = accelerate
         bound = operator.norm_bound
@@ -75,17 +72,6 @@ class Fista(Solver):
         self.t = 1.0
         self.objective = np.inf
         self._gradient = np.empty_like(self.x)
-
-    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
-        """Return the state, with what the prior's prox keeps."""
-        memory = self.prior.memory
-        kept = np.zeros(0) if memory is None else memory.copy() if copy else memory
-        return {**super().checkpoint(copy=copy), "prior": kept}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint taken from a solver of the same problem."""
-        super().restore(state)
-        self.prior.memory = np.array(state["prior"]) if state["prior"].size else None
 
     @property
     def solution(self) -> Array:

@@ -23,6 +23,7 @@ from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import Convolution
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
+from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
 from recon.solvers.prior_splits import ProxSplit, split_prior
 from recon.solvers.splitting import SensorData, Tuning
 from recon.solvers.volume_admm import ExactAdmm
@@ -48,7 +49,7 @@ class OperatorAdmm(ExactAdmm):
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
-        "x", "S", "e", "penalty", "_used_penalty", "_misfit", "_tolerance",
+        "x", "S", "e", "penalty", "_used_penalty", "_misfit", "system.tolerance",
     )  # fmt: skip
 
     def __init__(
@@ -84,7 +85,7 @@ class OperatorAdmm(ExactAdmm):
         """Eigenvalues of T under cosine transforms."""
         n_z, height, width = self.camera.domain_shape[1:]
         axes = [
-            w * w * 4 * np.sin(np.pi * np.arange(n) / (2 * n)) ** 2
+            w * w * laplacian_eigenvalues(2 * n)[:n]
             for w, n in zip(weights, (n_z, height, width), strict=True)
         ]
         total = axes[0][:, None, None] + axes[1][:, None] + axes[2] + self._pixels
@@ -95,7 +96,7 @@ class OperatorAdmm(ExactAdmm):
         if weights is None:
             return np.full((1, 1), self._pixels, self.camera.dtype)
         height, width = self.operator.grid_shape
-        y, x = (4 * np.sin(np.pi * np.arange(n) / n) ** 2 for n in (height, width))
+        y, x = (laplacian_eigenvalues(n) for n in (height, width))
         total = weights[1] ** 2 * y[:, None] + weights[2] ** 2 * x[: width // 2 + 1] + self._pixels
         return np.asarray(total, self.camera.dtype)
 

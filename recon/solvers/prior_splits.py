@@ -8,9 +8,8 @@ split ``z = y`` with its own prox and penalty, which adds to the pixels'.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from copy import copy as shallow_copy
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -53,12 +52,14 @@ class ProxSplit:
         Penalty.
     sums : tuple of float
         Squared norms of the last :meth:`meet`: primal residual, change and size of ``z``, multiplier / mu.
+    kept : tuple of str
+        What :meth:`checkpoint` returns, by name.
     """
 
+    kept: ClassVar[tuple[str, ...]] = ("state", "split", "mu", "sums", "memory")
+
     def __init__(self, prior: Prior, start: Array) -> None:
-        # Its own: what a prox keeps from call to call belongs to this run.
-        self.prior = shallow_copy(prior)
-        self.prior.memory = None
+        self.prior = prior.for_a_run()
         self.mu = 1.0
         self.state = start.copy()
         self.split = self._prox()
@@ -108,10 +109,8 @@ class ProxSplit:
     def checkpoint(self) -> dict[str, Any]:
         """Return the state, with what the prior's prox keeps."""
         memory = np.zeros(0) if self.prior.memory is None else self.prior.memory
-        return {
-            "state": to_host(self.state), "split": to_host(self.split), "mu": self.mu,
-            "sums": np.array(self.sums), "memory": to_host(memory),
-        }  # fmt: skip
+        values = (to_host(self.state), to_host(self.split), self.mu, np.array(self.sums), to_host(memory))
+        return dict(zip(self.kept, values, strict=True))
 
     def restore(self, kept: dict[str, Any]) -> None:
         """Go on from a checkpoint."""
@@ -119,19 +118,6 @@ class ProxSplit:
         self.state, self.split, self.mu = xp.array(kept["state"]), xp.array(kept["split"]), float(kept["mu"])
         self.sums = tuple(float(v) for v in kept["sums"])  # type: ignore[assignment]
         self.prior.memory = xp.array(kept["memory"]) if kept["memory"].size else None
-
-
-def kept_splits(splits: Sequence[ProxSplit]) -> dict[str, Any]:
-    """Return what splits keep, by name, for a solver's checkpoint."""
-    kept = enumerate(split.checkpoint() for split in splits)
-    return {f"prior_{i}_{name}": value for i, part in kept for name, value in part.items()}
-
-
-def restore_splits(splits: Sequence[ProxSplit], state: dict[str, Any]) -> None:
-    """Go on from a checkpoint with :func:`kept_splits` in it."""
-    for i, split in enumerate(splits):
-        prefix = f"prior_{i}_"
-        split.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
 
 
 class PriorSplits:
@@ -326,23 +312,13 @@ class PictureSplitting(Solver):
         start = np.zeros(operator.domain_shape, operator.dtype)
         if initial is not None:
             start[...] = initial
-        self._splits = splits = PriorSplits(prior, start)
-        self._y, self._tx, self._ty, self._t_w = splits.y, splits.tx, splits.ty, splits.t_w
-        self._mu = splits.mu
+        self._splits = PriorSplits(prior, start)
+        self._y, self._mu, self.splits = self._splits.y, self._splits.mu, self._splits.others
 
     @property
     def solution(self) -> Array:
         """The split variable that obeys the separable prior."""
         return self._splits.solution()
-
-    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
-        """Return the state, with that of priors known by their prox."""
-        return {**super().checkpoint(copy=copy), **kept_splits(self._splits.others)}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint taken from a solver of the same problem."""
-        super().restore(state)
-        restore_splits(self._splits.others, state)
 
 
 def split_prior(

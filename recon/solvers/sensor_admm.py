@@ -86,7 +86,9 @@ class SensorAdmm(PictureSplitting):
         Conjugate gradient steps an iteration.
     """
 
-    state_names: ClassVar[tuple[str, ...]] = ("_y", "_tx", "_ty", "_t_w", "_mu", "_e", "_E", "_data")
+    state_names: ClassVar[tuple[str, ...]] = (
+        "_y", "_mu", "_splits.tx", "_splits.ty", "_splits.t_w", "_e", "_E", "_data",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -297,7 +299,7 @@ class SensorAdmm(PictureSplitting):
             gradient = self._camera.adjoint(misfit)
             for c, pixels in enumerate(w):
                 size, slope = float(np.linalg.norm(pixels)), float(np.linalg.norm(gradient[c]))
-                multiplier = float(self._mu[1, c] * np.linalg.norm(self._t_w[c] - pixels))
+                multiplier = float(self._mu[1, c] * np.linalg.norm(self._splits.t_w[c] - pixels))
                 if size > 0:
                     balanced[1, c] = np.sqrt(multiplier * slope) / size
         steps = np.array(LARGEST_STEP)[:, None]

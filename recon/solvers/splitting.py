@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
-from recon.base.namespace import Namespace, namespace_of, to_host
+from recon.base.namespace import Namespace, namespace_of
 from recon.camera.base import Array
 from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
@@ -298,33 +297,6 @@ class VolumeSplitting(Solver):
         return self._on_device
 
     _on_device: Array | None = None
-
-    @property
-    def _tolerance(self) -> float:
-        """Part of the state: how exactly the sensor's system is solved next."""
-        return self.system.tolerance
-
-    @_tolerance.setter
-    def _tolerance(self, value: float) -> None:
-        self.system.tolerance = value
-
-    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
-        """Return the state, in the host's memory."""
-        state = super().checkpoint(copy=copy)
-        return (
-            state
-            if self.xp is np
-            else {k: to_host(v) if hasattr(v, "shape") else v for k, v in state.items()}
-        )
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint of a solver of the same problem, whichever device it was taken on."""
-        if self.xp is np:
-            super().restore(state)
-            return
-        for name in ("iteration", *self.state_names):
-            value = state[name]
-            setattr(self, name, self.xp.asarray(value) if isinstance(value, np.ndarray) else value)
 
     def _start(self) -> Array | None:
         return None  # zeros will do: a copy of a volume is too much to pay for a fall-back

@@ -14,6 +14,7 @@ from recon.base.threads import get_threads, in_blocks
 from recon.camera.base import Array
 from recon.camera.convolution import Convolution
 from recon.priors.base import Prior
+from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
 from recon.solvers.douglas_rachford import DouglasRachford, SparseDouglasRachford
 from recon.solvers.prior_splits import split_prior
 from recon.solvers.splitting import Room, SensorData, Tuning
@@ -48,8 +49,8 @@ class LeanTotalVariation(VolumeAdmm):
         dtype = operator.dtype
         _, nz, ny, nx = operator.domain_shape
         self.g = zeros((nz, *fft.spectrum_shape((ny, nx))), fft.complex_dtype(dtype))
-        self._dy2 = (4 * np.sin(np.pi * np.arange(ny) / ny) ** 2).astype(dtype)
-        self._dx2 = (4 * np.sin(np.pi * np.arange(nx // 2 + 1) / nx) ** 2).astype(dtype)
+        self._dy2, dx2 = (laplacian_eigenvalues(n).astype(dtype) for n in (ny, nx))
+        self._dx2 = dx2[: nx // 2 + 1].copy()
         self._q = np.empty(self.g.shape[1:], dtype)
         self._prepare_transfer()
         self.X = zeros(self.g.shape, self.g.dtype)

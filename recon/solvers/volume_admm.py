@@ -32,7 +32,8 @@ from recon.camera.convolution import Convolution
 from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import IterationRecord
-from recon.solvers.prior_splits import ProxSplit, kept_splits, restore_splits, split_prior
+from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
+from recon.solvers.prior_splits import ProxSplit, split_prior
 from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, is_due, residual_norm, squares
 
 FIRST_PENALTY = 0.5
@@ -173,15 +174,9 @@ class ExactAdmm(VolumeSplitting):
         if self.balance and is_due(self.iteration) and dual_residual > 0:
             ratio = np.sqrt(primal_residual / dual_residual)
             self.penalty *= float(np.clip(ratio, 0.2, 5.0))
-        return IterationRecord(
-            0,
-            0.0,
-            objective,
-            residual_norm(self.e),
-            primal_residual,
-            dual_residual,
-            change=float(np.sqrt(dual_p / max(xx, 1e-300))),
-        )
+        change = float(np.sqrt(dual_p / max(xx, 1e-300)))
+        data = residual_norm(self.e)
+        return IterationRecord(0, 0.0, objective, data, primal_residual, dual_residual, change)
 
     def _value(self) -> float:
         """Value of the priors other than total variation, of their split variables."""
@@ -195,15 +190,6 @@ class ExactAdmm(VolumeSplitting):
 
     def _end(self) -> Array:
         return self.solution
-
-    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
-        """Return the state, with that of the priors' splits."""
-        return {**super().checkpoint(copy=copy), **kept_splits(self.splits)}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint of a solver of the same problem, whichever device it was taken on."""
-        super().restore(state)
-        restore_splits(self.splits, state)
 
 
 class VolumeAdmm(ExactAdmm):
@@ -226,7 +212,7 @@ class VolumeAdmm(ExactAdmm):
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
-        "X", "S", "e", "penalty", "_used_penalty", "_misfit", "_tolerance",
+        "X", "S", "e", "penalty", "_used_penalty", "_misfit", "system.tolerance",
     )  # fmt: skip
 
     def __init__(
@@ -276,8 +262,8 @@ class VolumeAdmm(ExactAdmm):
         """Eliminate along depth once for all: ``T`` is tridiagonal in z for every lateral frequency."""
         xp, dtype = self.xp, self.operator.dtype
         ny, nx = self.operator.grid_shape
-        rows = xp.asarray((4 * np.sin(np.pi * np.arange(ny) / ny) ** 2).astype(dtype))[:, None]
-        columns = xp.asarray((4 * np.sin(np.pi * np.arange(nx // 2 + 1) / nx) ** 2).astype(dtype))[None]
+        rows, columns = (xp.asarray(laplacian_eigenvalues(n).astype(dtype)) for n in (ny, nx))
+        rows, columns = rows[:, None], columns[None, : nx // 2 + 1]
         squared = self.axis_weights**2
         self._deeper = [float(w) for w in squared[:-1, 0]]
         shape = (len(squared), ny, nx // 2 + 1)

@@ -10,6 +10,7 @@ from recon.base import fft
 from recon.camera.base import Array, LinearOperator
 from recon.camera.factors import CroppedConvolution, as_cropped_convolution
 from recon.solvers.base import Outcome, StopReason
+from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
 
 FLATNESS = 1e-3
 """Share of plain Tikhonov in the penalty: keeps the lowest frequencies, which have no gradient, bounded."""
@@ -40,37 +41,22 @@ def wiener(operator: LinearOperator, data: Array, regularisation: float | None =
         With an empty history; ``tau`` is the regularisation.
     """
     began = time.perf_counter()
-    structure = as_cropped_convolution(operator)
-    convolution = structure.convolution
-    B = fft.rfft(_continue_beyond_sensor(structure, np.asarray(data, operator.dtype)))
-    width = convolution.grid_shape[1]
-    power = convolution.power()
-    penalty = (_penalty(convolution.grid_shape) * float(np.mean(power))).astype(power.dtype)
+    data = np.asarray(data, operator.dtype)
     if regularisation is None:
-        regularisation = _cross_validated(power, penalty, B)
-    B *= np.conj(convolution.spectrum[:, 0])
-    B /= power + power.dtype.type(regularisation) * penalty
-    solution = fft.irfft(B, width)
+        regularisation = cross_validated(operator, data, enough=None)
+    solution = WienerFilter(operator, regularisation)(data)
     return Outcome(solution, (), StopReason.ONE_STEP, time.perf_counter() - began, float(regularisation))
 
 
 class WienerFilter:
     """The same filter with its regularisation settled once: two FFTs a picture, for previews.
 
-    Parameters
-    ----------
-    operator : LinearOperator
-        As of :func:`wiener`.
-    regularisation : float
-        As of :func:`wiener`.
+    ``operator`` and ``regularisation`` are as of :func:`wiener`.
     """
 
     def __init__(self, operator: LinearOperator, regularisation: float) -> None:
-        self._structure = structure = as_cropped_convolution(operator)
-        convolution = structure.convolution
-        power = convolution.power()
-        penalty = (_penalty(convolution.grid_shape) * float(np.mean(power))).astype(power.dtype)
-        self._filter = np.conj(convolution.spectrum[:, 0])
+        self._structure, power, penalty = _structure(operator)
+        self._filter = np.conj(self._structure.convolution.spectrum[:, 0])
         self._filter /= power + power.dtype.type(regularisation) * penalty
 
     def __call__(self, data: Array) -> Array:
@@ -80,27 +66,15 @@ class WienerFilter:
         return fft.irfft(B, self._structure.convolution.grid_shape[1])
 
 
-def cross_validated(operator: LinearOperator, data: Array) -> float:
-    """Return about the regularisation that :func:`wiener` would choose for data.
+def cross_validated(operator: LinearOperator, data: Array, enough: int | None = ENOUGH_FREQUENCIES) -> float:
+    """Return the regularisation that predicts left-out data best (Golub, Heath & Wahba 1979).
 
-    From every so many rows of frequencies, ``ENOUGH_FREQUENCIES`` in all: a live picture waits for it.
+    From every so many rows of frequencies, about ``enough`` in all (a live picture waits for it), or all.
     """
-    structure = as_cropped_convolution(operator)
-    power = structure.convolution.power()
-    penalty = (_penalty(structure.convolution.grid_shape) * float(np.mean(power))).astype(power.dtype)
+    structure, power, penalty = _structure(operator)
     B = fft.rfft(_continue_beyond_sensor(structure, data))
-    stride = max(B[0].size // ENOUGH_FREQUENCIES, 1)
-    return _cross_validated(power[:, ::stride], penalty[::stride], B[:, ::stride])
-
-
-def _penalty(grid_shape: tuple[int, ...]) -> Array:
-    height, width = grid_shape
-    penalty: Array = FLATNESS + _laplace(height)[:, None] + _laplace(width)[: width // 2 + 1]
-    return penalty
-
-
-def _cross_validated(power: Array, penalty: Array, B: Array) -> float:
-    """Return the regularisation that predicts left-out data best (Golub, Heath & Wahba 1979)."""
+    stride = 1 if enough is None else max(B[0].size // enough, 1)
+    power, penalty, B = power[:, ::stride], penalty[::stride], B[:, ::stride]
     signal = (B.real**2 + B.imag**2).astype(np.float64)
     candidates = np.logspace(-6, 2, 33)
     scores = []
@@ -108,6 +82,15 @@ def _cross_validated(power: Array, penalty: Array, B: Array) -> float:
         kept = 1 - power / (power + r * penalty)
         scores.append(float(np.sum(kept**2 * signal)) / float(np.sum(np.broadcast_to(kept, B.shape))) ** 2)
     return float(candidates[int(np.argmin(scores))])
+
+
+def _structure(operator: LinearOperator) -> tuple[CroppedConvolution, Array, Array]:
+    """Return what an operator is, ``|H|^2``, and ``mean|H|^2 (|Psi|^2 + flatness)``."""
+    structure = as_cropped_convolution(operator)
+    power = structure.convolution.power()
+    rows, columns = (laplacian_eigenvalues(n) for n in structure.convolution.grid_shape)
+    penalty = (FLATNESS + rows[:, None] + columns[: power.shape[-1]]) * float(np.mean(power))
+    return structure, power, penalty.astype(power.dtype)
 
 
 def _continue_beyond_sensor(structure: CroppedConvolution, data: Array) -> Array:
@@ -154,7 +137,3 @@ def _filled(data: Array, weight: Array) -> Array:
             break
         sigma *= 2
     return filled
-
-
-def _laplace(n: int) -> Array:
-    return 4 * np.sin(np.pi * np.arange(n) / n) ** 2

@@ -22,13 +22,10 @@ Floats = npt.NDArray[np.float32]
 
 PERCENTILE = 20.0
 """Of a pixel's values that its baseline is (Kuo 2020, Fig. 6.5)."""
-
 FLOOR_SHARE = 0.1
 """Least baseline that a change is divided by, relative to the bright part of the picture: where there is
 next to nothing, a relative change means nothing."""
-
 BRIGHT_PERCENTILE = 99.9
-
 MOST_COMPARED = 500
 """Frames whose light is compared, each with each, to find how it fades; of longer videos every so many."""
 
@@ -37,18 +34,12 @@ _ANCHORS_A_WINDOW = 4
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How far each frame lies off the mean of all, less the median frame.
-
-    Attributes
-    ----------
-    shifts : ndarray, (n_frames, 2)
-        Rows and columns, pixels.
-    largest_px : float
-        Of the frames' distances from their median place.
-    """
+    """How far each frame lies off the mean of all, less the median frame."""
 
     shifts: npt.NDArray[np.float64]
+    """(n_frames, 2): rows and columns, pixels."""
     largest_px: float
+    """Of the frames' distances from their median place."""
 
     @property
     def is_still(self) -> bool:
@@ -202,22 +193,15 @@ What lasts for one frame cannot be told from noise."""
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """Pixels that are active together.
-
-    Attributes
-    ----------
-    rows, columns : ndarray of int
-        Its pixels.
-    centre : (float, float)
-        Row and column, weighted with the activity.
-    correlation : float
-        Local correlation at its peak.
-    """
+    """Pixels that are active together."""
 
     rows: npt.NDArray[np.intp]
     columns: npt.NDArray[np.intp]
+    """``rows`` and ``columns``: its pixels."""
     centre: tuple[float, float]
+    """Row and column, weighted with the activity."""
     correlation: float
+    """Local correlation at its peak."""
 
     def trace(self, frames: Floats) -> Floats:
         """Return the mean over the region of each frame, (n_frames,)."""
@@ -235,8 +219,7 @@ def local_correlation(frames: Floats) -> Floats:
     """
     if len(frames) < 3:
         raise InputError(f"Correlation over time needs three frames at least, not {len(frames)}.")
-    courses = frames - frames.mean(axis=0)
-    norm = np.sqrt(np.sum(courses.astype(np.float64) ** 2, axis=0))
+    courses, norm = _courses(frames)
     courses = (courses / np.where(norm > 0, norm, 1)).astype(np.float32)
     height, width = norm.shape
     total, count = np.zeros(norm.shape), np.zeros(norm.shape)
@@ -248,6 +231,12 @@ def local_correlation(frames: Floats) -> Floats:
             total[part] += product
             count[part] += 1
     return (total / np.maximum(count, 1)).astype(np.float32)
+
+
+def _courses(frames: Floats) -> tuple[Floats, Array]:
+    """Return each pixel's course over time less its mean, and the courses' norms."""
+    courses = frames - frames.mean(axis=0)
+    return courses, np.sqrt(np.sum(courses.astype(np.float64) ** 2, axis=0))
 
 
 def lasts(course: Array) -> bool:
@@ -284,8 +273,7 @@ def find_regions(
 
     correlation = local_correlation(frames)
     height, width = correlation.shape
-    courses = frames - frames.mean(axis=0)
-    norm = np.sqrt(np.sum(courses.astype(np.float64) ** 2, axis=0))
+    courses, norm = _courses(frames)
     free = norm > 0
     peaks = (ndimage.maximum_filter(correlation, 3) == correlation) & (correlation >= least_correlation)
     places = np.argwhere(peaks)
@@ -304,23 +292,18 @@ def find_regions(
         likeness = np.einsum("t,tyx->yx", core / size, courses[:, *box]) / np.where(
             norm[box] > 0, norm[box], 1
         )
-        belongs = (likeness >= alike) & free[box] & (np.hypot(y - row, x - column) <= radius_px)
-        labels, _ = ndimage.label(belongs)
+        near = (likeness >= alike) & (np.hypot(y - row, x - column) <= radius_px)
+        labels, _ = ndimage.label(near & free[box])
         own = labels[row - box[0].start, column - box[1].start]
-        if own == 0:
-            continue
         mask = labels == own
-        if int(mask.sum()) < least_pixels:
+        if own == 0 or int(mask.sum()) < least_pixels:
             continue
-        rows, columns = np.nonzero(mask)
-        rows, columns = rows + box[0].start, columns + box[1].start
+        rows, columns = (places + side.start for places, side in zip(np.nonzero(mask), box, strict=True))
+        free[rows, columns] = False
         if not lasts(frames[:, rows, columns].mean(axis=1, dtype=np.float64)):
-            free[rows, columns] = False
             continue
         weight = norm[rows, columns]
         centre = (float(np.average(rows, weights=weight)), float(np.average(columns, weights=weight)))
-        free[rows, columns] = False
-        # Its halo is not another region.
-        free[box] &= ~((likeness >= alike) & (np.hypot(y - row, x - column) <= radius_px))
+        free[box] &= ~near  # its halo is not another region
         regions.append(Region(rows, columns, centre, float(correlation[row, column])))
     return regions

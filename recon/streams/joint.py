@@ -120,10 +120,8 @@ OVER_TIME: tuple[OverTimeName, ...] = ("tv", "lowrank")
 
 JOINT_ITERATIONS = 60
 """Of a block that is solved together; its first ones are all cold."""
-
 JOINT_BLOCK = 16
 """Frames of such a block: 16 of a megapixel take 5 GB."""
-
 TIME_SHARE = 1.0
 """Penalty of the split over time relative to that of the pixels, whose scale it shares."""
 
@@ -176,11 +174,8 @@ class JointAdmm(SensorAdmm):
 def require_joint(problem: Problem) -> None:
     """Refuse what a prior over time has no way for: frames are the channels of one problem.
 
-    Raises
-    ------
-    InputError
-        When frames are colour, or their camera has more than one PSF, one depth, or a background, which a
-        solver of one channel at a time cannot join; or another solver was asked for.
+    Raises InputError when frames are colour, or their camera has more than one PSF, one depth, or a
+    background, which a solver of one channel at a time cannot join; or another solver was asked for.
     """
     if not problem.flat:
         raise InputError("Priors over time take grey frames; reconstruct each channel on its own.")
@@ -207,6 +202,8 @@ def solve_together(
 ) -> Floats | None:
     """Reconstruct a block of frames with a prior over time.
 
+    Raises InputError when there are fewer than two frames, or as of :func:`require_joint`.
+
     Parameters
     ----------
     problem : Problem
@@ -224,11 +221,6 @@ def solve_together(
     -------
     ndarray, float32, (n_frames, height, width), or None
         In the units of :func:`recon.reconstruct`; None when given up.
-
-    Raises
-    ------
-    InputError
-        When there are fewer than two frames, or as of :func:`require_joint`.
     """
     require_joint(problem)
     if frames.ndim != 3 or len(frames) < 2:

@@ -32,14 +32,10 @@ Array = npt.NDArray[Any]
 
 LEAST_SIDE = 16
 """Pixels of a picture's short side below which no binning goes."""
-
 AT_ONCE = 150_000
 """Pixels of the first picture, at most: its filter is made and applied in about a tenth of a second."""
 
 _POLL_S = 0.005
-
-_Stamp = tuple[float, float]
-"""Seconds on the clock, and of this thread's processor time."""
 
 
 class LiveReconstructor:
@@ -55,6 +51,8 @@ class LiveReconstructor:
     the picture converges. While it moves, they go on from the picture before. After a cut, they begin anew.
     Another binning is prepared in a thread of its own while pictures go on. One that finds no memory is said
     in ``warnings`` and not tried again until :meth:`restart`; pictures go on as they are.
+
+    Raises InputError when the calibration or an option is unusable, or no solver has a way for them.
 
     Parameters
     ----------
@@ -75,11 +73,6 @@ class LiveReconstructor:
         May be changed at any time.
     warnings : tuple of str
         What is doubtful about the calibration, and what became of the pictures since.
-
-    Raises
-    ------
-    InputError
-        When the calibration or an option is unusable, or no solver has a way for them.
     """
 
     def __init__(
@@ -148,16 +141,13 @@ class LiveReconstructor:
         The first makes its filter, which takes about a tenth of a second; the first of another scene takes a
         little longer than others.
 
+        Raises InputError when the image does not fit the PSF or the frames before, or is not finite; such a
+        frame is left out, and the next goes on as if it had not been.
+
         Parameters
         ----------
         image : ndarray, (height, width) or (height, width, n_channels)
             Counts. Of the PSF's pixels, or of a whole multiple of them, which is then binned to them.
-
-        Raises
-        ------
-        InputError
-            When the image does not fit the PSF or the frames before, or is not finite; such a frame is left
-            out, and the next goes on as if it had not been.
         """
         began = _now()
         frame = self._measured(np.asarray(image))
@@ -173,7 +163,7 @@ class LiveReconstructor:
             self._follows = self._settled = False
             filtered = level.filtered(self._as_given(self._watch.mean))
             if too_slow:
-                self._pace.note_filter(_since(began))
+                self._pace.note_filter(_now() - began)
             return self._picture(level, filtered, 0, began)
         anew = self._scene is SceneState.NEW or not self._follows
         if anew:
@@ -182,10 +172,9 @@ class LiveReconstructor:
         self._follows = True
         done, steps = self._iterate(level, began, max(affordable, 1), lambda: False)
         picture = self._picture(level, level.solved(), done, began)
-        after = _since(began)
+        after = _now() - began
         if not anew and self._coming is None:  # otherwise it says nothing of the pictures to come
-            fixed = Spent(after.wall_ms - steps.wall_ms, after.work_ms - steps.work_ms)
-            self._pace.note(fixed, steps, done)
+            self._pace.note(after - steps, steps, done)
         return picture
 
     def refine(self, newer: Callable[[], bool] = lambda: False) -> LivePicture | None:
@@ -220,17 +209,14 @@ class LiveReconstructor:
     ) -> Reconstruction:
         """Reconstruct a frame as a single picture, to the end, with the same options; from any thread.
 
+        Raises InputError when the image does not fit the calibration.
+
         Parameters
         ----------
         image : ndarray
             As of :meth:`feed`.
         on_progress, cancel
             As of :func:`recon.reconstruct`.
-
-        Raises
-        ------
-        InputError
-            When the image does not fit the calibration.
         """
         pixels = np.moveaxis(self._on_calibration_pixels(image), 0, -1)
         pixels = pixels[..., 0] if image.ndim == 2 else pixels
@@ -258,7 +244,7 @@ class LiveReconstructor:
 
     # Pieces ----------------------------------------------------------------------------------------
     def _iterate(
-        self, level: Level, began: _Stamp, at_most: int | None, newer: Callable[[], bool]
+        self, level: Level, began: Spent, at_most: int | None, newer: Callable[[], bool]
     ) -> tuple[int, Spent]:
         """Do one iteration, and more while they fit into the budget; return how many, and what they took."""
         cost = self._pace.cost(level.binning)
@@ -269,9 +255,9 @@ class LiveReconstructor:
         while True:
             self._settled = level.solver.advance(level.tolerance)
             done += 1
-            spent_ms = _since(began).wall_ms
+            spent_ms = (_now() - began).wall_ms
             if self._settled or done == at_most or spent_ms + ahead_ms > self.budget_ms or newer():
-                return done, _since(first)
+                return done, _now() - first
 
     def _level_for(self, frame: Floats) -> Level:
         """Return the level for the next frame: the one there is, until another is made."""
@@ -392,7 +378,7 @@ class LiveReconstructor:
             )
         return block_mean(image[None] if image.ndim == 2 else np.moveaxis(image, 2, 0), factor)
 
-    def _picture(self, level: Level, volume: Floats, done: int, began: _Stamp) -> LivePicture:
+    def _picture(self, level: Level, volume: Floats, done: int, began: Spent) -> LivePicture:
         """Return a picture: of the filter, or of ``done`` iterations."""
         filtered, of = done == 0, f"of {self._n_planes} depths"
         plane = self.live.plane
@@ -407,7 +393,7 @@ class LiveReconstructor:
             scene=self._scene,
             frames=self._watch.count,
             settled=self._settled,
-            work_ms=_since(began).wall_ms,
+            work_ms=(_now() - began).wall_ms,
             budget_ms=self.budget_ms,
             volume=volume if len(volume) > 1 else None,
             shown=""
@@ -418,10 +404,6 @@ class LiveReconstructor:
         )
 
 
-def _now() -> _Stamp:
-    return time.perf_counter(), time.thread_time()
-
-
-def _since(began: _Stamp) -> Spent:
-    wall_s, work_s = _now()
-    return Spent(1e3 * (wall_s - began[0]), 1e3 * (work_s - began[1]))
+def _now() -> Spent:
+    """Return the clock's time, and this thread's processor time."""
+    return Spent(1e3 * time.perf_counter(), 1e3 * time.thread_time())

@@ -71,47 +71,33 @@ class LiveOptions:
 
 @dataclass(frozen=True, slots=True)
 class LivePicture:
-    """A picture, and what it is worth.
-
-    Attributes
-    ----------
-    image : ndarray, float32, (height, width) or (height, width, n_channels)
-        The part of the scene opposite to the sensor, on pixels binned ``binning x binning``; brightness does
-        not depend on the binning.
-    method : str
-        The solver that made it; ``"wiener"`` for a filter, which is of one depth and one PSF.
-    iterations : int
-        Done for this picture; 0 for ``"wiener"``.
-    total_iterations : int
-        Since the solver last began anew; what it knew of the scene before a movement stays with it.
-    scene : SceneState
-        Whether the scene is new, moving or still.
-    frames : int
-        Frames averaged; 1 unless the scene is still.
-    settled : bool
-        Whether further iterations on these frames would change nothing that can be seen.
-    work_ms : float
-        Time that the picture took.
-    budget_ms : float
-        Time that it was allowed.
-    volume : ndarray, float32, (n_z, height, width[, n_channels]), or None
-        All depths, where several are reconstructed; None for a filter's picture.
-    shown : str
-        Which of several depths ``image`` shows, in words.
-    """
+    """A picture, and what it is worth."""
 
     image: Floats
+    """(height, width) or (height, width, n_channels): the part of the scene opposite to the sensor, on pixels
+    binned ``binning x binning``; brightness does not depend on the binning."""
     binning: int
     method: str
+    """The solver that made it; ``"wiener"`` for a filter, which is of one depth and one PSF."""
     iterations: int
+    """Done for this picture; 0 for ``"wiener"``."""
     total_iterations: int
+    """Since the solver last began anew; what it knew of the scene before a movement stays with it."""
     scene: SceneState
+    """Whether the scene is new, moving or still."""
     frames: int
+    """Frames averaged; 1 unless the scene is still."""
     settled: bool
+    """Whether further iterations on these frames would change nothing that can be seen."""
     work_ms: float
+    """Time that the picture took."""
     budget_ms: float
+    """Time that it was allowed."""
     volume: Floats | None = None
+    """(n_z, height, width[, n_channels]): all depths, where several are reconstructed; None for a filter's
+    picture."""
     shown: str = ""
+    """Which of several depths ``image`` shows, in words."""
 
     @property
     def quality(self) -> str:
@@ -128,24 +114,17 @@ class Level:
     """Live pictures at one binning.
 
     Brightness does not depend on the binning: one binned pixel holds the light of all its pixels.
-
-    Attributes
-    ----------
-    problem : Problem
-        Of a first frame on binned pixels, which settles noise, scales and weights.
-    binning : int
-        Pixels averaged along each axis.
-    preview : Part
-        Of the same frame through one PSF, without a background: what the filter is for.
-    solver : VideoSolver or None
-        None until it was made: a filter is made in a moment, for the first picture.
     """
 
     problem: Problem
+    """Of a first frame on binned pixels, which settles noise, scales and weights."""
     binning: int
+    """Pixels averaged along each axis."""
     preview: Part
+    """Of the same frame through one PSF, without a background: what the filter is for."""
     filter: WienerFilter
     solver: VideoSolver | None = None
+    """None until it was made: a filter is made in a moment, for the first picture."""
 
     @classmethod
     def of(cls, problem: Problem, binning: int, plane: int) -> Level:

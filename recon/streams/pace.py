@@ -15,29 +15,21 @@ from statistics import median
 LEAST_ITERATIONS = 2
 """Iterations a frame below which a coarser binning gives the better picture: one warm iteration a frame does
 not keep up with a moving scene, two do, and binning 2 x 2 loses less than the second gains."""
-
 ROOM = 1.25
 """A finer binning is gone back to where it leaves this much room in the budget, so that it stays there."""
-
 PATIENCE_COARSER, PATIENCE_FINER, PATIENCE_NEW = 3, 20, 5
 """Frames in a row for which another binning must look right (a finer one that was never tried: fewer): a
 picture's pixels should not flicker."""
-
 LARGEST_PATIENCE = 320
 """A finer binning that had to be left again soon is waited for twice as long, up to this."""
-
 SOON = 60
 """Pictures within which a finer binning that is left again has failed."""
-
 MEMORY = 7
 """Pictures whose median tells what things take: of single ones it says nothing."""
-
 HELPED = 0.8
 """A coarser binning has helped when its pictures take at most this share of the finer one's time."""
-
 LEAST_WORK = 0.2
 """Share of a picture's time that must be work for coarser pixels to be worth trying."""
-
 HOLD = 150
 """Pictures for which no coarser binning is tried after one did not help."""
 
@@ -50,8 +42,14 @@ class Spent:
     work_ms: float
     """Of it, processor time of the thread."""
 
+    def __add__(self, other: Spent) -> Spent:
+        return Spent(self.wall_ms + other.wall_ms, self.work_ms + other.work_ms)
+
+    def __sub__(self, other: Spent) -> Spent:
+        return self + other.scaled(-1)
+
     def scaled(self, factor: float) -> Spent:
-        """Return the same on ``factor`` times as many pixels."""
+        """Return so many times as much."""
         return Spent(factor * self.wall_ms, factor * self.work_ms)
 
     def for_work(self, work_ms: float) -> Spent:
@@ -75,10 +73,7 @@ class Cost:
     @property
     def least(self) -> Spent:
         """A picture of ``LEAST_ITERATIONS``."""
-        fixed, step = self.fixed, self.step
-        return Spent(
-            fixed.wall_ms + LEAST_ITERATIONS * step.wall_ms, fixed.work_ms + LEAST_ITERATIONS * step.work_ms
-        )
+        return self.fixed + self.step.scaled(LEAST_ITERATIONS)
 
 
 @dataclass
@@ -124,7 +119,7 @@ class Pace:
     def note(self, fixed: Spent, steps: Spent, count: int) -> None:
         """Take note of a picture of ``count`` iterations, which took ``steps``, and ``fixed`` the rest."""
         record = self._record
-        step = Spent(steps.wall_ms / count, steps.work_ms / count)
+        step = steps.scaled(1 / count)
         record.fixed.append(fixed)
         record.step.append(step)
         record.least_step_ms = min(record.least_step_ms, step.wall_ms)
@@ -176,10 +171,7 @@ class Pace:
 
     def give_up(self, level: int) -> None:
         """Choose a level no more that cannot be had, nor finer ones unless one of those is in use."""
-        if level <= self._level:
-            self.levels = tuple(b for b in self.levels if b > level)
-        else:
-            self.levels = tuple(b for b in self.levels if b != level)
+        self.levels = tuple(b for b in self.levels if b > level or (level > self._level and b != level))
         self._came_from = None
         self._votes = 0
 
@@ -199,10 +191,8 @@ class Pace:
             return wanted
         direction = 1 if wanted > self._level else -1
         self._votes = self._votes + direction if self._votes * direction > 0 else direction
-        if direction > 0:
-            patience = PATIENCE_COARSER
-        else:
-            patience = self._patience if wanted in self._known else PATIENCE_NEW
+        finer = self._patience if wanted in self._known else PATIENCE_NEW
+        patience = PATIENCE_COARSER if direction > 0 else finer
         if abs(self._votes) < patience:
             return self._level
         self._votes = 0

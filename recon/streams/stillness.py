@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.blocks import block_mean
+
 Array = npt.NDArray[Any]
 
 BLOCKS = (2, 4, 8)
-"""Sides of the blocks, pixels: caustics are about as wide."""
-
+"""Sides of the blocks, pixels, each twice the one before: caustics are about as wide."""
 LEAST_RATIO = 1.4
 """Block variance over that of white noise from which the scene is taken to have changed, where there are many
 blocks; few make the ratio itself uncertain, and five deviations of that are allowed for."""
-
 NEW_SCENE = 0.5
 """Share of a frame's variance that changed, from which nothing of the scene before helps. Measured: with a
 picture panning by 3 x 6 pixels a frame (a share of about 0.3) a warm start is still as good as a cold one."""
@@ -109,23 +109,11 @@ class SceneWatch:
         if variance == 0:
             return True
         blocks = change
-        side = 1
-        for wanted in BLOCKS:
+        for side in BLOCKS:
             if min(blocks.shape[1:]) < 2:
                 break
-            blocks = halved(blocks)
-            side *= 2
-            assert side == wanted
+            blocks = block_mean(blocks, 2)
             ratio = side**2 * float(np.vdot(blocks, blocks)) / blocks.size / variance
             if ratio > max(LEAST_RATIO, 1 + 5 * float(np.sqrt(2 / blocks.size))):
                 return False
         return True
-
-
-def halved(image: Array) -> Array:
-    """Return means of 2 x 2 pixels of (n_channels, height, width); an odd row or column is left out."""
-    height, width = (n // 2 * 2 for n in image.shape[1:])
-    rows = image[:, 0:height:2] + image[:, 1:height:2]
-    halves: Array = rows[:, :, 0:width:2] + rows[:, :, 1:width:2]
-    halves *= image.dtype.type(0.25)
-    return halves

@@ -29,10 +29,8 @@ from recon.types import Calibration
 COLD_ITERATIONS, WARM_ITERATIONS = 20, 4
 """Iterations of a block's first frame and of the others: as good as independent frames at their best where
 the scene stands, and near it where it moves by less than a pixel a frame (docs/benchmarks/video.md)."""
-
 BLOCK = 32
 """Frames a block: its cold start is then a seventh of the work."""
-
 SETTLED = 2e-4
 """Change an iteration below which a video's frame is done before its iterations are."""
 
@@ -45,6 +43,8 @@ def stream_problem(
 ) -> Problem:
     """Settle noise, scales and camera from one frame, for all frames of a video.
 
+    Raises InputError when the input is unusable, or no solver has a way for it.
+
     Parameters
     ----------
     frame : Measurement or array, (height, width[, n_channels])
@@ -54,11 +54,6 @@ def stream_problem(
         and the exact-data ADMM where that has a way.
     **overrides
         Single options, and facts about the frame, by their names, as of :func:`recon.reconstruct`.
-
-    Raises
-    ------
-    InputError
-        When the input is unusable, or no solver has a way for it.
     """
     known, options = given(overrides, options)
     measurement = frame if isinstance(frame, Measurement) else Measurement(frame)
@@ -79,6 +74,8 @@ class VideoSolver:
     takes new data in the memory that it has; other solvers are made anew for each frame, which costs what
     their making costs.
 
+    Raises InputError when the solver has no iterations, or no way for the problem.
+
     Parameters
     ----------
     problem : Problem
@@ -92,11 +89,6 @@ class VideoSolver:
     ----------
     iterations : int
         Since the last frame that began from zero.
-
-    Raises
-    ------
-    InputError
-        When the solver has no iterations, or no way for the problem.
     """
 
     def __init__(

@@ -95,26 +95,18 @@ def group_of(method: str) -> str | None:
 
 @dataclass(frozen=True)
 class Cases:
-    """Cases of a group of methods.
-
-    Attributes
-    ----------
-    weights : mapping
-        The evidence that spans the space in which distances tell how alike they are, see :data:`ALIKE`.
-    places : ndarray, (n, n_features)
-        In that space.
-    severities : ndarray, (n,)
-    scenes : ndarray of int, (n,)
-        Numbers of the mixed scenes that they come from; -1 for those of maps.
-    maps : tuple of str
-        The maps that they come from.
-    """
+    """Cases of a group of methods."""
 
     weights: Mapping[str, float]
+    """The evidence that spans the space in which distances tell how alike they are, see :data:`ALIKE`."""
     places: Floats
+    """(n, n_features): in that space."""
     severities: Floats
+    """(n,)."""
     scenes: npt.NDArray[np.int_]
+    """(n,): numbers of the mixed scenes that they come from; -1 for those of maps."""
     maps: tuple[str, ...]
+    """The maps that they come from."""
 
     @cached_property
     def typical(self) -> Floats | None:
@@ -174,30 +166,24 @@ def mixed_scenes() -> tuple[Mapping[str, Any], ...]:
 def cases_of(group: str) -> Cases:
     """Return the cases of a group: the shipped maps' and those of mixed scenes."""
     weights = weights_of(group)
-    places, severities, scenes, names = [], [], [], []
-    for name, stress in shipped_maps().items():
-        if name in INVISIBLE:
-            continue
-        for method, result in stress["methods"].items():
-            # "admm tv, left out": what follows the comma is how the data was handled.
-            if method.partition(",")[0] not in GROUPS[group]:
-                continue
-            for entry in result["evidence"]:
-                if not is_whole(entry, weights):
-                    continue
-                places.append(place_of(entry, weights))
-                severities.append(float(entry["severity"]))
-                scenes.append(-1)
-                names.append(name)
-    for entry in mixed_scenes():
-        if entry["method"] in GROUPS[group] and is_whole(entry["evidence"], weights):
-            places.append(place_of(entry["evidence"], weights))
-            severities.append(float(entry["severity"]))
-            scenes.append(int(entry["scene"]))
+    of_maps = [
+        (entry, entry["severity"], -1, name)
+        for name, stress in shipped_maps().items()
+        if name not in INVISIBLE
+        for method, result in stress["methods"].items()
+        # "admm tv, left out": what follows the comma is how the data was handled.
+        if method.partition(",")[0] in GROUPS[group]
+        for entry in result["evidence"]
+    ]
+    mixed = [
+        (entry["evidence"], entry["severity"], entry["scene"], entry["method"]) for entry in mixed_scenes()
+    ]
+    mixed = [case for case in mixed if case[3] in GROUPS[group]]
+    cases = [case for case in of_maps + mixed if is_whole(case[0], weights)]
     return Cases(
         weights,
-        np.array(places).reshape(-1, len(weights)),
-        np.array(severities),
-        np.array(scenes, int),
-        tuple(dict.fromkeys(names)),
+        np.array([place_of(evidence, weights) for evidence, *_ in cases]).reshape(-1, len(weights)),
+        np.array([severity for _, severity, *_ in cases], float),
+        np.array([scene for _, _, scene, _ in cases], int),
+        tuple(dict.fromkeys(name for _, _, scene, name in cases if scene < 0)),
     )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -43,81 +43,58 @@ LIMITS = (StopReason.ITERATIONS, StopReason.TIME, StopReason.CANCELLED)
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What was measured.
-
-    Attributes
-    ----------
-    signal : float
-        Standard deviation of the measurement over its pixels, less the noise', in units of the noise: what
-        there is to reconstruct from.
-    detail : float
-        Signal over noise of the picture's details of four to ten pixels, as the camera transmits them: root
-        of the power of the picture times the PSF's on that ring of frequencies, over the noise'.
-    unexplained : float
-        Residual beyond the expected noise, relative to the measurement's standard deviation without noise:
-        what the model does not describe (a moved diffuser, another depth or colour, stray light, saturation).
-    erased, saturated : float
-        Shares of the pixels: not used; used though at full scale.
-    lit, edges : float
-        Shares of the voxels that are not dark, and that differ from a neighbour.
-    load : float
-        Unknowns a measured pixel: lit voxels or edges, whichever are fewer, over the pixels used.
-    planes : int
-        Depths.
-    similarity : float
-        Greatest inner product of PSFs of neighbouring depths; 0 for one depth.
-    dimming : float
-        Least norm of a depth's PSF relative to the greatest: how much dimmer the farthest points are.
-    ambiguity : float
-        Greatest correlation of a PSF with itself, three pixels or more apart: near 1 for a regular array.
-    unsettled : float
-        Change of the last iteration over ten times the tolerance, where a limit ended the run; else 0.
-    height, peaks, ends : float or None
-        Of the bright points of a volume (:class:`Points`); None of a picture.
-    """
+    """What was measured."""
 
     signal: float
+    """Standard deviation of the measurement over its pixels, less the noise', in units of the noise: what
+    there is to reconstruct from."""
     detail: float
+    """Signal over noise of the picture's details of four to ten pixels, as the camera transmits them: root of
+    the power of the picture times the PSF's on that ring of frequencies, over the noise'."""
     unexplained: float
+    """Residual beyond the expected noise, relative to the measurement's standard deviation without noise:
+    what the model does not describe (a moved diffuser, another depth or colour, stray light, saturation)."""
     erased: float
     saturated: float
+    """``erased`` and ``saturated``: shares of the pixels: not used; used though at full scale."""
     lit: float
     edges: float
+    """``lit`` and ``edges``: shares of the voxels that are not dark, and that differ from a neighbour."""
     load: float
+    """Unknowns a measured pixel: lit voxels or edges, whichever are fewer, over the pixels used."""
     planes: int
+    """Depths."""
     similarity: float
+    """Greatest inner product of PSFs of neighbouring depths; 0 for one depth."""
     dimming: float
+    """Least norm of a depth's PSF relative to the greatest: how much dimmer the farthest points are."""
     ambiguity: float
+    """Greatest correlation of a PSF with itself, three pixels or more apart: near 1 for a regular array."""
     unsettled: float
+    """Change of the last iteration over ten times the tolerance, where a limit ended the run; else 0."""
     height: float | None = None
     peaks: float | None = None
     ends: float | None = None
+    """``height``, ``peaks`` and ``ends``: of the bright points of a volume (:class:`Points`); None of a
+    picture."""
 
     def as_json(self) -> dict[str, float]:
         """Return the numbers by name, but for those that were not measured."""
-        measured = ((name, getattr(self, name)) for name in self.__dataclass_fields__)
-        return {name: float(value) for name, value in measured if value is not None}
+        return {name: float(value) for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """One channel of what the camera saw.
-
-    Attributes
-    ----------
-    data : ndarray, (height, width)
-        Measurement, background subtracted, in units of its noise.
-    valid : ndarray of bool, (height, width)
-    noise : float
-        Its deviation, counts.
-    saturated : float
-        Share of the valid pixels at full scale.
-    """
+    """One channel of what the camera saw."""
 
     data: Array
+    """(height, width): measurement, background subtracted, in units of its noise."""
     valid: npt.NDArray[np.bool_]
+    """(height, width)."""
     noise: float
+    """Its deviation, counts."""
     saturated: float = 0.0
+    """Share of the valid pixels at full scale."""
 
 
 def measure(
@@ -129,25 +106,17 @@ def measure(
     unsettled: float,
     points: bool = False,
 ) -> Evidence:
-    """Measure a reconstruction of one channel.
+    """Measure one channel of a reconstruction, as :func:`evidence_of`.
 
-    Parameters
-    ----------
-    volume : ndarray, (n_z, rows, columns)
-        The result: ``measurement = sum_z PSF_z * volume_z``.
-    psfs : ndarray, (n_z, height, width)
-        On-axis PSFs as calibrated.
-    residual_norm : float
-        ``||A x - b||`` over the valid pixels, in units of the noise.
-    points : bool
-        Whether to look for its bright points as well.
+    ``volume`` is (n_z, rows, columns) and ``psfs`` (n_z, height, width): ``measurement = sum_z PSF_z *
+    volume_z``.
     """
     data, noise = seen.data, seen.noise
     used = data[seen.valid].astype(np.float64)
     signal2 = max(float(np.var(used)) - 1.0, NO_LESS)
     beyond2 = max(residual_norm**2 / len(used) - 1.0, 0.0)
     lit, edges = lit_and_edges(volume)
-    found = points_of(volume, _norms(psfs) / noise, len(used)) if points else None
+    found = asdict(points_of(volume, _norms(psfs) / noise, len(used))) if points else {}
     return Evidence(
         signal=float(np.sqrt(signal2)),
         detail=_detail(volume, psfs, noise, len(used)),
@@ -162,9 +131,7 @@ def measure(
         dimming=_dimming(psfs),
         ambiguity=_ambiguity(psfs[len(psfs) // 2]),
         unsettled=unsettled,
-        height=None if found is None else found.height,
-        peaks=None if found is None else found.peaks,
-        ends=None if found is None else found.ends,
+        **found,
     )
 
 
@@ -259,23 +226,16 @@ def lit_and_edges(volume: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """The bright points of a volume.
-
-    Attributes
-    ----------
-    height : float
-        Median height of the peaks found, as the camera sees them: a voxel's value times its PSF's norm, over
-        the noise. That is how far a single point stands above the noise of all pixels which it lights.
-    peaks : float
-        Strong peaks for each thousand measured pixels.
-    ends : float
-        Mean light of the two outermost planes over the mean plane's: above 1 where light that fits nowhere
-        gathers, or where the scene goes on beyond the calibrated depths.
-    """
+    """The bright points of a volume."""
 
     height: float
+    """Median height of the peaks found, as the camera sees them: a voxel's value times its PSF's norm, over
+    the noise. That is how far a single point stands above the noise of all pixels which it lights."""
     peaks: float
+    """Strong peaks for each thousand measured pixels."""
     ends: float
+    """Mean light of the two outermost planes over the mean plane's: above 1 where light that fits nowhere
+    gathers, or where the scene goes on beyond the calibrated depths."""
 
 
 def points_of(volume: Array, norms: npt.NDArray[np.float64], count: int) -> Points:
@@ -365,7 +325,8 @@ def evidence_of(
     psfs : ndarray, (n_z, 1 or n_channels, height, width)
         As calibrated.
     residuals : sequence of float
-        Residual norms in units of the noise: one a channel, or one of all together.
+        Norms ``||A x - b||`` over the valid pixels, in units of the noise: one a channel, or one of
+        all together.
     points : bool
         Whether to look for the result's bright points as well: of volumes.
     """

@@ -156,52 +156,35 @@ def reliable_share(method: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One stress that makes a reconstruction less reliable.
-
-    Attributes
-    ----------
-    stress : str
-        Name of the evidence, see :class:`~recon.verdict.evidence.Evidence`.
-    value : float
-        What was measured.
-    gain : float
-        By how much the share of failing cases would fall, were this one as in a good case; where no case is
-        much like it, by how much nearer the nearest would be.
-    words, help : str
-        What it is, and what would help.
-    """
+    """One stress that makes a reconstruction less reliable."""
 
     stress: str
+    """Name of the evidence, see :class:`~recon.verdict.evidence.Evidence`."""
     value: float
+    """What was measured."""
     gain: float
+    """By how much the share of failing cases would fall, were this one as in a good case; where no case is
+    much like it, by how much nearer the nearest would be."""
     words: str
     help: str
+    """``words`` and ``help``: what it is, and what would help."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether to trust a reconstruction.
-
-    Attributes
-    ----------
-    method : str
-        The maps' name of the method.
-    failing : float or None
-        Share of the most similar cases of the maps that failed; None where there are none.
-    findings : tuple of Finding
-        What limits, the most limiting first.
-    evidence : mapping
-        What was measured, see :class:`~recon.verdict.evidence.Evidence`.
-    basis : str
-        By which cases it was judged.
-    """
+    """Whether to trust a reconstruction."""
 
     region: Region
     method: str
+    """The maps' name of the method."""
     failing: float | None
+    """Share of the most similar cases of the maps that failed; None where there are none."""
     findings: tuple[Finding, ...]
+    """What limits, the most limiting first."""
     evidence: Mapping[str, float] = field(default_factory=dict)
+    """What was measured, see :class:`~recon.verdict.evidence.Evidence`."""
     basis: str = ""
+    """By which cases it was judged."""
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -276,14 +259,11 @@ def verdict_on(evidence: Evidence, method: str, cases: Cases | None = None) -> V
     sources = [f"maps {', '.join(cases.maps)}"] if cases.maps else []
     sources += [f"{cases.n_scenes} mixed scenes"] if cases.n_scenes else []
     basis = f"{count} nearest of {len(cases.severities)} simulated cases ({'; '.join(sources)})"
-    if region is Region.UNKNOWN:  # those stresses first without which cases would be nearest
 
-        def gain(relieved: Floats) -> float:
-            return _third_nearest(cases, place) - _third_nearest(cases, relieved)
-    else:  # those first whose removal would lower the share of failures most
-
-        def gain(relieved: Floats) -> float:
-            return share - failing_share(cases, relieved, count)[0]
+    def gain(relieved: Floats) -> float:
+        other, third = failing_share(cases, relieved, count)
+        # Those stresses first without which cases would be nearest, or the share of failures lowest.
+        return nearest - third if region is Region.UNKNOWN else share - other
 
     findings = _clipped_first(_relieved(cases, place, numbers, gain), numbers)
     findings = _unfinished_first(findings, numbers, reliable)
@@ -313,10 +293,6 @@ def failing_share(cases: Cases, place: Floats, count: int) -> tuple[float, float
     return float(np.sum(weight * failed) / np.sum(weight)), float(distance[order[2]])
 
 
-def _third_nearest(cases: Cases, place: Floats) -> float:
-    return float(np.sort(np.linalg.norm(cases.places - place, axis=1))[2])
-
-
 def _relieved(
     cases: Cases, place: Floats, numbers: Mapping[str, float], gain_of: Callable[[Floats], float]
 ) -> tuple[Finding, ...]:
@@ -339,6 +315,13 @@ def _relieved(
     return tuple(sorted(findings, key=lambda f: -f.gain))
 
 
+def _named(stress: str, findings: tuple[Finding, ...], numbers: Mapping[str, float]) -> Finding:
+    """Return the finding of a stress; one that is not among the findings gains nothing."""
+    _, words, help_ = STRESSES[stress]
+    gain = next((f.gain for f in findings if f.stress == stress), 0.0)
+    return Finding(stress, numbers[stress], gain, words.format(value=numbers[stress]), help_)
+
+
 def _clipped_first(findings: tuple[Finding, ...], numbers: Mapping[str, float]) -> tuple[Finding, ...]:
     """Return the findings, first that pixels are at full scale where many are, and none that asks for light.
 
@@ -346,10 +329,7 @@ def _clipped_first(findings: tuple[Finding, ...], numbers: Mapping[str, float]) 
     """
     if numbers["saturated"] < CLIPPED:
         return findings
-    _, words, help_ = STRESSES["saturated"]
-    value = numbers["saturated"]
-    gain = next((f.gain for f in findings if f.stress == "saturated"), 0.0)
-    first = Finding("saturated", value, gain, words.format(value=value), help_)
+    first = _named("saturated", findings, numbers)
     others = (f for f in findings if f.stress not in ("saturated", *OF_LIGHT))
     return (first, *(replace(f, help=WITHOUT_LIGHT.get(f.stress, f.help)) for f in others))
 
@@ -366,9 +346,7 @@ def _unfinished_first(
     still_changing = numbers["unsettled"] >= UNSETTLED and reliable
     if numbers["unsettled"] < UNFINISHED and not still_changing:
         return findings
-    _, words, help_ = STRESSES["unsettled"]
+    first = _named("unsettled", findings, numbers)
     if numbers["unsettled"] >= DIVERGED:
-        help_ += ", or another method if they make it worse"
-    gain = next((f.gain for f in findings if f.stress == "unsettled"), 0.0)
-    first = Finding("unsettled", numbers["unsettled"], gain, words, help_)
+        first = replace(first, help=f"{first.help}, or another method if they make it worse")
     return (first, *(f for f in findings if f.stress != "unsettled"))

@@ -127,25 +127,18 @@ def convergence_severity(
 # Maps -----------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Stress:
-    """A stress.
-
-    Attributes
-    ----------
-    values : tuple of float
-        For the full size, rising.
-    quick : tuple of float
-        For the quick size.
-    named : callable, optional
-        ``named(value, size)`` says what a value is in other units: the name of its tick.
-    """
+    """A stress."""
 
     key: str
     label: str
     unit: str
     values: tuple[float, ...]
+    """For the full size, rising."""
     quick: tuple[float, ...]
+    """For the quick size."""
     logarithmic: bool = False
     named: Callable[[float, Size], str] | None = None
+    """``named(value, size)`` says what a value is in other units: the name of its tick."""
 
     def at(self, size: Size) -> tuple[float, ...]:
         """Return the values of a size."""
@@ -154,21 +147,14 @@ class Stress:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One reconstruction under stress.
-
-    Attributes
-    ----------
-    error : float
-        What the map's ``error`` says: NRMSE after the best scale, or decibels.
-    severities : mapping
-        By criterion, see :mod:`recon.verdict.map`.
-    evidence : mapping
-        What the data alone tell (see :mod:`recon.verdict.evidence`); empty where nothing was reconstructed.
-    """
+    """One reconstruction under stress."""
 
     error: float
+    """What the map's ``error`` says: NRMSE after the best scale, or decibels."""
     severities: Severities
+    """By criterion, see :mod:`recon.verdict.map`."""
     evidence: Mapping[str, float] = field(default_factory=dict)
+    """What the data alone tell (see :mod:`recon.verdict.evidence`); empty where nothing was reconstructed."""
 
 
 TrialFunction = Callable[[str, float, float, int, Size], Trial]
@@ -177,27 +163,20 @@ TrialFunction = Callable[[str, float, float, int, Size], Trial]
 
 @dataclass(frozen=True, slots=True)
 class StressMap:
-    """A map to be made.
-
-    Attributes
-    ----------
-    question : str
-        What it answers, in plain words.
-    error : str
-        What the errors are.
-    base : str
-        What the trials start from, in words that change when it does; empty where that is not known.
-    """
+    """A map to be made."""
 
     name: str
     title: str
     question: str
+    """What it answers, in plain words."""
     x: Stress
     y: Stress
     methods: tuple[str, ...]
     trial: TrialFunction
     error: str = "NRMSE"
+    """What the errors are."""
     base: str = ""
+    """What the trials start from, in words that change when it does; empty where that is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,19 +213,12 @@ def cell_of(method: str, ix: int, iy: int, trial: Trial, seconds: float) -> Cell
     return Cell(method, ix, iy, float(trial.error), severity, failure, evidence, seconds)
 
 
-def severity_grid(cells: list[Cell], method: str, shape: tuple[int, int]) -> npt.NDArray[np.float64]:
-    """Return the severities of a method, (n_y, n_x); NaN where there is no cell yet."""
-    grid = np.full(shape, np.nan)
-    for cell in cells:
-        if cell.method == method:
-            grid[cell.iy, cell.ix] = cell.severity
-    return grid
-
-
 def boundary(
     x: tuple[float, ...], y: tuple[float, ...], severity: npt.NDArray[np.float64], *, logarithmic: bool
 ) -> list[tuple[float, float]]:
     """Return where each row crosses from working to failing, ``(x, y)``; other rows have no point.
+
+    ``severity`` is (n_y, n_x), NaN where it is not known.
 
     Between two cells the crossing is interpolated on the logarithm of the severity, along ``x`` or its
     logarithm. A row that crosses more than once counts where most of its cells are on the right side.

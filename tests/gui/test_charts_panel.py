@@ -180,7 +180,7 @@ def test_a_chart_shows_the_front_and_ranks_the_settings(
     qtbot.mouseClick(panel.copy_button, Qt.MouseButton.LeftButton)
     names: dict = {}
     exec(QApplication.clipboard().text(), names)
-    assert names["ranked"][0]["psnr_db"] == 26.0
+    assert names["ranked"][0].psnr_db == 26.0
 
 
 def test_a_chart_of_calibrations_is_drawn_against_photographs_scene_by_scene(

@@ -12,6 +12,7 @@ from instrument.reconstruction.checkpointing import CheckpointFolder, digest
 from recon.camera.convolution import Convolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers import Fista, SensorAdmm, StoppingRules
+from recon.solvers.volume_admm import VolumeAdmm
 
 SIZE = 24
 
@@ -140,8 +141,55 @@ def test_a_damaged_file_is_named(tmp_path):
     with pytest.raises(FileError, match=r"picture\.npz.*cannot be read as a checkpoint"):
         keeper.resume("", solver())
     solver(Fista).run(StoppingRules(iterations=2), keeper=CheckpointFolder(tmp_path / "other", {}))
-    with pytest.raises(FileError, match="cannot be read as a checkpoint"):
+    with pytest.raises(FileError, match="kept by another version of the program, or of another solver"):
         CheckpointFolder(tmp_path / "other", {}).resume("", solver())
+
+
+def volume_solver():
+    rng = np.random.default_rng(2)
+    camera = Convolution(rng.random((2, 1, 5, 6)), (8, 9))
+    prior = TotalVariation.of_volume(0.1) + NonNegativity()
+    return VolumeAdmm(camera, rng.random((1, 8, 9)).astype(np.float32), prior)
+
+
+def test_what_priors_that_were_split_off_keep_is_gone_on_with(tmp_path):
+    keeper = CheckpointFolder(tmp_path / "kept", {})
+    rules = StoppingRules(iterations=12, tolerance=0)
+    whole = volume_solver().run(rules)
+    volume_solver().run(StoppingRules(iterations=5, tolerance=0), keeper=keeper)
+    assert np.array_equal(volume_solver().run(rules, keeper=keeper).solution, whole.solution)
+
+
+OLD_PROBLEM = {
+    "kind": "picture", "measurement": "1 x 24 x 24 float32, 0123456789abcdef", "method": "admm",
+    "program": "diffuserbench 0.1.0", "tau": None,
+}  # fmt: skip
+"""Some of what commit 813d646 wrote."""
+
+
+def test_a_folder_of_an_older_version_is_refused_in_one_sentence(files, run):
+    kept = files / "kept"
+    kept.mkdir()
+    (kept / "problem.json").write_text(json.dumps(OLD_PROBLEM))
+    np.savez(kept / "picture.npz", **{"history": np.ones((1, 8)), "state/_tx": np.zeros((1, 4, 4))})
+    before = {path.name: path.read_bytes() for path in kept.iterdir()}
+    code, said = run("--psf", files / "psf.tif", "-n", 5, "--checkpoint", kept, "-o", files / "a.tif")
+    assert code == 2
+    assert "was kept by another version of the program, which this one cannot go on from." in said
+    assert "Traceback" not in said
+    assert {path.name: path.read_bytes() for path in kept.iterdir()} == before
+
+
+@pytest.mark.parametrize("lacking", ["iteration", "_mu", "_splits.tx"])
+def test_a_state_that_lacks_something_is_refused(tmp_path, lacking):
+    keeper = CheckpointFolder(tmp_path / "kept", {})
+    solver().run(StoppingRules(iterations=2), keeper=keeper)
+    path = tmp_path / "kept" / "picture.npz"
+    with np.load(path) as kept:
+        state = {name: kept[name] for name in kept.files if name != f"state/{lacking}"}
+    np.savez(path, **state)
+    with pytest.raises(FileError, match=rf"another version of the program.* has no '{lacking}'"):
+        keeper.resume("", solver())
 
 
 def test_a_digest_tells_arrays_apart():

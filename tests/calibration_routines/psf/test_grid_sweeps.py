@@ -24,7 +24,7 @@ from calibration_routines import (
     grid_sweep,
     lateral_spacing,
     photograph,
-    watch_resumed,
+    watch_sweep,
 )
 from calibration_routines.psf.analysis import feature_size_px, optical_binning
 from calibration_routines.psf.stage_fit import fit_stage, judge_drift
@@ -286,7 +286,7 @@ def test_a_sweep_that_was_cut_off_is_resumed_and_becomes_a_calibration(bench: Be
     runner, findings = prepare_resume(bench, run)
     assert findings.stored >= 9
     events: list[SweepEvent] = []
-    watch_resumed(bench, runner, Following(on_event=events.append))
+    watch_sweep(bench, runner, Following(on_event=events.append))
     assert runner.execute().condition is RunCondition.COMPLETED
     done = finish_sweep(run, bench)
     assert done.findings == ()

@@ -9,15 +9,15 @@ from collections.abc import Callable
 
 import pytest
 
-from instrument.runs.finish import CtrlC, interrupts_held
+from instrument.runs.finish import ctrl_c_remembered, interrupts_held
 
 
-def in_context(work: Callable[[CtrlC], None]) -> None:
-    with CtrlC() as ctrl_c:
-        work(ctrl_c)
+def in_context(work: Callable[[Callable[[], None]], None]) -> None:
+    with ctrl_c_remembered() as check:
+        work(check)
 
 
-def swallow(_: CtrlC) -> None:
+def swallow(_: Callable[[], None]) -> None:
     with contextlib.suppress(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
 
@@ -26,7 +26,7 @@ def test_it_interrupts_at_once_and_puts_the_handler_back() -> None:
     before = signal.getsignal(signal.SIGINT)
     done: list[str] = []
 
-    def work(_: CtrlC) -> None:
+    def work(_: Callable[[], None]) -> None:
         signal.raise_signal(signal.SIGINT)
         done.append("went on")
 
@@ -39,10 +39,10 @@ def test_it_interrupts_at_once_and_puts_the_handler_back() -> None:
 def test_a_swallowed_interrupt_is_raised_again_by_the_next_check() -> None:
     done: list[str] = []
 
-    def work(ctrl_c: CtrlC) -> None:
-        swallow(ctrl_c)
+    def work(check: Callable[[], None]) -> None:
+        swallow(check)
         done.append("went on")
-        ctrl_c.check()
+        check()
         done.append("went on after the check")
 
     with pytest.raises(KeyboardInterrupt):
@@ -56,7 +56,7 @@ def test_a_swallowed_interrupt_is_raised_at_the_latest_at_the_end() -> None:
 
 
 def test_without_ctrl_c_and_in_other_threads_nothing_happens() -> None:
-    in_context(CtrlC.check)
+    in_context(lambda check: check())
     before = signal.getsignal(signal.SIGINT)
     during: list[object] = []
     thread = threading.Thread(

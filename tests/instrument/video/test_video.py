@@ -20,9 +20,10 @@ from ome_zarr_models.v05 import Image
 
 from instrument.cli import main
 from instrument.files.errors import BenchError, FileError
+from instrument.files.images import as_shown
 from instrument.plan import Part, Plan
 from instrument.reconstruction import video_work as block_module
-from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.options import InputOptions, VideoOptions
 from instrument.reconstruction.video import (
     PreparedVideo,
     VideoRequest,
@@ -30,7 +31,7 @@ from instrument.reconstruction.video import (
     prepare_video,
     solve_video,
 )
-from instrument.reconstruction.video_files import VideoPictures, as_shown, has_light, levels_of, require_video
+from instrument.reconstruction.video_files import VideoPictures, has_light, levels_of, require_video
 from instrument.reconstruction.video_work import BlockReport, cluster, on_cluster
 from instrument.runs.run import Run
 from recon import reconstruct
@@ -76,16 +77,16 @@ def request(recording: Path, folder: Path, **changes: object) -> VideoRequest:
         psf=recording.parent / "psf.npy",
         inputs=InputOptions(dark=20.0, binning=1),
         options=ReconstructionOptions(iterations=25),
-        block=4,
-        warm_iterations=5,
+        video=VideoOptions(block=4, warm_iterations=5),
     )
-    return replace(given, **changes)  # type: ignore[arg-type]
+    of_video = {name: changes.pop(name) for name in list(changes) if hasattr(given.video, name)}
+    return replace(given, video=replace(given.video, **of_video), **changes)  # type: ignore[arg-type]
 
 
-def solved(wanted: VideoRequest, **how: object) -> list[BlockReport]:
+def solved(wanted: VideoRequest) -> list[BlockReport]:
     reports: list[BlockReport] = []
     prepared = prepare_video(wanted)
-    assert solve_video(prepared, reports.append, threading.Event(), **how)  # type: ignore[arg-type]
+    assert solve_video(prepared, reports.append, threading.Event())
     finish_video(prepared)
     return reports
 

@@ -23,7 +23,7 @@ from recon.analysis.resolution import (
     lateral_spacing_um,
     voxel_grid,
 )
-from recon.camera.refocus import rescaled
+from recon.camera.registration import rescaled
 from recon.errors import InputError
 
 

@@ -11,14 +11,14 @@ import pytest
 import scipy.fft
 
 from recon.base import fft
-from recon.base.threads import in_blocks
+from recon.base.threads import get_threads, in_blocks, set_threads
 
 
 @pytest.fixture
 def threads():
-    before = fft.get_threads()
-    yield fft.set_threads
-    fft.set_threads(before)
+    before = get_threads()
+    yield set_threads
+    set_threads(before)
 
 
 SHAPES = [((6, 7), 2), ((2, 5, 8), 2), ((2, 3, 4, 6), 3), ((9,), 1), ((1, 1), 2)]

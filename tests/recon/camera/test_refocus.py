@@ -8,8 +8,8 @@ import pytest
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.correlation import across_field, similarity
-from recon.camera.refocus import at_depth, central_psfs, paraxial_scale, refocus, refocus_psf, rescaled
-from recon.camera.registration import register
+from recon.camera.refocus import at_depth, central_psfs, paraxial_scale, refocus, refocus_psf
+from recon.camera.registration import register, rescaled
 from recon.errors import InputError
 from recon.types import Calibration, Geometry
 
@@ -121,16 +121,13 @@ def test_of_a_field_the_psf_nearest_to_the_axis_is_taken_and_said() -> None:
     assert not refocus(calibrated([40e3, 60e3, 100e3]), 75e3).extrapolated
 
 
-def test_rescaling_keeps_the_centre_and_moves() -> None:
+def test_rescaling_keeps_the_centre() -> None:
     image = np.zeros((41, 61), np.float32)
     image[15:26, 25:36] = 1.0
     small = rescaled(image, 2.0)
     assert small.sum() == pytest.approx(image.sum() / 4, rel=0.02)
-    y, x = np.mgrid[:41, :61]
+    y = np.mgrid[:41, :61][0]
     assert (small * y).sum() / small.sum() == pytest.approx(20.0, abs=1e-3)
-    moved = rescaled(image, 1.0, shift=(2.0, -3.0))
-    assert (moved * x).sum() / moved.sum() == pytest.approx(27.0, abs=1e-3)
-    assert moved.min() >= 0
 
 
 def test_what_is_not_known_is_refused_in_words() -> None:

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.camera.refocus import paraxial_scale
-from recon.camera.registration import aligned, displacement, expected_shift, register, scaled
+from recon.camera.registration import aligned, displacement, expected_shift, register, rescaled
 from recon.errors import InputError
 from recon.optics.diffuser import microlens_diffuser, smooth_diffuser
 from recon.optics.grid import GREEN, PixelGrid
@@ -145,7 +145,7 @@ def test_scaling_keeps_the_light_and_the_centre() -> None:
     y, x = np.mgrid[:81, :101]
     blob = np.exp(-0.5 * (((y - 40) / 6) ** 2 + ((x - 50) / 6) ** 2)).astype(np.float32)
     for factor in (0.7, 1.4):
-        larger = scaled(blob, factor)
+        larger = rescaled(blob, 1 / factor) / factor**2
         assert larger.sum() == pytest.approx(blob.sum(), rel=2e-3)
         assert np.unravel_index(int(larger.argmax()), larger.shape) == (40, 50)
 

@@ -10,7 +10,7 @@ from recon.errors import InputError
 from recon.evaluation.chart_judge import Judge
 from recon.evaluation.chart_reconstruction import ChartProblem
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scored import Point, even_with_best, pareto
+from recon.evaluation.scored import HELD_OUT, KINDS, Point, even_with_best, pareto
 from recon.evaluation.trial import Setting
 from recon.priors import PRIORS
 from recon.reconstruction.reconstruct import reconstruct
@@ -189,8 +189,9 @@ def test_the_front_is_what_nothing_beats():
         Point("quick", 1, 1.0, 1.0, 2.0, 25.0),
         Point("same time, worse", 1, 1.0, 1.0, 3.0, 24.0),
     ]
-    assert [p.setting for p in pareto(made, "psnr_db")] == ["quick", "slow good"]
-    assert [p.setting for p in pareto(made, "held_out")] == ["quick", "slow good"]
+    psnr, *_ = KINDS["reconstruction"].scores
+    assert [p.setting for p in pareto(made, psnr)] == ["quick", "slow good"]
+    assert [p.setting for p in pareto(made, HELD_OUT)] == ["quick", "slow good"]
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])

@@ -11,7 +11,7 @@ from recon.evaluation.map_trials import _OffBalance
 from recon.evaluation.maps import MAPS, map_named, run_map
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers.sensor_admm import SensorAdmm
-from recon.verdict.map import Cell, Failure, Stress, StressMap, Trial, boundary, severity_grid
+from recon.verdict.map import Cell, Failure, Stress, StressMap, Trial, boundary
 
 X = Stress("light", "light", "electrons", (1, 10, 100, 1000), (1, 100), logarithmic=True)
 Y = Stress("noise", "noise", "electrons", (1, 2, 4), (1, 4))
@@ -39,8 +39,9 @@ def test_a_cell_survives_its_file() -> None:
 
 
 def test_the_boundary_is_interpolated_where_the_severity_crosses_one() -> None:
-    cells = list(run_map(MAP, "full"))
-    grid = severity_grid(cells, "one", (3, 4))
+    grid = np.empty((3, 4))
+    for cell in run_map(MAP, "full", methods=["one"]):
+        grid[cell.iy, cell.ix] = cell.severity
     # Severity 30 y / x is 1 at x = 30 y, exactly so on logarithmic axes.
     assert boundary(X.values, Y.values, grid, logarithmic=True) == [
         (pytest.approx(30 * y), y) for y in Y.values

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.base import fft
+from recon.base.threads import get_threads, set_threads
 from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.priors import L1, Box, Differences, HaarTotalVariation, NonNegativity, TotalVariation, Zero
@@ -135,15 +135,15 @@ def test_float32_follows_float64():
 
 
 def test_does_not_depend_on_threads():
-    before = fft.get_threads()
+    before = get_threads()
     solutions = []
     try:
         for threads in (1, 3):
-            fft.set_threads(threads)
+            set_threads(threads)
             solver = Admm(*problem(2, dtype=np.float32), PRIORS["isotropic tv"])
             solutions.append(solver.run(StoppingRules(iterations=30, tolerance=0)))
     finally:
-        fft.set_threads(before)
+        set_threads(before)
     assert np.array_equal(solutions[0].solution, solutions[1].solution)
     assert solutions[0].history[-1].objective == solutions[1].history[-1].objective
 
@@ -188,7 +188,7 @@ def test_settling_a_penalty_leaves_split_and_multiplier(name):
         solver.step()
 
     def split_and_multiplier():
-        t = np.stack([solver._tx, solver._ty])
+        t = np.stack([solver._splits.tx, solver._splits.ty])
         size = np.linalg.norm(t, axis=0) if "iso" in name else np.abs(t)
         mu = solver._mu[0][:, None, None]
         u = t * np.maximum(1 - 0.05 / mu / np.maximum(size, 1e-300), 0)

@@ -10,6 +10,7 @@ import scipy.fft
 
 from recon.base import fft
 from recon.base.metrics import psnr
+from recon.base.threads import get_threads, set_threads
 from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation, Zero
@@ -130,14 +131,14 @@ def test_float32_follows_float64():
 
 
 def test_does_not_depend_on_threads():
-    before = fft.get_threads()
+    before = get_threads()
     ends = []
     try:
         for threads in (1, 3):
-            fft.set_threads(threads)
+            set_threads(threads)
             ends.append(run(*problem(2, dtype=np.float32, erased=True), PRIORS["isotropic tv"], 30, 0))
     finally:
-        fft.set_threads(before)
+        set_threads(before)
     assert np.array_equal(ends[0].solution, ends[1].solution)
     assert ends[0].history[-1].objective == ends[1].history[-1].objective
 
