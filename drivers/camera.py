@@ -212,12 +212,8 @@ class Camera(Device):
     def snap(self) -> Frame:
         """Take one frame whose exposure begins after this call, and wait for it.
 
-        Raises
-        ------
-        DeviceTimeoutError
-            When no frame came in the time the exposure and read-out need, with a margin.
-        StoppedError
-            When ``stop_sequence`` was called from another thread meanwhile.
+        Raises DeviceTimeoutError when no frame came in the time the exposure and read-out need, with a
+        margin; StoppedError when ``stop_sequence`` was called from another thread meanwhile.
         """
 
     @abstractmethod

@@ -392,10 +392,7 @@ def _naming(part: str) -> Iterator[None]:
 def _stage_driver(name: str) -> type[Stage]:
     """Return the driver of a part.
 
-    Raises
-    ------
-    ValidationError
-        At the key ``driver``, when there is no such driver or it cannot be a part.
+    Raises ValidationError: at the key ``driver``, when there is no such driver or it cannot be a part.
     """
     names = [known for known in driver_names("stage") if known != _NAME]
     if name not in names:

@@ -155,10 +155,8 @@ class Device(ABC):
 
         Nothing is opened that another program may be using, and nothing is written to a serial port.
 
-        Raises
-        ------
-        DeviceError
-            When its bus cannot be looked at: a library that is not installed, with how to install it.
+        Raises DeviceError when its bus cannot be looked at: a library that is not installed, with how to
+        install it.
         """
         return ()
 
@@ -168,10 +166,7 @@ class Device(ABC):
 
         Only called on the user's request, with the port claimed.
 
-        Raises
-        ------
-        DeviceError
-            When the port cannot be opened. Silence and other devices' answers are no error.
+        Raises DeviceError when the port cannot be opened. Silence and other devices' answers are no error.
         """
         return None
 
@@ -184,10 +179,7 @@ class Device(ABC):
     def open(self) -> None:
         """Connect and bring the device to its safe state. Opening an open device does nothing.
 
-        Raises
-        ------
-        DeviceError
-            When it is missing, busy or does not answer.
+        Raises DeviceError when it is missing, busy or does not answer.
         """
 
     @abstractmethod

@@ -70,19 +70,13 @@ class LedArray(Device):
     def set_pattern(self, pattern: LedPattern) -> LedPattern:
         """Show a pattern and return it once the device has confirmed.
 
-        Raises
-        ------
-        LimitError
-            When an index or a level is out of range; the pattern shown stays.
+        Raises LimitError when an index or a level is out of range; the pattern shown stays.
         """
 
     def check(self, pattern: LedPattern) -> None:
         """Refuse a pattern that the array cannot show.
 
-        Raises
-        ------
-        LimitError
-            When an index or a level is out of range.
+        Raises LimitError when an index or a level is out of range.
         """
         count = len(self.led_positions_mm)
         for led, rgb in pattern.levels:

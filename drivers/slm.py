@@ -40,10 +40,7 @@ class Slm(Device):
     def display(self, levels: npt.NDArray[np.uint8]) -> None:
         """Show ``(height, width)`` uint8 grey levels, confirmed and settled when this returns.
 
-        Raises
-        ------
-        LimitError
-            When shape or dtype do not fit; the image shown stays.
+        Raises LimitError when shape or dtype do not fit; the image shown stays.
         """
 
     @property

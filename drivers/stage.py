@@ -73,13 +73,8 @@ class Stage(Device):
         dict
             The position reached (or, without waiting, the position as the move starts).
 
-        Raises
-        ------
-        LimitError
-            When any target is outside its soft limits or no finite number, an axis is unknown, or the
-            stage is not homed.
-        StoppedError
-            When ``stop`` ended the move.
+        Raises LimitError when any target is outside its soft limits or no finite number, an axis is unknown,
+        or the stage is not homed; StoppedError when ``stop`` ended the move.
         """
 
     def move_by(self, delta: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:

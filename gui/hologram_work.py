@@ -47,10 +47,7 @@ _FRAME_S = 0.02
 def plane_of(text: str) -> tuple[Path, float]:
     """Return a picture in another plane and its depth in mm, from ``FILE @ DEPTH mm``.
 
-    Raises
-    ------
-    BenchError
-        When it is not understood, or there is no such file.
+    Raises BenchError when it is not understood, or there is no such file.
     """
     name, at, depth = text.rpartition("@")
     bare = depth.strip().removesuffix("mm").strip()

@@ -85,10 +85,7 @@ class JobContext:
     def report(self, value: object) -> None:
         """Tell how far it is (``Job.progressed``); of several in quick succession only the newest arrives.
 
-        Raises
-        ------
-        JobCancelledError
-            When the job was cancelled, so that work which reports can be cancelled.
+        Raises JobCancelledError when the job was cancelled, so that work which reports can be cancelled.
         """
         with self._lock:
             first, self._newest = not self._newest, [value]
@@ -225,11 +222,8 @@ class JobRunner(QObject):
 
         One that is ``endless`` goes on until it is cancelled: nothing may wait behind it.
 
-        Raises
-        ------
-        BusyError
-            When a job that holds the whole bench runs or waits, an endless one holds a device, or too many
-            jobs wait.
+        Raises BusyError when a job that holds the whole bench runs or waits, an endless one holds a device,
+        or too many jobs wait.
         """
         self._require_free(lanes)
         if len(self._waiting) >= _MOST_WAITING:
@@ -241,10 +235,7 @@ class JobRunner(QObject):
     def exclusive(self, title: str, work: Work) -> Job:
         """Run a job that needs the whole bench: a sweep, a run, a calibration.
 
-        Raises
-        ------
-        BusyError
-            When another such job runs or waits, or an endless one holds a device.
+        Raises BusyError when another such job runs or waits, or an endless one holds a device.
         """
         self._require_free(DEVICE_LANES)
         return self._add(title, work, DEVICE_LANES, exclusive=True)

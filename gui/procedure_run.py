@@ -188,10 +188,7 @@ class ProcedureRun(QObject):
     def start(self, title: str, procedure: Procedure) -> Job:
         """Carry out a procedure, in a job.
 
-        Raises
-        ------
-        BusyError
-            When something else holds the bench.
+        Raises BusyError when something else holds the bench.
         """
         control, mailbox, bench = RunControl(), _Mailbox(), self._session.bench
 

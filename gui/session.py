@@ -215,10 +215,7 @@ class BenchSession(QObject):
     def exclusive_job(self, title: str, work: Work) -> Job:
         """Run a job that needs the whole bench (a run, a calibration): the live view is ended for it.
 
-        Raises
-        ------
-        BusyError
-            When another such job runs.
+        Raises BusyError when another such job runs.
         """
 
         def alone(context: JobContext) -> Any:

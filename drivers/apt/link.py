@@ -84,12 +84,7 @@ class Link(SerialTransport):
         channel : int, optional
             First word of the reply's data, or its first parameter.
 
-        Raises
-        ------
-        DeviceTimeoutError
-            When no whole reply came.
-        DeviceError
-            When the port failed.
+        Raises DeviceTimeoutError when no whole reply came; DeviceError when the port failed.
         """
         for attempt in range(_ATTEMPTS):
             try:
@@ -107,10 +102,7 @@ class Link(SerialTransport):
     def info(self) -> HardwareInfo:
         """Ask who the controller is.
 
-        Raises
-        ------
-        DeviceError
-            When it is of another type than ``bench.toml`` says.
+        Raises DeviceError when it is of another type than ``bench.toml`` says.
         """
         address = self.controller.address
         data = self.ask(short(HW_REQ_INFO, address), HW_GET_INFO, None).data

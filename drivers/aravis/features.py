@@ -33,10 +33,7 @@ def load(device: str) -> Any:
     device : str
         Who asks, for the error.
 
-    Raises
-    ------
-    DeviceError
-        When PyGObject or Aravis is not installed, saying which.
+    Raises DeviceError when PyGObject or Aravis is not installed, saying which.
     """
     with _lock:
         try:
@@ -62,10 +59,7 @@ def library_error() -> type[Exception]:
 def find_camera(aravis: Any, device: str, wanted: str | None) -> Any:
     """Return the library's camera of an id or network address; of None the only one there is.
 
-    Raises
-    ------
-    DeviceError
-        When it is not found, or there are several.
+    Raises DeviceError when it is not found, or there are several.
     """
     if wanted is not None and wanted.startswith(FAKE_PREFIX):
         aravis.enable_interface("Fake")
@@ -270,10 +264,7 @@ class Features:
     def set_any(self, name: str, value: FeatureValue) -> None:
         """Set a feature of any kind by what its description says it is.
 
-        Raises
-        ------
-        LimitError
-            No such feature, or a value it does not take.
+        Raises LimitError: no such feature, or a value it does not take.
         """
         node = self._device.get_feature(name)
         if node is None:

@@ -168,10 +168,7 @@ class BufferedCamera(KeptSettings):
     def open(self) -> None:
         """Connect, bring the camera to its safe state, and bring back what was set before.
 
-        Raises
-        ------
-        DeviceError
-            When it is missing or busy, or does not take back its settings.
+        Raises DeviceError when it is missing or busy, or does not take back its settings.
         """
         if self.is_open:
             return

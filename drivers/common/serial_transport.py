@@ -133,10 +133,8 @@ class SerialTransport:
     def open(self) -> None:
         """Open the port for this owner alone. Opening an open port does nothing.
 
-        Raises
-        ------
-        DeviceError
-            When the port is missing, may not be used, or has another owner (which is named where known).
+        Raises DeviceError when the port is missing, may not be used, or has another owner (which is named
+        where known).
         """
         with self._owner:
             if self._serial is not None:
@@ -185,10 +183,7 @@ class SerialTransport:
         tuple of str
             The settings that could not be brought back; each is logged with its reason.
 
-        Raises
-        ------
-        DeviceError
-            When the device is not there again.
+        Raises DeviceError when the device is not there again.
         """
         with self._owner:
             self.close()
@@ -216,14 +211,9 @@ class SerialTransport:
         timeout_s : float, optional
             For the whole reply.
 
-        Raises
-        ------
-        DeviceTimeoutError
-            When the reply did not end in time. Should it come later it is not mistaken for another's.
-        StoppedError
-            When ``cancel`` or ``close`` was called meanwhile.
-        DeviceError
-            When the port failed: a pulled cable.
+        Raises DeviceTimeoutError when the reply did not end in time. Should it come later it is not mistaken
+        for another's; StoppedError when ``cancel`` or ``close`` was called meanwhile; DeviceError when the
+        port failed: a pulled cable.
         """
         ticket = self._cancelled
         with self._owner:

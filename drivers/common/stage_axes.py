@@ -107,11 +107,8 @@ class AxisMap:
         speed_per_s, resolution : float
             In the controller's unit; their signs do not matter.
 
-        Raises
-        ------
-        LimitError
-            When a soft limit lies outside the controller's range (it would be no limit), or nothing is left
-            between the two.
+        Raises LimitError when a soft limit lies outside the controller's range (it would be no limit), or
+        nothing is left between the two.
         """
         low, high = sorted(self.to_bench(end) for end in ends)
         soft_low = low if options.lower_limit is None else options.lower_limit
@@ -146,10 +143,8 @@ def check_target(device: str, axes: Iterable[StageAxis], target: Mapping[str, fl
     homed : bool
         Whether the stage's positions mean anything.
 
-    Raises
-    ------
-    LimitError
-        Naming every axis that is unknown, whose target is no finite number, or lies outside its limits.
+    Raises LimitError: naming every axis that is unknown, whose target is no finite number, or lies outside
+    its limits.
     """
     if not homed:
         raise LimitError(device, "is not homed: its positions mean nothing yet.", "Home it first.")

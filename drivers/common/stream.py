@@ -139,10 +139,7 @@ class FrameStream:
 
         The ring is let go of; frames that somebody holds stay as they are.
 
-        Raises
-        ------
-        Exception
-            What a callback given to ``subscribe`` raised.
+        Raises Exception: what a callback given to ``subscribe`` raised.
         """
         self._end()
         if self._thread is not None:
@@ -214,10 +211,7 @@ class FrameStream:
         timeout_s : float, optional
             None means what the exposure needs, with a margin.
 
-        Raises
-        ------
-        DeviceTimeoutError
-            When no such frame came in time.
+        Raises DeviceTimeoutError when no such frame came in time.
 
         Notes
         -----

@@ -79,10 +79,7 @@ class StreamReader:
         The frame's ``dropped_before`` counts all frames between it and the one got before: lost by the
         device, or missed by this reader.
 
-        Raises
-        ------
-        DeviceError
-            When the camera failed; frames that came before are returned first.
+        Raises DeviceError when the camera failed; frames that came before are returned first.
         """
         stream = self._stream
         with stream.changed:

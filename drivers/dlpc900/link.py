@@ -103,10 +103,7 @@ class HidLink:
     def open(self) -> None:
         """Find and open the controller.
 
-        Raises
-        ------
-        DeviceError
-            When it is missing, there are several, or it may not be opened.
+        Raises DeviceError when it is missing, there are several, or it may not be opened.
         """
         try:
             found = self._find()
@@ -140,10 +137,7 @@ class HidLink:
     def read(self, command: Command, n_bytes: int) -> bytes:
         """Ask for a value.
 
-        Raises
-        ------
-        DeviceError
-            When the controller refuses, is silent, answers too little, or was unplugged.
+        Raises DeviceError when the controller refuses, is silent, answers too little, or was unplugged.
         """
         data = self._exchange(command, b"", read=True).data
         if len(data) < n_bytes:

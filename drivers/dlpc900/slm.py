@@ -113,10 +113,8 @@ class Dlpc900Slm(Slm):
     def open(self) -> None:
         """Connect, check the hardware, and show a blank pattern.
 
-        Raises
-        ------
-        DeviceError
-            When the controller is missing, faulty, or drives a DMD that this driver does not know.
+        Raises DeviceError when the controller is missing, faulty, or drives a DMD that this driver does not
+        know.
         """
         with self._lock:
             if self.is_open:
@@ -237,14 +235,9 @@ class Dlpc900Slm(Slm):
     def display(self, levels: npt.NDArray[np.uint8]) -> None:
         """Upload and show grey levels; running and settled when this returns.
 
-        Raises
-        ------
-        LimitError
-            When shape or dtype do not fit, or with ``bit_depth = 1`` a level is neither 0 nor 255.
-        StoppedError
-            When ``close`` or ``blank`` was called meanwhile.
-        DeviceError
-            When the controller refuses or was unplugged; what is shown is then unknown.
+        Raises LimitError when shape or dtype do not fit, or with ``bit_depth = 1`` a level is neither 0 nor
+        255; StoppedError when ``close`` or ``blank`` was called meanwhile; DeviceError when the controller
+        refuses or was unplugged; what is shown is then unknown.
         """
         self._check(levels)
         if self.options.bit_depth == 1 and np.any((levels != 0) & (levels != _FULL)):
@@ -289,10 +282,7 @@ class Dlpc900Slm(Slm):
     def start(self) -> None:
         """Show the pattern that ``stop`` ended again, from its beginning, without another upload.
 
-        Raises
-        ------
-        DeviceError
-            When no pattern was stopped, or the controller does not start it.
+        Raises DeviceError when no pattern was stopped, or the controller does not start it.
         """
         with self._lock:
             self._require()

@@ -96,10 +96,7 @@ class GrblLink(SerialTransport):
     def command(self, line: bytes) -> list[bytes]:
         """Send a line and return what came before its ``ok``.
 
-        Raises
-        ------
-        DeviceError
-            When the controller refuses it, with the error's meaning.
+        Raises DeviceError when the controller refuses it, with the error's meaning.
         """
         *lines, end = self.request(line, line_matcher())
         code = parse_error(end)

@@ -180,10 +180,7 @@ class ControllerSettings:
         axes : int
             Number of axes in the controller's reports.
 
-        Raises
-        ------
-        DeviceError
-            When settings of an axis are missing or make no sense, or positions come in inches.
+        Raises DeviceError when settings of an axis are missing or make no sense, or positions come in inches.
         """
         for axis in range(axes):
             for base, what in (

@@ -59,10 +59,8 @@ def read_geometry(link: Link, distance_mm: float | None) -> ArrayGeometry:
     distance_mm : float, optional
         From the LED with index 0 to the sample, where the array's own setting is not to be believed.
 
-    Raises
-    ------
-    DeviceError
-        When a reply is incomplete or contradicts another: no geometry is better than a wrong one.
+    Raises DeviceError when a reply is incomplete or contradicts another: no geometry is better than a wrong
+    one.
     """
     properties = parse_properties(link.command(link.dialect.properties, _SLOW_S))
     if properties is None:

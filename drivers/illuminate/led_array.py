@@ -245,10 +245,7 @@ class IlluminateLedArray(LedArray):
     def off(self) -> None:
         """Turn every LED off, ahead of whatever is running; returns when the array has confirmed.
 
-        Raises
-        ------
-        DeviceError
-            When it does not confirm, or was lost: the light may be on.
+        Raises DeviceError when it does not confirm, or was lost: the light may be on.
         """
         if self._geometry is None:
             raise DeviceNotOpenError(self.name)

@@ -183,10 +183,7 @@ class Link(SerialTransport):
     def connect(self) -> None:
         """Open the port, ask for the version and turn the light off.
 
-        Raises
-        ------
-        DeviceError
-            When nobody answers, or the firmware is one this driver does not know.
+        Raises DeviceError when nobody answers, or the firmware is one this driver does not know.
         """
         self.open()
         try:
@@ -210,10 +207,7 @@ class Link(SerialTransport):
     def command(self, words: bytes, timeout_s: float | None = None) -> list[bytes]:
         """Send a command (without newline) and return the lines of its reply.
 
-        Raises
-        ------
-        DeviceError
-            When the array refuses it, with the firmware's own words.
+        Raises DeviceError when the array refuses it, with the firmware's own words.
         """
         lines = self.request(words + b"\n", reply_matcher, timeout_s)
         refused = refusal(lines)
@@ -235,10 +229,7 @@ class Link(SerialTransport):
     def setting(self, words: bytes, key: str, timeout_s: float | None = None) -> tuple[int, ...]:
         """Send a command and return the numbers of its machine-mode reply ``KEY.n.n``.
 
-        Raises
-        ------
-        DeviceError
-            When there is no such line in the reply.
+        Raises DeviceError when there is no such line in the reply.
         """
         lines = self.command(words, timeout_s)
         numbers = parse_short(lines, key)

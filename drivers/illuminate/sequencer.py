@@ -36,10 +36,8 @@ class Sequencer:
         patterns : sequence of LedPattern
             Dark ones may be among them.
 
-        Raises
-        ------
-        LimitError
-            When a pattern is out of range, too long for the firmware, or of another colour than the rest.
+        Raises LimitError when a pattern is out of range, too long for the firmware, or of another colour than
+        the rest.
         """
         array = self._array
         dialect = array.link.dialect if array.is_open else None
@@ -112,14 +110,9 @@ class Sequencer:
         int
             Patterns shown.
 
-        Raises
-        ------
-        LimitError
-            When an argument is out of range or the array has no such trigger line.
-        StoppedError
-            When ``off`` ended it.
-        DeviceError
-            When the firmware refuses (an interval shorter than its LEDs take) or ends it: no trigger came.
+        Raises LimitError when an argument is out of range or the array has no such trigger line; StoppedError
+        when ``off`` ended it; DeviceError when the firmware refuses (an interval shorter than its LEDs take)
+        or ends it: no trigger came.
         """
         array = self._array
         geometry = array.geometry
@@ -160,10 +153,8 @@ class Sequencer:
     def set_output(self, output: int, pulse_us: int, delay_us: int = 0) -> tuple[int, int]:
         """Set a trigger output's pulse width and the delay behind it; returns what the array has now.
 
-        Raises
-        ------
-        LimitError
-            When there is no such output, or a time is out of range (1, or 0, to 65535 microseconds).
+        Raises LimitError when there is no such output, or a time is out of range (1, or 0, to 65535
+        microseconds).
         """
         array = self._array
         self._check_line("output", output, array.geometry.outputs)

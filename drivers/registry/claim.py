@@ -34,10 +34,7 @@ class Claim:
     device : str
         The device as error messages name it.
 
-    Raises
-    ------
-    DeviceBusyError
-        Naming the program, its process and since when it has the device.
+    Raises DeviceBusyError: naming the program, its process and since when it has the device.
     """
 
     def __init__(self, resource: str, device: str) -> None:

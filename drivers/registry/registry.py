@@ -61,11 +61,8 @@ def registration_mistakes() -> tuple[str, ...]:
 def load_driver(kind: str, name: str) -> type[Device]:
     """Import and return the driver class registered as ``NAME.KIND``.
 
-    Raises
-    ------
-    DeviceError
-        When no such driver is registered or several are, when it cannot be imported (the text says what is
-        missing), and when it is no driver of that kind.
+    Raises DeviceError when no such driver is registered or several are, when it cannot be imported (the text
+    says what is missing), and when it is no driver of that kind.
     """
     device = f"{kind} ({name})"
     points = [point for point in _points() if point.name == f"{name}.{kind}"]

@@ -92,11 +92,8 @@ class Output:
 def choose(outputs: Sequence[Output], options: SecondDisplayOptions, device: str) -> Output:
     """Return the one output that is meant and that can show 8-bit levels exactly.
 
-    Raises
-    ------
-    DeviceError
-        When none or several fit what was given, or the one that fits is the desktop's primary output, has
-        another shape than expected, or too few bits a pixel.
+    Raises DeviceError when none or several fit what was given, or the one that fits is the desktop's primary
+    output, has another shape than expected, or too few bits a pixel.
     """
     wanted = options.wanted
     fitting = [

@@ -67,10 +67,8 @@ class SecondDisplaySlm(Slm):
     def open(self) -> None:
         """Cover the output with a blank window.
 
-        Raises
-        ------
-        DeviceError
-            When Qt is not installed, there is no desktop, or the output is missing or in a wrong mode.
+        Raises DeviceError when Qt is not installed, there is no desktop, or the output is missing or in a
+        wrong mode.
         """
         with self._lock:
             if self.is_open:

@@ -142,10 +142,7 @@ class PatternScreen:
         str
             What keeps the screen saver off, in words.
 
-        Raises
-        ------
-        DeviceError
-            See ``choose``; or when the window does not become visible.
+        Raises DeviceError: see ``choose``; or when the window does not become visible.
         """
         output = choose(outputs(), options, self._device)
         screen = QGuiApplication.screens()[output.index]
@@ -183,10 +180,8 @@ class PatternScreen:
     def show(self, levels: bytes | bytearray | memoryview) -> None:
         """Draw ``height * width`` bytes of grey levels; the display server has them when this returns.
 
-        Raises
-        ------
-        DeviceError
-            When the output is lost, the window is hidden, or (if so configured) the screenshot differs.
+        Raises DeviceError when the output is lost, the window is hidden, or (if so configured) the screenshot
+        differs.
         """
         self._look_at_place()
         if self._lost is not None:

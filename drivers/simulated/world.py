@@ -328,10 +328,7 @@ class SimulatedWorld(Surroundings):
             Brightness of every pixel's cell as a multiple of the point source's (one LED, white), upside down
             as in :mod:`recon.types`.
 
-        Raises
-        ------
-        ValueError
-            When there is no scene.
+        Raises ValueError when there is no scene.
         """
         if self._scene is None:
             raise ValueError("There is no scene, so there is no ground truth.")

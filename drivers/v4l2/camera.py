@@ -195,10 +195,7 @@ class V4l2Camera(BufferedCamera):
     def set_control(self, name: str, value: int) -> int:
         """Set a control by its name; returns what it reads afterwards.
 
-        Raises
-        ------
-        LimitError
-            No such control, or a value outside its range.
+        Raises LimitError: no such control, or a value outside its range.
         """
         if not self._connected:
             self._require()

@@ -127,10 +127,7 @@ class Controls:
     def switch_automatics_off(self) -> None:
         """Have nothing set by the camera itself.
 
-        Raises
-        ------
-        DeviceError
-            When its exposure cannot be set by hand.
+        Raises DeviceError when its exposure cannot be set by hand.
         """
         auto = self.find(api.CID_EXPOSURE_AUTO)
         if auto is not None:
@@ -158,12 +155,8 @@ class Controls:
     def set(self, control: Control, value: int) -> int:
         """Set a control; returns what it reads afterwards (a button: ``value``).
 
-        Raises
-        ------
-        LimitError
-            Outside the control's range, or nothing on its menu.
-        DeviceError
-            When the driver refuses (read only, or inactive while an automatic is on).
+        Raises LimitError: outside the control's range, or nothing on its menu; DeviceError when the driver
+        refuses (read only, or inactive while an automatic is on).
         """
         if not control.takes(value):
             raise LimitError(

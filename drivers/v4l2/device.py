@@ -72,10 +72,7 @@ class VideoDevice:
     def open(self) -> None:
         """Open the node and see that it is a camera that streams.
 
-        Raises
-        ------
-        DeviceError
-            Missing, not permitted, no camera.
+        Raises DeviceError: missing, not permitted, no camera.
         """
         try:
             self._fd = self._kernel.open(self.path)

@@ -20,10 +20,7 @@ _RATE_TOLERANCE = 0.01
 def offered_formats(device: VideoDevice) -> tuple[V4l2Format, ...]:
     """Return the device's formats that can be decoded, the best for measuring first.
 
-    Raises
-    ------
-    DeviceError
-        When there is none, naming those that it has.
+    Raises DeviceError when there is none, naming those that it has.
     """
     found = device.enumerate(api.ENUM_FMT, api.FormatDescription, type=api.BUF_TYPE_VIDEO_CAPTURE)
     codes = [item.pixelformat for item in found]
@@ -54,10 +51,7 @@ def largest_shape(device: VideoDevice, code: int) -> tuple[int, int] | None:
 def set_format(device: VideoDevice, wanted: V4l2Format, shape: tuple[int, int] | None) -> api.PixFormat:
     """Set format and image size (None: as it is); returns what the driver made of them.
 
-    Raises
-    ------
-    DeviceError
-        When the driver takes another format instead.
+    Raises DeviceError when the driver takes another format instead.
     """
     asked = api.Format(type=api.BUF_TYPE_VIDEO_CAPTURE)
     device.call(api.G_FMT, asked, "say its image format")

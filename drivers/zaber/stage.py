@@ -63,12 +63,8 @@ class Chain(SerialTransport):
     def ask(self, text: str, device: int, axis: int = 0) -> Message:
         """Send a command to one device or axis and return its reply.
 
-        Raises
-        ------
-        DeviceTimeoutError
-            When no whole reply came.
-        DeviceError
-            When the device rejects the command (with its reason in words), or the port failed.
+        Raises DeviceTimeoutError when no whole reply came; DeviceError when the device rejects the command
+        (with its reason in words), or the port failed.
         """
         for attempt in range(_ATTEMPTS):
             with self._counting:
@@ -102,10 +98,7 @@ class Chain(SerialTransport):
     def have_checksums(self, device: int) -> bool:
         """Have a device send checksums from now on; return whether it did before.
 
-        Raises
-        ------
-        DeviceError
-            When its firmware cannot.
+        Raises DeviceError when its firmware cannot.
         """
         before = self.number("get comm.checksum", device) != 0
         if not before:

@@ -120,10 +120,7 @@ class OptionsForm(QWidget):
     def value(self, name: str) -> Any:
         """Return one option's value.
 
-        Raises
-        ------
-        BenchError
-            When it cannot be read.
+        Raises BenchError when it cannot be read.
         """
         if not self.applies(name):
             return self.fields[name].default
@@ -135,10 +132,7 @@ class OptionsForm(QWidget):
     def make(self, declared: type[_T]) -> _T:
         """Return the options of one class, as they stand here.
 
-        Raises
-        ------
-        BenchError
-            When one cannot be read, or they do not go together.
+        Raises BenchError when one cannot be read, or they do not go together.
         """
         names = [o.name for o in options_of(declared) if o.name in self.fields]
         try:

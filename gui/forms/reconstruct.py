@@ -132,10 +132,7 @@ class ReconstructForm(QWidget):
     def request(self) -> PictureRequest | VolumeRequest:
         """Return what the form asks for.
 
-        Raises
-        ------
-        BenchError
-            When a field is not understood, or does not go with the others.
+        Raises BenchError when a field is not understood, or does not go with the others.
         """
         make = self.options.make
         return request_of(make(SourceOptions), make(InputOptions), make(ReconstructionOptions))
@@ -150,10 +147,7 @@ class ReconstructForm(QWidget):
     def outputs(self) -> Outputs:
         """Return where the result goes.
 
-        Raises
-        ------
-        FileError
-            When the name does not end as it must.
+        Raises FileError when the name does not end as it must.
         """
         return Outputs.named(self.options.value("out"), volume=self.kind == VOLUME)
 

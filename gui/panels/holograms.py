@@ -142,10 +142,7 @@ class HologramsPanel(Panel):
     def order(self, *, preview: bool = False) -> HologramOrder:
         """Return what the form asks for.
 
-        Raises
-        ------
-        BenchError, InputError
-            When a field is not understood, or nothing counts.
+        Raises BenchError, InputError when a field is not understood, or nothing counts.
         """
         options = replace(self.form.make(HologramOptions), weights=self.target.weights())
         if preview:

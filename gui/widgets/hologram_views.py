@@ -116,10 +116,7 @@ class WeightsView(StretchedImage):
     def weights(self) -> npt.NDArray[np.float64] | None:
         """Return the weights over the field, or None where everything counts alike.
 
-        Raises
-        ------
-        InputError
-            When nothing counts.
+        Raises InputError when nothing counts.
         """
         if self.mode == "uniform":
             return None

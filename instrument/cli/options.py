@@ -92,7 +92,7 @@ class GroupedCommand(TyperCommand):
         groups = {name: groups[name] for name in sorted(groups, key=lambda name: name == RARE)}
         if len(groups) > 1 and len(groups[_MAIN]) == 1:  # --help alone
             alone = groups.pop(_MAIN)
-            groups[next(name for name in reversed(groups) if name != RARE)] += alone
+            groups[next(reversed(groups))] += alone
         shown = [(heading, rows) for heading, rows in [("Arguments", arguments), *groups.items()] if rows]
         for number, (heading, rows) in enumerate(shown):
             if len(declared) <= _MANY or number == 0:

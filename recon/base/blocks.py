@@ -32,10 +32,7 @@ def block_sum(
     ndarray, (..., height // factor, width // factor)
         About the axis one block less where that many do not fit.
 
-    Raises
-    ------
-    ValueError
-        When not one block fits.
+    Raises ValueError when not one block fits.
     """
     if factor == 1:
         return np.asarray(image, dtype)

@@ -23,10 +23,8 @@ SATURATED_LIGHT = 0.01
 def as_channels(image: npt.ArrayLike, name: str) -> npt.NDArray[np.float32]:
     """Return an image (height, width[, n_channels]) of any numeric dtype as float32, channels first.
 
-    Raises
-    ------
-    InputError
-        When it has another number of axes, is empty, is no array of real numbers, or is not finite.
+    Raises InputError when it has another number of axes, is empty, is no array of real numbers, or is not
+    finite.
     """
     array = np.asarray(image)
     if array.dtype.kind not in "uifb":
@@ -58,10 +56,7 @@ def require_finite(array: npt.NDArray[Any], name: str) -> None:
 def check_psf(psfs: npt.NDArray[np.float32]) -> tuple[str, ...]:
     """Check PSF images (n_channels, height, width); returns warnings.
 
-    Raises
-    ------
-    InputError
-        When a PSF is not finite, empty, constant or negative on the whole.
+    Raises InputError when a PSF is not finite, empty, constant or negative on the whole.
     """
     require_finite(psfs, "PSF")
     warnings: list[str] = []
@@ -111,10 +106,7 @@ def select_psf(calibration: Calibration, z_um: float | None) -> tuple[npt.NDArra
     The nearest calibrated plane in 1/z, along which PSFs change evenly (Kuo 2020, sec. 4.7); among equal
     depths the source nearest to the axis.
 
-    Raises
-    ------
-    InputError
-        When there are several PSFs and no depth is asked for, or the depths are unknown.
+    Raises InputError when there are several PSFs and no depth is asked for, or the depths are unknown.
     """
     n = len(calibration.psfs)
     if n == 0:

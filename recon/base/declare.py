@@ -300,10 +300,7 @@ def require(options: object) -> None:
 def with_overrides(options: _T, overrides: Mapping[str, Any]) -> _T:
     """Return options with some fields replaced.
 
-    Raises
-    ------
-    InputError
-        For a name that is no option, with the nearest one that is.
+    Raises InputError for a name that is no option, with the nearest one that is.
     """
     known = [field.name for field in dataclasses.fields(options)]  # type: ignore[arg-type]
     for name in overrides:

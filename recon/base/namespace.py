@@ -20,10 +20,7 @@ DEVICES: tuple[Device, ...] = ("cpu", "gpu")
 def array_namespace(device: Device) -> Namespace:
     """Return the module whose arrays live on a device.
 
-    Raises
-    ------
-    InputError
-        When there is no GPU, or no CuPy that fits it; the text says what to install.
+    Raises InputError when there is no GPU, or no CuPy that fits it; the text says what to install.
     """
     if device == "cpu":
         return np

@@ -20,10 +20,7 @@ def read(o: Option, typed: str | Sequence[str]) -> Any:
 
     Limits and choices are not checked here (:meth:`~recon.base.declare.Option.mistake` does).
 
-    Raises
-    ------
-    InputError
-        With the flag, what was expected and what was found.
+    Raises InputError with the flag, what was expected and what was found.
     """
     if o.item is not None:
         one = dataclasses.replace(o, type=o.item)

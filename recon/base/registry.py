@@ -57,10 +57,7 @@ class Registry(Mapping[str, T], Generic[T]):
     def register(self, registered: T) -> T:
         """Offer an object under its name, for the rest of the program.
 
-        Raises
-        ------
-        InputError
-            When the project itself has one of that name, or it has no name and help.
+        Raises InputError when the project itself has one of that name, or it has no name and help.
         """
         if not all(isinstance(getattr(registered, word, None), str) for word in ("name", "help")):
             raise InputError(
@@ -79,10 +76,7 @@ class Registry(Mapping[str, T], Generic[T]):
     def named(self, name: str) -> T:
         """Return what has a name.
 
-        Raises
-        ------
-        InputError
-            When nothing has, with the names that there are.
+        Raises InputError when nothing has, with the names that there are.
         """
         if name in self:
             return self[name]

@@ -135,10 +135,8 @@ def calibrate_from_beads(
     on_progress : callable, optional
         Called with what is being done and the share done.
 
-    Raises
-    ------
-    InputError
-        When there are fewer than two images, one is empty, or the window does not fit the sensor.
+    Raises InputError when there are fewer than two images, one is empty, or the window does not fit the
+    sensor.
     """
     settings = settings or BlindSettings()
     # Negative noise is kept: clipped, it would be a haze that PSFs and beads had to explain.

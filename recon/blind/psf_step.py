@@ -55,10 +55,7 @@ def refuse_what_is_no_beads(data: Floats, model: Floats, beads: Sequence[Points]
     data, model : ndarray, float32, (n_images, height, width)
     beads : sequence of Points
 
-    Raises
-    ------
-    InputError
-        Saying what was found and what to do.
+    Raises InputError: saying what was found and what to do.
     """
     part = explained(data, model)
     if part < LEAST_EXPLAINED:

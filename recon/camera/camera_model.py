@@ -156,10 +156,7 @@ def members_of_depths(positions_um: npt.NDArray[np.float64]) -> list[npt.NDArray
 def one_depth(calibration: Calibration, z_um: float | None) -> Calibration:
     """Return the part of a calibration at the depth nearest to ``z_um`` (in 1/z, as PSFs change).
 
-    Raises
-    ------
-    InputError
-        When there are several depths and none is asked for, or they are not known.
+    Raises InputError when there are several depths and none is asked for, or they are not known.
     """
     groups = members_of_depths(calibration.source_positions_um)
     if len(groups) > 1:

@@ -64,10 +64,7 @@ class CroppedConvolution:
 def as_cropped_convolution(operator: LinearOperator) -> CroppedConvolution:
     """Return an operator's structure as a cropped convolution.
 
-    Raises
-    ------
-    StructureError
-        When it is something else.
+    Raises StructureError when it is something else.
     """
     weight = np.ones(operator.range_shape, operator.dtype)
     inner = operator

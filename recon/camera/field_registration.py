@@ -65,10 +65,7 @@ def registered_field(calibration: Calibration, group: Group) -> tuple[Array, Fie
         Which PSFs could not be registered by their images, and were by their sources' places; and where none
         stands near the axis.
 
-    Raises
-    ------
-    InputError
-        When a PSF can be registered neither by its image nor by its source's place.
+    Raises InputError when a PSF can be registered neither by its image nor by its source's place.
     """
     if len(group) == 1:
         alone = calibration.psfs[group]

@@ -119,10 +119,7 @@ def refocus(
     deflection_deg : float
         Typical angle by which the diffuser bends light (its half width at half maximum), for the error.
 
-    Raises
-    ------
-    InputError
-        When depths or the distance from diffuser to sensor are unknown.
+    Raises InputError when depths or the distance from diffuser to sensor are unknown.
     """
     depths, psfs = central_psfs(calibration)
     distance_um = _distance_um(calibration)

@@ -81,10 +81,7 @@ def register(
         Where the displacement is expected, e.g. by :func:`expected_shift`: only ``within_px`` of it is
         searched. Needed where a pattern resembles its own shift (a regular lenslet array). None: everywhere.
 
-    Raises
-    ------
-    InputError
-        When the images differ in shape or one of them is constant.
+    Raises InputError when the images differ in shape or one of them is constant.
     """
     first, second = (np.asarray(image, np.float32) for image in (psf, reference))
     if first.ndim != 2 or first.shape != second.shape:

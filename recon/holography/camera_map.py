@@ -94,10 +94,8 @@ def register_camera(
     search : int
         Largest local shift, pixels.
 
-    Raises
-    ------
-    InputError
-        When the speckle is not found: the frame is dark, another mask is in the beam, or the map is far off.
+    Raises InputError when the speckle is not found: the frame is dark, another mask is in the beam, or the
+    map is far off.
     """
     from scipy.ndimage import gaussian_filter
 

@@ -167,11 +167,8 @@ class Display:
         ``z_mm`` is the plane's distance from the Fourier lens' focal plane, away from the lens. With
         ``u = X / (lambda f1)`` the phase is ``pi z X^2 / (lambda f1^2)``. The constant phase is left out.
 
-        Raises
-        ------
-        InputError
-            When the factor turns by more than pi between mask pixels at the aperture's edge: the plane
-            would be aliased.
+        Raises InputError when the factor turns by more than pi between mask pixels at the aperture's edge:
+        the plane would be aliased.
         """
         require_defocus(
             z_mm, greatest_defocus_mm(self.mask.shape, self.mask_pitch_um, self.wavelength_nm, self.focal_mm)

@@ -143,9 +143,6 @@ LOSSES: Registry[Loss] = Registry("hologram loss", "diffuserbench.losses", _own)
 def loss_of(loss: str | Loss) -> Loss:
     """Return the loss of a name, or the given one.
 
-    Raises
-    ------
-    InputError
-        When there is no such name.
+    Raises InputError when there is no such name.
     """
     return LOSSES.named(loss) if isinstance(loss, str) else loss

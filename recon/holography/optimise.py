@@ -99,10 +99,7 @@ def compute_hologram(
     **overrides
         Single options of the search.
 
-    Raises
-    ------
-    InputError
-        For options that contradict each other, and for an override of what made the model.
+    Raises InputError for options that contradict each other, and for an override of what made the model.
     """
     if made := [name for name in _OF_THE_MODEL if name in overrides]:
         raise InputError(f"{', '.join(made)}: this is the model's; make another HologramModel.")

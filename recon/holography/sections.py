@@ -193,10 +193,7 @@ def fit_field(
         borders) that is expected before anything is measured: keeps the field tame between and beyond the
         sections.
 
-    Raises
-    ------
-    InputError
-        When fewer than half of the sections were found.
+    Raises InputError when fewer than half of the sections were found.
     """
     known = np.isfinite(found.error).all(axis=1)
     if 2 * known.sum() < len(sections):

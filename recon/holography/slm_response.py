@@ -32,10 +32,8 @@ def phases_from_frames(frames: Array) -> npt.NDArray[np.float64]:
     ndarray, float64, (n_levels,)
         Unwrapped, 0 at the first level, and growing with the level (the sign cannot be told from pictures).
 
-    Raises
-    ------
-    InputError
-        When the pictures do not lie on an ellipse: too little phase, too much noise, or unstable light.
+    Raises InputError when the pictures do not lie on an ellipse: too little phase, too much noise, or
+    unstable light.
     """
     flat = np.asarray(frames, np.float64).reshape(len(frames), -1)
     if len(flat) < 8:

@@ -48,10 +48,7 @@ def gaussian_fall_off(sigma_y_deg: float, sigma_x_deg: float | None = None) -> F
 def table_fall_off(angles_deg: npt.ArrayLike, responses: npt.ArrayLike) -> FallOff:
     """Response from a measured table, linear between its entries and constant beyond them.
 
-    Raises
-    ------
-    ValueError
-        When the angles do not ascend from 0 or a response is negative.
+    Raises ValueError when the angles do not ascend from 0 or a response is negative.
     """
     angles = np.deg2rad(np.asarray(angles_deg, np.float64))
     values = np.asarray(responses, np.float64)

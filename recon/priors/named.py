@@ -46,10 +46,7 @@ class NamedPrior:
     def __call__(self, weight: float) -> Prior:
         """Return the prior of a weight.
 
-        Raises
-        ------
-        InputError
-            Where what was registered makes none.
+        Raises InputError where what was registered makes none.
         """
         try:
             made = self.make(weight)

@@ -63,10 +63,7 @@ class Measurement:
     def light(self) -> Floats:
         """Return the patterns, checked.
 
-        Raises
-        ------
-        InputError
-            When they are no patterns.
+        Raises InputError when they are no patterns.
         """
         light = np.asarray(self.patterns, np.float32)
         if light.ndim != 3 or not np.isfinite(light).all():
@@ -78,10 +75,7 @@ class Measurement:
     def counts(self) -> Counts:
         """Return the image less its background, channels first.
 
-        Raises
-        ------
-        InputError
-            When the image or what is known of it is unusable.
+        Raises InputError when the image or what is known of it is unusable.
         """
         require_noise(self.noise)
         counts = self.channels()
@@ -101,10 +95,7 @@ class Measurement:
     def like(self, image: npt.ArrayLike, data: Floats, name: str) -> Floats:
         """Broadcast a number, one image, or one for each channel (of patterned light: frame) to the data.
 
-        Raises
-        ------
-        InputError
-            When it is shaped otherwise.
+        Raises InputError when it is shaped otherwise.
         """
         if np.ndim(image) == 0:
             return np.full_like(data, float(np.asarray(image)))

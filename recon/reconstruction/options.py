@@ -57,10 +57,7 @@ class Overrides:
     def parse(cls, text: Mapping[str, str]) -> Overrides:
         """Read overrides from words: ``{"model": "local", "binning": "1", "background": "off"}``.
 
-        Raises
-        ------
-        InputError
-            Which choice is not known, and what is.
+        Raises InputError: which choice is not known, and what is.
         """
         known: dict[str, dict[str, Any] | None] = {
             "model": {m: m for m in model_names() if m != "auto"},

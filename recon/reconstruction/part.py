@@ -207,8 +207,8 @@ class Part:
             return str(self.plan)
         share = on_disk / max(self.plan.state, 1)
         return (
-            f"{self.plan}; {on_disk / memory.GIB:.2f} GiB of the state in files, of which an iteration reads "
-            f"and writes about {share * self.plan.traffic / memory.GIB:.2f} GiB"
+            f"{self.plan}; {memory.in_words(on_disk)} of the state in files, of which an iteration reads "
+            f"and writes about {memory.in_words(share * self.plan.traffic)}"
         )
 
     def close(self) -> None:

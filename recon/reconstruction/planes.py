@@ -162,10 +162,7 @@ def between_of(
         ``k`` for a plane half way, in 1/z, between depths ``k`` and ``k + 1``.
     Decision
 
-    Raises
-    ------
-    InputError
-        Where planes between are wished for and cannot be made.
+    Raises InputError where planes between are wished for and cannot be made.
     """
     gaps = [k for k in planes if k + 1 in planes]
     prevented = _prevented(calibration, depths)

@@ -113,10 +113,8 @@ class Problem:
         extent : Extent, optional
             How much of the PSFs and of the field to model; default all.
 
-        Raises
-        ------
-        InputError
-            When the input is unusable; the text says what was found, what was expected and what to do.
+        Raises InputError when the input is unusable; the text says what was found, what was expected and what
+        to do.
         """
         options = options or ReconstructionOptions()
         extent = extent or Extent()
@@ -175,10 +173,8 @@ class Problem:
         image : array, shaped as the measurement's
             Less its background where the measurement was given without one.
 
-        Raises
-        ------
-        InputError
-            When it is shaped otherwise, or this problem was reduced for its photograph by ``choose``.
+        Raises InputError when it is shaped otherwise, or this problem was reduced for its photograph by
+        ``choose``.
         """
         if self.reduction is not None:
             raise InputError("This problem was reduced for one photograph: choose anew for another.")
@@ -381,10 +377,7 @@ class Problem:
     def start(self, before: Reconstruction, channels: slice, grid_shape: tuple[int, int]) -> Array:
         """Place a reconstruction's object on the operator's grid of some channels, scaled.
 
-        Raises
-        ------
-        InputError
-            When it does not fit.
+        Raises InputError when it does not fit.
         """
         shape = (self.n_channels, self.n_planes, *grid_shape)
         scale = self.image_scale[channels]

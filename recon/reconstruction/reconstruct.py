@@ -64,11 +64,8 @@ def reconstruct(
     **overrides
         Single options by their names: ``reconstruct(image, psf, prior="l1", iterations=50)``.
 
-    Raises
-    ------
-    InputError
-        When the input is unusable, or the solver has no way for it; the text says what was found, what was
-        expected and what to do.
+    Raises InputError when the input is unusable, or the solver has no way for it; the text says what was
+    found, what was expected and what to do.
     """
     known, options = given(overrides, options)
     if not isinstance(measurement, Measurement):

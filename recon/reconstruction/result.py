@@ -162,10 +162,7 @@ class Reconstruction:
     def image(self) -> npt.NDArray[np.float32]:
         """The picture, (height, width[, n_channels]).
 
-        Raises
-        ------
-        ValueError
-            When there are several planes.
+        Raises ValueError when there are several planes.
         """
         if not self.is_picture:
             raise ValueError(f"This is a volume of {len(self.volume)} planes: take .volume.")

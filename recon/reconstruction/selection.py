@@ -65,10 +65,7 @@ def choose(problem: Problem, options: ReconstructionOptions | None = None) -> Pr
         With ``choice`` (the reasons, and what one step up and down would cost) and ``reduction`` (the way
         back). The same problem where the options ask for a model.
 
-    Raises
-    ------
-    InputError
-        When the input is unusable, or a choice was asked for that cannot be had.
+    Raises InputError when the input is unusable, or a choice was asked for that cannot be had.
     """
     if options is not None:
         problem = replace(problem, options=options)

@@ -71,10 +71,7 @@ def solve(
         Keeps the solvers' state, and has them go on from what was kept of the same problem. Turns for a
         positive background are not kept: they begin anew.
 
-    Raises
-    ------
-    InputError
-        When the solver has no way for the problem, or it does not fit into memory.
+    Raises InputError when the solver has no way for the problem, or it does not fit into memory.
     """
     if options is not None:
         problem = _with_options(problem, options)
@@ -166,10 +163,7 @@ def _solve(
 def rules_of(problem: Problem, offered: OfferedSolver, runs: int = 1) -> StoppingRules:
     """Return when to stop one of so many runs: time is shared evenly by them.
 
-    Raises
-    ------
-    InputError
-        When a limit is asked for that a solver in one step does not have.
+    Raises InputError when a limit is asked for that a solver in one step does not have.
     """
     options = problem.options
     if offered.one_step:

@@ -16,7 +16,7 @@ import numpy as np
 from recon.base.registry import Registry
 from recon.camera.base import Array, LinearOperator
 from recon.errors import InputError
-from recon.priors import PRIORS, Prior
+from recon.priors import PRIORS, Prior, Sum
 from recon.solvers.base import IterationRecord, Outcome, Solver, StoppingRules, StopReason
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def _plain_only(problem: Problem) -> str | None:
     if problem.n_planes > 1:
         return "it is for one depth"
     if problem.varies:
-        return f"it is for one PSF; the {problem.model} model has a solver of its own (admm)"
+        return f"it is for one convolution: for the {problem.model} model take admm"
     if problem.smooth:
         return "it estimates no background"
     return "it runs on the cpu only" if problem.options.device != "cpu" else None
@@ -158,7 +158,11 @@ def _fista(part: Part, start: Array | None) -> Solver:
 def _fista_refuses(problem: Problem) -> str | None:
     if problem.options.device != "cpu":
         return "it runs on the cpu only"
-    return "it is for one depth" if problem.n_planes > 1 else None
+    if problem.n_planes > 1:
+        return "it is for one depth"
+    prior = PRIORS[problem.prior](1.0) if isinstance(problem.prior, str) else problem.prior
+    sums = isinstance(prior, Sum)
+    return f"the prior {problem.prior_name} is a sum without a common prox: take admm" if sums else None
 
 
 class OneStep(Solver):
@@ -227,7 +231,7 @@ def _offered() -> tuple[OfferedSolver, ...]:
         ),
         OfferedSolver(
             name="fista",
-            help="Accelerated proximal gradient, for pictures with any prior.",
+            help="Accelerated proximal gradient, for pictures with any prior of one prox.",
             make=_fista,
             refuses=_fista_refuses,
             tolerance=lambda problem: 2e-4 if problem.patterned else 5e-4,
@@ -265,10 +269,7 @@ def require_solver(name: str) -> None:
 def solver_for(problem: Problem) -> OfferedSolver:
     """Return the solver that was asked for, or the first that takes a problem.
 
-    Raises
-    ------
-    InputError
-        When it has no way for the problem, with the reason.
+    Raises InputError when it has no way for the problem, with the reason.
     """
     asked = problem.options.solver
     require_solver(asked)

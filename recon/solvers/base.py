@@ -298,10 +298,8 @@ class Solver(ABC):
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint of a solver of the same problem, whichever device it was taken on.
 
-        Raises
-        ------
-        KeyError
-            With the name of what the checkpoint does not have: another solver's, or another version's.
+        Raises KeyError with the name of what the checkpoint does not have: another solver's, or another
+        version's.
         """
         for name in ("iteration", *self.state_names):
             value, present = state[name], attrgetter(name)(self)

@@ -19,6 +19,13 @@ from recon.camera.convolution import GROUPS
 from recon.errors import InputError
 
 GIB = 2**30
+
+
+def in_words(n_bytes: float) -> str:
+    """Return an amount of memory: ``"1.50 GiB"``, below a tenth of one ``"3.2 MiB"``."""
+    return f"{n_bytes / GIB:.2f} GiB" if n_bytes >= 0.1 * GIB else f"{n_bytes / 2**20:.1f} MiB"
+
+
 VOLUMES = {"tv": 6, "l1": 2}
 """Volumes that each solver keeps: X, g and four states; z and the transfer functions."""
 KEPT_FREE = 0.1
@@ -64,8 +71,8 @@ class MemoryPlan:
     def __str__(self) -> str:
         """Say it in words."""
         return (
-            f"{self.total / GIB:.2f} GiB ({self.state / GIB:.2f} GiB solver state, {self.work / GIB:.2f} GiB "
-            f"PSFs, planes and result) of {self.available / GIB:.2f} GiB available"
+            f"{in_words(self.total)} ({in_words(self.state)} solver state, {in_words(self.work)} "
+            f"PSFs, planes and result) of {in_words(self.available)} available"
         )
 
 
@@ -169,10 +176,7 @@ class Storage:
     ) -> npt.NDArray[Any]:
         """Return an array of zeros; a lasting one outlives its :meth:`turn`.
 
-        Raises
-        ------
-        InputError
-            When the scratch folder's disk has no room for it.
+        Raises InputError when the scratch folder's disk has no room for it.
         """
         size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
         if self._folder is None or size <= self._room:
@@ -182,8 +186,8 @@ class Storage:
         free = shutil.disk_usage(self._folder).free
         if size > free:
             raise InputError(
-                f"The scratch folder {self._folder.parent} has {free / GIB:.2f} GiB free; "
-                f"{size / GIB:.2f} GiB more are needed. Name a folder on another disk."
+                f"The scratch folder {self._folder.parent} has {in_words(free)} free; "
+                f"{in_words(size)} more are needed. Name a folder on another disk."
             )
         self._count += 1
         self.on_disk += size
@@ -201,10 +205,7 @@ class Storage:
 def scratch_for(plan: MemoryPlan, scratch: Path | str | None) -> Path | str:
     """Return the scratch folder for a plan that does not fit into memory.
 
-    Raises
-    ------
-    InputError
-        When there is none, or not even the part that must be in memory fits.
+    Raises InputError when there is none, or not even the part that must be in memory fits.
     """
     if plan.work > (1 - KEPT_FREE) * plan.available:
         raise InputError(f"This volume needs {plan}. Bin the images or take fewer depths.")
@@ -212,7 +213,7 @@ def scratch_for(plan: MemoryPlan, scratch: Path | str | None) -> Path | str:
         raise InputError(
             f"This volume needs {plan}. Bin the images, take fewer depths, use the l1 prior (two volumes "
             "instead of six), or name a scratch folder (--scratch) on a fast disk for the solver's state; "
-            f"an iteration then reads and writes {plan.traffic / GIB:.2f} GiB there at most."
+            f"an iteration then reads and writes {in_words(plan.traffic)} there at most."
         )
     if lies_in_memory(Path(scratch)):
         raise InputError(f"The scratch folder {scratch} lies in memory itself (tmpfs). Name one on a disk.")

@@ -326,10 +326,7 @@ def split_prior(
 ) -> tuple[TotalVariation | None, Separable, tuple[Prior, ...]]:
     """Take a prior apart: total variation of the kind that a solver has a sweep for, separable part, others.
 
-    Raises
-    ------
-    StructureError
-        When a prior's prox is not that of its value.
+    Raises StructureError when a prior's prox is not that of its value.
     """
     separable, tv, others = Separable(), None, []
     for term in prior.terms():

@@ -159,10 +159,7 @@ def volume_solver(
     a common prox, are ADMM's; any other prior is Douglas-Rachford's. Both have compiled sweeps for what they
     are used for most.
 
-    Raises
-    ------
-    StructureError
-        When the prior's prox is not that of its value.
+    Raises StructureError when the prior's prox is not that of its value.
     """
     compiled = room is None or room.xp is np
     tv, separable, others = split_prior(prior, is_lateral_periodic)

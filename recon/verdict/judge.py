@@ -197,6 +197,8 @@ class Verdict:
             said = [STILL_CHANGING]
         elif self.region is Region.UNKNOWN and self.evidence.get("signal", 0.0) >= NOISELESS:
             said = [COMPUTED]
+        elif self.region is Region.UNKNOWN and not self.basis:
+            said = [f"not judged: there are no known cases of {self.method}"]
         elif self.failing is not None and self.region is not Region.UNKNOWN:
             said[0] += f" (of the most similar simulated cases {self.failing:.0%} failed)"
         if self.region in (Region.NEAR, Region.OUTSIDE):

@@ -165,7 +165,7 @@ def test_refuses_what_does_not_fit_or_puts_it_on_disk(tmp_path, monkeypatch):
     same = reconstruct(measurement(), calibration(), model="convolution", iterations=5)
     np.testing.assert_array_equal(result.volume, same.volume)
     assert not list(tmp_path.iterdir()), "scratch files are removed"
-    assert "GiB of the state in files" in result.provenance["memory"]
+    assert "iB of the state in files" in result.provenance["memory"]
     assert "in files" not in same.provenance["memory"]
     monkeypatch.setattr(memory, "lies_in_memory", lambda folder: True)
     with pytest.raises(InputError, match="lies in memory itself"):
@@ -393,7 +393,7 @@ def test_a_picture_of_colour_and_its_refusals():
     assert result.image.shape == (SIZE, SIZE, 3)
     assert seen == [(1, SIZE, SIZE)] * 6
     assert reconstruct(b, c, model="local", solver="fista", prior="tv-haar", iterations=2).model == "local"
-    with pytest.raises(InputError, match="for one PSF"):
+    with pytest.raises(InputError, match="for one convolution"):
         reconstruct(b, c, model="local", solver="admm-sensor")
     with pytest.raises(InputError, match="several places of the field"):
         reconstruct(b, c.psfs[0, 0], model="lowrank")
