@@ -21,6 +21,7 @@ from instrument.plan import Plan, check, estimate
 from instrument.runs.acquire import abilities_of, acquire, prepare_resume
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
+from instrument.runs.runner import discarded
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +59,7 @@ class ResumeProcedure(Procedure):
         words = f"{found.condition}: {len(found.records)} of {found.n_frames} frames are stored"
         if not todo:
             return Outlook((words,))
-        check(found.plan, abilities, todo=todo, start=found.start)
+        # What is left is held against the run's own camera settings once they are restored (prepare_resume).
         cost = estimate(found.plan, abilities, todo=todo, start=found.start)
         return replace(outlook_of(bench, found.plan, self.run, [words]), cost=cost)
 
@@ -71,11 +72,12 @@ class ResumeProcedure(Procedure):
             runner, findings = prepare_resume(
                 bench, self.run, on_verify=listener.share, on_progress=listener.frame
             )
-            listener.said(f"Found {findings}")
-            if routine is not None and routine.watch is not None:
-                routine.watch(bench, runner, listener)
-            listener.step(found.label)
-            control.follow(runner)
+            with discarded(runner):
+                listener.said(f"Found {findings}")
+                if routine is not None and routine.watch is not None:
+                    routine.watch(bench, runner, listener)
+                listener.step(found.label)
+                control.follow(runner)
             found = runner.execute()
         frames = run_outcome(found)
         if found.condition is RunCondition.COMPLETED and lacks_result(self.run):
@@ -109,7 +111,8 @@ def finished(run: Run, bench: Bench | None, control: RunControl, listener: Liste
 
 def run_outcome(run: Run) -> Outcome:
     """Return what a run leaves, in words: frames, drops, saturation."""
-    words = [f"{run.condition}: {len(run.records)} of {run.n_frames} frames"]
+    mark = " SIMULATED" if run.is_simulated else ""
+    words = [f"{run.condition}: {len(run.records)} of {run.n_frames} frames{mark}"]
     dropped = sum(record.metadata.dropped_before for record in run.records.values())
     saturated = [i for i, record in run.records.items() if record.metadata.saturated_fraction > 0]
     if dropped:

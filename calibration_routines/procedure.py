@@ -21,7 +21,7 @@ from instrument.plan import Plan, PlanEstimate, Step, estimate
 from instrument.runs.acquire import abilities_of, prepare
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import Runner, RunStatus
+from instrument.runs.runner import Runner, RunStatus, discarded
 from recon.base.declare import options_of
 from recon.base.option_text import size
 from recon.base.registry import Registry
@@ -198,7 +198,7 @@ class Procedure(ABC):
         control: RunControl | None = None,
         listener: Listener | None = None,
     ) -> Outcome:
-        """Check it, then do it; the light is off and nothing moves when this returns or raises.
+        """Check it, then do it; after an error in doing it the light is off and nothing moves.
 
         Raises EndedEarlyError, RunEndedError when it was aborted or stopped (what was taken is kept);
         BenchError, DeviceError when it cannot be done or a device fails.
@@ -253,7 +253,8 @@ class Purpose(Generic[T]):
     ) -> Runner:
         """Return the runner of a plan whose run has the record; errors as ``prepare``."""
         runner = prepare(bench, plan, folder, on_progress=listener.frame, control=control)
-        self.format.write(runner.path / self.file, plain(record))
+        with discarded(runner):
+            self.format.write(runner.path / self.file, plain(record))
         return runner
 
 

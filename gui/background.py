@@ -39,6 +39,7 @@ class NewestOnly:
         self._failed = failed
         self._job: Job | None = None
         self._wanted: dict[str, tuple[Read, Done]] = {}
+        self._last: list[Read] = []
         self._epoch = 0
 
     @property
@@ -57,12 +58,20 @@ class NewestOnly:
         self._wanted.clear()
         self._epoch += 1
         if last is not None:
-            self.ask(last, lambda _: None)
+            self._last.append(last)
+        if self._job is None:
+            self._begin()
 
     def _begin(self) -> None:
-        if not self._wanted:
+        read: Read
+        done: Done = lambda _: None  # noqa: E731 - what is read last is shown nowhere
+        if self._last:  # never gives way: a file is closed by it
+            read = self._last.pop(0)
+        elif self._wanted:
+            read, done = self._wanted.pop(next(iter(self._wanted)))
+        else:
             return
-        (read, done), epoch = self._wanted.pop(next(iter(self._wanted))), self._epoch
+        epoch = self._epoch
         self._job = job = self._jobs.watch(self._title, lambda _: read())
         job.succeeded.connect(lambda value: done(value) if epoch == self._epoch else None)
         if (failed := self._failed) is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 
 from PySide6.QtCore import QEvent, QObject, QSettings, QSize, Qt
@@ -398,9 +399,10 @@ class MainWindow(QMainWindow):
 
     def _end(self) -> None:
         self.job_label.setText("Closing: light off, motion stopped …")
-        for panel in self._panels.values():
-            panel.shutdown()
-        self.session.close()
+        with ExitStack() as each:  # one that fails keeps neither the others nor the bench from their end
+            each.callback(self.session.close)
+            for panel in self._panels.values():
+                each.callback(panel.shutdown)
 
     def _close_now(self) -> None:
         self._may_close = True

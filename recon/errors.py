@@ -9,3 +9,7 @@ class InputError(ValueError):
 
 class StructureError(InputError, TypeError):
     """A solver has no way for this kind of operator or prior; the text says which solver may."""
+
+
+class NoMemoryError(InputError, MemoryError):
+    """The memory that may be taken does not hold the problem; the text says how much it needs."""

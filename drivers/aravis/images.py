@@ -57,7 +57,7 @@ class Images:
         )
         self.formats: dict[str, PixelFormat] = dict(best)
         self.apply_format(best[0][0])
-        self.apply_roi(Roi(0, 0, *self.sensor))
+        self._apply_whole()
 
     @property
     def format(self) -> PixelFormat:
@@ -104,6 +104,12 @@ class Images:
         self.roi = self._read_roi()
         return True
 
+    def _apply_whole(self) -> None:
+        if not self.apply_roi(Roi(0, 0, *self.sensor)):
+            raise LimitError(
+                self._name, f"has no region at binning {self.binning} on its sensor.", self.refused()
+            )
+
     def _read_roi(self) -> Roi:
         with self._features.words("say its region"):
             region = self._camera.get_region()
@@ -121,7 +127,7 @@ class Images:
                     self._name, f"bins {made[0]:g} x {made[1]:g} pixels.", f"Asked for {binning}."
                 )
             self.binning = int(made[0])
-        self.apply_roi(Roi(0, 0, *self.sensor))
+        self._apply_whole()
 
 
 def set_trigger(features: Features, name: str, mode: TriggerMode, line: str, activation: str) -> None:

@@ -277,10 +277,13 @@ class LivePanel(Panel):
         if "led_array" in self.session.kinds:
             self.switch_light(LightState.SCENE, quiet=True)
         else:  # nobody is asked to darken a point source that may not be there
-            job = self.session.jobs.device(
-                "Light: scene", lambda _: self.session.bench.scene_on(), {"light"}, quiet=True
+            job = self.begin(
+                lambda: self.session.jobs.device(
+                    "Light: scene", lambda _: self.session.bench.scene_on(), {"light"}, quiet=True
+                )
             )
-            self.follow(job).ended.connect(self._show_light)
+            if job is not None:
+                job.ended.connect(self._show_light)
 
     def _show_light(self) -> None:
         now = self.light

@@ -88,6 +88,7 @@ class ReconstructionsPanel(Panel):
         self._names = SuggestedName(self.jobs, self.form.options, folder, ".tif")
         self._suggest_out()
         self._depths = NewestOnly(self.jobs, "Reading a calibration's depths")
+        self._newest = NewestOnly(self.jobs, "Looking for the newest calibration")
         self.form.options.settled.connect(self._settled)
         self.refresh()
 
@@ -371,7 +372,7 @@ class ReconstructionsPanel(Panel):
         form.options.set_values({form.source if path.is_dir() else "image": path})
         if not path.is_dir() and not form.text(form.source) and form.kind != PSF:
             folder = self.session.runs_folder
-            self._depths.ask(lambda: newest_calibration(folder), self._offer_calibration)
+            self._newest.ask(lambda: newest_calibration(folder), self._offer_calibration)
 
     def _offer_calibration(self, newest: Path | None) -> None:
         """Begin with the newest calibration where none was named."""
@@ -404,6 +405,7 @@ class ReconstructionsPanel(Panel):
         if self.job is not None:
             self.job.cancel()
         self._depths.forget()
+        self._newest.forget()
         self._close_result()
 
 

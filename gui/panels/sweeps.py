@@ -123,7 +123,7 @@ class SweepsPanel(ProcedurePanel):
             self.frame_words.setText("The photograph, dark frames taken off")
         pictures = [file for file in outcome.files if file.suffix == ".png"]
         if pictures:
-            self._reader.ask(lambda: QImage(str(pictures[0])), self._show_result)
+            self._reader.ask(lambda: QImage(str(pictures[0])), self._show_result, "result")
 
     def _show_result(self, picture: QImage) -> None:
         self.picture.show_pixmap(QPixmap.fromImage(picture))
@@ -167,20 +167,20 @@ class SweepsPanel(ProcedurePanel):
             return
         self._plan_file = file
         if file is not None:
-            self._reader.ask(lambda: _plan_text(file), self._show_plan)
+            self._reader.ask(lambda: _plan_text(file), self._show_plan, "plan")
 
-    def _show_plan(self, text: str | FileError) -> None:
+    def _show_plan(self, text: str | BenchError) -> None:
         if isinstance(text, str):
             self.views["plan"].set_values({"text": text})
         else:
             self.views["plan"].refuse("file", str(text))
 
 
-def _plan_text(file: Path) -> str | FileError:
+def _plan_text(file: Path) -> str | BenchError:
     """Return a plan as TOML; why it cannot be read."""
     try:
         return file.read_text() if file.suffix == ".toml" else plan_toml(load_plan(file))
-    except FileError as error:
+    except BenchError as error:
         return error
     except (UnicodeDecodeError, OSError) as error:
         return FileError(file, str(error))

@@ -179,8 +179,8 @@ class Step(PlanData):
 class Plan(PlanData):
     """What will be acquired: parts done one after the other, each step storing one frame.
 
-    A plan is data: it can be counted, checked (:mod:`instrument.plan.limits`), written to JSON and read from
-    TOML or JSON without any device.
+    A plan is data: it can be counted, checked (:mod:`instrument.plan.abilities`), written to JSON and read
+    from TOML or JSON without any device.
     """
 
     label: Label
@@ -388,8 +388,7 @@ def illumination_plan(lights: Sequence[Light], *, exposure_ms: float, average: i
     """Return a plan that photographs the scene in each light in turn, and once in the dark.
 
     The frames of its part ``"pattern"``, less the one of its part ``"dark"``, are what
-    :func:`recon.reconstruction.patterned.reconstruct_patterned` takes;
-    :mod:`instrument.reconstruction.patterned` reads them from runs.
+    :func:`recon.reconstruct` takes with patterns; :mod:`instrument.reconstruction.patterned` reads them.
 
     Raises BenchError when there is no light.
     """

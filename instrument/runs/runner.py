@@ -15,7 +15,8 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
@@ -250,6 +251,10 @@ class Runner:
         stop_until(stop, self._finished, once=executes_here)
 
     # In one thread -------------------------------------------------------------------------------
+    def discard(self) -> None:
+        """Close the run's files without carrying anything out; it can be resumed."""
+        self._writer.close()
+
     def execute(self) -> Run:
         """Do the steps; returns the finished run, whose ``reason`` says how it ended.
 
@@ -391,3 +396,13 @@ class Runner:
             status = self._status
         if self.on_progress is not None:
             self.on_progress(status)
+
+
+@contextmanager
+def discarded(runner: Runner) -> Iterator[None]:
+    """Give a run's folder up again where something fails between a runner's making and its run."""
+    try:
+        yield
+    except BaseException:
+        runner.discard()
+        raise

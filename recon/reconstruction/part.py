@@ -15,7 +15,7 @@ from recon.camera.convolution import Convolution, field_of
 from recon.camera.factors import BackgroundRemoval, Erasures, PatternedCamera
 from recon.camera.spatially_varying import SpatiallyVarying
 from recon.camera.varying_psfs import FieldOfPsfs, local_convolution, low_rank
-from recon.errors import InputError
+from recon.errors import NoMemoryError
 from recon.priors import Prior, TotalVariation
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import window_of
@@ -143,7 +143,7 @@ class Part:
         size = self.dtype.itemsize * int(np.prod(plane.domain_shape))
         self.plan = memory.MemoryPlan(0, 12 * size, self._limit)
         if not self.plan.fits:
-            raise InputError(f"This picture needs {self.plan}. Bin the images, or allow more.")
+            raise NoMemoryError(f"This picture needs {self.plan}. Bin the images, or allow more.")
 
     def _convolution(self, psfs: Array) -> Convolution:
         height, width = self.problem.sensor_shape
@@ -187,7 +187,7 @@ class Part:
         available = memory.available_bytes() if self._limit is None else self._limit
         self.plan = memory.MemoryPlan(0, volumes * size + camera.nbytes, available)
         if not self.plan.fits:
-            raise InputError(
+            raise NoMemoryError(
                 f"The {problem.model} model needs {self.plan}. Bin the images or take fewer depths."
             )
         return camera

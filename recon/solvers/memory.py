@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from recon.base.threads import get_threads
 from recon.camera.convolution import GROUPS
-from recon.errors import InputError
+from recon.errors import InputError, NoMemoryError
 
 GIB = 2**30
 
@@ -205,12 +205,12 @@ class Storage:
 def scratch_for(plan: MemoryPlan, scratch: Path | str | None) -> Path | str:
     """Return the scratch folder for a plan that does not fit into memory.
 
-    Raises InputError when there is none, or not even the part that must be in memory fits.
+    Raises NoMemoryError when there is none, or not even the part that must be in memory fits.
     """
     if plan.work > (1 - KEPT_FREE) * plan.available:
-        raise InputError(f"This volume needs {plan}. Bin the images or take fewer depths.")
+        raise NoMemoryError(f"This volume needs {plan}. Bin the images or take fewer depths.")
     if scratch is None:
-        raise InputError(
+        raise NoMemoryError(
             f"This volume needs {plan}. Bin the images, take fewer depths, use the l1 prior (two volumes "
             "instead of six), or name a scratch folder (--scratch) on a fast disk for the solver's state; "
             f"an iteration then reads and writes {in_words(plan.traffic)} there at most."

@@ -225,8 +225,11 @@ class LiveReconstructor:
 
     def shown(self, volume: Floats) -> Floats:
         """Return the picture of depths (n_z, ...): of the one chosen, else each pixel's brightest."""
-        chosen = volume.max(axis=0) if self.live.plane is None else volume[self.live.plane]
-        return np.ascontiguousarray(volume[0] if len(volume) == 1 else chosen)
+        if len(volume) == 1:  # one depth, or the filter's picture of one
+            return np.ascontiguousarray(volume[0])
+        return np.ascontiguousarray(
+            volume.max(axis=0) if self.live.plane is None else volume[self.live.plane]
+        )
 
     def restart(self) -> None:
         """Forget the scene, the machine's timing and the noise, and give up what solvers hold.
@@ -262,7 +265,11 @@ class LiveReconstructor:
     def _level_for(self, frame: Floats) -> Level:
         """Return the level for the next frame: the one there is, until another is made."""
         if self._level is None:
-            self._level = self._level_of(self._first_binning(), frame.copy())
+            try:
+                self._level = self._level_of(self._first_binning(), frame.copy())
+            except InputError:
+                self._shape = ()  # a frame that is refused settles nothing
+                raise
             self._pace.enter(self._level.binning)
             self._coming = ComingLevel(self._level.binning, self._level.solving)
         elif self._coming is not None:

@@ -172,7 +172,7 @@ def test_a_bench_shows_its_scene_live() -> None:
     with open_bench(parse_config(BENCH, None)) as bench:
         bench.scene_on()
         bench.camera.snap()  # renders what is replayed
-        shape = bench.camera.frame_shape[:2]
+        n_axes, shape = len(bench.camera.frame_shape), bench.camera.frame_shape[:2]
         psf = np.zeros(shape, np.float32)
         psf[tuple(n // 2 for n in shape)] = 1.0
         calibration = replace(Calibration(psf[None, None], np.full((1, 3), np.nan)), geometry=bench.geometry)
@@ -180,4 +180,4 @@ def test_a_bench_shows_its_scene_live() -> None:
             result = live.wait_newer(None, 60.0)
     assert result is not None
     assert result.picture.budget_ms == 50.0
-    assert result.picture.image.ndim == len(bench.camera.frame_shape)
+    assert result.picture.image.ndim == n_axes

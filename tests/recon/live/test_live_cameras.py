@@ -112,10 +112,30 @@ def test_of_several_depths_the_brightest_is_shown_or_one_that_is_chosen(channels
     np.testing.assert_array_equal(picture.image, picture.volume.max(axis=0))
     assert "brightest of 2 depths" in picture.quality
     np.testing.assert_array_equal(live.shown(alone), alone.max(axis=0))
-    nearest = settled(LiveReconstructor(scene.calibration, plane=0, **PACE, **options), [scene.measurement])
-    assert nearest.volume is not None
-    np.testing.assert_array_equal(nearest.image, nearest.volume[0])
-    assert "depth 0 of 2 depths" in nearest.quality
+    for plane in (0, 1):
+        view = LiveReconstructor(scene.calibration, plane=plane, **PACE, **options)
+        chosen = settled(view, [scene.measurement])
+        assert chosen.volume is not None
+        np.testing.assert_array_equal(chosen.image, chosen.volume[plane])
+        assert f"depth {plane} of 2 depths" in chosen.quality
+
+
+def test_a_frame_that_is_refused_settles_nothing() -> None:
+    rng = np.random.default_rng(0)
+    live = LiveReconstructor(rng.random((SIZE, SIZE, 3)).astype(np.float32) ** 8, **PACE)
+    with pytest.raises(InputError, match="channel"):
+        live.feed(rng.random((SIZE, SIZE)).astype(np.float32))
+    assert live.feed(rng.random((SIZE, SIZE, 3)).astype(np.float32)).image.shape == (SIZE, SIZE, 3)
+
+
+def test_pictures_go_on_where_a_solver_finds_no_room() -> None:
+    scene = make_scene("beads", size=SIZE, depths=2, photons=2000.0)
+    live = LiveReconstructor(scene.calibration, memory_gib=1e-6, **PACE)
+    assert live.feed(scene.measurement).method == "wiener"
+    for _ in range(20):
+        live.refine()
+        live.feed(scene.measurement)
+    assert any("no memory" in words for words in live.warnings)
 
 
 def test_a_picture_to_the_end_has_the_same_options() -> None:
@@ -134,7 +154,7 @@ def test_a_picture_to_the_end_has_the_same_options() -> None:
         ({"solver": "wiener"}, "no iterations"),
         ({"iterations": 5}, "budget_ms"),
         ({"positive_background": True}, "not for live pictures"),
-        ({"solver": "admm-sensor", "model": "local"}, "one PSF"),
+        ({"solver": "admm-sensor", "model": "local"}, "one convolution"),
         ({"prior": "tv", "solver": "fista", "z_um": None, "tau": -1.0}, "tau"),
         ({"plane": 1}, "plane 1"),
         ({"background": np.zeros((5, 5))}, "background has 5 x 5"),
