@@ -205,7 +205,7 @@ def test_a_plan_is_carried_out_with_the_stage_homed(bench: Bench, tmp_path: Path
         {"x_um": 0.0, "y_um": 0.0, "z_um": 9e4},
     )
     done = procedure.carry_out(bench, tmp_path)
-    assert done.verdict[0] == "completed: 2 of 2 frames"
+    assert done.verdict[0] == "completed: 2 of 2 frames SIMULATED"
 
 
 def test_the_angular_procedure_fills_in_the_distance(bench: Bench, tmp_path: Path) -> None:
