@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from PySide6.QtWidgets import QLineEdit, QProgressBar, QWidget
+from shiboken6 import isValid
 
 from drivers.camera import Camera, Roi
 from gui.background import NewestOnly
@@ -107,14 +108,18 @@ class CameraForm(QWidget):
         return job
 
     def _taken(self, name: str, state: CameraState) -> None:
-        self._panel.accepted()
         widget = self.widgets[name]
+        if not isValid(widget):
+            return
+        self._panel.accepted()
         if isinstance(widget, QLineEdit):
             widget.setModified(False)
         self._show(state)
 
     def _refuse(self, name: str, why: str) -> None:
         widget = self.widgets[name]
+        if not isValid(widget):
+            return  # the window is closed; the session's log has said it
         if isinstance(widget, NumberEdit | Entry):
             widget.setModified(True)
             widget.refuse(why)  # what was typed stays to be corrected

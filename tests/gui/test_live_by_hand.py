@@ -155,9 +155,9 @@ _Usage = namedtuple("_Usage", "total used free")
 
 def _ask_the_disk(qtbot: QtBot, live: LivePanel) -> None:
     bar = live.record_bar
-    qtbot.waitUntil(lambda: bar._looking is None, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not bar._reader.is_reading, timeout=WAIT_MS)
     bar._look_at_disk()
-    qtbot.waitUntil(lambda: bar._looking is None, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not bar._reader.is_reading, timeout=WAIT_MS)
 
 
 @pytest.mark.parametrize("answer", [_Usage(0, 0, 0), OSError(5, "Input/output error")])
@@ -189,7 +189,7 @@ def test_a_server_that_is_silent_holds_up_nothing_but_the_gauge(
     qtbot: QtBot, live: LivePanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bar = live.record_bar
-    qtbot.waitUntil(lambda: bar._looking is None, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not bar._reader.is_reading, timeout=WAIT_MS)
     answered = threading.Event()
     asked: list[Path] = []
 
