@@ -20,6 +20,8 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.errors import SettingsError
 from instrument.plan import Part, Plan, PlanError
+from instrument.plan.abilities import SPARE_BYTES
+from instrument.runs import acquire
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import RunState, RunStatus
@@ -132,6 +134,39 @@ def test_abort_between_two_frames_keeps_them_and_resume_makes_the_calibration(
     done = resume.carry_out(bench)
     assert done.good
     assert done.calibration == run.path / "calibration"
+
+
+def _aborted(bench: Bench, folder: Path) -> Run:
+    """Return the sweep's run, ended after five frames."""
+    control = RunControl()
+    at_five = Following(lambda status: control.abort() if status.done == 5 else None)
+    with pytest.raises(RunEndedError) as ended:
+        AXIAL.carry_out(bench, folder, control=control, listener=at_five)
+    return ended.value.run
+
+
+def test_a_resume_needs_room_for_frames_as_the_run_has_them(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.camera.set_binning(4)
+    run = _aborted(bench, tmp_path)
+    bench.camera.set_binning(1)  # as it is opened another day
+    binned = 2 * 60 * 80  # bytes of a frame
+    monkeypatch.setattr(acquire, "free_bytes", lambda _: SPARE_BYTES + 3 * run.n_frames * binned)
+    assert ResumeProcedure(run.path).carry_out(bench).good
+
+
+def test_a_resume_that_fails_before_its_first_frame_gives_the_run_up_again(
+    bench: Bench, tmp_path: Path
+) -> None:
+    run = _aborted(bench, tmp_path)
+    record = run.path / "sweep.json"
+    whole = record.read_text()
+    record.write_text(whole[: len(whole) // 2])
+    with pytest.raises(CalibrationError, match="cannot be read"):
+        ResumeProcedure(run.path).carry_out(bench)
+    record.write_text(whole)
+    assert ResumeProcedure(run.path).carry_out(bench).good
 
 
 def test_pause_waits_dark_until_it_goes_on(bench: Bench, tmp_path: Path) -> None:

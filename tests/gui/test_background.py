@@ -38,3 +38,24 @@ def test_of_quick_requests_the_newest_is_read_and_what_is_forgotten_is_not_shown
     qtbot.waitUntil(lambda: shown[-1] == 6, timeout=WAIT_MS)
     assert 5 not in shown
     assert jobs.join(10)
+
+
+def test_everything_that_is_to_be_closed_is_closed(qtbot: QtBot) -> None:
+    """Two volumes that follow one another while a slice of the first is read."""
+    jobs = JobRunner()
+    reader = NewestOnly(jobs, "reading")
+    go_on, begun, closed = threading.Event(), threading.Event(), []
+
+    def read() -> None:
+        begun.set()
+        go_on.wait(20)
+
+    reader.ask(read, lambda _: None)
+    qtbot.waitUntil(begun.is_set, timeout=WAIT_MS)
+    reader.forget(last=lambda: closed.append("first"))
+    reader.forget(last=lambda: closed.append("second"))
+    reader.ask(lambda: closed.append("read"), lambda _: None)
+    go_on.set()
+    qtbot.waitUntil(lambda: len(closed) == 3, timeout=WAIT_MS)
+    assert closed == ["first", "second", "read"]
+    assert jobs.join(10)
