@@ -97,10 +97,9 @@ class Part:
         Its prior deviation is their root mean square: object and background do not trade places beyond that.
         """
         power = float(np.sum(self.problem.data[self._rows].astype(np.float64) ** 2))
-        restraint = np.count_nonzero(self.valid) / max(power, np.count_nonzero(self.valid))
-        return BackgroundRemoval(
-            self.valid.shape, BACKGROUND_FREQUENCIES, self.valid, self.dtype, float(restraint)
-        )
+        pixels = int(np.count_nonzero(self.valid))
+        restraint = pixels / max(power, pixels)
+        return BackgroundRemoval(self.valid.shape, BACKGROUND_FREQUENCIES, self.valid, self.dtype, restraint)
 
     def set_data(self, problem: Problem) -> None:
         """Take another photograph's data."""
