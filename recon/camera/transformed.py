@@ -1,4 +1,4 @@
-"""PSFs moved, enlarged, turned, mirrored: what a camera casts that was, and the decoys of one that was not."""
+"""PSFs moved, enlarged, turned, mirrored: of a camera that was, and decoys for one that was not."""
 
 from __future__ import annotations
 
