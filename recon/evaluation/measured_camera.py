@@ -112,7 +112,9 @@ def measured_camera(
     depths: tuple[float, float],
     *,
     plane: float | None,
-    **imperfections: float,
+    fall_off_deg: float = np.inf,
+    aberration: float = 0.0,
+    dispersion: float = 0.0,
 ) -> MeasuredCamera:
     """Return the camera of a measured set, its sensor cut and binned to a shape.
 
@@ -126,8 +128,8 @@ def measured_camera(
         Depths of the nearest and the farthest measured PSF, relative to the distance of diffuser and sensor.
     plane : float or None
         For scenes in one plane: which of the measured depths, from 0 to below 1; it stands for all.
-    **imperfections
-        ``fall_off_deg``, ``aberration``, ``dispersion`` of :class:`MeasuredCamera`.
+    fall_off_deg, aberration, dispersion : float
+        Of :class:`MeasuredCamera`.
 
     Raises InputError when the set is not there, too small, or has one depth where several are asked for.
     """
@@ -139,8 +141,16 @@ def measured_camera(
     distance_um = DISTANCE * max(shape) * PITCH_UM
     near, far = (1 / (depth * distance_um) for depth in depths)
     light = np.float32(psfs[len(psfs) // 2].sum(dtype=np.float64))
-    camera = MeasuredCamera(shape, PITCH_UM, distance_um, psfs / light, (near, far))
-    return replace(camera, **imperfections)
+    return MeasuredCamera(
+        shape,
+        PITCH_UM,
+        distance_um,
+        psfs / light,
+        (near, far),
+        fall_off_deg,
+        aberration,
+        dispersion,
+    )
 
 
 @lru_cache(maxsize=4)
