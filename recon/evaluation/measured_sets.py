@@ -50,14 +50,14 @@ def measured_set(name: MeasuredSet) -> tuple[Floats, Floats]:
 
 
 def _files(folder: Path, pattern: str) -> list[Floats]:
-    import tifffile
+    import cv2
 
     if not (files := sorted(folder.glob(pattern))):
         raise InputError(
             f"The measured set {folder.name} is not there: no {pattern} in {folder.resolve()}. Name the "
             "folder that holds it in the environment variable DIFFUSERBENCH_DATA."
         )
-    return [np.asarray(tifffile.imread(file), np.float32) for file in files]
+    return [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float32) for file in files]
 
 
 def _hand(root: Path) -> tuple[Floats, Floats]:
