@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from recon.base.threads import set_threads
 from recon.evaluation.lenslets import LensletCamera, build_camera
-from recon.streams.activity import aligned, baseline, change, fading, find_regions, motion
+from recon.streams.activity import aligned, baseline, change, fading, find_regions, floor_of, motion
 from recon.streams.video import BLOCK, VideoSolver, stream_problem
 
 SHAPE = (128, 160)
@@ -144,14 +144,16 @@ def neurons(  # noqa: PLR0913 - what its table varies
     if align:
         pictures = aligned(pictures, found_motion)
     fade = fading(pictures)
-    dff = change(pictures, baseline(pictures, 100, fade=fade))
+    base = baseline(pictures, 100, fade=fade)
+    floor = floor_of(base)
+    dff = change(pictures, base, floor)
     regions = find_regions(dff)
     centre = np.array(SHAPE) // 2
     traces = []
     for region in regions:
         light = region.trace(pictures)[:, None, None]
         level = baseline(light, 100, fade=fade)
-        traces.append(((light - level) / np.maximum(level, 1e-30))[:, 0, 0])
+        traces.append(change(light, level, floor)[:, 0, 0])
     distance = np.array([[np.hypot(*(np.array(r.centre) - centre - p)) for p in places] for r in regions])
     correlations = []
     if len(regions):
@@ -164,7 +166,7 @@ def neurons(  # noqa: PLR0913 - what its table varies
     for (row, column), course in zip(inside, active, strict=True):
         light = pictures[:, row - 2 : row + 3, column - 2 : column + 3].mean(axis=(1, 2))[:, None, None]
         level = baseline(light, 100, fade=fade)
-        trace = ((light - level) / np.maximum(level, 1e-30))[:, 0, 0]
+        trace = change(light, level, floor)[:, 0, 0]
         at_place.append(float(np.corrcoef(trace, course)[0, 1]) if trace.std() > 0 else 0.0)
     figures = {
         "found": len(correlations),

@@ -24,6 +24,7 @@ from instrument.reconstruction.video_files import (
 )
 from recon.base.declare import option
 from recon.streams.activity import (
+    LEAST_FRAMES,
     Motion,
     Region,
     aligned,
@@ -31,6 +32,7 @@ from recon.streams.activity import (
     change,
     fading,
     find_regions,
+    floor_of,
     local_correlation,
     motion,
 )
@@ -114,8 +116,12 @@ def find_activity(
     """
     settings = settings or ActivitySettings()
     indices = [index for index in range(len(video)) if video.is_written(index)]
-    if len(indices) < 3:
-        raise FileError(video.path, f"has {len(indices)} pictures; activity needs three at least.")
+    if len(indices) < LEAST_FRAMES:
+        raise FileError(
+            video.path,
+            f"has {len(indices)} pictures; activity is looked for in {LEAST_FRAMES} at least.",
+            "In fewer nothing tells it from noise: record for longer.",
+        )
     height, width = video.read(indices[0]).shape[:2]
     need = COPIES * len(indices) * height * width * 4
     if free_bytes is not None and need > free_bytes:
@@ -134,13 +140,14 @@ def find_activity(
     window = round(settings.window_s / (period_s or 0.1))
     fade = fading(frames)
     base = baseline(frames, max(window, 3), settings.percentile, fade)
-    dff = change(frames, base)
+    floor = floor_of(base)
+    dff = change(frames, base, floor)
     regions = find_regions(dff, least_correlation=settings.least_correlation, radius_px=settings.radius_px)
     traces = np.zeros((len(regions), len(indices)), np.float32)
     for trace, region in zip(traces, regions, strict=True):
         light = region.trace(frames)[:, None, None]
         level = baseline(light, max(window, 3), settings.percentile, fade)
-        trace[...] = ((light - level) / np.maximum(level, np.finfo(np.float32).tiny))[:, 0, 0]
+        trace[...] = change(light, level, floor)[:, 0, 0]
     return Activity(
         indices=tuple(indices),
         times_s=np.array(indices) * (period_s or 1.0),

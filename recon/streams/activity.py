@@ -26,6 +26,8 @@ FLOOR_SHARE = 0.1
 """Least baseline that a change is divided by, relative to the bright part of the picture: where there is
 next to nothing, a relative change means nothing."""
 BRIGHT_PERCENTILE = 99.9
+LEAST_FRAMES = 30
+"""Fewer cannot tell what lasts from what merely varies."""
 MOST_COMPARED = 500
 """Frames whose light is compared, each with each, to find how it fades; of longer videos every so many."""
 
@@ -171,16 +173,26 @@ def baseline(
     return result
 
 
-def change(frames: Floats, base: Floats) -> Floats:
+def floor_of(base: Floats) -> float:
+    """Return the least baseline that a change is divided by: a tenth of the picture's bright part.
+
+    Raises InputError when the baseline, (n_frames, height, width), is zero nearly everywhere.
+    """
+    floor = FLOOR_SHARE * float(np.percentile(base, BRIGHT_PERCENTILE))
+    if not floor > 0:
+        raise InputError("The video is dark: its baseline is zero nearly everywhere.")
+    return floor
+
+
+def change(frames: Floats, base: Floats, floor: float) -> Floats:
     """Return dF/F, ``(F - F0) / max(F0, floor)``; the floor keeps what hardly shines from looking active.
 
     Parameters
     ----------
     frames, base : ndarray, (n_frames, height, width)
+    floor : float
+        Of :func:`floor_of` the pictures' baseline.
     """
-    floor = FLOOR_SHARE * float(np.percentile(base, BRIGHT_PERCENTILE))
-    if not floor > 0:
-        raise InputError("The video is dark: its baseline is zero nearly everywhere.")
     return ((frames - base) / np.maximum(base, np.float32(floor))).astype(np.float32)
 
 

@@ -7,7 +7,16 @@ import pytest
 from scipy import ndimage
 
 from recon import InputError
-from recon.streams.activity import aligned, baseline, change, fading, find_regions, local_correlation, motion
+from recon.streams.activity import (
+    aligned,
+    baseline,
+    change,
+    fading,
+    find_regions,
+    floor_of,
+    local_correlation,
+    motion,
+)
 
 SHAPE = (40, 48)
 PLACES = ((10, 12), (12, 34), (29, 20))
@@ -78,11 +87,11 @@ def test_fading_of_what_does_not_shine_is_none(frames: np.ndarray) -> None:
 def test_change_is_relative_where_it_shines_and_small_where_it_is_dark() -> None:
     base = np.full((5, 10, 10), 100.0, np.float32)
     base[:, :, :5] = 0.01
-    dff = change(base * 1.5 + 0.01, base)
+    dff = change(base * 1.5 + 0.01, base, floor_of(base))
     assert dff[:, :, 5:] == pytest.approx(0.5, abs=1e-3)
     assert np.abs(dff[:, :, :5]).max() < 0.01
     with pytest.raises(InputError, match="dark"):
-        change(np.zeros((3, 4, 4), np.float32), np.zeros((3, 4, 4), np.float32))
+        floor_of(np.zeros((3, 4, 4), np.float32))
 
 
 @pytest.mark.parametrize("settings", [{"window": 2}, {"window": 10, "percentile": 101}])
@@ -106,7 +115,8 @@ def test_local_correlation_is_the_mean_over_the_neighbours() -> None:
 
 def test_cells_are_found_with_their_courses_and_nothing_else() -> None:
     frames, active = cells()
-    regions = find_regions(change(frames, baseline(frames, 100)))
+    base = baseline(frames, 100)
+    regions = find_regions(change(frames, base, floor_of(base)))
     assert len(regions) == 3
     for place, course in zip(PLACES, active, strict=True):
         own = min(regions, key=lambda region: np.hypot(*np.subtract(region.centre, place)))
