@@ -1,10 +1,10 @@
 """A camera's PSF from photographs of known pictures: a monitor instead of a pinhole.
 
-What photograph ``i`` shows in channel ``c`` is ``b_ic = C (h_c * (a_i x_ic + l_ic)) + o_ic``: the picture ``x``
-and the light ``l`` that is not in it (beyond its edges, and what it lost where it is saturated), through the
-PSF ``h``, cropped to the sensor (Kuo 2020, Eq. 3.4), with a brightness ``a`` a photograph and an even offset
-``o`` (stray light, black level). The PSF and the unknown light are solved in turn, each by non-negative least
-squares (FISTA), first on binned images.
+What photograph ``i`` shows in channel ``c`` is ``b_ic = C (h_c * (a_i x_ic + l_ic)) + o_ic``: the picture
+``x`` and the light ``l`` that is not in it (beyond its edges, and what it lost where it is saturated), through
+the PSF ``h``, cropped to the sensor (Kuo 2020, Eq. 3.4), with a brightness ``a`` a photograph and an even
+offset ``o`` (stray light, black level). The PSF and the unknown light are solved in turn, each by non-negative
+least squares (FISTA), first on binned images.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ class _Estimate:
         for k in range(len(self.psf)):
             part = slice(None) if len(self.psf) == 1 else slice(k, k + 1)
             mixer = _Mixed(scene[:, part].reshape(-1, *self.field), self.sensor)
-            camera = Composition(BackgroundRemoval(mixer.range_shape, (1, 1)), mixer)
+            camera = Composition(BackgroundRemoval((mixer.range_shape[0], *self.sensor), (1, 1)), mixer)
             target = camera.outer.forward(self.data[:, part].reshape(mixer.range_shape))
             step = 1 / (_NORM_MARGIN * estimate_norm(camera, 15)) ** 2
             solver = Fista(camera, target, NonNegativity(), initial=self.psf[k : k + 1], step=step)
@@ -222,10 +222,10 @@ class _Estimate:
             known = self._on_grid(
                 self.brightness[:, None, None].astype(np.float32) * self.known[:, c], camera
             )
-            even = BackgroundRemoval(camera.range_shape, (1, 1))
+            even = BackgroundRemoval((len(self.data), *self.sensor), (1, 1))
             where = self._on_grid(self.unknown[:, c], camera).astype(bool)
             seen = Composition(even, Composition(camera, Erasures(where, camera.domain_shape)))
-            target = even.forward(self.data[:, c] - camera.forward(known))
+            target = even.forward(self.data[:, c] - camera.forward(self._on_grid(lit, camera)))
             solver = Fista(seen, target, NonNegativity(), initial=self._on_grid(self.light[:, c], camera))
             found = solver.run(StoppingRules(iterations=self.settings.light_iterations)).solution
             self.light[:, c] = (found * where)[:, : self.field[0], : self.field[1]]
