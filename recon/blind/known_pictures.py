@@ -1,10 +1,10 @@
 """A camera's PSF from photographs of known pictures: a monitor instead of a pinhole.
 
 What photograph ``i`` shows in channel ``c`` is ``b_ic = C (h_c * (a_i x_ic + l_ic)) + o_ic``: the picture
-``x`` and the light ``l`` that is not in it (beyond its edges, and what it lost where it is saturated), through
-the PSF ``h``, cropped to the sensor (Kuo 2020, Eq. 3.4), with a brightness ``a`` a photograph and an even
-offset ``o`` (stray light, black level). The PSF and the unknown light are solved in turn, each by non-negative
-least squares (FISTA), first on binned images.
+``x`` and the light ``l`` that is not in it (beyond its edges, and what it lost where it is saturated),
+through the PSF ``h``, cropped to the sensor (Kuo 2020, Eq. 3.4), with a brightness ``a`` a photograph and an
+even offset ``o`` (stray light, black level). The PSF and the unknown light are solved in turn, each by
+non-negative least squares (FISTA), first on binned images.
 """
 
 from __future__ import annotations
@@ -219,9 +219,7 @@ class _Estimate:
         for c in range(self.channels):
             psf = self.psf[c if len(self.psf) > 1 else 0] * np.float32(self.gains[c])
             camera = Convolution(psf[None], self.sensor, n_channels=len(self.data))
-            known = self._on_grid(
-                self.brightness[:, None, None].astype(np.float32) * self.known[:, c], camera
-            )
+            lit = self.brightness[:, None, None].astype(np.float32) * self.known[:, c]
             even = BackgroundRemoval((len(self.data), *self.sensor), (1, 1))
             where = self._on_grid(self.unknown[:, c], camera).astype(bool)
             seen = Composition(even, Composition(camera, Erasures(where, camera.domain_shape)))
