@@ -29,7 +29,7 @@ import numpy as np
 from scipy.stats import beta
 
 from recon.base.threads import set_threads
-from recon.evaluation.scene import FAMILIES, SceneSpec, spec_of
+from recon.evaluation.scene import Family, SceneSpec, spec_of
 from recon.evaluation.scene_trial import Options, run_scene
 from recon.verdict.cases import cases_of, group_of, is_whole, mixed_scenes, weights_of
 from recon.verdict.evidence import Evidence
@@ -42,6 +42,8 @@ CASES = {*range(100, 504), *range(700, 900), *range(1200, 1230)}
 UNSEEN_FROM = 2000
 CLEAR = 0.7
 """Severity up to which a reconstruction is good beyond doubt, and not merely better than trivial."""
+FAMILIES: tuple[Family, ...] = ("dense-picture", "sparse-picture", "beads", "dense-volume", "microscope")
+"""Of these scenes, in the order of their numbers."""
 DIGITS = 4
 """Of the evidence that is shipped."""
 AUTO = ", auto"

@@ -28,7 +28,6 @@ from instrument.reconstruction.video_files import (
     SAMPLES,
     VideoPictures,
     create_output,
-    has_light,
     levels_of,
     require_video,
 )
@@ -40,6 +39,7 @@ from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, require_joint
+from recon.streams.stillness import has_light
 from recon.streams.video import BLOCK, COLD_ITERATIONS, VideoSolver, stream_problem
 
 

@@ -18,6 +18,7 @@ from recon.verdict.judge import Verdict
 if TYPE_CHECKING:
     from recon.reconstruction.choice import Choice
     from recon.reconstruction.problem import Problem
+    from recon.reconstruction.uncertainty import Uncertainty
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +120,8 @@ class Reconstruction:
         What may be wrong with the result, in sentences.
     verdict : Verdict or None
         Whether to trust it, from the data alone; None where nobody asked for one.
+    uncertainty : Uncertainty or None
+        How far it may be off, pixel by pixel; None where nobody asked for it.
     choice : Choice or None
         What was chosen and why, where the program chose (``model="auto"``).
     state : ndarray or None
@@ -148,6 +151,7 @@ class Reconstruction:
     empty_planes: tuple[EmptyPlanes, ...] = ()
     warnings: tuple[str, ...] = ()
     verdict: Verdict | None = None
+    uncertainty: Uncertainty | None = None
     choice: Choice | None = None
     state: npt.NDArray[Any] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)

@@ -22,7 +22,7 @@ from recon.reconstruction.reconstruct import given, reconstruct
 from recon.reconstruction.reduction import on_blocks, reduced_calibration
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import Progress
-from recon.streams.live_picture import ComingLevel, Level, LiveOptions, LivePicture
+from recon.streams.live_picture import NOISE_ONLY, ComingLevel, Level, LiveOptions, LivePicture
 from recon.streams.pace import Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch
 from recon.streams.video import require_steps, stream_problem
@@ -118,6 +118,7 @@ class LiveReconstructor:
         self._greeted = False
         """Whether the newest scene was shown by a Wiener filter already."""
         self._settled = False
+        self._doubt = ""
 
     def _checked(self) -> Problem:
         """Return the problem of a frame that holds nothing: what has no way is refused before the stream."""
@@ -154,6 +155,7 @@ class LiveReconstructor:
         level = self._level_for(frame)
         small = block_mean(frame, level.binning, about_axis=True)
         self._scene = self._watch.see(small)
+        self._doubt = self._doubted(level, frame)
         affordable = self._pace.affordable(level.binning, self.budget_ms)
         cut = self._scene is SceneState.NEW and not self._greeted
         too_slow = affordable < 1 and self._scene is not SceneState.STILL
@@ -246,6 +248,15 @@ class LiveReconstructor:
         self._follows = self._greeted = self._settled = False
 
     # Pieces ----------------------------------------------------------------------------------------
+    def _doubted(self, level: Level, frame: Floats) -> str:
+        """Return why the newest picture is none; have a level that was settled on noise made anew."""
+        if not level.sees_light(self._as_given(self._watch.mean), self._watch.count):
+            return NOISE_ONLY
+        if not level.lit and self._coming is None:
+            self._level = replace(level, lit=True)  # once, also where there is no memory for another
+            self._make(level.binning, frame)
+        return ""
+
     def _iterate(
         self, level: Level, began: Spent, at_most: int | None, newer: Callable[[], bool]
     ) -> tuple[int, Spent]:
@@ -408,6 +419,7 @@ class LiveReconstructor:
             else f"brightest {of}"
             if plane is None
             else f"depth {plane} {of}",
+            doubt=self._doubt,
         )
 
 

@@ -1,4 +1,4 @@
-"""Whether the scene of a video stands still, told from the frames alone, whatever their noise is.
+"""Whether a video's frames hold light, and whether its scene stands still, told from the frames alone.
 
 Camera noise is white, whether it comes from photons or from reading: the mean of ``s x s`` pixels of it has
 ``1 / s^2`` of the variance. What a moved scene changes is not: caustics are several pixels wide. The variance
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.blocks import block_mean
+from recon.base.noise import estimate_deviation
 
 Array = npt.NDArray[Any]
 
@@ -26,6 +27,39 @@ blocks; few make the ratio itself uncertain, and five deviations of that are all
 NEW_SCENE = 0.5
 """Share of a frame's variance that changed, from which nothing of the scene before helps. Measured: with a
 picture panning by 3 x 6 pixels a frame (a share of about 0.3) a warm start is still as good as a cold one."""
+
+
+_BLOCK = 8
+"""Pixels along a side over which light is averaged to tell it from noise."""
+LIT = 2.0
+"""Variance of block means from which a frame has light, in units of what its pixels' noise makes of it."""
+
+
+def has_light(frame: Array, deviation: Array) -> bool:
+    """Tell whether there is more in a frame than noise.
+
+    Noise of single pixels goes away where pixels are averaged, a scene through a diffuser does not: the
+    variance of the means of 8 x 8 pixels is compared with what noise leaves of it. Noise grows with light: a
+    frame dimmer than the one that ``deviation`` was found on has less, which it tells itself.
+
+    Parameters
+    ----------
+    frame : ndarray, (height, width) or (height, width, n_channels)
+        Counts less dark.
+    deviation : ndarray, (n_channels,)
+        Of the noise, counts; that of another frame of the same camera is enough.
+    """
+    channels = frame[None] if frame.ndim == 2 else np.moveaxis(frame, 2, 0)
+    height, width = (n // _BLOCK for n in channels.shape[1:])
+    if min(height, width) < 2:
+        return True  # too few blocks to tell
+    means = block_mean(channels, _BLOCK, dtype=np.float64)
+    spread = means.var(axis=(1, 2)) * _BLOCK**2
+    given = np.asarray(deviation, np.float64).reshape(-1)
+    if (spread > LIT * given**2).any():
+        return True
+    own = np.array([estimate_deviation(channel) for channel in channels])
+    return bool(((own > 0) & (spread > LIT * own**2)).any())  # 0 is no estimate: most pixels are alike
 
 
 class SceneState(enum.StrEnum):

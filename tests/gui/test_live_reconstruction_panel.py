@@ -74,6 +74,26 @@ def test_it_follows_a_stream_that_was_interrupted(
     qtbot.waitUntil(lambda: panel._shown is not shown, timeout=WAIT_MS)
 
 
+def test_a_picture_of_noise_is_called_so_by_its_own_frame_and_an_old_one_old(
+    qtbot: QtBot, window: MainWindow, panel: LiveReconstructionPanel
+) -> None:
+    qtbot.waitUntil(lambda: panel._shown is not None and not panel._shown.picture.doubt, timeout=WAIT_MS)
+    assert not panel.view.caution
+    session = window.session
+    session.bench.scene_off()
+    qtbot.waitUntil(lambda: panel.view.caution.startswith("Noise only"), timeout=WAIT_MS)
+    assert "Noise only" in panel.status.text()
+    session.bench.scene_on()
+    qtbot.waitUntil(lambda: not panel.view.caution, timeout=WAIT_MS)
+    held = threading.Event()
+    job = session.exclusive_job("A run", lambda _: held.wait(WAIT_MS / 1000))
+    qtbot.waitUntil(lambda: panel.view.caution.startswith("Old picture"), timeout=WAIT_MS)
+    held.set()
+    qtbot.waitUntil(lambda: job.is_over and not panel.view.caution, timeout=WAIT_MS)
+    panel.run_button.setChecked(False)
+    assert panel.view.caution == "Old picture: the preview is off"
+
+
 def test_frames_that_do_not_fit_the_calibration_are_told(
     qtbot: QtBot, window: MainWindow, panel: LiveReconstructionPanel
 ) -> None:
