@@ -16,6 +16,7 @@ from recon.priors import PRIORS
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
+from recon.reconstruction.psf_refinement import refined
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solve import Progress, solve
@@ -71,11 +72,18 @@ def reconstruct(
     if not isinstance(measurement, Measurement):
         measurement = Measurement(measurement)
     problem = Problem.of(replace(measurement, **known), calibration, options)
+    refinement = None
+    if options.refine_psf:
+        problem, refinement = refined(problem, cancel=cancel)
     problem = choose(problem)
     result = solve(problem, warm=warm, on_progress=on_progress, cancel=cancel, keeper=keeper)
-    return (
+    result = (
         judged(result, problem, started=warm is not None) if options.judged else replace(result, basis=None)
     )
+    if refinement is None:
+        return result
+    provenance = {**result.provenance, "psf_refinement": refinement.to_json()}
+    return replace(result, refinement=refinement, provenance=provenance)
 
 
 def given(
