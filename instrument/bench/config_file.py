@@ -34,7 +34,7 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 
 def template(name: str = "default") -> str:
-    """Return a commented configuration: ``default``, the simulated bench; ``display``; ``led_microscope``."""
+    """Return a commented simulated bench: ``default``, ``display``, ``led_microscope`` or ``screen``."""
     return resources.files("instrument.bench").joinpath(f"{name}_bench.toml").read_text("utf-8")
 
 

@@ -31,6 +31,7 @@ _OF_THE_WINDOW = ("PySide6", "shiboken6", "pyqtgraph")
         "diffuserbench new --force          overwrite an existing bench.toml",
         "diffuserbench new display.toml --display",
         "diffuserbench new microscope.toml --led-microscope",
+        "diffuserbench new screen.toml --screen",
     )
 )
 def new(
@@ -40,6 +41,9 @@ def new(
     led_microscope: Annotated[
         bool, typer.Option("--led-microscope", help="An LED array microscope instead, for calibrate dpc.")
     ] = False,
+    screen: Annotated[
+        bool, typer.Option("--screen", help="A camera before a monitor instead, for calibrate screen.")
+    ] = False,
 ) -> None:
     """Write a commented bench.toml in which every key is explained: the simulated bench to start from."""
     from instrument.bench.config_file import DEFAULT_NAME, template
@@ -48,14 +52,16 @@ def new(
     if file.is_dir():
         raise FileError(file, "is a folder.", f"Name a file in it, e.g. {file / DEFAULT_NAME}")
     require_new(file, overwrite=force)
-    if display and led_microscope:
-        raise BenchError("Give --display or --led-microscope, not both.")
-    text, what = template(), "bench, with every key explained"
+    if display + led_microscope + screen > 1:
+        raise BenchError("Give one of --display, --led-microscope and --screen.")
+    name, what = "default", "bench, with every key explained"
     if display:
-        text, what = template("display"), "holographic display"
+        name, what = "display", "holographic display"
     if led_microscope:
-        text, what = template("led_microscope"), "LED array microscope"
-    write_text(file, text)
+        name, what = "led_microscope", "LED array microscope"
+    if screen:
+        name, what = "screen", "camera before a monitor"
+    write_text(file, template(name))
     typer.echo(f"Wrote {file}: a SIMULATED {what}.")
     typer.echo(f"Next: diffuserbench check{'' if file == Path(DEFAULT_NAME) else f' --bench {file}'}")
 

@@ -1,0 +1,299 @@
+"""A camera's PSF from photographs of known pictures: a monitor instead of a pinhole.
+
+What photograph ``i`` shows in channel ``c`` is ``b_ic = C (h_c * (a_i x_ic + l_ic)) + o_ic``: the picture
+``x`` and the light ``l`` that is not in it (beyond its edges, and what it lost where it is saturated),
+through the PSF ``h``, cropped to the sensor (Kuo 2020, Eq. 3.4), with a brightness ``a`` a photograph and an
+even offset ``o`` (stray light, black level). The PSF and the unknown light are solved in turn, each by
+non-negative least squares (FISTA), first on binned images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.blocks import block_mean, enlarged
+from recon.blind.psf_step import BeadMixer
+from recon.camera.base import Array, Composition, LinearOperator, estimate_norm
+from recon.camera.convolution import Convolution, field_of
+from recon.camera.factors import BackgroundRemoval, Erasures
+from recon.errors import InputError
+from recon.priors import NonNegativity
+from recon.solvers import Fista, StoppingRules
+
+Floats = npt.NDArray[np.float32]
+Progress = Callable[[str, float], object]
+
+SATURATED = 0.97
+"""Of the pictures' peak: from here on a pixel is known to be at least so bright."""
+_COARSE_PX = 64  # rows of the coarsest images
+_NORM_MARGIN = 1.1  # the power iteration's norm is a lower bound
+_FLATTEST = 1e-3  # relative deviation of a photograph or picture that shows something
+
+
+@dataclass(frozen=True, slots=True)
+class PictureSettings:
+    """How the photographs are solved.
+
+    Attributes
+    ----------
+    one_psf : bool
+        One PSF for all channels, which differ in brightness: a diffuser hardly disperses. Else one a channel.
+    beyond : float
+        How far beyond the pictures' field there may be light, in parts of the sensor's height; 0: nowhere.
+    rounds : int
+        How often PSF and unknown light are solved in turn, at each scale.
+    psf_iterations, light_iterations : int
+        Of each half-step.
+    """
+
+    one_psf: bool = True
+    beyond: float = 0.18
+    rounds: int = 4
+    psf_iterations: int = 80
+    light_iterations: int = 30
+
+
+@dataclass(frozen=True)
+class PicturePsf:
+    """What photographs of known pictures tell of a camera.
+
+    Attributes
+    ----------
+    psf : ndarray, float32, (n_channels, height, width)
+        On the sensor's pixels; a source on the pictures' centre pixel casts it. Not negative.
+    gains : ndarray, float64, (n_channels,)
+        Light of each channel's PSF.
+    brightness : ndarray, float64, (n_photographs,)
+        Of each photograph relative to its picture; mean 1.
+    stray : ndarray, float32, (n_photographs, n_channels)
+        Even light that no picture accounts for, in the photographs' unit.
+    light : ndarray, float32, (n_photographs, n_channels, field height, field width)
+        Light that was not in the pictures, in their unit, where it can reach the sensor.
+    misfit : float
+        What is left of the photographs' standard deviation.
+    """
+
+    psf: Floats
+    gains: npt.NDArray[np.float64]
+    brightness: npt.NDArray[np.float64]
+    stray: Floats
+    light: Floats
+    misfit: float
+
+
+def psf_from_pictures(
+    photographs: Array,
+    pictures: Array,
+    settings: PictureSettings | None = None,
+    *,
+    on_progress: Progress | None = None,
+) -> PicturePsf:
+    """Estimate the PSF from photographs of known pictures.
+
+    Parameters
+    ----------
+    photographs : ndarray, (n, n_channels, height, width)
+        Linear in the light, dark frame subtracted, any scale.
+    pictures : ndarray, the same shape
+        What was shown, linear in the light, on the sensor's pixels: one object pixel further moves the
+        pattern by one sensor pixel. Their peak may be saturated.
+    settings : PictureSettings, optional
+    on_progress : callable, optional
+        Called with what is being done and the share done.
+
+    Raises InputError when shapes differ, there are fewer than two pairs, values are not finite or negative
+    pictures are given, or a picture or photograph shows nothing.
+    """
+    settings = settings or PictureSettings()
+    data, known = (np.asarray(images, np.float32) for images in (photographs, pictures))
+    _check(data, known, settings)
+    report = on_progress or (lambda _what, _share: None)
+    factors = [1]
+    while data.shape[2] // (2 * factors[-1]) >= _COARSE_PX:
+        factors.append(2 * factors[-1])
+    costs = np.array([1 / f**2 for f in reversed(factors)])
+    found: _Estimate | None = None
+    for number, factor in enumerate(reversed(factors)):
+        begin, part = costs[:number].sum() / costs.sum(), costs[number] / costs.sum()
+        scale = _Estimate(
+            block_mean(data, factor, about_axis=True), block_mean(known, factor, about_axis=True), settings
+        )
+        if found is not None:
+            scale.start_from(found)
+
+        def share(what: str, done: float, begin: float = begin, part: float = part) -> None:
+            report(what, begin + part * done)
+
+        scale.solve(share)
+        found = scale
+    assert found is not None
+    return found.result()
+
+
+class _Estimate:
+    """The unknowns at one scale, and what improves each."""
+
+    def __init__(self, data: Floats, known: Floats, settings: PictureSettings) -> None:
+        self.settings = settings
+        count, self.channels, *sensor = data.shape
+        self.sensor = (sensor[0], sensor[1])
+        self.field, centre = field_of(self.sensor, self.sensor)
+        self.window = tuple(
+            slice(c - n // 2, c - n // 2 + n) for c, n in zip(centre, self.sensor, strict=True)
+        )
+        self.data = data
+        self.known = np.zeros((count, self.channels, *self.field), np.float32)
+        self.known[:, :, *self.window] = known
+        self.unknown = self._where_unknown(known)
+        self.light = np.zeros_like(self.known)
+        self.brightness = np.ones(count)
+        self.psf = np.zeros((1 if settings.one_psf else self.channels, *self.sensor), np.float32)
+        self.gains = np.ones(self.channels)
+        self.misfit = np.inf
+
+    def _where_unknown(self, known: Floats) -> npt.NDArray[np.bool_]:
+        """Return where there may be light that the pictures do not tell of: beyond them, where saturated."""
+        reach = round(self.settings.beyond * self.sensor[0])
+        around = np.zeros(self.field, bool)
+        around[tuple(slice(max(w.start - reach, 0), w.stop + reach) for w in self.window)] = True
+        around[self.window] = False
+        unknown = np.broadcast_to(around, self.known.shape).copy()
+        unknown[:, :, *self.window] = known >= SATURATED * known.max()
+        return unknown
+
+    def start_from(self, coarse: _Estimate) -> None:
+        """Take over what binned images gave."""
+        factor = round(self.sensor[0] / coarse.sensor[0])
+        self.psf = np.maximum(enlarged(coarse.psf, factor, self.sensor), 0)
+        self.light = enlarged(coarse.light, factor, self.field) * np.float32(factor**2) * self.unknown
+        self.brightness, self.gains = coarse.brightness, coarse.gains
+
+    def solve(self, report: Progress) -> None:
+        """Solve PSF, brightness and unknown light in turn; ends with the PSF."""
+        for number in range(self.settings.rounds):
+            report("PSF", number / self.settings.rounds)
+            self.solve_psf()
+            self.solve_brightness()
+            if number < self.settings.rounds - 1 and self.unknown.any():
+                report("light beyond the pictures", (number + 0.7) / self.settings.rounds)
+                self.solve_light()
+
+    def scene(self) -> Floats:
+        """Return all light in the photographs' unit but for the PSF: (n, n_channels, field)."""
+        lit = self.brightness[:, None, None, None].astype(np.float32) * self.known + self.light
+        return np.asarray(lit * self.gains[:, None, None].astype(np.float32), np.float32)
+
+    def solve_psf(self) -> None:
+        scene = self.scene()
+        for k in range(len(self.psf)):
+            part = slice(None) if len(self.psf) == 1 else slice(k, k + 1)
+            mixer = _Mixed(scene[:, part].reshape(-1, *self.field), self.sensor)
+            camera = Composition(BackgroundRemoval((mixer.range_shape[0], *self.sensor), (1, 1)), mixer)
+            target = camera.outer.forward(self.data[:, part].reshape(mixer.range_shape))
+            step = 1 / (_NORM_MARGIN * estimate_norm(camera, 15)) ** 2
+            solver = Fista(camera, target, NonNegativity(), initial=self.psf[k : k + 1], step=step)
+            self.psf[k] = solver.run(StoppingRules(iterations=self.settings.psf_iterations)).solution[0]
+
+    def solve_brightness(self) -> None:
+        """Fit each channel's and each photograph's brightness to the data, in turn."""
+        data = self._even_removed(self.data)
+        for axes in ((0, 2, 3), (1, 2, 3)):
+            model = self._even_removed(self.seen(self.scene()))
+            power = np.einsum("nchw,nchw->nc", model, model, dtype=np.float64)
+            match = np.einsum("nchw,nchw->nc", model, data, dtype=np.float64)
+            ratio = match.sum(axis=axes[0]) / np.maximum(power.sum(axis=axes[0]), 1e-30)
+            if axes[0] == 0:
+                self.gains = self.gains * ratio
+            else:
+                self.brightness = self.brightness * ratio / ratio.mean()
+                self.light *= (ratio / ratio.mean())[:, None, None, None].astype(np.float32)
+        model = self._even_removed(self.seen(self.scene()))
+        self.misfit = float(np.linalg.norm(model - data) / np.linalg.norm(data))
+
+    def solve_light(self) -> None:
+        """Solve what is not in the pictures, channel by channel, not negative."""
+        for c in range(self.channels):
+            psf = self.psf[c if len(self.psf) > 1 else 0] * np.float32(self.gains[c])
+            camera = Convolution(psf[None], self.sensor, n_channels=len(self.data))
+            lit = self.brightness[:, None, None].astype(np.float32) * self.known[:, c]
+            even = BackgroundRemoval((len(self.data), *self.sensor), (1, 1))
+            where = self._on_grid(self.unknown[:, c], camera).astype(bool)
+            seen = Composition(even, Composition(camera, Erasures(where, camera.domain_shape)))
+            target = even.forward(self.data[:, c] - camera.forward(self._on_grid(lit, camera)))
+            solver = Fista(seen, target, NonNegativity(), initial=self._on_grid(self.light[:, c], camera))
+            found = solver.run(StoppingRules(iterations=self.settings.light_iterations)).solution
+            self.light[:, c] = (found * where)[:, : self.field[0], : self.field[1]]
+
+    def seen(self, scene: Floats) -> Floats:
+        """Return what the sensor sees of scenes (n, n_channels, field)."""
+        camera = Convolution(self.psf, self.sensor, n_channels=self.channels)
+        return np.stack([camera.forward(self._on_grid(one, camera)) for one in scene])
+
+    def _on_grid(self, images: Array, camera: Convolution) -> Floats:
+        padded = np.zeros((*images.shape[:-2], *camera.grid_shape), np.float32)
+        padded[..., : self.field[0], : self.field[1]] = images
+        return padded
+
+    @staticmethod
+    def _even_removed(images: Floats) -> Floats:
+        return np.asarray(images - images.mean(axis=(2, 3), keepdims=True), np.float32)
+
+    def result(self) -> PicturePsf:
+        """Return what was found."""
+        stray = (self.data - self.seen(self.scene())).mean(axis=(2, 3))
+        psf = self.psf * self.gains[:, None, None].astype(np.float32)
+        return PicturePsf(
+            psf, psf.sum(axis=(1, 2), dtype=np.float64), self.brightness, stray, self.light, self.misfit
+        )
+
+
+class _Mixed(LinearOperator):
+    """The map from one PSF (1, height, width) to photographs (n, height, width) of fixed scenes."""
+
+    def __init__(self, scenes: Floats, sensor: tuple[int, int]) -> None:
+        super().__init__((1, *sensor), (len(scenes), *sensor), np.float32)
+        self._mixer = BeadMixer(np.ones((1, *scenes.shape[1:]), np.float32), scenes, sensor, sensor)
+
+    def forward(self, x: Array, out: Array | None = None) -> Array:
+        """Convolve each scene with the PSF."""
+        seen = self._mixer.forward(x)
+        return seen if out is None else _into(out, seen)
+
+    def adjoint(self, y: Array, out: Array | None = None) -> Array:
+        """Correlate each photograph with its scene, and sum."""
+        back = self._mixer.adjoint(y)
+        return back if out is None else _into(out, back)
+
+    @property
+    def norm_bound(self) -> float:
+        """As :class:`BeadMixer` gives it."""
+        return float(np.sqrt(self._mixer.lipschitz))
+
+
+def _into(out: Array, values: Array) -> Array:
+    out[...] = values
+    return out
+
+
+def _check(data: Floats, known: Floats, settings: PictureSettings) -> None:
+    if data.ndim != 4 or data.shape != known.shape or len(data) < 2:
+        raise InputError(
+            "Two or more photographs (n, n_channels, height, width) and pictures of the same shape are "
+            f"needed, not {data.shape} and {known.shape}."
+        )
+    if not (np.isfinite(data).all() and np.isfinite(known).all()):
+        raise InputError("A photograph or picture holds values that are not finite numbers.")
+    if known.min() < 0:
+        raise InputError(f"Pictures are light and not negative; the least value is {known.min():g}.")
+    for what, images in (("Photograph", data), ("Picture", known)):
+        for number, image in enumerate(images):
+            if not image.std() > _FLATTEST * abs(image).max():
+                raise InputError(f"{what} {number + 1} shows nothing: all its pixels are alike.")
+    if settings.rounds < 1 or min(settings.psf_iterations, settings.light_iterations) < 1:
+        raise InputError("Rounds and iterations are at least 1.")
+    if not 0 <= settings.beyond <= 1:
+        raise InputError(f"Light beyond the pictures is looked for within 0 to 1, not {settings.beyond:g}.")
