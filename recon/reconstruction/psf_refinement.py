@@ -96,7 +96,7 @@ class Refinement:
     @property
     def helps(self) -> bool:
         """Whether the copy is certainly better."""
-        return min(self.certainty, self.significance) >= CERTAIN
+        return bool(min(self.certainty, self.significance) >= CERTAIN)
 
     def of(self, calibration: Calibration) -> Calibration:
         """Return the calibration with the copy, and its sources where they then are; as given if no help."""
