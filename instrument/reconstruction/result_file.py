@@ -26,6 +26,7 @@ from instrument.files.volumes import (
 )
 from instrument.reconstruction.job import Job
 from recon.reconstruction.result import Grid, Reconstruction
+from recon.reconstruction.uncertainty import Uncertainty
 
 WHITE_PERCENTILE = 99.9
 """The preview's white; brighter pixels are shown white too."""
@@ -33,21 +34,25 @@ WHITE_PERCENTILE = 99.9
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """The files of one reconstruction: float32 TIFF, 8-bit preview, settings and history, optional figure.
+    """The files of one reconstruction: float32 TIFF, 8-bit preview, settings and history, and optional ones.
 
-    A volume may be an OME-Zarr folder instead of a TIFF.
+    Those are a figure, and a float32 TIFF of standard deviations. A volume may be an OME-Zarr folder instead
+    of a TIFF.
     """
 
     image: Path
     preview: Path
     record: Path
     figure: Path | None = None
+    deviation: Path | None = None
 
     @classmethod
-    def named(cls, out: Path, figure: Path | None = None, *, volume: bool = False) -> Outputs:
+    def named(
+        cls, out: Path, figure: Path | None = None, *, volume: bool = False, uncertainty: bool = False
+    ) -> Outputs:
         """Return the files that go with ``out``, whose suffix must be ``.tif`` (volumes: or ``.ome.zarr``).
 
-        Raises FileError.
+        With ``uncertainty`` a picture's standard deviations are one of them. Raises FileError.
         """
         if volume and is_zarr_name(out):
             if not (stem := stem_of(out)):
@@ -63,14 +68,16 @@ class Outputs:
             )
         if figure is not None and figure.suffix.lower() not in (".png", ".pdf", ".svg"):
             raise FileError(figure, "a figure is written as .png, .pdf or .svg.")
-        outputs = cls(out, out.with_suffix(".png"), out.with_suffix(".json"), figure)
+        deviation = out.with_name(f"{out.stem}-deviation{out.suffix}") if uncertainty else None
+        outputs = cls(out, out.with_suffix(".png"), out.with_suffix(".json"), figure, deviation)
         if figure in outputs.files()[:3]:
             raise FileError(out.with_suffix(".png"), "is the preview; give the figure another name.")
         return outputs
 
     def files(self) -> tuple[Path, ...]:
         """Return every file that will be written."""
-        return tuple(p for p in (self.image, self.preview, self.record, self.figure) if p is not None)
+        files = self.image, self.preview, self.record, self.figure, self.deviation
+        return tuple(p for p in files if p is not None)
 
     def check(self, n_pixels: int, *, overwrite: bool = False) -> None:
         """Refuse places that cannot be written, or are taken, before the work.
@@ -102,7 +109,11 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
     write_image(outputs.image, image, {"simulated": job.simulated, "record": outputs.record.name})
     pixels, white = preview(image)
     write_image(outputs.preview, pixels)
+    if outputs.deviation is not None and result.uncertainty is not None:
+        deviation = np.rot90(result.uncertainty.deviation[0], rotate_deg // 90)
+        write_image(outputs.deviation, deviation, {"simulated": job.simulated, "record": outputs.record.name})
     record = reconstruction_record(result, job, volume=False) | {
+        "uncertainty": _of_uncertainty(result.uncertainty, outputs.deviation),
         "rotated_deg": rotate_deg,
         "preview": {"white": white, "white_percentile": WHITE_PERCENTILE, "black": 0.0},
     }
@@ -168,6 +179,19 @@ def _of_picture(result: Reconstruction) -> dict[str, Any]:
         "iterations": len(result.history),
         "grid": picture_grid(result.grid),
         "history": [asdict(entry) for entry in result.history],
+    }
+
+
+def _of_uncertainty(found: Uncertainty | None, file: Path | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    return {
+        "file": None if file is None else file.name,
+        "sentences": found.sentences,
+        "trusted": found.trusted,
+        "repeats": found.repeats,
+        "residual_over_noise": found.misfit,
+        "seconds": found.seconds,
     }
 
 

@@ -303,6 +303,13 @@ class ReconstructionOptions:
         recorded=False,
         applies=("picture", "volume", "live picture"),
     )
+    uncertainty: bool = option(
+        False,
+        help="Also the standard deviation of every pixel; takes about seven times as long.",
+        group=_MAIN,
+        applies=("picture",),
+        identifies=False,
+    )
     judged: bool = option(
         True,
         help="Say whether the result can be trusted.",

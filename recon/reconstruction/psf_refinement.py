@@ -49,6 +49,8 @@ FIT_PX, FIT_ITERATIONS = 200, 100
 """The same of those that it is fitted with."""
 HELD_SHARE = 0.1
 """Of the pixels, for the fit, and as many again for the judgement."""
+BETWEEN_PX = 0.37
+"""By how much all copies are displaced."""
 FINE_PX = 3.0
 """Deviation of the Gaussian whose mean is taken off what is left, binned pixels."""
 TILES = 4
@@ -310,9 +312,12 @@ def _radius_px(psfs: Array) -> float:
 
 
 def _copied(depths: Depths, how: Transformation) -> Depths:
-    """Return depths whose PSFs are transformed, with the places that they were registered from."""
-    if how == Transformation():
-        return depths
+    """Return depths whose PSFs are transformed, with the places that they were registered from.
+
+    All are displaced by part of a pixel, which displaces the picture alone: else the PSFs as given would be
+    the only ones that are not interpolated.
+    """
+    how = replace(how, rows=BETWEEN_PX, columns=BETWEEN_PX)
     fields = [FieldOfPsfs(transformed(f.psfs, how), f.points @ how.matrix.T) for f in depths.fields]
     return replace(depths, central=transformed(depths.central, how), fields=fields)
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from recon.reconstruction.choice import Choice
     from recon.reconstruction.problem import Problem
     from recon.reconstruction.psf_refinement import Refinement
+    from recon.reconstruction.uncertainty import Uncertainty
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +121,8 @@ class Reconstruction:
         What may be wrong with the result, in sentences.
     verdict : Verdict or None
         Whether to trust it, from the data alone; None where nobody asked for one.
+    uncertainty : Uncertainty or None
+        How far it may be off, pixel by pixel; None where nobody asked for it.
     choice : Choice or None
         What was chosen and why, where the program chose (``model="auto"``).
     refinement : Refinement or None
@@ -151,6 +154,7 @@ class Reconstruction:
     empty_planes: tuple[EmptyPlanes, ...] = ()
     warnings: tuple[str, ...] = ()
     verdict: Verdict | None = None
+    uncertainty: Uncertainty | None = None
     choice: Choice | None = None
     refinement: Refinement | None = None
     state: npt.NDArray[Any] | None = None

@@ -15,8 +15,9 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from recon.camera.camera_model import choose_model
 from recon.errors import InputError
-from recon.reconstruction.measurement import Floats, Measurement
+from recon.reconstruction.measurement import Floats, Measurement, depths_of
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
@@ -50,20 +51,38 @@ def stream_problem(
     frame : Measurement or array, (height, width[, n_channels])
         Background subtracted. A bright one, where the video has brighter and darker ones.
     options : ReconstructionOptions, optional
-        Any camera model, prior, background and depths; ``"auto"`` is one PSF a depth here, as the quickest,
-        and the exact-data ADMM where that has a way.
+        Any camera model, prior, background and depths; ``"auto"`` is one PSF a depth here, as the quickest
+        (the problem's warnings say where PSFs differ over the field), and the exact-data ADMM where that has
+        a way.
     **overrides
         Single options, and facts about the frame, by their names, as of :func:`recon.reconstruct`.
     """
     known, options = given(overrides, options)
     measurement = frame if isinstance(frame, Measurement) else Measurement(frame)
+    doubt = ""
     if options.model == "auto":
+        doubt = _by_one_psf(calibration, options)
         options = replace(options, model="convolution")
     problem = Problem.of(replace(measurement, **known), calibration, options)
+    if doubt:
+        problem = replace(problem, warnings=(*problem.warnings, doubt))
     if options.solver == "auto" and SOLVERS["admm-sensor"].accepts(problem) is None:
         problem = replace(problem, options=replace(options, solver="admm-sensor"))
     problem.solver  # noqa: B018 - refuses at once what it has no way for
     return problem
+
+
+def _by_one_psf(calibration: Calibration | npt.ArrayLike, options: ReconstructionOptions) -> str:
+    """Say what one PSF for the whole field does not tell of a calibration; empty where it is enough."""
+    if not isinstance(calibration, Calibration) or len(calibration.psfs) == 1:
+        return ""
+    model, why = choose_model(depths_of(calibration, options)[1], "auto")
+    if model == "convolution":
+        return ""
+    return (
+        f"One PSF serves the whole field, as is quickest: {why}. "
+        f"--model {model} takes all of them, in several times the time."
+    )
 
 
 class VideoSolver:
