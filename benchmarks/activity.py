@@ -148,7 +148,7 @@ def neurons(  # noqa: PLR0913 - what its table varies
         pictures = aligned(pictures, found_motion)
     fade = fading(pictures)
     base = baseline(pictures, 100, fade=fade)
-    floor = floor_of(base)
+    floor = floor_of(pictures)
     dff = change(pictures, base, floor)
     search = find_regions(
         pictures - base, noise=noise_of(pictures), moved=None if found_motion.is_still else found_motion
@@ -284,7 +284,7 @@ def nothing(kind: str, frames: int, photons: float, speed: float, seed: int = 0)
     fade = fading(pictures)
     base = baseline(pictures, 300, fade=fade)
     try:
-        floor = floor_of(base)
+        floor = floor_of(pictures)
     except InputError as error:
         return {**figures, "regions": 0, "refused": str(error)}
     moved = None if found.is_still else found

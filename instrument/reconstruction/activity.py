@@ -147,7 +147,7 @@ def find_activity(
     window = round(settings.window_s / (period_s or 0.1))
     fade = fading(frames)
     base = baseline(frames, max(window, 3), settings.percentile, fade)
-    floor = floor_of(base)
+    floor = floor_of(frames)
     dff = change(frames, base, floor)
     noise = noise_of(frames)
     excess = np.subtract(frames, base, out=base)

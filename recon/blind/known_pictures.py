@@ -27,10 +27,9 @@ from recon.solvers import Fista, StoppingRules
 Floats = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]
 
-SATURATED = 0.97
-"""Of the pictures' peak: from here on a pixel is known to be at least so bright."""
 _COARSE_PX = 64  # rows of the coarsest images
 _NORM_MARGIN = 1.1  # the power iteration's norm is a lower bound
+_LARGEST_STEP, _GAMMAS = 0.3, (0.3, 4.0)  # of the exponent
 _FLATTEST = 1e-3  # relative deviation of a photograph or picture that shows something
 
 
@@ -44,6 +43,11 @@ class PictureSettings:
         One PSF for all channels, which differ in brightness: a diffuser hardly disperses. Else one a channel.
     beyond : float
         How far beyond the pictures' field there may be light, in parts of the sensor's height; 0: nowhere.
+    saturated : float or None
+        Part of the pictures' peak from which on a pixel is known to be at least so bright, as in photographs
+        through a lens. None: pictures say all, as those that were drawn.
+    gamma : float or None
+        Exponent that makes a picture's values light; None: found.
     rounds : int
         How often PSF and unknown light are solved in turn, at each scale.
     psf_iterations, light_iterations : int
@@ -52,6 +56,8 @@ class PictureSettings:
 
     one_psf: bool = True
     beyond: float = 0.18
+    saturated: float | None = 0.97
+    gamma: float | None = 1.0
     rounds: int = 4
     psf_iterations: int = 80
     light_iterations: int = 30
@@ -72,7 +78,9 @@ class PicturePsf:
     stray : ndarray, float32, (n_photographs, n_channels)
         Even light that no picture accounts for, in the photographs' unit.
     light : ndarray, float32, (n_photographs, n_channels, field height, field width)
-        Light that was not in the pictures, in their unit, where it can reach the sensor.
+        Light that was not in the pictures, relative to their peak, where it can reach the sensor.
+    gamma : float
+        Exponent that makes a picture's values light.
     misfit : float
         What is left of the photographs' standard deviation.
     """
@@ -82,6 +90,7 @@ class PicturePsf:
     brightness: npt.NDArray[np.float64]
     stray: Floats
     light: Floats
+    gamma: float
     misfit: float
 
 
@@ -99,8 +108,8 @@ def psf_from_pictures(
     photographs : ndarray, (n, n_channels, height, width)
         Linear in the light, dark frame subtracted, any scale.
     pictures : ndarray, the same shape
-        What was shown, linear in the light, on the sensor's pixels: one object pixel further moves the
-        pattern by one sensor pixel. Their peak may be saturated.
+        What was shown, on the sensor's pixels: one object pixel further moves the
+        pattern by one sensor pixel. Values are light, or light to the power of 1 / gamma.
     settings : PictureSettings, optional
     on_progress : callable, optional
         Called with what is being done and the share done.
@@ -112,6 +121,7 @@ def psf_from_pictures(
     data, known = (np.asarray(images, np.float32) for images in (photographs, pictures))
     _check(data, known, settings)
     report = on_progress or (lambda _what, _share: None)
+    known = known / known.max()
     factors = [1]
     while data.shape[2] // (2 * factors[-1]) >= _COARSE_PX:
         factors.append(2 * factors[-1])
@@ -146,8 +156,9 @@ class _Estimate:
             slice(c - n // 2, c - n // 2 + n) for c, n in zip(centre, self.sensor, strict=True)
         )
         self.data = data
-        self.known = np.zeros((count, self.channels, *self.field), np.float32)
-        self.known[:, :, *self.window] = known
+        self.pictures = known
+        self.gamma = 1.0 if settings.gamma is None else settings.gamma
+        self.known = self._as_light(known**self.gamma)
         self.unknown = self._where_unknown(known)
         self.light = np.zeros_like(self.known)
         self.brightness = np.ones(count)
@@ -162,15 +173,22 @@ class _Estimate:
         around[tuple(slice(max(w.start - reach, 0), w.stop + reach) for w in self.window)] = True
         around[self.window] = False
         unknown = np.broadcast_to(around, self.known.shape).copy()
-        unknown[:, :, *self.window] = known >= SATURATED * known.max()
+        if self.settings.saturated is not None:
+            unknown[:, :, *self.window] = known >= self.settings.saturated
         return unknown
+
+    def _as_light(self, pictures: Array) -> Floats:
+        light = np.zeros((len(self.data), self.channels, *self.field), np.float32)
+        light[:, :, *self.window] = pictures
+        return light
 
     def start_from(self, coarse: _Estimate) -> None:
         """Take over what binned images gave."""
         factor = round(self.sensor[0] / coarse.sensor[0])
         self.psf = np.maximum(enlarged(coarse.psf, factor, self.sensor), 0)
         self.light = enlarged(coarse.light, factor, self.field) * np.float32(factor**2) * self.unknown
-        self.brightness, self.gains = coarse.brightness, coarse.gains
+        self.brightness, self.gains, self.gamma = coarse.brightness, coarse.gains, coarse.gamma
+        self.known = self._as_light(self.pictures**self.gamma)
 
     def solve(self, report: Progress) -> None:
         """Solve PSF, brightness and unknown light in turn; ends with the PSF."""
@@ -178,6 +196,8 @@ class _Estimate:
             report("PSF", number / self.settings.rounds)
             self.solve_psf()
             self.solve_brightness()
+            if self.settings.gamma is None:
+                self.solve_gamma()
             if number < self.settings.rounds - 1 and self.unknown.any():
                 report("light beyond the pictures", (number + 0.7) / self.settings.rounds)
                 self.solve_light()
@@ -214,6 +234,20 @@ class _Estimate:
         model = self._even_removed(self.seen(self.scene()))
         self.misfit = float(np.linalg.norm(model - data) / np.linalg.norm(data))
 
+    def solve_gamma(self) -> None:
+        """Fit the pictures' exponent: a Gauss-Newton step, each photograph's brightness free."""
+        with np.errstate(divide="ignore"):
+            slope = np.where(self.pictures > 0, np.log(self.pictures), 0) * self.pictures**self.gamma
+        lit = self.brightness[:, None, None, None] * self._as_light(slope) * self.gains[:, None, None]
+        change = self._even_removed(self.seen(np.asarray(lit, np.float32)))
+        model = self._even_removed(self.seen(self.scene()))
+        left = self._even_removed(self.data) - model
+        for image, seen in zip(change, model, strict=True):
+            image -= seen * np.float32(np.vdot(seen, image) / max(float(np.vdot(seen, seen)), 1e-30))
+        step = float(np.vdot(change, left)) / max(float(np.vdot(change, change)), 1e-30)
+        self.gamma = float(np.clip(self.gamma + np.clip(step, -_LARGEST_STEP, _LARGEST_STEP), *_GAMMAS))
+        self.known = self._as_light(self.pictures**self.gamma)
+
     def solve_light(self) -> None:
         """Solve what is not in the pictures, channel by channel, not negative."""
         for c in range(self.channels):
@@ -247,7 +281,13 @@ class _Estimate:
         stray = (self.data - self.seen(self.scene())).mean(axis=(2, 3))
         psf = self.psf * self.gains[:, None, None].astype(np.float32)
         return PicturePsf(
-            psf, psf.sum(axis=(1, 2), dtype=np.float64), self.brightness, stray, self.light, self.misfit
+            psf=psf,
+            gains=psf.sum(axis=(1, 2), dtype=np.float64),
+            brightness=self.brightness,
+            stray=stray,
+            light=self.light,
+            gamma=self.gamma,
+            misfit=self.misfit,
         )
 
 

@@ -110,9 +110,7 @@ def fading(frames: Floats) -> npt.NDArray[np.float64]:
     first, later = np.triu_indices(len(at), 1)
     level = np.log(light[at])
     slope = float(np.median((level[later] - level[first]) / (at[later] - at[first])))
-    rest = level - slope * at
-    scatter = 1.48 * float(np.median(np.abs(rest - np.median(rest))))
-    error = scatter / float(np.sqrt(len(at)) * at.std())
+    error = float(np.std(level - slope * at) / (np.sqrt(len(at)) * at.std()))
     relative: npt.NDArray[np.float64] = np.exp(slope * (abs(slope) > SURE * error) * np.arange(len(frames)))
     return relative
 
@@ -178,14 +176,14 @@ def brightness(image: Floats) -> float:
     return float(values[np.searchsorted(light, light[-1] / 2)])
 
 
-def floor_of(base: Floats) -> float:
-    """Return the least baseline that a change is divided by: a tenth of how bright its light is.
+def floor_of(frames: Floats) -> float:
+    """Return the least baseline that a change is divided by: a tenth of how bright the pictures' light is.
 
-    Raises InputError when the baseline, (n_frames, height, width), is zero everywhere.
+    Raises InputError when the pictures, (n_frames, height, width), hold no light.
     """
-    floor = FLOOR_SHARE * brightness(base.mean(axis=0))
+    floor = FLOOR_SHARE * brightness(frames.mean(axis=0))
     if not floor > 0:
-        raise InputError("The video is dark: its baseline is zero everywhere.")
+        raise InputError("The video is dark: it holds no light anywhere.")
     return floor
 
 
@@ -196,6 +194,6 @@ def change(frames: Floats, base: Floats, floor: float) -> Floats:
     ----------
     frames, base : ndarray, (n_frames, height, width)
     floor : float
-        Of :func:`floor_of` the pictures' baseline.
+        Of :func:`floor_of`.
     """
     return ((frames - base) / np.maximum(base, np.float32(floor))).astype(np.float32)

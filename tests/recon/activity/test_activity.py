@@ -158,7 +158,7 @@ def test_a_static_scene_has_no_regions_though_its_pictures_settle_from_block_to_
     found = find_regions(frames - base, noise=noise_of(frames))
     assert found.regions == []
     assert WEAK in found.left_out
-    assert np.abs(change(frames, base, floor_of(base))).max() < 0.3
+    assert np.abs(change(frames, base, floor_of(frames))).max() < 0.3
 
 
 def drifting(count: int, speed: float) -> np.ndarray:

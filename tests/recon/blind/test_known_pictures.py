@@ -15,7 +15,7 @@ BRIGHTNESS = (1.1, 0.9, 1.0, 1.05, 0.95)
 EDGE = 12  # rows and columns of scene beyond the pictures
 
 
-def _taken(seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def taken(seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return photographs, pictures and the PSF (height, width): light beyond and above the pictures' peak."""
     rng = np.random.default_rng(seed)
     psf = ndimage.gaussian_filter(rng.random((17, 19)), 1.5)
@@ -37,7 +37,7 @@ def _taken(seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def found() -> tuple[PicturePsf, np.ndarray]:
-    data, pictures, truth = _taken()
+    data, pictures, truth = taken()
     return psf_from_pictures(data, pictures), truth
 
 
@@ -61,7 +61,7 @@ def test_light_beyond_the_pictures_and_above_their_peak_is_told_from_the_psf(
     found: tuple[PicturePsf, np.ndarray],
 ) -> None:
     result, truth = found
-    data, pictures, _ = _taken()
+    data, pictures, _ = taken()
     ignorant = psf_from_pictures(data, pictures, PictureSettings(beyond=0))
     assert ignorant.misfit > 2 * result.misfit
     assert 1 - _alike(ignorant.psf[0], truth) > 2 * (1 - _alike(result.psf[0], truth))
@@ -79,6 +79,14 @@ def test_light_beyond_the_pictures_and_above_their_peak_is_told_from_the_psf(
     ],
 )
 def test_what_cannot_be_solved_is_refused_in_words(spoil: object, words: str) -> None:
-    data, pictures, _ = _taken()
+    data, pictures, _ = taken()
     with pytest.raises(InputError, match=words):
         psf_from_pictures(*spoil(data, pictures))  # type: ignore[operator]
+
+
+def test_the_pictures_gamma_is_found() -> None:
+    data, pictures, truth = taken()
+    settings = PictureSettings(gamma=None, saturated=None)
+    found = psf_from_pictures(data, pictures ** (1 / 1.8), settings)
+    assert found.gamma == pytest.approx(1.8, abs=0.15)
+    assert _alike(found.psf[0], truth) > 0.95
