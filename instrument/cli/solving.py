@@ -54,7 +54,8 @@ def reconstruct_photograph(
         keeper = checkpoint_for(output.checkpoint, job, request)
         total = iteration_limit(request.options) or 1000
         what = "volume" if is_volume else "picture"
-        with one_task(what, total) as advance, first_interrupt_cancels() as cancel:
+        note = "choosing what it needs" if request.options.model == "auto" else ""
+        with one_task(what, total, note=note) as advance, first_interrupt_cancels() as cancel:
 
             def show(record: IterationRecord, _picture: object) -> None:
                 share = done_share(request.options, record)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -37,16 +36,9 @@ from recon.reconstruction.weights import kind_of
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
-Choosing = Callable[[float, str], object]
-"""``on_choosing(share, what)``: how much of the choosing is done, 0 to 1, and what was looked at last."""
 
 
-def choose(
-    problem: Problem,
-    options: ReconstructionOptions | None = None,
-    *,
-    on_choosing: Choosing | None = None,
-) -> Problem:
+def choose(problem: Problem, options: ReconstructionOptions | None = None) -> Problem:
     """Return the smallest problem that explains the data as well: model ``"auto"``.
 
     What is chosen: the camera model, the depths that take part and planes between them, the field, binning,
@@ -59,8 +51,6 @@ def choose(
     problem : Problem
     options : ReconstructionOptions, optional
         Default the problem's own.
-    on_choosing : callable, optional
-        ``on_choosing(share, what)`` as it goes on.
 
     Returns
     -------
@@ -79,13 +69,12 @@ def choose(
                 "Leave one of the two out."
             )
         return problem
-    return reduced(choice_for(problem, on_choosing), problem)
+    return reduced(choice_for(problem), problem)
 
 
-def choice_for(problem: Problem, on_choosing: Choosing | None = None) -> Choice:
+def choice_for(problem: Problem) -> Choice:
     """Choose what to reconstruct a problem with; errors as :func:`choose`."""
     began = time.perf_counter()
-    tell = on_choosing or (lambda *_: None)
     overrides, held = _held(problem, _settled(problem))
     measurement, calibration = problem.measurement, problem.calibration
     counts = measurement.counts()
@@ -107,15 +96,12 @@ def choice_for(problem: Problem, on_choosing: Choosing | None = None) -> Choice:
     looked = not picture or len(scale) > 1  # else one PSF is all there is
     coarse = _coarse(data, valid, calibration, problem.options.z_um) if looked else []
     costs = {m: camera_cost(coarse[0], m) for m in scale} if len(scale) > 1 else {}
-    tell(0.2, "camera models")
     contrast = None if kind == "l1" or picture else _contrast(data, valid, deviation)
     model, by_model = model_of(depths, overrides, contrast, costs)
     sparse = coarse_passes(coarse) if looked else None
-    tell(0.4, "depths")
     given = measurement.background is not None
     open_ = looked and not given and overrides.background is None
     smooth = background_of(_trial(problem, coarse, model) if open_ else None, overrides, given=given)
-    tell(0.8, "background")
     estimated = smooth.value == "estimated"
     planes, dropped = planes_of(sparse, depths, overrides)
     between, added = between_of(calibration, depths, planes, overrides)
