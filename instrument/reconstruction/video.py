@@ -116,6 +116,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         ),
         picture.calibration,
         replace(options, iterations=None),
+        choosing=request.video.over_time is None,
     )
     if request.video.over_time is not None:
         require_joint(problem)

@@ -15,13 +15,14 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.camera_model import choose_model
+from recon.camera.camera_model import CAMERAS, choose_model
 from recon.errors import InputError
 from recon.reconstruction.measurement import Floats, Measurement, depths_of
-from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import given
+from recon.reconstruction.selection import choice_for
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver
 from recon.solvers.base import Solver, StoppingRules
 from recon.solvers.sensor_admm import SensorAdmm
@@ -40,6 +41,8 @@ def stream_problem(
     frame: Measurement | npt.ArrayLike,
     calibration: Calibration | npt.ArrayLike,
     options: ReconstructionOptions | None = None,
+    *,
+    choosing: bool = True,
     **overrides: Any,
 ) -> Problem:
     """Settle noise, scales and camera from one frame, for all frames of a video.
@@ -54,6 +57,8 @@ def stream_problem(
         Any camera model, prior, background and depths; ``"auto"`` is one PSF a depth here, as the quickest
         (the problem's warnings say where PSFs differ over the field), and the exact-data ADMM where that has
         a way.
+    choosing : bool
+        Whether a smooth background is estimated where a photograph would have one, unless the options say.
     **overrides
         Single options, and facts about the frame, by their names, as of :func:`recon.reconstruct`.
     """
@@ -64,12 +69,33 @@ def stream_problem(
         doubt = _by_one_psf(calibration, options)
         options = replace(options, model="convolution")
     problem = Problem.of(replace(measurement, **known), calibration, options)
+    problem = _with_background(problem) if choosing else problem
     if doubt:
         problem = replace(problem, warnings=(*problem.warnings, doubt))
     if options.solver == "auto" and SOLVERS["admm-sensor"].accepts(problem) is None:
         problem = replace(problem, options=replace(options, solver="admm-sensor"))
     problem.solver  # noqa: B018 - refuses at once what it has no way for
     return problem
+
+
+def _with_background(problem: Problem) -> Problem:
+    """Return a problem with a smooth background where a photograph would have one, and nobody said.
+
+    Of pictures: volumes have one unless it is given.
+    """
+    options, model = problem.options, problem.model
+    said = options.estimate_background is not None or problem.measurement.background is not None
+    if said or problem.n_planes > 1 or problem.patterned or model in CAMERAS:
+        return problem
+    asked = replace(options, choose=Overrides(model=model, binning=1, channels="all"))
+    choice = choice_for(replace(problem, options=asked))
+    if not choice.background:
+        return problem
+    (why,) = (d.why for d in choice.decisions if d.name == "background")
+    options = replace(options, estimate_background=True)
+    problem = Problem.of(problem.measurement, problem.calibration, options)
+    said_so = f"A smooth background is estimated in each frame: {why}."
+    return replace(problem, warnings=(*problem.warnings, said_so))
 
 
 def _by_one_psf(calibration: Calibration | npt.ArrayLike, options: ReconstructionOptions) -> str:
