@@ -132,14 +132,14 @@ def psf_from_pictures(
     found: _Estimate | None = None
     for number, factor in enumerate(reversed(factors)):
         begin, part = costs[:number].sum() / costs.sum(), costs[number] / costs.sum()
-        images = [block_mean(stack, factor, about_axis=True) for stack in (data, known)]
+        taken, shown = (block_mean(stack, factor, about_axis=True) for stack in (data, known))
 
         def share(what: str, done: float, begin: float = begin, part: float = part) -> None:
             report(what, begin + part * done)
 
         if found is None and settings.gamma is None:
-            settings = replace(settings, gamma=_gamma_worth_having(*images, settings))
-        scale = _Estimate(*images, settings)
+            settings = replace(settings, gamma=_gamma_worth_having(taken, shown, settings))
+        scale = _Estimate(taken, shown, settings)
         if found is not None:
             scale.start_from(found)
             if factor == 1:
