@@ -135,6 +135,8 @@ def _print(result: Reconstruction) -> None:
             typer.echo(line)
     else:
         typer.echo(f"{'Model':<12}{result.model}: {result.reason}")
+    if result.refinement is not None:
+        typer.echo(f"{'PSF':<12}{result.refinement}")
     typer.echo(f"{'Method':<12}{result.solver}, prior {result.prior}{weight}")
     if memory := result.provenance.get("memory"):
         typer.echo(f"{'Memory':<12}{memory}")

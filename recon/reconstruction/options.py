@@ -242,6 +242,13 @@ class ReconstructionOptions:
         group=_RARE,
         applies=("picture", "volume"),
     )
+    refine_psf: bool = option(
+        False,
+        help="First fit the PSFs' size and rotation to the photograph itself, judged on held-out pixels.",
+        label="Refine the PSF",
+        group=_CHOICE,
+        applies=("picture", "volume"),
+    )
     axis_weights: npt.ArrayLike | None = option(
         None,
         help="Weights of the z, y and x differences of TV, (3,) or (n_z, 3).",

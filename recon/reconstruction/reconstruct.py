@@ -17,6 +17,7 @@ from recon.priors import PRIORS
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
+from recon.reconstruction.psf_refinement import refined
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solve import Progress, solve
@@ -78,10 +79,16 @@ def reconstruct(
     problem = Problem.of(replace(measurement, **known), calibration, options)
     if options.uncertainty and (reason := refused(problem)) is not None:
         raise InputError(f"{reason[0].upper()}{reason[1:]}.")
+    refinement = None
+    if options.refine_psf:
+        problem, refinement = refined(problem, cancel=cancel)
     problem = choose(problem)
     result = solve(problem, warm=warm, on_progress=on_progress, cancel=cancel, keeper=keeper)
     if options.uncertainty:
         result = uncertain(result, problem, on_repeat=on_repeat, cancel=cancel)
+    if refinement is not None:
+        provenance = {**result.provenance, "psf_refinement": refinement.to_json()}
+        result = replace(result, refinement=refinement, provenance=provenance)
     return (
         judged(result, problem, started=warm is not None) if options.judged else replace(result, basis=None)
     )

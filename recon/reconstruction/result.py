@@ -18,6 +18,7 @@ from recon.verdict.judge import Verdict
 if TYPE_CHECKING:
     from recon.reconstruction.choice import Choice
     from recon.reconstruction.problem import Problem
+    from recon.reconstruction.psf_refinement import Refinement
     from recon.reconstruction.uncertainty import Uncertainty
 
 
@@ -124,6 +125,8 @@ class Reconstruction:
         How far it may be off, pixel by pixel; None where nobody asked for it.
     choice : Choice or None
         What was chosen and why, where the program chose (``model="auto"``).
+    refinement : Refinement or None
+        How the PSFs were brought to fit the photograph, where that was asked for (``refine_psf``).
     state : ndarray or None
         The whole object on the operator's grid in measurement units, (n_channels, n_z, grid height, grid
         width), for a start that forgets nothing; None where that would take too much memory, or does not fit
@@ -153,6 +156,7 @@ class Reconstruction:
     verdict: Verdict | None = None
     uncertainty: Uncertainty | None = None
     choice: Choice | None = None
+    refinement: Refinement | None = None
     state: npt.NDArray[Any] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     basis: tuple[Problem, Reconstruction] | None = field(default=None, repr=False, compare=False)
