@@ -34,7 +34,7 @@ def residual_in_words(
         Its expected norm.
     """
     times = residual / noise
-    if not history or not np.isfinite(times):
+    if len(history) <= FEW or not np.isfinite(times):  # so few say nothing
         return []
     norms = [record.data_residual for record in history]
     least = int(np.argmin(norms))
