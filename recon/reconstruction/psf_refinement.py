@@ -47,6 +47,8 @@ SEARCH_PX, SEARCH_ITERATIONS = 100, 30
 """Longest side, about, and iterations of the reconstructions that a first guess is searched with."""
 FIT_PX, FIT_ITERATIONS = 200, 100
 """The same of those that it is fitted with."""
+LARGE = 3
+"""So many fewer iterations of volumes and of PSFs that vary, whose iterations cost most."""
 HELD_SHARE = 0.1
 """Of the pixels, for the fit, and as many again for the judgement."""
 BETWEEN_PX = 0.37
@@ -126,17 +128,18 @@ class Refinement:
             "held_out_found": self.found,
             "standard_errors": self.certainty,
             "used": self.helps,
+            "words": str(self),
         }
 
     def __str__(self) -> str:
         """Say it in words."""
         how = self.transformation
-        sizes = f"{100 * (how.scale - 1):+.2f} +- {100 * self.scale_error:.2f} % larger"
-        found = f"turned by {how.rotation_deg:+.2f} +- {self.rotation_error_deg:.2f} degrees and {sizes}"
+        turned = f"turned by {how.rotation_deg:+.2f} +- {self.rotation_error_deg:.2f} degrees"
+        copy = f"{turned}, {100 * (how.scale - 1):+.2f} +- {100 * self.scale_error:.2f} % larger"
         left = f"{self.given:.3g} to {self.found:.3g} times the noise"
         if self.helps:
-            return f"the PSF fits better {found}: fine structure left on held-out pixels falls from {left}"
-        return f"the PSF is taken as it is: {found} it fits no better for certain ({left} on held-out pixels)"
+            return f"fits better {copy}: fine structure left on held-out pixels falls from {left}"
+        return f"taken as it is: {copy} it fits no better for certain ({left} on held-out pixels)"
 
 
 def refined(
@@ -247,7 +250,7 @@ class _Trials:
         self._problem = replace(self._problem, model=model)
         self._data = image / self._problem.noise[0]
         self._known = known.astype(np.float32)
-        self._iterations = iterations
+        self._iterations = iterations if self._problem.is_plain else iterations // LARGE
         self._done: dict[tuple[float, ...], tuple[Floats, Floats]] = {}
         rows, columns = (np.minimum(np.arange(n) * TILES // n, TILES - 1) for n in image.shape)
         self._tile = TILES * rows[:, None] + columns
