@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage, signal
@@ -12,6 +14,7 @@ from recon.errors import InputError
 SHAPE = (48, 56)
 GAINS = (0.5, 0.8)
 BRIGHTNESS = (1.1, 0.9, 1.0, 1.05, 0.95)
+QUICK = PictureSettings(psf_iterations=120)
 EDGE = 12  # rows and columns of scene beyond the pictures
 
 
@@ -38,7 +41,7 @@ def taken(seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def found() -> tuple[PicturePsf, np.ndarray]:
     data, pictures, truth = taken()
-    return psf_from_pictures(data, pictures), truth
+    return psf_from_pictures(data, pictures, QUICK), truth
 
 
 def _alike(first: np.ndarray, second: np.ndarray) -> float:
@@ -62,7 +65,7 @@ def test_light_beyond_the_pictures_and_above_their_peak_is_told_from_the_psf(
 ) -> None:
     result, truth = found
     data, pictures, _ = taken()
-    ignorant = psf_from_pictures(data, pictures, PictureSettings(beyond=0))
+    ignorant = psf_from_pictures(data, pictures, replace(QUICK, beyond=0))
     assert ignorant.misfit > 2 * result.misfit
     assert 1 - _alike(ignorant.psf[0], truth) > 2 * (1 - _alike(result.psf[0], truth))
 
@@ -86,7 +89,7 @@ def test_what_cannot_be_solved_is_refused_in_words(spoil: object, words: str) ->
 
 def test_the_pictures_gamma_is_found() -> None:
     data, pictures, truth = taken()
-    settings = PictureSettings(gamma=None, saturated=None)
+    settings = replace(QUICK, rounds=3, gamma=None, saturated=None)
     found = psf_from_pictures(data, pictures ** (1 / 1.8), settings)
     assert found.gamma == pytest.approx(1.8, abs=0.15)
     assert _alike(found.psf[0], truth) > 0.95
