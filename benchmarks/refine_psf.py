@@ -6,7 +6,7 @@ Plants 2 % of scale, 2 degrees, a shift of 5 pixels, alone and together, and pri
 picture is worth: of simulated scenes, whose diffuser moves between calibration and photograph and is rendered
 lenslet by lenslet, against the truth; of the measured hand and USAF target (``DIFFUSERBENCH_DATA``, else
 ``../shared/data``), where the right PSF is not known, against what is found of the PSF as it came. PSNR is
-after the best whole shift, as a moved PSF moves the picture, and the best gain.
+after the best shift, as a moved PSF moves the picture, and the best gain.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from recon import Calibration, reconstruct
 from recon.base.blocks import block_mean
 from recon.base.threads import set_threads
-from recon.camera.registration import displacement, shifted
+from recon.camera.registration import aligned, register
 from recon.camera.transformed import Transformation, transformed
 from recon.evaluation.measured_sets import measured_set
 from recon.evaluation.scene import make_scene
@@ -43,8 +43,8 @@ EDGE = 12
 
 
 def psnr(picture: np.ndarray, truth: np.ndarray) -> float:
-    """Return the PSNR (dB) of a picture after the best whole shift and gain, without its border."""
-    back = shifted(picture, *(-n for n in displacement(picture, truth)))
+    """Return the PSNR (dB) of a picture after the best shift and gain, without its border."""
+    back = aligned(picture, register(picture, truth))
     a, b = (image[EDGE:-EDGE, EDGE:-EDGE].astype(np.float64) for image in (back, truth))
     error = a * (np.vdot(a, b) / max(np.vdot(a, a), 1e-30)) - b
     return float(10 * np.log10(b.max() ** 2 / np.mean(error**2)))

@@ -32,7 +32,7 @@ from recon.errors import InputError
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
-from recon.reconstruction.problem import Problem
+from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import reduced_calibration
 from recon.reconstruction.solvers import SOLVERS
 from recon.reconstruction.weights import kind_of
@@ -41,7 +41,6 @@ from recon.types import Calibration
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
-Share = Callable[[float], object]
 
 SEARCH_PX, SEARCH_ITERATIONS = 100, 30
 """Longest side, about, and iterations of the reconstructions that a first guess is searched with."""
@@ -143,7 +142,7 @@ class Refinement:
 
 
 def refined(
-    problem: Problem, *, on_progress: Share | None = None, cancel: threading.Event | None = None
+    problem: Problem, *, on_stage: Stage | None = None, cancel: threading.Event | None = None
 ) -> tuple[Problem, Refinement | None]:
     """Return a problem with the PSFs that fit its photograph, and how they came of the given ones.
 
@@ -153,14 +152,14 @@ def refined(
     ----------
     problem : Problem
         Not reduced yet (before ``choose``).
-    on_progress : callable, optional
-        Called with the share done, 0 to 1.
+    on_stage : callable, optional
+        ``on_stage(share, what)`` as it goes on.
     cancel : threading.Event, optional
 
     Raises InputError when the photograph was taken under patterns of light.
     """
     try:
-        refinement = refine_psf(problem, on_progress=on_progress, cancel=cancel)
+        refinement = refine_psf(problem, on_stage=on_stage, cancel=cancel)
     except _CancelledError:
         return problem, None
     if not refinement.helps:
@@ -173,7 +172,7 @@ class _CancelledError(Exception):
 
 
 def refine_psf(
-    problem: Problem, *, on_progress: Share | None = None, cancel: threading.Event | None = None
+    problem: Problem, *, on_stage: Stage | None = None, cancel: threading.Event | None = None
 ) -> Refinement:
     """Fit size and rotation of a problem's PSFs, about the sensor's centre, to its photograph.
 
@@ -183,13 +182,13 @@ def refine_psf(
     if problem.patterned:
         raise InputError("refine_psf is for photographs in one light, not for frames under patterns.")
     began = time.perf_counter()
-    tell = on_progress or (lambda _: None)
+    tell = on_stage or (lambda *_: None)
 
     def count(share: float) -> None:
         """Tell how much is done; end where it is cancelled."""
         if cancel is not None and cancel.is_set():
             raise _CancelledError
-        tell(share)
+        tell(share, "fitting the PSF")
 
     start = _searched(_Trials(problem, SEARCH_PX, SEARCH_ITERATIONS), count)
     trials = _Trials(problem, FIT_PX, FIT_ITERATIONS)
@@ -200,7 +199,7 @@ def refine_psf(
     given, found = trials.judged(np.zeros(2)), trials.judged(fit.place)
     ratio = np.log(given / found)
     scatter = float(np.std(ratio, ddof=1)) / np.sqrt(len(ratio))
-    tell(1.0)
+    count(1.0)
     return Refinement(
         _transformation(fit.place),
         float(np.exp(fit.place[0]) * np.sqrt(fit.covariance[0, 0])),
@@ -325,7 +324,7 @@ def _copied(depths: Depths, how: Transformation) -> Depths:
     return replace(depths, central=transformed(depths.central, how), fields=fields)
 
 
-def _searched(trials: _Trials, count: Share) -> Floats:
+def _searched(trials: _Trials, count: Callable[[float], object]) -> Floats:
     """Return the best place of a lattice that its neighbours lead to, from none."""
     step = SEARCH_STEP_PX / trials.radius_px
     reach = max(int(LARGEST / step), 1)
@@ -354,7 +353,7 @@ MOVES = 3
 """Times that the trials are centred anew where the least lies beyond them."""
 
 
-def _fitted(trials: _Trials, centre: Floats, step: float, count: Share) -> _Fit:
+def _fitted(trials: _Trials, centre: Floats, step: float, count: Callable[[float], object]) -> _Fit:
     """Fit a paraboloid to trials about a place.
 
     Every tile has its own, and the scatter of their slopes at the least tells how sure it is (a sandwich

@@ -54,7 +54,7 @@ def right(scene: TestScene) -> tuple[Refinement, list[float]]:
     """What is found of the right PSF, and the shares of the work that were told."""
     shares: list[float] = []
     problem = Problem.of(scene.measurement, scene.calibration)
-    return refine_psf(problem, on_progress=shares.append), shares
+    return refine_psf(problem, on_stage=lambda share, _: shares.append(share)), shares
 
 
 def test_right_psfs_stay_as_they_are(scene: TestScene, right: tuple[Refinement, list[float]]) -> None:
