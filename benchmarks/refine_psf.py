@@ -59,8 +59,9 @@ def refined(image: np.ndarray, calibration: Calibration) -> tuple[Refinement, fl
 def told(name: str, planted: Transformation, found: Refinement, seconds: float, rest: str) -> None:
     """Print one row."""
     how = found.transformation
+    error = "-" if found.scale_error is None else f"{100 * found.scale_error:.2f}"
     print(
-        f"| {name} | {planted} | {100 * (how.scale - 1):+.2f} +- {100 * found.scale_error:.2f} | "
+        f"| {name} | {planted} | {100 * (how.scale - 1):+.2f} +- {error} | "
         f"{how.rotation_deg:+.2f} +- {found.rotation_error_deg:.2f} | {found.given:.2f}, {found.found:.2f} | "
         f"{'yes' if found.helps else 'no'} | {rest} | {seconds:.0f} |",
         flush=True,

@@ -317,6 +317,7 @@ _MODULES = (
     "optics.angular",
     "optics.dpc",
     "optics.beads",
+    "optics.screen_bench",
     "display.slm_calibration",
     "display.mask_alignment",
 )

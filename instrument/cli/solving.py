@@ -70,8 +70,7 @@ def reconstruct_photograph(
                 typer.echo(f"{'Planes':<12}{steps} Each plane's depth is in {outputs.record.name}.")
         else:
             _write_picture(outputs, result, job, int(output.rotate_deg))
-        files = [f for f in outputs.files() if f != outputs.deviation or result.uncertainty is not None]
-        typer.echo(f"{'Wrote':<12}{', '.join(map(str, files))}")
+        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.written(result)))}")
         for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
             typer.echo(f"{name:<12}{text}")
     _end(result, what)
@@ -141,7 +140,8 @@ def _print(result: Reconstruction) -> None:
     _print_end(result)
     _print_verdict(result.verdict)
     if (found := result.uncertainty) is not None:
-        typer.echo(f"{'Uncertainty':<12}{found.sentences[0]} ({found.seconds:.1f} s)")
+        for index, sentence in enumerate(found.sentences):
+            typer.echo(f"{'Uncertainty' if not index else 'Points':<12}{sentence}")
     for warning in result.warnings:
         typer.echo(f"Warning: {warning}", err=True)
 

@@ -100,7 +100,7 @@ class StoredResult:
         if self.verdict:
             facts.append(("Verdict", " ".join(self.verdict)))
         if said := (record.get("uncertainty") or {}).get("sentences"):
-            facts.append(("Uncertainty", " ".join(map(str, said))))
+            facts += [(name, str(one)) for name, one in zip(("Uncertainty", "Points"), said, strict=False)]
         if refined := (origin.get("psf_refinement") or {}).get("words"):
             facts.append(("Refined PSF", str(refined)))
         chosen = self._chosen()

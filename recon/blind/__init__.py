@@ -2,7 +2,7 @@
 
 from recon.blind.alternate import BlindResult, BlindSettings, calibrate_from_beads
 from recon.blind.known_pictures import PicturePsf, PictureSettings, psf_from_pictures
-from recon.blind.points import Points
+from recon.camera.points import Points
 
 __all__ = [
     "BlindResult",

@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement, product
 from typing import Any
 
 import numpy as np
@@ -75,7 +76,7 @@ class Refinement:
     transformation : Transformation
         What makes of the given PSFs those that fit best.
     scale_error, rotation_error_deg : float
-        Standard deviations of its scale and rotation.
+        Standard deviations of its scale (None in a volume, where it is not fitted) and rotation.
     given, found : float
         Fine structure that is left on pixels held out of all fits, in units of the noise: by the PSFs as
         given, and by the copy.
@@ -88,7 +89,7 @@ class Refinement:
     """
 
     transformation: Transformation
-    scale_error: float
+    scale_error: float | None
     rotation_error_deg: float
     given: float
     found: float
@@ -133,8 +134,9 @@ class Refinement:
     def __str__(self) -> str:
         """Say it in words."""
         how = self.transformation
-        turned = f"turned by {how.rotation_deg:+.2f} +- {self.rotation_error_deg:.2f} degrees"
-        copy = f"{turned}, {100 * (how.scale - 1):+.2f} +- {100 * self.scale_error:.2f} % larger"
+        copy = f"turned by {how.rotation_deg:+.2f} +- {self.rotation_error_deg:.2f} degrees"
+        if self.scale_error is not None:
+            copy += f", {100 * (how.scale - 1):+.2f} +- {100 * self.scale_error:.2f} % larger"
         left = f"{self.given:.3g} to {self.found:.3g} times the noise"
         if self.helps:
             return f"fits better {copy}: fine structure left on held-out pixels falls from {left}"
@@ -176,6 +178,8 @@ def refine_psf(
 ) -> Refinement:
     """Fit size and rotation of a problem's PSFs, about the sensor's centre, to its photograph.
 
+    In a volume rotation alone: larger PSFs are nearly those of nearer planes, and a wrong size finds a scene
+    at other depths that fits as well (2 % on simulated beads).
     Of several channels the one with most contrast over its noise counts. Parameters and errors as
     :func:`refined`.
     """
@@ -196,14 +200,15 @@ def refine_psf(
     fit = _fitted(
         trials, fit.place, FIT_STEPS_PX[1] / trials.radius_px, lambda done: count(0.65 + 0.35 * done)
     )
-    given, found = trials.judged(np.zeros(2)), trials.judged(fit.place)
+    given, found = trials.judged(0 * fit.place), trials.judged(fit.place)
+    how, errors = _transformation(fit.place), np.sqrt(np.diag(fit.covariance))
     ratio = np.log(given / found)
     scatter = float(np.std(ratio, ddof=1)) / np.sqrt(len(ratio))
     count(1.0)
     return Refinement(
-        _transformation(fit.place),
-        float(np.exp(fit.place[0]) * np.sqrt(fit.covariance[0, 0])),
-        float(np.rad2deg(np.sqrt(fit.covariance[1, 1]))),
+        how,
+        how.scale * float(errors[1]) if trials.n_numbers > 1 else None,
+        float(np.rad2deg(errors[0])),
         float(np.sqrt(given.mean())),
         float(np.sqrt(found.mean())),
         float(np.mean(ratio)) / max(scatter, 1e-12),
@@ -213,8 +218,9 @@ def refine_psf(
 
 
 def _transformation(place: Floats) -> Transformation:
-    """Return the transformation of a place: (logarithm of the scale, rotation in radians)."""
-    return Transformation(scale=float(np.exp(place[0])), rotation_deg=float(np.rad2deg(place[1])))
+    """Return the transformation of a place: rotation in radians, logarithm of the scale where fitted."""
+    scale = float(np.exp(place[1])) if len(place) > 1 else 1.0
+    return Transformation(scale=scale, rotation_deg=float(np.rad2deg(place[0])))
 
 
 class _Trials:
@@ -232,6 +238,7 @@ class _Trials:
             calibration = replace(calibration, psfs=calibration.psfs[:, channel : channel + 1])
         calibration = reduced_calibration(replace(calibration, background=None), factor, None)
         several = problem.n_planes > 1
+        self.n_numbers = 1 if several else 2
         options = ReconstructionOptions(
             prior=kind_of(problem.prior_name),
             axis_weights=(1.0, 1.0, 1.0) if several else None,
@@ -328,9 +335,9 @@ def _searched(trials: _Trials, count: Callable[[float], object]) -> Floats:
     """Return the best place of a lattice that its neighbours lead to, from none."""
     step = SEARCH_STEP_PX / trials.radius_px
     reach = max(int(LARGEST / step), 1)
-    at, rounds, moved = np.zeros(2, int), 0, True
+    at, rounds, moved = np.zeros(trials.n_numbers, int), 0, True
     while moved:
-        near = [at + np.array([i, j]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        near = [at + np.array(by) for by in product((-1, 0, 1), repeat=len(at))]
         left = {}
         for place in near:
             if np.abs(place).max() <= reach:
@@ -359,32 +366,29 @@ def _fitted(trials: _Trials, centre: Floats, step: float, count: Callable[[float
     Every tile has its own, and the scatter of their slopes at the least tells how sure it is (a sandwich
     estimate): it makes no difference whether noise or errors of the model make them scatter.
     """
-    offsets = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1)], float)
-    table = np.stack(
-        [
-            np.ones(6),
-            *offsets.T,
-            offsets[:, 0] ** 2 / 2,
-            offsets[:, 0] * offsets[:, 1],
-            offsets[:, 1] ** 2 / 2,
-        ],
-        axis=1,
-    )
+    n = len(centre)
+    each = np.eye(n)
+    pairs = list(combinations_with_replacement(range(n), 2))
+    offsets = np.array([0 * each[0], *each, *-each, *(each[i] + each[j] for i, j in pairs if i != j)])
+    squares = [offsets[:, i] * offsets[:, j] / (2 if i == j else 1) for i, j in pairs]
+    table = np.stack([np.ones(len(offsets)), *offsets.T, *squares], axis=1)
     for number in range(MOVES):
         seen = []
         for k, offset in enumerate(offsets):
             seen.append(trials.fitted(centre + step * offset))
             count((number + (k + 1) / len(offsets)) / MOVES)
         terms = np.linalg.solve(table, np.stack(seen))
-        slopes, mean = terms[1:3], terms.mean(axis=1)
-        bend = np.array([[mean[3], mean[4]], [mean[4], mean[5]]])
+        slopes, mean = terms[1 : n + 1], terms.mean(axis=1)
+        bend = np.zeros((n, n))
+        for (i, j), value in zip(pairs, mean[n + 1 :], strict=True):
+            bend[i, j] = bend[j, i] = value
         values, axes = np.linalg.eigh(bend)
         values = np.maximum(values, 1e-3 * max(float(values.max()), 1e-12))
         inverse = axes @ np.diag(1 / values) @ axes.T
-        move = -inverse @ mean[1:3]
+        move = -inverse @ mean[1 : n + 1]
         scatter = slopes - slopes.mean(axis=1, keepdims=True)
-        n = slopes.shape[1]
-        covariance = inverse @ (scatter @ scatter.T / (n * (n - 1))) @ inverse * step**2
+        tiles = slopes.shape[1]
+        covariance = inverse @ (scatter @ scatter.T / (tiles * (tiles - 1))) @ inverse * step**2
         beyond = float(np.abs(move).max())
         centre = centre + step * move * min(1.0, 2.0 / max(beyond, 1e-12))
         if beyond <= 1.5:

@@ -69,7 +69,8 @@ def stream_problem(
         doubt = _by_one_psf(calibration, options)
         options = replace(options, model="convolution")
     problem = Problem.of(replace(measurement, **known), calibration, options)
-    problem = _with_background(problem) if choosing else problem
+    if choosing and isinstance(calibration, Calibration):
+        problem = _with_background(problem, calibration)
     if doubt:
         problem = replace(problem, warnings=(*problem.warnings, doubt))
     if options.solver == "auto" and SOLVERS["admm-sensor"].accepts(problem) is None:
@@ -78,17 +79,17 @@ def stream_problem(
     return problem
 
 
-def _with_background(problem: Problem) -> Problem:
+def _with_background(problem: Problem, calibration: Calibration) -> Problem:
     """Return a problem with a smooth background where a photograph would have one, and nobody said.
 
-    Of pictures: volumes have one unless it is given.
+    Of pictures: volumes have one unless it is given. All of the calibration's PSFs tell whether there is one.
     """
     options, model = problem.options, problem.model
     said = options.estimate_background is not None or problem.measurement.background is not None
     if said or problem.n_planes > 1 or problem.patterned or model in CAMERAS:
         return problem
-    asked = replace(options, choose=Overrides(model=model, binning=1, channels="all"))
-    choice = choice_for(replace(problem, options=asked))
+    asked = replace(options, model="auto", choose=Overrides(model=model, binning=1, channels="all"))
+    choice = choice_for(Problem.of(problem.measurement, calibration, asked))
     if not choice.background:
         return problem
     (why,) = (d.why for d in choice.decisions if d.name == "background")

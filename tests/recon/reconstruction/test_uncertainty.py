@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon import InputError, reconstruct
+from recon import InputError, Measurement, Options, Problem, reconstruct, solve
 from recon.evaluation.scene import make_scene
+from recon.reconstruction.point_errors import points_of, points_problem
 from recon.reconstruction.uncertainty import REPEATS, Mosaic, Uncertainty
 
 
@@ -48,7 +49,7 @@ def test_a_wider_interval_holds_more_and_none_reaches_below_what_light_can_be(re
 def test_a_mosaic_is_gathered_where_its_parts_came_from(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(0)
     for _ in range(4):
-        mosaic = Mosaic.drawn(rng, shape)
+        mosaic = Mosaic.drawn(rng, shape, 2)
         coarse = rng.random((1, shape[0] // 2, shape[1] // 2))
         picture = np.repeat(np.repeat(coarse, 2, axis=1), 2, axis=2)
         picture = np.pad(picture, [(0, 0), (0, shape[0] % 2), (0, shape[1] % 2)], mode="edge")
@@ -100,6 +101,40 @@ def test_what_has_no_uncertainty_is_refused_before_the_work() -> None:
 
 
 def test_sentences_say_how_to_read_it() -> None:
-    found = Uncertainty(np.ones((1, 2, 2), np.float32), 6, 1.0, 0.0)
+    found = Uncertainty(np.ones((1, 2, 2), np.float32), 6, 1.0, 0.0, 2.0)
     assert "1.96" in found.sentences[0]
-    assert len(replace(found, misfit=3.0).sentences) == 2
+    assert not found.doubt
+    assert "3.0 times the noise" in replace(found, misfit=3.0).doubt[0]
+
+
+def test_points_have_error_bars_that_hold_their_places_and_light() -> None:
+    scene = make_scene("beads", size=64, depths=1, layers=(0.5, 0.5), seed=3, density=0.4, photons=100)
+    problem = Problem.of(
+        Measurement(scene.measurement, scene.noise),
+        scene.calibration,
+        Options(prior="l1", model="convolution", judged=False),
+    )
+    result = solve(problem)
+    own = points_problem(problem)
+    assert own is not None
+    points = points_of(result, own)
+    to_pixels = -scene.camera.distance_um / scene.points[:, 2] / scene.camera.pitch_um
+    true = scene.points[:, 1::-1] * to_pixels[:, None] + result.grid.centre
+    distance = np.linalg.norm(points.places[:, None] - true, axis=2)
+    assert len(points.light) == len(true)
+    assert distance.min(axis=1).max() < 0.5
+    error = points.places - true[distance.argmin(axis=1)]
+    assert (np.abs(error) <= 1.96 * points.deviations[:, :2]).mean() > 0.75
+    assert np.abs(error).max() > 0.2 * np.median(points.deviations[:, :2])
+    assert f"{len(true)}, placed to" in points.words
+
+
+def test_a_black_picture_has_no_points() -> None:
+    rng = np.random.default_rng(0)
+    psf = rng.random((16, 16)).astype(np.float32)
+    options = Options(prior="l1", model="convolution", judged=False, iterations=2, tau=10.0)
+    problem = Problem.of(rng.normal(0, 1, (16, 16)).astype(np.float32), psf, options)
+    own = points_problem(problem)
+    assert own is not None
+    assert len(points_of(solve(problem), own).light) == 0
+    assert points_problem(Problem.of(psf, psf, Options(prior="tv"))) is None

@@ -107,7 +107,9 @@ def test_a_stream_s_scratch_files_do_not_grow_with_frames_and_go_with_it(
 def test_a_video_has_the_background_that_a_photograph_would_have() -> None:
     told = []
     for stray in (0.0, 2.0):
-        scene = make_scene("sparse-picture", size=48, background=stray, photons=3000.0)
+        scene = make_scene(
+            "sparse-picture", size=48, grid=3, aberration=4.0, background=stray, photons=3000.0
+        )
         asked = {"prior": "l1"}
         chosen = choose(Problem.of(scene.measurement, scene.calibration, ReconstructionOptions(**asked)))
         assert chosen.choice is not None
