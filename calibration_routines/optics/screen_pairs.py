@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.procedure import Checked, FromFiles, Listener, Outcome
+from calibration_routines.procedure import Checked, Listener, Outcome
 from calibration_routines.psf.analysis import channels_first
 from instrument.files.atomic import require_new
 from instrument.files.calibration_file import save_calibration
@@ -256,15 +256,3 @@ def _lines(pairs: Pairs, solved: PicturePsf, left_out: Sequence[LeftOut], good: 
             "photographs'?"
         ]
     return lines
-
-
-SCREEN_FILES = FromFiles(
-    options=PairFiles,
-    named="pairs",
-    uses=("z_um", "channels"),
-    look=lambda _screen, files: look_at_pairs(files),
-    make=lambda screen, files, out, listener: solve_pairs(
-        files, screen.z_um, not screen.channels, out, listener
-    ),
-)
-"""How ``calibrate screen`` takes pairs of files instead of a screen on the bench."""

@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from recon.base import fft
 from recon.base.blocks import block_mean, enlarged
-from recon.blind.psf_step import BeadMixer
-from recon.camera.base import Array, Composition, LinearOperator, estimate_norm
+from recon.camera.base import Array, Composition, LinearOperator, Projection, estimate_norm
 from recon.camera.convolution import Convolution, field_of
-from recon.camera.factors import BackgroundRemoval, Erasures
+from recon.camera.factors import Erasures
 from recon.errors import InputError
 from recon.priors import NonNegativity
 from recon.solvers import Fista, StoppingRules
@@ -229,9 +229,9 @@ class _Estimate:
         scene = self.scene()
         for k in range(len(self.psf)):
             part = slice(None) if len(self.psf) == 1 else slice(k, k + 1)
-            mixer = _Mixed(scene[:, part].reshape(-1, *self.field), self.sensor)
-            camera = Composition(BackgroundRemoval((mixer.range_shape[0], *self.sensor), (1, 1)), mixer)
-            target = camera.outer.forward(self.data[:, part].reshape(mixer.range_shape))
+            seen = KnownScenes(scene[:, part].reshape(-1, *self.field), self.sensor)
+            camera = Composition(EvenRemoved(seen.range_shape, seen.range_shape, np.float32), seen)
+            target = camera.outer.forward(self.data[:, part].reshape(seen.range_shape))
             step = 1 / (_NORM_MARGIN * estimate_norm(camera, 15)) ** 2
             solver = Fista(camera, target, NonNegativity(), initial=self.psf[k : k + 1], step=step)
             self.psf[k] = solver.run(StoppingRules(iterations=self.settings.psf_iterations)).solution[0]
@@ -272,7 +272,7 @@ class _Estimate:
             psf = self.psf[c if len(self.psf) > 1 else 0] * np.float32(self.gains[c])
             camera = Convolution(psf[None], self.sensor, n_channels=len(self.data))
             lit = self.brightness[:, None, None].astype(np.float32) * self.known[:, c]
-            even = BackgroundRemoval((len(self.data), *self.sensor), (1, 1))
+            even = EvenRemoved(camera.range_shape, camera.range_shape, np.float32)
             where = self._on_grid(self.unknown[:, c], camera).astype(bool)
             seen = Composition(even, Composition(camera, Erasures(where, camera.domain_shape)))
             target = even.forward(self.data[:, c] - camera.forward(self._on_grid(lit, camera)))
@@ -309,27 +309,63 @@ class _Estimate:
         )
 
 
-class _Mixed(LinearOperator):
-    """The map from one PSF (1, height, width) to photographs (n, height, width) of fixed scenes."""
+class EvenRemoved(Projection):
+    """Images (n, height, width) less their means: an even light is nobody's business."""
+
+    def forward(self, x: Array, out: Array | None = None) -> Array:
+        """Subtract each image's mean."""
+        means = x.mean(axis=(1, 2), keepdims=True, dtype=np.float64).astype(self.dtype)
+        left: Array = np.subtract(x, means, out=out)
+        return left
+
+
+class KnownScenes(LinearOperator):
+    """The map from one PSF (1, height, width) to photographs (n, height, width) of fixed scenes.
+
+    Parameters
+    ----------
+    scenes : ndarray, float32, (n, field height, field width)
+        Everything that can reach the sensor (:func:`~recon.camera.convolution.field_of`), not negative.
+    sensor : (int, int)
+        Of photographs and PSF.
+    """
 
     def __init__(self, scenes: Floats, sensor: tuple[int, int]) -> None:
         super().__init__((1, *sensor), (len(scenes), *sensor), np.float32)
-        self._mixer = BeadMixer(np.ones((1, *scenes.shape[1:]), np.float32), scenes, sensor, sensor)
+        self._grid = fft.fast_shape(field_of(sensor, sensor)[0])
+        padded = np.zeros((len(scenes), *self._grid), np.float32)
+        padded[:, : scenes.shape[1], : scenes.shape[2]] = scenes
+        self._spectra = fft.rfft(padded)
+        self._power = float((scenes.sum(axis=(1, 2), dtype=np.float64) ** 2).sum())
+        self._image = np.empty((1, *self._grid), np.float32)
+        self._rows = np.empty((len(scenes), sensor[0], self._grid[1]), np.float32)
+        self._work = np.empty_like(self._spectra)
 
     def forward(self, x: Array, out: Array | None = None) -> Array:
         """Convolve each scene with the PSF."""
-        seen = self._mixer.forward(x)
-        return seen if out is None else _into(out, seen)
+        height, width = self.domain_shape[1:]
+        self._image[...] = 0
+        self._image[:, :height, :width] = x
+        np.multiply(self._spectra, fft.rfft(self._image), out=self._work)
+        rows = fft.irfft_strip(self._work, height - 1, self._rows)
+        seen = rows[:, :, width - 1 : 2 * width - 1]
+        return seen.copy() if out is None else _into(out, seen)
 
     def adjoint(self, y: Array, out: Array | None = None) -> Array:
         """Correlate each photograph with its scene, and sum."""
-        back = self._mixer.adjoint(y)
-        return back if out is None else _into(out, back)
+        height, width = self.domain_shape[1:]
+        self._rows[...] = 0
+        self._rows[:, :, width - 1 : 2 * width - 1] = y
+        fft.rfft_strip(self._rows, height - 1, self._work)
+        fft.multiply(self._work, self._spectra, conjugate=True)
+        total = self._work.sum(axis=0, keepdims=True)
+        back = fft.irfft(total, self._grid[1], out=self._image)[:, :height, :width]
+        return back.copy() if out is None else _into(out, back)
 
     @property
     def norm_bound(self) -> float:
-        """As :class:`BeadMixer` gives it."""
-        return float(np.sqrt(self._mixer.lipschitz))
+        """Root of the sum of the scenes' squared light: no frequency has more, as nothing is negative."""
+        return float(np.sqrt(self._power))
 
 
 def _into(out: Array, values: Array) -> Array:

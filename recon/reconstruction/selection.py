@@ -18,7 +18,7 @@ from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.planes import between_of, planes_of
 from recon.reconstruction.probe import COARSE_PX, camera_cost, coarse_copy, coarse_passes
-from recon.reconstruction.problem import Problem
+from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import on_blocks, reduced, reduced_calibration
 from recon.reconstruction.rules import (
     SETTLED,
@@ -38,7 +38,12 @@ from recon.types import Calibration
 Array = npt.NDArray[Any]
 
 
-def choose(problem: Problem, options: ReconstructionOptions | None = None) -> Problem:
+def choose(
+    problem: Problem,
+    options: ReconstructionOptions | None = None,
+    *,
+    on_stage: Stage | None = None,
+) -> Problem:
     """Return the smallest problem that explains the data as well: model ``"auto"``.
 
     What is chosen: the camera model, the depths that take part and planes between them, the field, binning,
@@ -51,6 +56,8 @@ def choose(problem: Problem, options: ReconstructionOptions | None = None) -> Pr
     problem : Problem
     options : ReconstructionOptions, optional
         Default the problem's own.
+    on_stage : callable, optional
+        ``on_stage(share, what)`` as it goes on.
 
     Returns
     -------
@@ -69,12 +76,14 @@ def choose(problem: Problem, options: ReconstructionOptions | None = None) -> Pr
                 "Leave one of the two out."
             )
         return problem
-    return reduced(choice_for(problem), problem)
+    return reduced(choice_for(problem, on_stage), problem)
 
 
-def choice_for(problem: Problem) -> Choice:
+def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     """Choose what to reconstruct a problem with; errors as :func:`choose`."""
     began = time.perf_counter()
+    tell = on_stage or (lambda *_: None)
+    tell(0.0, "choosing: camera models")
     overrides, held = _held(problem, _settled(problem))
     measurement, calibration = problem.measurement, problem.calibration
     counts = measurement.counts()
@@ -96,9 +105,11 @@ def choice_for(problem: Problem) -> Choice:
     looked = not picture or len(scale) > 1  # else one PSF is all there is
     coarse = _coarse(data, valid, calibration, problem.options.z_um) if looked else []
     costs = {m: camera_cost(coarse[0], m) for m in scale} if len(scale) > 1 else {}
+    tell(0.2, "choosing: where light is")
     contrast = None if kind == "l1" or picture else _contrast(data, valid, deviation)
     model, by_model = model_of(depths, overrides, contrast, costs)
     sparse = coarse_passes(coarse) if looked else None
+    tell(0.4, "choosing: a background")
     given = measurement.background is not None
     open_ = looked and not given and overrides.background is None
     smooth = background_of(_trial(problem, coarse, model) if open_ else None, overrides, given=given)
