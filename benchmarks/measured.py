@@ -118,13 +118,9 @@ def hand(folder: Path, binnings: tuple[int, ...]) -> list[str]:
         f"A copy in colour, gains 1, 0.7, 0.5: found {tints / tints[0]}, {seconds:.1f} CPU s.",
     ]
     pictures.append(("colour", result.image))
-    draw_row(pictures, folder / "measured_hand.jpg")
-    return [
-        *lines,
-        *said(results),
-        "",
-        "![The hand at bin 4 by every prior, and in colour](measured_hand.jpg)",
-    ]
+    picture = f"measured_hand_{binnings[-1]}.jpg"
+    draw_row(pictures, folder / picture)
+    return [*lines, "", *said(results), "", f"![The hand by every prior, and in colour]({picture})"]
 
 
 def usaf(folder: Path, binning: int) -> list[str]:
