@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from statistics import NormalDist
@@ -33,14 +32,12 @@ from recon.base.declare import settled
 from recon.errors import InputError
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.point_errors import PointErrors, points_of, points_problem
-from recon.reconstruction.problem import Problem
+from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import solve
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
-OnRepeat = Callable[[int, int], object]
-"""``on_repeat(done, of)``: after each repetition."""
 
 REPEATS = 6
 """Each has a place of the picture four times or more."""
@@ -125,7 +122,7 @@ def uncertain(
     result: Reconstruction,
     problem: Problem,
     *,
-    on_repeat: OnRepeat | None = None,
+    on_stage: Stage | None = None,
     cancel: threading.Event | None = None,
 ) -> Reconstruction:
     """Return the result with its uncertainty, at the cost of :data:`REPEATS` further reconstructions.
@@ -136,7 +133,8 @@ def uncertain(
         As :func:`~recon.reconstruction.solve.solve` returned it.
     problem : Problem
         That was solved.
-    on_repeat : callable, optional
+    on_stage : callable, optional
+        ``on_stage(share, what)`` after each repetition.
     cancel : threading.Event, optional
         Set it to leave the uncertainty out; the result then says so.
     """
@@ -149,8 +147,9 @@ def uncertain(
             words = "No uncertainty: it was interrupted before the repetitions were done."
             return replace(result, warnings=(*result.warnings, words))
         total += replicas.squared_error(number, replicas.shrink, cancel)
-        if on_repeat is not None:
-            on_repeat(number + 1, REPEATS)
+        if on_stage is not None:
+            done = number + 1
+            on_stage(done / REPEATS, f"uncertainty: repetition {done} of {REPEATS}")
     deviation = replicas.deviation(total / REPEATS)
     finest_px = replicas.finest_px * (1 if solved.choice is None else solved.choice.binning)
     if solved.reduction is not None:
