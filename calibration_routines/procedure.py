@@ -259,6 +259,22 @@ class Purpose(Generic[T]):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FromFiles:
+    """How a routine's result is made of files instead of on a bench."""
+
+    options: type[Any]
+    """Frozen dataclass with declared fields: the files, and what is not known of them."""
+    named: str
+    """Its field that names them; None there: the bench."""
+    uses: tuple[str, ...]
+    """The routine's options that matter with files, too."""
+    look: Callable[[Any, Any], Sequence[str]]
+    """Takes the routine's options and the files, says what would be done; raises what is wrong with them."""
+    make: Callable[[Any, Any, Path | None, Listener], Outcome]
+    """Takes the same, where the result goes, and who follows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Routine:
     """A row of the registry: what ``calibrate`` and the window offer, from its options to its result."""
 
@@ -288,6 +304,7 @@ class Routine:
     listener."""
     watch: Callable[[Bench, Runner, Listener], None] | None = None
     """Makes the runner of such a run that goes on look at its frames as from its beginning."""
+    files: FromFiles | None = None
     file: str = ""
     """Where the command line writes the result when nothing else is said, of options with an ``out``."""
     command: str = "calibrate"
@@ -300,6 +317,7 @@ _MODULES = (
     "optics.angular",
     "optics.dpc",
     "optics.beads",
+    "optics.screen_bench",
     "display.slm_calibration",
     "display.mask_alignment",
 )

@@ -112,7 +112,8 @@ def test_a_calibration_makes_a_volume(here: Path, command: Command) -> None:
     )
     command("reconstruct", *given, "-n", "8", "--out", "again.tif")
     old, new = tifffile.imread(here / "results/volume.tif"), tifffile.imread(here / "again.tif")
-    assert np.linalg.norm(new - old) < 0.02 * np.linalg.norm(old)
+    # Its background was not restrained then (decision 0059).
+    assert np.linalg.norm(new - old) < 0.15 * np.linalg.norm(old)
 
 
 def test_a_recording_becomes_a_video(here: Path, command: Command) -> None:

@@ -98,17 +98,16 @@ class SimulatedScreen(SimulatedPanel):
         return layers
 
     def _layers(self, radiance: npt.NDArray[np.float32]) -> tuple[Scene, ...]:
-        """Return what glows of the screen's pixels as a picture parallel to the sensor; nothing: empty.
+        """Return the screen's pixels as a picture parallel to the sensor; empty where none of them glows.
 
-        Only the part that glows, and whose light gets to the sensor.
+        As far as its light gets to the sensor. It has one size whatever glows, so that all pictures are
+        rendered from the same point spread functions, which are kept.
         """
-        rows, columns = (np.flatnonzero(radiance.any(axis=axis)) for axis in (1, 0))
-        if not len(rows):
+        if not radiance.any():
             return ()
-        part = radiance[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        height, width = part.shape
+        height, width = radiance.shape
         corners = np.array([(0, 0), (0, width), (height, width), (height, 0)], float) - 0.5
-        seen = self.place_um(corners[:, 0] + rows[0], corners[:, 1] + columns[0])
+        seen = self.place_um(corners[:, 0], corners[:, 1])
         world = self.world
         bent_y, bent_x = world.propagator.half_extent_um(self.z_um)
         side_y, side_x = (n * world.sensor.pitch_um / 2 for n in world.sensor.shape)
@@ -120,7 +119,7 @@ class SimulatedScreen(SimulatedPanel):
         shape = [max(1, int(n)) for n in np.ceil((high - low) / pitch)]
         on_layer = (seen - (low + high) / 2) / pitch + (np.array(shape) - 1) / 2
         warp = cv2.getPerspectiveTransform(corners[:, ::-1].astype(np.float32), on_layer.astype(np.float32))
-        flat = np.asarray(cv2.warpPerspective(np.ascontiguousarray(part), warp, shape), np.float32)
+        flat = np.asarray(cv2.warpPerspective(radiance, warp, shape), np.float32)
         x, y = (low + high) / 2
         size_um = (shape[1] * pitch, shape[0] * pitch)
         grey = np.broadcast_to(flat[:, :, None], (*flat.shape, 3))

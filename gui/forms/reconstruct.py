@@ -20,7 +20,13 @@ from instrument.files.errors import BenchError
 from instrument.reconstruction.checkpointing import checkpoint_for, require_kept, settle_checkpoint
 from instrument.reconstruction.job import Job as Prepared
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
-from instrument.reconstruction.request import PictureRequest, VolumeRequest, done_share, request_of
+from instrument.reconstruction.request import (
+    PictureRequest,
+    VolumeRequest,
+    done_share,
+    repeated_share,
+    request_of,
+)
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
 from recon.base.declare import Imports, expression, option, options_of
 from recon.priors import PRIORS
@@ -149,7 +155,9 @@ class ReconstructForm(QWidget):
 
         Raises FileError when the name does not end as it must.
         """
-        return Outputs.named(self.options.value("out"), volume=self.kind == VOLUME)
+        volume = self.kind == VOLUME
+        uncertainty = bool(self.options.value("uncertainty")) and not volume
+        return Outputs.named(self.options.value("out"), volume=volume, uncertainty=uncertainty)
 
     def as_python(self) -> str:
         """Return lines that make this reconstruction; errors as :meth:`work`."""
@@ -293,12 +301,18 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
         # Of a picture its only plane.
         context.offer(lambda: SoFar(share, note, prepared, np.array(present().max(axis=0)), tuple(history)))
 
+    def repeated(done: int, of: int) -> None:
+        share, note = repeated_share(done, of)
+        context.offer(lambda: SoFar(share, note, prepared, None, tuple(history)))
+
     if isinstance(request, VolumeRequest):
         volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper)
         write_volume(outputs, volume, prepared)
         settled = settle_checkpoint(keeper, volume.stop_reasons)
     else:
-        picture = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper)
+        picture = request.solve(
+            prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_repeat=repeated
+        )
         write_reconstruction(outputs, picture, prepared, rotate_deg=work.rotate_deg)
         settled = settle_checkpoint(keeper, [picture.stop_reason])
     return Written(outputs.image, settled)
@@ -323,7 +337,8 @@ def lines_of(work: ReconstructionWork) -> str:
             "result = request.solve(job, keeper=keeper)",
         ]
         settled.append(f"settle_checkpoint(keeper, {reasons})")
-    named = f"Outputs.named({expression(work.outputs.image, imports)}{', volume=True' if volume else ''})"
+    kind = ", volume=True" if volume else ", uncertainty=True" if work.outputs.deviation is not None else ""
+    named = f"Outputs.named({expression(work.outputs.image, imports)}{kind})"
     turned = f", rotate_deg={work.rotate_deg}" if work.rotate_deg and not volume else ""
     lines.append(f"{write}({named}, result, job{turned})")
     return "\n".join([*imports.lines(), "", *lines, *settled, ""])

@@ -27,6 +27,7 @@ from instrument.files.errors import BenchError, duration
 from instrument.live.live import LiveResult
 from instrument.reconstruction.job import find_calibration
 from recon.base.declare import Imports, expression, options_of
+from recon.camera.camera_model import members_of_depths
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS
@@ -380,6 +381,7 @@ def _calibration_of(run: Path) -> Path | None:
 
 def _depths_um(calibration: Calibration) -> list[float]:
     """Return the depths to choose from, ascending; none where there is but one, or none is known."""
-    depths = np.unique(calibration.source_positions_um[:, 2])
-    depths = depths[np.isfinite(depths)]
-    return [float(z_um) for z_um in depths] if len(depths) > 1 else []
+    z_um = calibration.source_positions_um[:, 2]
+    groups = members_of_depths(calibration.source_positions_um)  # a stage does not come back to the same z
+    depths = sorted(float(z_um[group[0]]) for group in groups if np.isfinite(z_um[group[0]]))
+    return depths if len(depths) > 1 else []

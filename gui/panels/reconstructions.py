@@ -153,7 +153,7 @@ class ReconstructionsPanel(Panel):
         else:
             assert result.image is not None
             self.viewers.setCurrentWidget(self.picture)
-            self.picture.show_picture(result.image, pitch_um=result.pitch_um)
+            self.picture.show_picture(result.image, pitch_um=result.pitch_um, deviation=result.deviation)
 
     def _close_result(self) -> None:
         self.volume.release()

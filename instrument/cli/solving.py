@@ -14,7 +14,13 @@ from instrument.reconstruction.checkpointing import checkpoint_for, settle_check
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.options import OutputOptions
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned, solve_patterned
-from instrument.reconstruction.request import PictureRequest, VolumeRequest, done_share, iteration_limit
+from instrument.reconstruction.request import (
+    PictureRequest,
+    VolumeRequest,
+    done_share,
+    iteration_limit,
+    repeated_share,
+)
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
 from instrument.reconstruction.video import (
     PreparedVideo,
@@ -54,7 +60,11 @@ def reconstruct_photograph(
                 share = done_share(request.options, record)
                 advance(round(total * share), note=f"change {record.change:.1e}")
 
-            result = request.solve(job, watch=show, cancel=cancel, keeper=keeper)
+            def repeated(done: int, of: int) -> None:
+                share, note = repeated_share(done, of)
+                advance(round(total * share), note=note)
+
+            result = request.solve(job, watch=show, cancel=cancel, keeper=keeper, on_repeat=repeated)
         _print(result)
         if is_volume:
             write_volume(outputs, result, job)
@@ -62,7 +72,7 @@ def reconstruct_photograph(
                 typer.echo(f"{'Planes':<12}{steps} Each plane's depth is in {outputs.record.name}.")
         else:
             _write_picture(outputs, result, job, int(output.rotate_deg))
-        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
+        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.written(result)))}")
         for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
             typer.echo(f"{name:<12}{text}")
     _end(result, what)
@@ -124,11 +134,16 @@ def _print(result: Reconstruction) -> None:
             typer.echo(line)
     else:
         typer.echo(f"{'Model':<12}{result.model}: {result.reason}")
+    if result.refinement is not None:
+        typer.echo(f"{'PSF':<12}{result.refinement}")
     typer.echo(f"{'Method':<12}{result.solver}, prior {result.prior}{weight}")
     if memory := result.provenance.get("memory"):
         typer.echo(f"{'Memory':<12}{memory}")
     _print_end(result)
     _print_verdict(result.verdict)
+    if (found := result.uncertainty) is not None:
+        for index, sentence in enumerate(found.sentences):
+            typer.echo(f"{'Uncertainty' if not index else 'Points':<12}{sentence}")
     for warning in result.warnings:
         typer.echo(f"Warning: {warning}", err=True)
 

@@ -34,6 +34,7 @@ from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choice_for
 from recon.reconstruction.solve import ITERATIONS
 from recon.reconstruction.solvers import SOLVERS, volume_priors
+from recon.reconstruction.uncertainty import REPEATS, OnRepeat
 from recon.solvers.base import IterationRecord, Keeper
 from recon.types import Calibration
 
@@ -67,6 +68,7 @@ class _Request:
         watch: Watch | None = None,
         cancel: threading.Event | None = None,
         keeper: Keeper | None = None,
+        on_repeat: OnRepeat | None = None,
     ) -> Reconstruction:
         """Reconstruct what ``prepare`` returned.
 
@@ -74,7 +76,13 @@ class _Request:
         """
         measurement = self._measurement(job)
         return reconstruct(
-            measurement, job.calibration, self.options, on_progress=watch, cancel=cancel, keeper=keeper
+            measurement,
+            job.calibration,
+            self.options,
+            on_progress=watch,
+            cancel=cancel,
+            keeper=keeper,
+            on_repeat=on_repeat,
         )
 
     def explain(self, job: Job) -> Choice:
@@ -176,7 +184,12 @@ def done_share(options: ReconstructionOptions, record: IterationRecord) -> float
     limit = iteration_limit(options)
     by_count = 0.0 if limit is None else record.iteration / limit
     by_time = 0.0 if options.time_s is None else record.seconds / options.time_s
-    return min(max(by_count, by_time), 1.0)
+    return min(max(by_count, by_time), 1.0) / (1 + REPEATS if options.uncertainty else 1)
+
+
+def repeated_share(done: int, of: int) -> tuple[float, str]:
+    """Return how much of a reconstruction with uncertainty is done after some repetitions, and in words."""
+    return (1 + done) / (1 + of), f"uncertainty: repetition {done} of {of}"
 
 
 def _require_known(inputs: InputOptions, options: ReconstructionOptions) -> None:

@@ -41,6 +41,8 @@ class StoredResult:
     """The volume; None for a picture. Close it in the end."""
     record: Mapping[str, Any]
     """What was written beside it; empty for results from elsewhere."""
+    deviation: npt.NDArray[np.float32] | None = None
+    """Standard deviation of a picture's pixels, as it; None where it was not asked for."""
 
     @property
     def simulated(self) -> bool:
@@ -97,6 +99,8 @@ class StoredResult:
         facts: list[tuple[str, str]] = []
         if self.verdict:
             facts.append(("Verdict", " ".join(self.verdict)))
+        if said := (record.get("uncertainty") or {}).get("sentences"):
+            facts += [(name, str(one)) for name, one in zip(("Uncertainty", "Points"), said, strict=False)]
         chosen = self._chosen()
         facts += chosen
         if record and "Model" not in dict(chosen):
@@ -180,7 +184,16 @@ def open_result(path: Path | str) -> StoredResult:
     if is_zarr_name(path) or path.is_dir() or _is_volume(path, record):
         return StoredResult(path, None, open_volume(path), record)
     pixels = read_image(path).pixels
-    return StoredResult(path, np.asarray(pixels, np.float32), None, record)
+    return StoredResult(path, np.asarray(pixels, np.float32), None, record, _deviation_of(path, record))
+
+
+def _deviation_of(path: Path, record: Mapping[str, Any]) -> npt.NDArray[np.float32] | None:
+    """Read the standard deviations that were written beside a picture; None where they are no more."""
+    name = (record.get("uncertainty") or {}).get("file")
+    beside = path.with_name(Path(str(name)).name)
+    if name is None or not beside.is_file():
+        return None
+    return np.asarray(read_image(beside).pixels, np.float32)
 
 
 def record_file(path: Path) -> Path:

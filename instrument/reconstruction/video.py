@@ -116,6 +116,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         ),
         picture.calibration,
         replace(options, iterations=None),
+        choosing=request.video.over_time is None,
     )
     if request.video.over_time is not None:
         require_joint(problem)
@@ -144,7 +145,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         _create(request, run, plan, picture)
         job = VideoJob.create(request.out, plan, problem, reduction)
     saturated = sum(record.metadata.saturated_fraction > 0 for record in run.records.values())
-    warnings = list(picture.warnings)
+    warnings = list(dict.fromkeys((*picture.warnings, *problem.warnings)))
     if saturated:
         warnings.append(f"{saturated} of {len(frames)} frames have saturated pixels: expect halos there.")
     if not has_light(picture.measurement, problem.noise):

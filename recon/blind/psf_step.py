@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
-from recon.blind.points import Mixer, Points
+from recon.blind.points import Mixer
 from recon.camera.base import Array
 from recon.camera.convolution import field_of
+from recon.camera.points import Points
 from recon.camera.registration import LOCAL_MEAN_PX
 from recon.errors import InputError
 

@@ -49,15 +49,44 @@ def measured_set(name: MeasuredSet) -> tuple[Floats, Floats]:
     return psfs, photograph
 
 
-def _files(folder: Path, pattern: str) -> list[Floats]:
-    import cv2
+@lru_cache(maxsize=1)
+def measured_pairs() -> tuple[tuple[str, ...], Floats, Floats]:
+    """Return names, photographs through the diffuser and the pictures they show; not to be written to.
 
+    Raises InputError when the set is not there.
+
+    Returns
+    -------
+    names : tuple of str
+        In the order of the files.
+    photographs, pictures : ndarray, (n, 3, height, width)
+        Red, green, blue, black level subtracted; neither flipped, both centred.
+    """
+    folder = data_folder() / "diffusercam_pairs"
+    names = tuple(file.stem.removeprefix("raw_") for file in _found(folder, "raw_*.npy"))
+    photographs, pictures = (
+        np.stack([np.moveaxis(np.load(folder / f"{kind}_{name}.npy"), -1, 0) for name in names])
+        for kind in ("raw", "truth")
+    )
+    for array in (photographs, pictures):
+        array.flags.writeable = False
+    return names, photographs, pictures
+
+
+def _found(folder: Path, pattern: str) -> list[Path]:
     if not (files := sorted(folder.glob(pattern))):
         raise InputError(
             f"The measured set {folder.name} is not there: no {pattern} in {folder.resolve()}. Name the "
             "folder that holds it in the environment variable DIFFUSERBENCH_DATA."
         )
-    return [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float32) for file in files]
+    return files
+
+
+def _files(folder: Path, pattern: str) -> list[Floats]:
+    import cv2
+
+    found = _found(folder, pattern)
+    return [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float32) for file in found]
 
 
 def _hand(root: Path) -> tuple[Floats, Floats]:

@@ -59,6 +59,8 @@ class Decision:
         Whether the caller chose.
     numbers : mapping of str to float
         What ``why`` says, to compute with.
+    open : bool
+        Whether there was anything to decide; what was not is told only where everything is.
     """
 
     name: Name
@@ -69,6 +71,7 @@ class Decision:
     down: Option | None = None
     overruled: bool = False
     numbers: Mapping[str, float] = field(default_factory=dict)
+    open: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,10 +130,16 @@ class Choice:
         return hashlib.sha256(repr(chosen).encode()).hexdigest()[:8]
 
     def lines(self, *, steps: bool = True) -> list[str]:
-        """Return what was chosen and why, a line a choice, and what one step up and down would be."""
+        """Return what was chosen and why, a line a choice, and what one step up and down would be.
+
+        Without ``steps`` only what there was to decide.
+        """
         text = []
         for d in self.decisions:
-            text.append(f"{d.name.capitalize():<12}{d.value}: {d.why}{' (as asked)' if d.overruled else ''}")
+            if not (steps or d.open or d.overruled):
+                continue
+            asked = (" (as asked)" if d.why else "as asked") if d.overruled else ""
+            text.append(f"{d.name.capitalize():<12}{d.value}: {d.why}{asked}")
             if steps:
                 ways = (("up", d.up), ("down", d.down))
                 text += [f"{'':<12}  one step {way}: {o}" for way, o in ways if o is not None]

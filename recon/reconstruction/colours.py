@@ -118,7 +118,7 @@ def channels_of(
     """Decide whether colour channels are reconstructed as one; also return how they are proportional."""
     n = len(data)
     if n == 1:
-        return Decision("channels", "one", "the photograph has one channel"), None
+        return Decision("channels", "one", "the photograph has one channel", open=False), None
     common = int(np.count_nonzero(valid.all(axis=0)))
     if common < max(LEAST_COMMON, LEAST_COMMON_SHARE * valid[0].size):
         why = f"only {common} of {valid[0].size} pixels tell all colours, as with a colour mosaic"

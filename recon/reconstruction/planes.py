@@ -33,14 +33,16 @@ TV_LEAVES = 2.0
 rightly, from 2.6 times where wrongly, on two scenes of beads, each with one PSF and with nine a depth."""
 
 
-def planes_of(passed: CoarsePass, depths: Depths, overrides: Overrides) -> tuple[tuple[int, ...], Decision]:
+def planes_of(
+    passed: CoarsePass | None, depths: Depths, overrides: Overrides
+) -> tuple[tuple[int, ...], Decision]:
     """Decide which depths take part, by where a coarse pass finds light."""
     n = len(depths.z_um)
     everything = tuple(range(n))
-    if n == 1:
+    if n == 1 or passed is None:
         if isinstance(overrides.planes, tuple):
             _within(overrides.planes, n)
-        return everything, Decision("planes", "1", "one depth was calibrated")
+        return everything, Decision("planes", "1", "one depth was calibrated", open=False)
     lit = np.any([_most_of(light) for light in passed.light], axis=0)
     # The coarse pass may take a plane for its neighbour: those of lit planes stay.
     order = np.argsort(depths.z_um) if np.isfinite(depths.z_um).all() else np.arange(n)
@@ -171,7 +173,7 @@ def between_of(
         why = prevented or "no two neighbouring depths take part"
         if overrides.between:
             raise InputError(f"Planes cannot be added between depths (between=on): {why}.")
-        return (), Decision("between", "no planes", why, overruled=asked)
+        return (), Decision("between", "no planes", why, overruled=asked, open=False)
     alike = {k: similarity(depths.central[k], depths.central[k + 1]) for k in gaps}
     worst = min(gaps, key=alike.__getitem__)
     unlike = tuple(k for k in gaps if alike[k] < UNLIKE)

@@ -13,15 +13,18 @@ import numpy.typing as npt
 from recon.base.checks import require_photograph
 from recon.base.declare import with_overrides
 from recon.camera.camera_model import CAMERAS
+from recon.errors import InputError
 from recon.priors import PRIORS
 from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
+from recon.reconstruction.psf_refinement import refined
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solve import Progress, solve
 from recon.reconstruction.solvers import SOLVERS
+from recon.reconstruction.uncertainty import OnRepeat, refused, uncertain
 from recon.solvers.base import Keeper
 from recon.types import Calibration
 from recon.verdict.evidence import evidence_of, not_judged, observations, unsettled_by
@@ -40,6 +43,7 @@ def reconstruct(
     on_progress: Progress | None = None,
     cancel: threading.Event | None = None,
     keeper: Keeper | None = None,
+    on_repeat: OnRepeat | None = None,
     **overrides: Any,
 ) -> Reconstruction:
     """Reconstruct a picture or a volume from a lensless camera's measurement.
@@ -63,6 +67,8 @@ def reconstruct(
         Set it to stop after the iteration in progress.
     keeper : Keeper, optional
         Keeps the solvers' state, and has them go on from what was kept of the same reconstruction.
+    on_repeat : callable, optional
+        ``on_repeat(done, of)`` after each repetition that the option ``uncertainty`` asks for.
     **overrides
         Single options by their names: ``reconstruct(image, psf, prior="l1", iterations=50)``.
 
@@ -75,8 +81,18 @@ def reconstruct(
     problem = Problem.of(replace(measurement, **known), calibration, options)
     if not problem.patterned:
         require_photograph(problem.data, problem.depths.central[problem.n_planes // 2])
+    if options.uncertainty and (reason := refused(problem)) is not None:
+        raise InputError(f"{reason[0].upper()}{reason[1:]}.")
+    refinement = None
+    if options.refine_psf:
+        problem, refinement = refined(problem, cancel=cancel)
     problem = choose(problem)
     result = solve(problem, warm=warm, on_progress=on_progress, cancel=cancel, keeper=keeper)
+    if options.uncertainty:
+        result = uncertain(result, problem, on_repeat=on_repeat, cancel=cancel)
+    if refinement is not None:
+        provenance = {**result.provenance, "psf_refinement": refinement.to_json()}
+        result = replace(result, refinement=refinement, provenance=provenance)
     return (
         judged(result, problem, started=warm is not None) if options.judged else replace(result, basis=None)
     )

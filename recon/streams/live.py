@@ -131,7 +131,7 @@ class LiveReconstructor:
         options = self.options
         if options.estimate_background is None and "background" in known:
             options = replace(options, estimate_background=False)
-        problem = stream_problem(Measurement(blank, **known), self._given, options)
+        problem = stream_problem(Measurement(blank, **known), self._given, options, choosing=False)
         require_steps(problem)
         return problem
 
@@ -300,7 +300,8 @@ class LiveReconstructor:
         measurement = on_blocks(frame, valid, self._known.get("noise"), binning, flat=len(self._shape) == 2)
         calibration = reduced_calibration(self.calibration, binning, None)
         plane = self._n_planes // 2 if self.live.plane is None else self.live.plane
-        return Level.of(stream_problem(measurement, calibration, self._options), binning, plane)
+        problem = stream_problem(measurement, calibration, self._options, choosing=False)
+        return Level.of(problem, binning, plane)
 
     def _first_binning(self) -> int:
         """Return the finest binning at which a first picture takes no time to speak of."""

@@ -29,8 +29,8 @@ NEW_SCENE = 0.5
 picture panning by 3 x 6 pixels a frame (a share of about 0.3) a warm start is still as good as a cold one."""
 
 
-_BLOCK = 8
-"""Pixels along a side over which light is averaged to tell it from noise."""
+LIT_BLOCKS = (8, 16, 32)
+"""Pixels along a side over which light is averaged to tell it from noise: dim scenes show in large ones."""
 LIT = 2.0
 """Variance of block means from which a frame has light, in units of what its pixels' noise makes of it."""
 
@@ -39,8 +39,8 @@ def has_light(frame: Array, deviation: Array) -> bool:
     """Tell whether there is more in a frame than noise.
 
     Noise of single pixels goes away where pixels are averaged, a scene through a diffuser does not: the
-    variance of the means of 8 x 8 pixels is compared with what noise leaves of it. Noise grows with light: a
-    frame dimmer than the one that ``deviation`` was found on has less, which it tells itself.
+    variance of the means of 8 x 8 to 32 x 32 pixels is compared with what noise leaves of it. Noise grows
+    with light: a frame dimmer than the one that ``deviation`` was found on has less, which it tells itself.
 
     Parameters
     ----------
@@ -50,16 +50,24 @@ def has_light(frame: Array, deviation: Array) -> bool:
         Of the noise, counts; that of another frame of the same camera is enough.
     """
     channels = frame[None] if frame.ndim == 2 else np.moveaxis(frame, 2, 0)
-    height, width = (n // _BLOCK for n in channels.shape[1:])
-    if min(height, width) < 2:
+    if min(channels.shape[1:]) < 2 * LIT_BLOCKS[0]:
         return True  # too few blocks to tell
-    means = block_mean(channels, _BLOCK, dtype=np.float64)
-    spread = means.var(axis=(1, 2)) * _BLOCK**2
-    given = np.asarray(deviation, np.float64).reshape(-1)
-    if (spread > LIT * given**2).any():
+    spreads = [_spread(channels, side) for side in LIT_BLOCKS if min(channels.shape[1:]) >= 2 * side]
+    if _beyond_noise(spreads, np.asarray(deviation, np.float64).reshape(-1)):
         return True
     own = np.array([estimate_deviation(channel) for channel in channels])
-    return bool(((own > 0) & (spread > LIT * own**2)).any())  # 0 is no estimate: most pixels are alike
+    # 0 is no estimate: most pixels are alike.
+    return _beyond_noise(spreads, np.where(own > 0, own, np.inf))
+
+
+def _spread(channels: Array, side: int) -> tuple[int, Array]:
+    """Return how many blocks there are, and the variance of their means if their pixels were independent."""
+    means = block_mean(channels, side, dtype=np.float64)
+    return means[0].size, means.var(axis=(1, 2)) * side**2
+
+
+def _beyond_noise(spreads: list[tuple[int, Array]], deviation: Array) -> bool:
+    return any((spread > _beyond_chance(LIT, n) * deviation**2).any() for n, spread in spreads)
 
 
 class SceneState(enum.StrEnum):
@@ -71,6 +79,11 @@ class SceneState(enum.StrEnum):
     """The scene of before, changed."""
     STILL = "still"
     """As before, within the noise."""
+
+
+def _beyond_chance(ratio: float, blocks: int) -> float:
+    """Return the ratio of variances that counts: few blocks make it uncertain by itself."""
+    return max(ratio, 1 + 5 * float(np.sqrt(2 / blocks)))
 
 
 LARGEST_GAIN = 2.0
@@ -148,6 +161,6 @@ class SceneWatch:
                 break
             blocks = block_mean(blocks, 2)
             ratio = side**2 * float(np.vdot(blocks, blocks)) / blocks.size / variance
-            if ratio > max(LEAST_RATIO, 1 + 5 * float(np.sqrt(2 / blocks.size))):
+            if ratio > _beyond_chance(LEAST_RATIO, blocks.size):
                 return False
         return True

@@ -15,12 +15,14 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from recon.camera.camera_model import CAMERAS, choose_model
 from recon.errors import InputError
-from recon.reconstruction.measurement import Floats, Measurement
-from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.measurement import Floats, Measurement, depths_of
+from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import given
+from recon.reconstruction.selection import choice_for
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver
 from recon.solvers.base import Solver, StoppingRules
 from recon.solvers.sensor_admm import SensorAdmm
@@ -39,6 +41,8 @@ def stream_problem(
     frame: Measurement | npt.ArrayLike,
     calibration: Calibration | npt.ArrayLike,
     options: ReconstructionOptions | None = None,
+    *,
+    choosing: bool = True,
     **overrides: Any,
 ) -> Problem:
     """Settle noise, scales and camera from one frame, for all frames of a video.
@@ -50,20 +54,62 @@ def stream_problem(
     frame : Measurement or array, (height, width[, n_channels])
         Background subtracted. A bright one, where the video has brighter and darker ones.
     options : ReconstructionOptions, optional
-        Any camera model, prior, background and depths; ``"auto"`` is one PSF a depth here, as the quickest,
-        and the exact-data ADMM where that has a way.
+        Any camera model, prior, background and depths; ``"auto"`` is one PSF a depth here, as the quickest
+        (the problem's warnings say where PSFs differ over the field), and the exact-data ADMM where that has
+        a way.
+    choosing : bool
+        Whether a smooth background is estimated where a photograph would have one, unless the options say.
     **overrides
         Single options, and facts about the frame, by their names, as of :func:`recon.reconstruct`.
     """
     known, options = given(overrides, options)
     measurement = frame if isinstance(frame, Measurement) else Measurement(frame)
+    doubt = ""
     if options.model == "auto":
+        doubt = _by_one_psf(calibration, options)
         options = replace(options, model="convolution")
     problem = Problem.of(replace(measurement, **known), calibration, options)
+    if choosing and isinstance(calibration, Calibration):
+        problem = _with_background(problem, calibration)
+    if doubt:
+        problem = replace(problem, warnings=(*problem.warnings, doubt))
     if options.solver == "auto" and SOLVERS["admm-sensor"].accepts(problem) is None:
         problem = replace(problem, options=replace(options, solver="admm-sensor"))
     problem.solver  # noqa: B018 - refuses at once what it has no way for
     return problem
+
+
+def _with_background(problem: Problem, calibration: Calibration) -> Problem:
+    """Return a problem with a smooth background where a photograph would have one, and nobody said.
+
+    Of pictures: volumes have one unless it is given. All of the calibration's PSFs tell whether there is one.
+    """
+    options, model = problem.options, problem.model
+    said = options.estimate_background is not None or problem.measurement.background is not None
+    if said or problem.n_planes > 1 or problem.patterned or model in CAMERAS:
+        return problem
+    asked = replace(options, model="auto", choose=Overrides(model=model, binning=1, channels="all"))
+    choice = choice_for(Problem.of(problem.measurement, calibration, asked))
+    if not choice.background:
+        return problem
+    (why,) = (d.why for d in choice.decisions if d.name == "background")
+    options = replace(options, estimate_background=True)
+    problem = Problem.of(problem.measurement, problem.calibration, options)
+    said_so = f"A smooth background is estimated in each frame: {why}."
+    return replace(problem, warnings=(*problem.warnings, said_so))
+
+
+def _by_one_psf(calibration: Calibration | npt.ArrayLike, options: ReconstructionOptions) -> str:
+    """Say what one PSF for the whole field does not tell of a calibration; empty where it is enough."""
+    if not isinstance(calibration, Calibration) or len(calibration.psfs) == 1:
+        return ""
+    model, why = choose_model(depths_of(calibration, options)[1], "auto")
+    if model == "convolution":
+        return ""
+    return (
+        f"One PSF serves the whole field, as is quickest: {why}. "
+        f"--model {model} takes all of them, in several times the time."
+    )
 
 
 class VideoSolver:

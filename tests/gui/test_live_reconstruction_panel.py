@@ -192,6 +192,19 @@ def test_of_depths_chosen_in_quick_succession_the_last_is_shown(
     assert panel.follower._view.reconstructor is panel.loaded.reconstructor
 
 
+def test_sources_of_a_lateral_sweep_are_one_depth(
+    qtbot: QtBot, panel: LiveReconstructionPanel, tmp_path: Path
+) -> None:
+    one = load_calibration(tmp_path / "calibration")
+    places = [(x, y, 1e5 + 0.3 * (x > 0)) for y in (-300.0, 0.0, 300.0) for x in (-300.0, 0.0, 300.0)]
+    nine = Calibration(np.repeat(one.psfs, 9, axis=0), np.array(places))
+    panel.file.setText(str(save_calibration(nine, tmp_path / "lateral")))
+    panel.load()
+    qtbot.waitUntil(lambda: panel.loaded is not None and panel.loaded.path.name == "lateral", timeout=WAIT_MS)
+    assert panel.plane.isHidden()
+    qtbot.waitUntil(lambda: "latency" in panel.status.text(), timeout=WAIT_MS)
+
+
 def test_a_depth_that_cannot_be_prepared_is_told_and_the_one_before_goes_on(
     qtbot: QtBot, panel: LiveReconstructionPanel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

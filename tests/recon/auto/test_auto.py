@@ -102,7 +102,7 @@ def test_planes_with_light_that_were_left_out_are_put_back(beads, chosen_beads, 
     assert 0 < max(chosen_beads.provenance["light_in_planes_left_out"]) < 1
     assert not any("left out" in w for w in chosen_beads.warnings)
     wrong = replace(chosen_beads.choice, planes=(0, 1, 2), n_planes=6)
-    monkeypatch.setattr("recon.reconstruction.selection.choice_for", lambda _: wrong)
+    monkeypatch.setattr("recon.reconstruction.selection.choice_for", lambda *_: wrong)
     result = recon.reconstruct(beads.measurement, beads.calibration, prior="l1", judged=False)
     assert result.choice is not None
     assert set(result.choice.planes) > {0, 1, 2}
@@ -120,7 +120,7 @@ def test_a_run_with_planes_put_back_that_is_cut_short_serves_only_where_it_came_
 ):
     scene = make_scene("beads", size=40, depths=6, grid=3, layers=(0.0, 0.3), density=0.5, seed=31)
     wrong = replace(choose(scene.measurement, scene.calibration, prior=prior), planes=tried)
-    monkeypatch.setattr("recon.reconstruction.selection.choice_for", lambda _: wrong)
+    monkeypatch.setattr("recon.reconstruction.selection.choice_for", lambda *_: wrong)
     runs = []
     solve = solving._solve
 

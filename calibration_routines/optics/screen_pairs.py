@@ -1,0 +1,258 @@
+"""A PSF from files: photographs of known pictures, each with what it shows, whoever took them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration_routines.procedure import Checked, Listener, Outcome
+from calibration_routines.psf.analysis import channels_first
+from instrument.files.atomic import require_new
+from instrument.files.calibration_file import save_calibration
+from instrument.files.errors import FileError
+from instrument.files.images import ImageFile, read_image
+from recon.base.declare import RARE, option
+from recon.blind.known_pictures import PicturePsf, PictureSettings, psf_from_pictures
+from recon.blind.left_out import LeftOut, leave_out
+from recon.types import Calibration, Geometry
+
+Floats = npt.NDArray[np.float32]
+
+PAIRS_FOLDER = "calibration-screen"
+"""Where the command line writes the calibration."""
+PHOTOGRAPHS, PICTURES = ("raw_", "photograph_"), ("truth_", "picture_")
+"""What names of files begin with, before what a photograph and its picture have in common."""
+_FILES = "With image files"
+_SOLVER = PictureSettings()
+_JUDGED_ROWS = 128  # of the images that left-out photographs are judged on
+_POOR_DB = 3.0  # better than an even picture: with less the PSF explains nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairFiles(Checked):
+    """Photographs of known pictures, and how to solve them."""
+
+    pairs: Path | None = option(
+        None,
+        metavar="FOLDER",
+        help="Photographs raw_NAME and what they show, truth_NAME: of equal size, one object pixel a "
+        "photograph's pixel, neither flipped.",
+        default_words="taken on the bench",
+        group=_FILES,
+    )
+    dark: float = option(0.0, least=0, help="Dark level of the photographs, counts.", group=_FILES)
+    gamma: float | None = option(
+        None,
+        above=0.2,
+        most=5,
+        help="Exponent that makes a picture's values light.",
+        default_words="found",
+        group=_FILES,
+    )
+    judged: int = option(
+        3,
+        least=0,
+        help="Photographs that are left out in turn to judge the calibration.",
+        group=_FILES,
+    )
+    beyond: float = option(
+        _SOLVER.beyond,
+        least=0,
+        most=1,
+        help="How far beyond the pictures there may be light, of the photographs' height.",
+        group=RARE,
+    )
+    pixel_um: float | None = option(
+        None, unit="um", above=0, help="Pixel pitch.", default_words="not known", group=_FILES
+    )
+    distance_mm: float | None = option(
+        None,
+        unit="mm",
+        above=0,
+        help="From diffuser to sensor.",
+        default_words="not known",
+        group=_FILES,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Photographs and what they show.
+
+    Attributes
+    ----------
+    names : tuple of str
+    photographs, pictures : ndarray, float32, (n, n_channels, height, width)
+    simulated : bool
+        Whether the simulated bench took one.
+    """
+
+    names: tuple[str, ...]
+    photographs: Floats
+    pictures: Floats
+    simulated: bool
+
+
+def read_pairs(folder: Path, dark: float = 0.0) -> Pairs:
+    """Read the pairs of a folder, in the order of their names; pictures are scaled to a peak of 1.
+
+    Raises FileError when there are fewer than two pairs, a photograph has no picture or the other way round,
+    or sizes or channels differ.
+    """
+    photographs, pictures = (_named(folder, beginnings) for beginnings in (PHOTOGRAPHS, PICTURES))
+    alone = sorted(set(photographs) ^ set(pictures))
+    if alone:
+        file = photographs.get(alone[0]) or pictures[alone[0]]
+        partner = PICTURES[0] if alone[0] in photographs else PHOTOGRAPHS[0]
+        raise FileError(
+            file, f"has no partner {partner}{alone[0]} beside it.", "Add it, or take this one away."
+        )
+    if len(photographs) < 2:
+        raise FileError(
+            folder,
+            f"holds {len(photographs)} pairs of raw_NAME and truth_NAME; two or more are needed.",
+            "Name each photograph raw_NAME and what it shows truth_NAME (.npy, .tif, .png).",
+        )
+    names = tuple(sorted(photographs))
+    first = read_image(photographs[names[0]])
+    taken, shown = (
+        [_of_shape(read_image(files[name]), first) for name in names] for files in (photographs, pictures)
+    )
+    peak = max(float(image.max()) for image in shown) or 1.0
+    return Pairs(
+        names,
+        np.stack(taken) - np.float32(dark),
+        np.stack(shown) / np.float32(peak),
+        first.is_simulated,
+    )
+
+
+def _named(folder: Path, beginnings: Sequence[str]) -> dict[str, Path]:
+    if not folder.is_dir():
+        raise FileError(folder, "is no folder.", "Name the folder that holds the pairs raw_NAME, truth_NAME.")
+    return {
+        file.stem.removeprefix(beginning): file
+        for beginning in beginnings
+        for file in folder.glob(f"{beginning}*")
+        if file.suffix != ".json"
+    }
+
+
+def _of_shape(image: ImageFile, first: ImageFile) -> Floats:
+    if image.pixels.shape != first.pixels.shape:
+        raise FileError(
+            image.path,
+            f"is {image.describe()}, but {first.path.name} is {first.describe()}.",
+            "Photographs and pictures have one size and as many channels; scale the pictures to the "
+            "photographs' pixels.",
+        )
+    return channels_first(np.asarray(image.pixels, np.float32))
+
+
+def look_at_pairs(files: PairFiles) -> tuple[str, ...]:
+    """Return what the folder holds, in words; errors as :func:`read_pairs`."""
+    assert files.pairs is not None
+    pairs = read_pairs(files.pairs, files.dark)
+    _, channels, height, width = pairs.photographs.shape
+    return (
+        f"{len(pairs.names)} pairs of {height} x {width} pixels, {channels} "
+        f"channel{'s' if channels > 1 else ''}: {', '.join(pairs.names)}",
+    )
+
+
+def solve_pairs(
+    options: PairFiles, z_um: float | None, one_psf: bool, out: Path | None, listener: Listener
+) -> Outcome:
+    """Solve the pairs of a folder for the PSF, judge it by photographs left out, and save the calibration.
+
+    Raises BenchError when the calibration exists; errors as :func:`read_pairs` and ``psf_from_pictures``.
+    """
+    out = Path(PAIRS_FOLDER) if out is None else out
+    assert options.pairs is not None
+    require_new(out, overwrite=False)
+    listener.step("reading the pairs")
+    pairs = read_pairs(options.pairs, options.dark)
+    settings = PictureSettings(one_psf=one_psf, beyond=options.beyond, gamma=options.gamma)
+    listener.step("solving for the PSF")
+    solved = psf_from_pictures(
+        pairs.photographs,
+        pairs.pictures,
+        settings,
+        on_progress=lambda _words, done: listener.share(done, 1.0),
+    )
+    judged = np.unique(np.linspace(0, len(pairs.names) - 1, min(options.judged, len(pairs.names))).round())
+    left_out: list[LeftOut] = []
+    if len(judged) and len(pairs.names) > 2:
+        listener.step("judging it by photographs left out")
+        left_out = leave_out(
+            pairs.photographs,
+            pairs.pictures,
+            [int(n) for n in judged],
+            settings,
+            binning=max(1, pairs.photographs.shape[2] // _JUDGED_ROWS),
+            on_progress=lambda _words, done: listener.share(done, 1.0),
+        )
+    calibration = Calibration(
+        psfs=solved.psf[None],
+        source_positions_um=np.array([(0.0, 0.0, np.nan if z_um is None else z_um)]),
+        geometry=Geometry(pixel_pitch_um=options.pixel_um, diffuser_distance_mm=options.distance_mm),
+        quality=_quality(pairs, solved, left_out),
+        provenance={
+            "made_by": f"diffuserbench {version('diffuserbench')}",
+            "utc": datetime.now(UTC).isoformat(timespec="seconds"),
+            "method": "photographs of known pictures, non-negative least squares",
+            "pairs": str(options.pairs.resolve()),
+            "simulated": pairs.simulated,
+        },
+    )
+    path = save_calibration(calibration, out)
+    good = not left_out or all(one.psnr_db > one.flat_db + _POOR_DB for one in left_out)
+    return Outcome(
+        verdict=tuple(_lines(pairs, solved, left_out, good)), good=good, calibration=path, result=calibration
+    )
+
+
+def _quality(pairs: Pairs, solved: PicturePsf, left_out: Sequence[LeftOut]) -> dict[str, Any]:
+    return {
+        "pairs": list(pairs.names),
+        "misfit": solved.misfit,
+        "gamma": solved.gamma,
+        "gains": solved.gains.tolist(),
+        "brightness": solved.brightness.tolist(),
+        "stray": solved.stray.tolist(),
+        "left_out": [
+            {"name": pairs.names[one.number], "psnr_db": one.psnr_db, "even_db": one.flat_db}
+            for one in left_out
+        ],
+    }
+
+
+def _lines(pairs: Pairs, solved: PicturePsf, left_out: Sequence[LeftOut], good: bool) -> list[str]:
+    lines = ["SIMULATED: a photograph comes from the simulated bench"] if pairs.simulated else []
+    lines += [
+        f"The PSF leaves {solved.misfit:.1%} of the photographs' standard deviation unexplained; the "
+        f"pictures' gamma is {solved.gamma:.2f}"
+    ]
+    spread = float(np.abs(solved.brightness - 1).max())
+    if spread > 0.02:
+        lines += [f"The photographs' exposures differ by up to {spread:.0%} from their pictures' (taken out)"]
+    if left_out:
+        lines += ["Photographs left out, reconstructed with the PSF from the others, against their pictures:"]
+        lines += [
+            f"  {pairs.names[one.number]:<12}{one.psnr_db:.1f} dB (an even picture: {one.flat_db:.1f} dB)"
+            for one in left_out
+        ]
+    if not good:
+        lines += [
+            "Quality: left-out photographs are hardly reconstructed: do photographs and pictures belong "
+            "together, are the pictures neither flipped nor shifted, and is one of their pixels one of the "
+            "photographs'?"
+        ]
+    return lines

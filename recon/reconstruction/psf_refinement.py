@@ -1,0 +1,390 @@
+"""Self-calibration: how large the PSFs are and how they are turned, fitted from the photograph itself.
+
+Between calibration and photograph a diffuser is bumped, a sensor warms up, a scene stands at another depth.
+A copy of the PSFs is right when it predicts pixels that the reconstruction has not seen. So a share of the
+pixels is erased, reconstructed from the rest through scaled and turned copies on binned pixels, and what is
+left there is made as small as it gets; other pixels, which no fit has seen, then say whether it helped.
+
+Only fine structure counts: what is left less its own local mean. Slow waves (stray light, unfinished
+iterations) are most of a residual on measured data and pull the scale by half a percent; without them forty
+iterations say what four hundred do, to 0.06 %.
+
+A photograph cannot tell where a PSF lies nor how bright it is: a PSF that is moved or brighter makes a
+picture that is moved or darker, and fits as well.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.blocks import block_sum
+from recon.camera.camera_model import CAMERAS, Depths, choose_model
+from recon.camera.transformed import Transformation, transformed
+from recon.camera.varying_psfs import FieldOfPsfs
+from recon.errors import InputError
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import Part
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.reduction import reduced_calibration
+from recon.reconstruction.solvers import SOLVERS
+from recon.reconstruction.weights import kind_of
+from recon.solvers import StoppingRules
+from recon.types import Calibration
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float64]
+Share = Callable[[float], object]
+
+SEARCH_PX, SEARCH_ITERATIONS = 100, 30
+"""Longest side, about, and iterations of the reconstructions that a first guess is searched with."""
+FIT_PX, FIT_ITERATIONS = 200, 100
+"""The same of those that it is fitted with."""
+HELD_SHARE = 0.1
+"""Of the pixels, for the fit, and as many again for the judgement."""
+BETWEEN_PX = 0.37
+"""By how much all copies are displaced."""
+FINE_PX = 3.0
+"""Deviation of the Gaussian whose mean is taken off what is left, binned pixels."""
+TILES = 4
+"""Along each axis of the photograph, judged apart: how much they differ tells how sure the whole is."""
+SEARCH_STEP_PX = 1.0
+"""Steps of the search, binned pixels at the pattern's root mean square radius."""
+LARGEST = 0.1
+"""Change of size, and turn in radians, that are searched."""
+FIT_STEPS_PX = (0.5, 0.3)
+"""The same of the two fits, one after the other."""
+CERTAIN = 3.0
+"""Standard errors by which held-out pixels, and the parameters, must differ for a copy to be the better."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """How the PSFs of a calibration fit a photograph best.
+
+    Attributes
+    ----------
+    transformation : Transformation
+        What makes of the given PSFs those that fit best.
+    scale_error, rotation_error_deg : float
+        Standard deviations of its scale and rotation.
+    given, found : float
+        Fine structure that is left on pixels held out of all fits, in units of the noise: by the PSFs as
+        given, and by the copy.
+    certainty : float
+        By how many standard errors the copy is better there.
+    significance : float
+        How far the transformation is from none, in its own standard errors.
+    seconds : float
+        Wall time.
+    """
+
+    transformation: Transformation
+    scale_error: float
+    rotation_error_deg: float
+    given: float
+    found: float
+    certainty: float
+    significance: float
+    seconds: float
+
+    @property
+    def helps(self) -> bool:
+        """Whether the copy is certainly better."""
+        return bool(min(self.certainty, self.significance) >= CERTAIN)
+
+    def of(self, calibration: Calibration) -> Calibration:
+        """Return the calibration with the copy, and its sources where they then are; as given if no help."""
+        if not self.helps:
+            return calibration
+        positions = calibration.source_positions_um.copy()
+        # A pattern that is turned or enlarged is that of a source elsewhere: (x, y) is (column, row).
+        positions[:, 1::-1] = positions[:, 1::-1] @ self.transformation.matrix.T
+        return replace(
+            calibration,
+            psfs=transformed(calibration.psfs, self.transformation),
+            source_positions_um=positions,
+            provenance={**calibration.provenance, "psf_refined": self.to_json()},
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all of it for a file."""
+        how = self.transformation
+        return {
+            "scale": how.scale,
+            "scale_error": self.scale_error,
+            "rotation_deg": how.rotation_deg,
+            "rotation_error_deg": self.rotation_error_deg,
+            "held_out_given": self.given,
+            "held_out_found": self.found,
+            "standard_errors": self.certainty,
+            "used": self.helps,
+        }
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        how = self.transformation
+        sizes = f"{100 * (how.scale - 1):+.2f} +- {100 * self.scale_error:.2f} % larger"
+        found = f"turned by {how.rotation_deg:+.2f} +- {self.rotation_error_deg:.2f} degrees and {sizes}"
+        left = f"{self.given:.3g} to {self.found:.3g} times the noise"
+        if self.helps:
+            return f"the PSF fits better {found}: fine structure left on held-out pixels falls from {left}"
+        return f"the PSF is taken as it is: {found} it fits no better for certain ({left} on held-out pixels)"
+
+
+def refined(
+    problem: Problem, *, on_progress: Share | None = None, cancel: threading.Event | None = None
+) -> tuple[Problem, Refinement | None]:
+    """Return a problem with the PSFs that fit its photograph, and how they came of the given ones.
+
+    The same problem where that is no certain help; None where it was cancelled.
+
+    Parameters
+    ----------
+    problem : Problem
+        Not reduced yet (before ``choose``).
+    on_progress : callable, optional
+        Called with the share done, 0 to 1.
+    cancel : threading.Event, optional
+
+    Raises InputError when the photograph was taken under patterns of light.
+    """
+    try:
+        refinement = refine_psf(problem, on_progress=on_progress, cancel=cancel)
+    except _CancelledError:
+        return problem, None
+    if not refinement.helps:
+        return problem, refinement
+    return Problem.of(problem.measurement, refinement.of(problem.calibration), problem.options), refinement
+
+
+class _CancelledError(Exception):
+    """It was cancelled."""
+
+
+def refine_psf(
+    problem: Problem, *, on_progress: Share | None = None, cancel: threading.Event | None = None
+) -> Refinement:
+    """Fit size and rotation of a problem's PSFs, about the sensor's centre, to its photograph.
+
+    Of several channels the one with most contrast over its noise counts. Parameters and errors as
+    :func:`refined`.
+    """
+    if problem.patterned:
+        raise InputError("refine_psf is for photographs in one light, not for frames under patterns.")
+    began = time.perf_counter()
+    tell = on_progress or (lambda _: None)
+
+    def count(share: float) -> None:
+        """Tell how much is done; end where it is cancelled."""
+        if cancel is not None and cancel.is_set():
+            raise _CancelledError
+        tell(share)
+
+    start = _searched(_Trials(problem, SEARCH_PX, SEARCH_ITERATIONS), count)
+    trials = _Trials(problem, FIT_PX, FIT_ITERATIONS)
+    fit = _fitted(trials, start, FIT_STEPS_PX[0] / trials.radius_px, lambda done: count(0.3 + 0.35 * done))
+    fit = _fitted(
+        trials, fit.place, FIT_STEPS_PX[1] / trials.radius_px, lambda done: count(0.65 + 0.35 * done)
+    )
+    given, found = trials.judged(np.zeros(2)), trials.judged(fit.place)
+    ratio = np.log(given / found)
+    scatter = float(np.std(ratio, ddof=1)) / np.sqrt(len(ratio))
+    tell(1.0)
+    return Refinement(
+        _transformation(fit.place),
+        float(np.exp(fit.place[0]) * np.sqrt(fit.covariance[0, 0])),
+        float(np.rad2deg(np.sqrt(fit.covariance[1, 1]))),
+        float(np.sqrt(given.mean())),
+        float(np.sqrt(found.mean())),
+        float(np.mean(ratio)) / max(scatter, 1e-12),
+        float(np.sqrt(fit.place @ np.linalg.solve(fit.covariance, fit.place))),
+        time.perf_counter() - began,
+    )
+
+
+def _transformation(place: Floats) -> Transformation:
+    """Return the transformation of a place: (logarithm of the scale, rotation in radians)."""
+    return Transformation(scale=float(np.exp(place[0])), rotation_deg=float(np.rad2deg(place[1])))
+
+
+class _Trials:
+    """Reconstructions through copies of the PSFs on binned pixels, each done once."""
+
+    def __init__(self, problem: Problem, side_px: int, iterations: int) -> None:
+        factor = max(1, -(-max(problem.sensor_shape) // side_px))
+        contrast = [
+            float(d[v].std(dtype=np.float64)) for d, v in zip(problem.data, problem.valid, strict=True)
+        ]
+        channel = int(np.argmax(contrast))
+        image, known = _binned(problem.data[channel], problem.valid[channel], factor)
+        calibration = problem.calibration
+        if calibration.psfs.shape[1] > 1:
+            calibration = replace(calibration, psfs=calibration.psfs[:, channel : channel + 1])
+        calibration = reduced_calibration(replace(calibration, background=None), factor, None)
+        several = problem.n_planes > 1
+        options = ReconstructionOptions(
+            prior=kind_of(problem.prior_name),
+            axis_weights=(1.0, 1.0, 1.0) if several else None,
+            estimate_background=several,
+            drop_empty=False,
+        )
+        draw = np.random.default_rng(0).random(image.shape)
+        self._fit, self._judge = known & (draw < HELD_SHARE), known & (draw > 1 - HELD_SHARE)
+        held = Measurement(image, erasures=~known | self._fit | self._judge)
+        self._problem = Problem.of(held, calibration, options)
+        model = problem.model
+        if model not in CAMERAS and model != "convolution":
+            varies = choose_model(self._problem.depths, "auto")[0] != "convolution"
+            model = "local" if varies else "convolution"
+        self._problem = replace(self._problem, model=model)
+        self._data = image / self._problem.noise[0]
+        self._known = known.astype(np.float32)
+        self._iterations = iterations
+        self._done: dict[tuple[float, ...], tuple[Floats, Floats]] = {}
+        rows, columns = (np.minimum(np.arange(n) * TILES // n, TILES - 1) for n in image.shape)
+        self._tile = TILES * rows[:, None] + columns
+        self.radius_px = _radius_px(self._problem.depths.central)
+
+    def fitted(self, place: Floats) -> Floats:
+        """Return the mean square of what is left on the fit's pixels, one a tile."""
+        return self._at(place)[0]
+
+    def judged(self, place: Floats) -> Floats:
+        """Return the same on the pixels that no fit has seen."""
+        return self._at(place)[1]
+
+    def _at(self, place: Floats) -> tuple[Floats, Floats]:
+        key = tuple(np.round(place, 9))
+        if key not in self._done:
+            square = self._left(_transformation(place)) ** 2
+            self._done[key] = self._by_tile(square, self._fit), self._by_tile(square, self._judge)
+        return self._done[key]
+
+    def _by_tile(self, square: Array, where: Array) -> Floats:
+        tile, n = self._tile[where], TILES**2
+        count = np.bincount(tile, minlength=n)
+        mean: Floats = np.bincount(tile, square[where], n) / np.maximum(count, 1)
+        return mean[count > 0]
+
+    def _left(self, how: Transformation) -> Array:
+        """Return the fine structure that a copy of the PSFs leaves of the photograph, (height, width)."""
+        from scipy.ndimage import gaussian_filter
+
+        problem = replace(self._problem, depths=_copied(self._problem.depths, how))
+        part = Part(problem, slice(0, 1))
+        try:
+            part.weigh(None)
+            solver = SOLVERS.named("admm-sensor" if problem.is_plain else "admm").make(part, None)
+            outcome = solver.run(StoppingRules(iterations=self._iterations, tolerance=0.0))
+            solution = part.lifted(outcome.solution)
+            rest = self._data - part.camera.forward(solution)[0]
+            if problem.smooth:
+                rest -= part.background(solution)[0]
+        finally:
+            part.close()
+        rest *= self._known
+        share = np.maximum(gaussian_filter(self._known, FINE_PX), 1e-3)
+        fine: Array = (rest - gaussian_filter(rest, FINE_PX) / share) * self._known
+        return fine
+
+
+def _binned(image: Array, valid: Array, factor: int) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Average what is known of each block of pixels; return it, and where anything is."""
+    known = block_sum(valid.astype(np.float32), factor, about_axis=True)
+    light = block_sum(np.where(valid, image, 0), factor, about_axis=True)
+    return light / np.maximum(known, 1), known > 0
+
+
+def _radius_px(psfs: Array) -> float:
+    """Return the root mean square distance of the PSFs' light from the centre, pixels."""
+    light = np.maximum(psfs, 0).sum(axis=(0, 1), dtype=np.float64)
+    rows, columns = (np.arange(n) - (n - 1) / 2 for n in light.shape)
+    square = rows[:, None] ** 2 + columns**2
+    return max(float(np.sqrt((light * square).sum() / max(light.sum(), 1e-30))), 1.0)
+
+
+def _copied(depths: Depths, how: Transformation) -> Depths:
+    """Return depths whose PSFs are transformed, with the places that they were registered from.
+
+    All are displaced by part of a pixel, which displaces the picture alone: else the PSFs as given would be
+    the only ones that are not interpolated.
+    """
+    how = replace(how, rows=BETWEEN_PX, columns=BETWEEN_PX)
+    fields = [FieldOfPsfs(transformed(f.psfs, how), f.points @ how.matrix.T) for f in depths.fields]
+    return replace(depths, central=transformed(depths.central, how), fields=fields)
+
+
+def _searched(trials: _Trials, count: Share) -> Floats:
+    """Return the best place of a lattice that its neighbours lead to, from none."""
+    step = SEARCH_STEP_PX / trials.radius_px
+    reach = max(int(LARGEST / step), 1)
+    at, rounds, moved = np.zeros(2, int), 0, True
+    while moved:
+        near = [at + np.array([i, j]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        left = {}
+        for place in near:
+            if np.abs(place).max() <= reach:
+                left[tuple(place)] = float(trials.fitted(place * step).mean())
+                count(0.3 * (1 - 0.6**rounds))
+        best = np.array(min(left, key=lambda place: left[place]))
+        moved, at, rounds = bool((best != at).any()), best, rounds + 1
+    return at * step
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Where a paraboloid through trials is least, and how sure the place is."""
+
+    place: Floats
+    covariance: Floats
+
+
+MOVES = 3
+"""Times that the trials are centred anew where the least lies beyond them."""
+
+
+def _fitted(trials: _Trials, centre: Floats, step: float, count: Share) -> _Fit:
+    """Fit a paraboloid to trials about a place.
+
+    Every tile has its own, and the scatter of their slopes at the least tells how sure it is (a sandwich
+    estimate): it makes no difference whether noise or errors of the model make them scatter.
+    """
+    offsets = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1)], float)
+    table = np.stack(
+        [
+            np.ones(6),
+            *offsets.T,
+            offsets[:, 0] ** 2 / 2,
+            offsets[:, 0] * offsets[:, 1],
+            offsets[:, 1] ** 2 / 2,
+        ],
+        axis=1,
+    )
+    for number in range(MOVES):
+        seen = []
+        for k, offset in enumerate(offsets):
+            seen.append(trials.fitted(centre + step * offset))
+            count((number + (k + 1) / len(offsets)) / MOVES)
+        terms = np.linalg.solve(table, np.stack(seen))
+        slopes, mean = terms[1:3], terms.mean(axis=1)
+        bend = np.array([[mean[3], mean[4]], [mean[4], mean[5]]])
+        values, axes = np.linalg.eigh(bend)
+        values = np.maximum(values, 1e-3 * max(float(values.max()), 1e-12))
+        inverse = axes @ np.diag(1 / values) @ axes.T
+        move = -inverse @ mean[1:3]
+        scatter = slopes - slopes.mean(axis=1, keepdims=True)
+        n = slopes.shape[1]
+        covariance = inverse @ (scatter @ scatter.T / (n * (n - 1))) @ inverse * step**2
+        beyond = float(np.abs(move).max())
+        centre = centre + step * move * min(1.0, 2.0 / max(beyond, 1e-12))
+        if beyond <= 1.5:
+            break
+    return _Fit(centre, covariance)

@@ -1,0 +1,82 @@
+"""``calibrate screen --pairs``: a PSF from files of photographs and what they show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration_routines.optics.screen_pairs import PairFiles, read_pairs, solve_pairs
+from calibration_routines.procedure import Listener
+from instrument.files.calibration_file import load_calibration
+from instrument.files.errors import FileError
+from tests.recon.blind.test_known_pictures import taken
+
+
+@pytest.fixture
+def pairs(tmp_path: Path) -> Path:
+    folder = tmp_path / "pairs"
+    folder.mkdir()
+    data, pictures, _ = taken()
+    for number in range(len(data)):
+        np.save(folder / f"raw_{number}.npy", data[number, 0])
+        np.save(folder / f"truth_{number}.npy", pictures[number, 0])
+    return folder
+
+
+def test_pairs_become_a_calibration_that_says_how_left_out_pictures_fare(pairs: Path, tmp_path: Path) -> None:
+    files = PairFiles(pairs=pairs, judged=1, pixel_um=5.0)
+    done = solve_pairs(files, 2e5, True, tmp_path / "calibration", Listener())
+    assert done.calibration is not None
+    found = load_calibration(done.calibration)
+    assert found.psfs.shape == (1, 1, 48, 56)
+    assert found.source_positions_um[0, 2] == 2e5
+    assert found.geometry.pixel_pitch_um == 5.0
+    (judged,) = found.quality["left_out"]
+    assert judged["psnr_db"] > judged["even_db"] + 3
+    assert done.good
+    assert any(f"{judged['psnr_db']:.1f} dB" in line for line in done.verdict)
+
+
+def test_pictures_that_do_not_belong_to_their_photographs_are_told_of(pairs: Path, tmp_path: Path) -> None:
+    for number in range(5):
+        np.save(pairs / f"truth_{number}.npy", np.load(pairs / f"truth_{number}.npy")[::-1, ::-1])
+    (pairs / "truth_3.npy").replace(pairs / "keep.npy")
+    (pairs / "truth_4.npy").replace(pairs / "truth_3.npy")
+    (pairs / "keep.npy").replace(pairs / "truth_4.npy")
+    done = solve_pairs(PairFiles(pairs=pairs, judged=1), None, True, tmp_path / "calibration", Listener())
+    assert not done.good
+    assert "belong together" in done.verdict[-1]
+
+
+def _remove(folder: Path) -> None:
+    (folder / "truth_2.npy").unlink()
+
+
+def _shrink(folder: Path) -> None:
+    np.save(folder / "truth_2.npy", np.ones((4, 5), np.float32))
+
+
+def _empty(folder: Path) -> None:
+    for file in folder.iterdir():
+        file.unlink()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (_remove, "raw_2.npy: has no partner truth_2"),
+        (_shrink, r"truth_2.npy: is 4 x 5 grey float32, but raw_0.npy is 48 x 56"),
+        (_empty, "holds 0 pairs"),
+    ],
+)
+def test_a_folder_without_proper_pairs_is_refused(pairs: Path, spoil: object, words: str) -> None:
+    spoil(pairs)  # type: ignore[operator]
+    with pytest.raises(FileError, match=words):
+        read_pairs(pairs)
+
+
+def test_a_file_instead_of_a_folder_is_refused(pairs: Path) -> None:
+    with pytest.raises(FileError, match="is no folder"):
+        read_pairs(pairs / "raw_0.npy")
