@@ -99,8 +99,7 @@ class CalibrationCheck:
                 "one of the two was flipped or turned: give both as the camera saw them"
                 if self.better in FAR
                 else "diffuser or sensor moved since it was made, or the scene lies at another depth: "
-                "--refine-psf fits the PSF to this photograph; else calibrate again, or choose the PSF of the "
-                "scene's depth"
+                "--refine-psf fits the PSF to it; else calibrate again, or choose the scene's depth"
             )
             return (
                 "the calibration does not fit this photograph: its PSF explains it better "
