@@ -24,7 +24,6 @@ from instrument.reconstruction.request import (
     PictureRequest,
     VolumeRequest,
     done_share,
-    repeated_share,
     request_of,
 )
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
@@ -301,18 +300,15 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
         # Of a picture its only plane.
         context.offer(lambda: SoFar(share, note, prepared, np.array(present().max(axis=0)), tuple(history)))
 
-    def repeated(done: int, of: int) -> None:
-        share, note = repeated_share(done, of)
-        context.offer(lambda: SoFar(share, note, prepared, None, tuple(history)))
+    def stage(share: float, what: str) -> None:
+        context.offer(lambda: SoFar(share, what, prepared, None, tuple(history)))
 
     if isinstance(request, VolumeRequest):
-        volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper)
+        volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_stage=stage)
         write_volume(outputs, volume, prepared)
         settled = settle_checkpoint(keeper, volume.stop_reasons)
     else:
-        picture = request.solve(
-            prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_repeat=repeated
-        )
+        picture = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_stage=stage)
         write_reconstruction(outputs, picture, prepared, rotate_deg=work.rotate_deg)
         settled = settle_checkpoint(keeper, [picture.stop_reason])
     return Written(outputs.image, settled)

@@ -19,7 +19,6 @@ from instrument.reconstruction.request import (
     VolumeRequest,
     done_share,
     iteration_limit,
-    repeated_share,
 )
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
 from instrument.reconstruction.video import (
@@ -60,11 +59,10 @@ def reconstruct_photograph(
                 share = done_share(request.options, record)
                 advance(round(total * share), note=f"change {record.change:.1e}")
 
-            def repeated(done: int, of: int) -> None:
-                share, note = repeated_share(done, of)
-                advance(round(total * share), note=note)
+            def stage(share: float, what: str) -> None:
+                advance(round(total * share), note=what)
 
-            result = request.solve(job, watch=show, cancel=cancel, keeper=keeper, on_repeat=repeated)
+            result = request.solve(job, watch=show, cancel=cancel, keeper=keeper, on_stage=stage)
         _print(result)
         if is_volume:
             write_volume(outputs, result, job)

@@ -28,13 +28,12 @@ from recon.camera.refocus import at_depth
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.problem import Problem
+from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reconstruct import reconstruct
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choice_for
 from recon.reconstruction.solve import ITERATIONS
 from recon.reconstruction.solvers import SOLVERS, volume_priors
-from recon.reconstruction.uncertainty import REPEATS, OnRepeat
 from recon.solvers.base import IterationRecord, Keeper
 from recon.types import Calibration
 
@@ -68,7 +67,7 @@ class _Request:
         watch: Watch | None = None,
         cancel: threading.Event | None = None,
         keeper: Keeper | None = None,
-        on_repeat: OnRepeat | None = None,
+        on_stage: Stage | None = None,
     ) -> Reconstruction:
         """Reconstruct what ``prepare`` returned.
 
@@ -82,7 +81,7 @@ class _Request:
             on_progress=watch,
             cancel=cancel,
             keeper=keeper,
-            on_repeat=on_repeat,
+            on_stage=on_stage,
         )
 
     def explain(self, job: Job) -> Choice:
@@ -180,16 +179,11 @@ def iteration_limit(options: ReconstructionOptions) -> int | None:
 
 
 def done_share(options: ReconstructionOptions, record: IterationRecord) -> float:
-    """Return how much of the work is done, 0 to 1: whichever of count and time is nearer to its end."""
+    """Return how much of the iterations is done, 0 to 1: whichever of count and time is nearer to its end."""
     limit = iteration_limit(options)
     by_count = 0.0 if limit is None else record.iteration / limit
     by_time = 0.0 if options.time_s is None else record.seconds / options.time_s
-    return min(max(by_count, by_time), 1.0) / (1 + REPEATS if options.uncertainty else 1)
-
-
-def repeated_share(done: int, of: int) -> tuple[float, str]:
-    """Return how much of a reconstruction with uncertainty is done after some repetitions, and in words."""
-    return (1 + done) / (1 + of), f"uncertainty: repetition {done} of {of}"
+    return min(max(by_count, by_time), 1.0)
 
 
 def _require_known(inputs: InputOptions, options: ReconstructionOptions) -> None:

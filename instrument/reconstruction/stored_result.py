@@ -101,6 +101,8 @@ class StoredResult:
             facts.append(("Verdict", " ".join(self.verdict)))
         if said := (record.get("uncertainty") or {}).get("sentences"):
             facts += [(name, str(one)) for name, one in zip(("Uncertainty", "Points"), said, strict=False)]
+        if refined := (origin.get("psf_refinement") or {}).get("words"):
+            facts.append(("Refined PSF", str(refined)))
         chosen = self._chosen()
         facts += chosen
         if record and "Model" not in dict(chosen):

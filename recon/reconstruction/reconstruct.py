@@ -10,19 +10,21 @@ from typing import Any
 
 import numpy.typing as npt
 
+from recon.base.checks import require_photograph
 from recon.base.declare import with_overrides
 from recon.camera.camera_model import CAMERAS
 from recon.errors import InputError
 from recon.priors import PRIORS
+from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.problem import Problem
+from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.psf_refinement import refined
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solve import Progress, solve
 from recon.reconstruction.solvers import SOLVERS
-from recon.reconstruction.uncertainty import OnRepeat, refused, uncertain
+from recon.reconstruction.uncertainty import refused, uncertain
 from recon.solvers.base import Keeper
 from recon.types import Calibration
 from recon.verdict.evidence import evidence_of, not_judged, observations, unsettled_by
@@ -41,7 +43,7 @@ def reconstruct(
     on_progress: Progress | None = None,
     cancel: threading.Event | None = None,
     keeper: Keeper | None = None,
-    on_repeat: OnRepeat | None = None,
+    on_stage: Stage | None = None,
     **overrides: Any,
 ) -> Reconstruction:
     """Reconstruct a picture or a volume from a lensless camera's measurement.
@@ -65,8 +67,9 @@ def reconstruct(
         Set it to stop after the iteration in progress.
     keeper : Keeper, optional
         Keeps the solvers' state, and has them go on from what was kept of the same reconstruction.
-    on_repeat : callable, optional
-        ``on_repeat(done, of)`` after each repetition that the option ``uncertainty`` asks for.
+    on_stage : callable, optional
+        ``on_stage(share, what)`` as what goes before and after the iterations goes on: fitting the PSF
+        (``refine_psf``), choosing, the repetitions of ``uncertainty``.
     **overrides
         Single options by their names: ``reconstruct(image, psf, prior="l1", iterations=50)``.
 
@@ -77,15 +80,17 @@ def reconstruct(
     if not isinstance(measurement, Measurement):
         measurement = Measurement(measurement)
     problem = Problem.of(replace(measurement, **known), calibration, options)
+    if not problem.patterned:
+        require_photograph(problem.data, problem.depths.central[problem.n_planes // 2])
     if options.uncertainty and (reason := refused(problem)) is not None:
         raise InputError(f"{reason[0].upper()}{reason[1:]}.")
     refinement = None
     if options.refine_psf:
-        problem, refinement = refined(problem, cancel=cancel)
-    problem = choose(problem)
+        problem, refinement = refined(problem, on_stage=on_stage, cancel=cancel)
+    problem = choose(problem, on_stage=on_stage)
     result = solve(problem, warm=warm, on_progress=on_progress, cancel=cancel, keeper=keeper)
     if options.uncertainty:
-        result = uncertain(result, problem, on_repeat=on_repeat, cancel=cancel)
+        result = uncertain(result, problem, on_stage=on_stage, cancel=cancel)
     if refinement is not None:
         provenance = {**result.provenance, "psf_refinement": refinement.to_json()}
         result = replace(result, refinement=refinement, provenance=provenance)
@@ -109,7 +114,9 @@ def _defaults() -> ReconstructionOptions:
 
 
 def judged(result: Reconstruction, problem: Problem, *, started: bool = False) -> Reconstruction:
-    """Return the result with a verdict on whether to trust it, at the cost of about two iterations.
+    """Return the result with a verdict on whether to trust it and whether the calibration is its own.
+
+    At the cost of about two iterations, and of a hundred on few pixels.
 
     Parameters
     ----------
@@ -159,6 +166,8 @@ def _verdict(
             ),
             points=not picture,
         )
-        return verdict_on(evidence, method_name(result.solver, result.prior, volume=not picture)), ()
+        verdict = verdict_on(evidence, method_name(result.solver, result.prior, volume=not picture))
+        check = check_calibration(problem)
+        return (verdict if check is None else verdict.with_calibration(check)), ()
     except Exception as error:  # noqa: BLE001 - the result may be hours of work: it is worth more than this
         return None, (not_judged(error),)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +18,7 @@ from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.planes import between_of, planes_of
 from recon.reconstruction.probe import COARSE_PX, camera_cost, coarse_copy, coarse_passes
-from recon.reconstruction.problem import Problem
+from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import on_blocks, reduced, reduced_calibration
 from recon.reconstruction.rules import (
     SETTLED,
@@ -37,15 +36,13 @@ from recon.reconstruction.weights import kind_of
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
-Choosing = Callable[[float, str], object]
-"""``on_choosing(share, what)``: how much of the choosing is done, 0 to 1, and what was looked at last."""
 
 
 def choose(
     problem: Problem,
     options: ReconstructionOptions | None = None,
     *,
-    on_choosing: Choosing | None = None,
+    on_stage: Stage | None = None,
 ) -> Problem:
     """Return the smallest problem that explains the data as well: model ``"auto"``.
 
@@ -59,8 +56,8 @@ def choose(
     problem : Problem
     options : ReconstructionOptions, optional
         Default the problem's own.
-    on_choosing : callable, optional
-        ``on_choosing(share, what)`` as it goes on.
+    on_stage : callable, optional
+        ``on_stage(share, what)`` as it goes on.
 
     Returns
     -------
@@ -79,13 +76,14 @@ def choose(
                 "Leave one of the two out."
             )
         return problem
-    return reduced(choice_for(problem, on_choosing), problem)
+    return reduced(choice_for(problem, on_stage), problem)
 
 
-def choice_for(problem: Problem, on_choosing: Choosing | None = None) -> Choice:
+def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     """Choose what to reconstruct a problem with; errors as :func:`choose`."""
     began = time.perf_counter()
-    tell = on_choosing or (lambda *_: None)
+    tell = on_stage or (lambda *_: None)
+    tell(0.0, "choosing: camera models")
     overrides, held = _held(problem, _settled(problem))
     measurement, calibration = problem.measurement, problem.calibration
     counts = measurement.counts()
@@ -107,15 +105,14 @@ def choice_for(problem: Problem, on_choosing: Choosing | None = None) -> Choice:
     looked = not picture or len(scale) > 1  # else one PSF is all there is
     coarse = _coarse(data, valid, calibration, problem.options.z_um) if looked else []
     costs = {m: camera_cost(coarse[0], m) for m in scale} if len(scale) > 1 else {}
-    tell(0.2, "camera models")
+    tell(0.2, "choosing: where light is")
     contrast = None if kind == "l1" or picture else _contrast(data, valid, deviation)
     model, by_model = model_of(depths, overrides, contrast, costs)
     sparse = coarse_passes(coarse) if looked else None
-    tell(0.4, "depths")
+    tell(0.4, "choosing: a background")
     given = measurement.background is not None
     open_ = looked and not given and overrides.background is None
     smooth = background_of(_trial(problem, coarse, model) if open_ else None, overrides, given=given)
-    tell(0.8, "background")
     estimated = smooth.value == "estimated"
     planes, dropped = planes_of(sparse, depths, overrides)
     between, added = between_of(calibration, depths, planes, overrides)

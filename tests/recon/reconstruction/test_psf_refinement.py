@@ -54,7 +54,7 @@ def right(scene: TestScene) -> tuple[Refinement, list[float]]:
     """What is found of the right PSF, and the shares of the work that were told."""
     shares: list[float] = []
     problem = Problem.of(scene.measurement, scene.calibration)
-    return refine_psf(problem, on_progress=shares.append), shares
+    return refine_psf(problem, on_stage=lambda share, _: shares.append(share)), shares
 
 
 def test_right_psfs_stay_as_they_are(scene: TestScene, right: tuple[Refinement, list[float]]) -> None:
@@ -62,6 +62,7 @@ def test_right_psfs_stay_as_they_are(scene: TestScene, right: tuple[Refinement, 
     assert not found.helps
     assert found.of(scene.calibration) is scene.calibration
     assert "taken as it is" in str(found)
+    assert found.scale_error is not None
     assert found.scale_error < 0.003
     assert found.rotation_error_deg < 0.2
     assert shares[-1] == 1.0
@@ -87,3 +88,12 @@ def test_frames_under_patterns_are_refused(scene: TestScene) -> None:
     frames = np.stack([scene.measurement] * 2)
     with pytest.raises(InputError, match="one light"):
         reconstruct(frames, scene.calibration, patterns=np.ones_like(frames), refine_psf=True)
+
+
+def test_of_volumes_the_rotation_alone_is_fitted() -> None:
+    scene = make_scene("beads", size=48, seed=5, depths=2, drift_deg=3.0)
+    found = refine_psf(Problem.of(scene.measurement, scene.calibration))
+    assert found.scale_error is None
+    assert found.transformation.scale == 1
+    assert abs(found.transformation.rotation_deg) == pytest.approx(3.0, abs=0.3)
+    assert "larger" not in str(found)

@@ -68,9 +68,10 @@ def test_a_wrong_calibration_makes_deviations_that_are_not_to_be_trusted(scene) 
 def test_an_interruption_leaves_the_picture_and_says_what_is_missing(scene) -> None:
     cancel, done = threading.Event(), []
 
-    def stop(count: int, of: int) -> None:
-        done.append((count, of))
-        cancel.set()
+    def stop(share: float, what: str) -> None:
+        if what.startswith("uncertainty"):
+            done.append(share)
+            cancel.set()
 
     found = reconstruct(
         scene.measurement,
@@ -78,10 +79,10 @@ def test_an_interruption_leaves_the_picture_and_says_what_is_missing(scene) -> N
         iterations=3,
         uncertainty=True,
         cancel=cancel,
-        on_repeat=stop,
+        on_stage=stop,
         judged=False,
     )
-    assert done == [(1, REPEATS)]
+    assert done == [1 / REPEATS]
     assert found.uncertainty is None
     assert "No uncertainty" in found.warnings[-1]
 
