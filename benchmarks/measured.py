@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.uncertainty import measured_pairs_held
 from recon import Calibration, Reconstruction, reconstruct
 from recon.base.blocks import block_mean
 from recon.base.threads import get_threads, set_threads
@@ -200,6 +201,16 @@ def draw_volumes(results: Mapping[str, Reconstruction], path: Path) -> None:
     figure.savefig(path, dpi=50)
 
 
+def intervals(_: Path) -> list[str]:
+    """Return what 95 % intervals of the pairs' pictures hold of their truths."""
+    return [
+        "What 95 % intervals hold of the pairs' truths (binned 4 x 4), each through the PSF that the other "
+        "six give: columns in [uncertainty.md](uncertainty.md).",
+        "",
+        *measured_pairs_held(4),
+    ]
+
+
 def pyplot() -> Any:
     """Return matplotlib's pyplot, which draws into files only."""
     import matplotlib as mpl
@@ -215,6 +226,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Path], list[str]]]] = {
     "hand-fine": ("The hand, bin 2", lambda folder: hand(folder, (2,))),
     "usaf": ("The tilted USAF target, half size", lambda folder: usaf(folder, 2)),
     "usaf-full": ("The tilted USAF target, full size", lambda folder: usaf(folder, 1)),
+    "intervals": ("How far the pairs' pictures may be off", intervals),
 }
 """By name: a title, and what makes the section."""
 HEAD = """# Measured photographs
