@@ -18,7 +18,13 @@ from calibration_routines.optics.screen_pictures import (
     field_along,
     random_cells,
 )
-from calibration_routines.optics.screen_solve import PICTURE, TONE, ScreenCalibration, ScreenOptions
+from calibration_routines.optics.screen_solve import (
+    PICTURE,
+    TONE,
+    ScreenCalibration,
+    ScreenOptions,
+    findings_of,
+)
 from calibration_routines.procedure import CalibrationError
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
@@ -150,3 +156,21 @@ def test_pictures_are_as_asked_and_the_same_for_a_seed() -> None:
     assert not np.array_equal(drawn[PICTURE], other[PICTURE])
     assert 0.1 < (random_cells((60, 60), 0) > 0).mean() < 0.3
     assert len(np.unique(dead_leaves((60, 60), 0))) > 100
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"flicker": 0.05}, "5.0% from frame to frame"),
+        ({"drift": -0.04}, "changed by 4.0% during the run"),
+        ({"wander": 0.03}, "changed by 3.0% during the run"),
+        ({"saturated_frames": 2}, "2 frames have saturated pixels"),
+        ({"judged_db": [11.0]}, "hardly reconstructed"),
+        ({}, None),
+    ],
+)
+def test_what_is_wrong_with_the_light_is_named(changed: dict[str, object], words: str | None) -> None:
+    good = {"flicker": 1e-4, "drift": 0.0, "wander": 0.0, "saturated_frames": 0}
+    said = findings_of({**good, "judged_db": [20.0], "even_db": [10.0], **changed})
+    assert len(said) == (words is not None)
+    assert words is None or words in said[0]
