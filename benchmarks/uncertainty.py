@@ -269,6 +269,32 @@ def table(found: list[dict[str, Any]]) -> Iterator[str]:
         )
 
 
+def draw(out: Path, size: int, seed: int) -> None:
+    """Draw truth, picture, its error and its deviation for four scenes."""
+    from matplotlib.figure import Figure
+
+    shown = (("random", "dense-picture"), ("hand", "texture"), ("usaf", "sparse-picture"), ("smooth", "text"))
+    figure = Figure(figsize=(9, 9.4), layout="constrained")
+    axes = figure.subplots(len(shown), 4)
+    for row, (optics, family) in zip(axes, shown, strict=True):
+        scene = make_scene(family, optics=optics, seed=seed, size=size, photons=500)  # type: ignore[arg-type]
+        options = Options(judged=False, uncertainty=True)
+        result = reconstruct(Measurement(scene.measurement, scene.noise), scene.calibration, options)
+        assert result.uncertainty is not None
+        truth, white = scene.truth * fall_off(scene), float(result.image.max())
+        error = np.abs(result.image - truth)
+        images = (truth, result.image, error, result.uncertainty.deviation[0])
+        for axis, image, top in zip(row, images, (white, white, white / 2, white / 2), strict=True):
+            axis.imshow(image, cmap="gray", vmin=0, vmax=top)
+            axis.set(xticks=[], yticks=[])
+        row[0].set_ylabel(f"{family}, {optics}")
+    for axis, words in zip(
+        axes[0], ("truth", "picture", "error (white: half)", "deviation (the same)"), strict=True
+    ):
+        axis.set_title(words)
+    figure.savefig(out, dpi=80)
+
+
 def main() -> None:
     """Print the tables; keep every row in a CSV where one is named."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -280,7 +306,11 @@ def main() -> None:
     parser.add_argument("--csv", type=Path)
     parser.add_argument("--points", action="store_true", help="error bars of points only")
     parser.add_argument("--pairs", type=int, metavar="BIN", help="measured pairs only, binned so much")
+    parser.add_argument("--figure", type=Path, help="draw four scenes there, no tables")
     asked = parser.parse_args()
+    if asked.figure:
+        draw(asked.figure, asked.size, asked.seeds[0])
+        return
     if asked.pairs:
         for line in measured_pairs_held(asked.pairs):
             print(line, flush=True)
