@@ -83,6 +83,7 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     """Choose what to reconstruct a problem with; errors as :func:`choose`."""
     began = time.perf_counter()
     tell = on_stage or (lambda *_: None)
+    tell(0.0, "choosing: camera models")
     overrides, held = _held(problem, _settled(problem))
     measurement, calibration = problem.measurement, problem.calibration
     counts = measurement.counts()
@@ -104,15 +105,14 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     looked = not picture or len(scale) > 1  # else one PSF is all there is
     coarse = _coarse(data, valid, calibration, problem.options.z_um) if looked else []
     costs = {m: camera_cost(coarse[0], m) for m in scale} if len(scale) > 1 else {}
-    tell(0.2, "camera models")
+    tell(0.2, "choosing: where light is")
     contrast = None if kind == "l1" or picture else _contrast(data, valid, deviation)
     model, by_model = model_of(depths, overrides, contrast, costs)
     sparse = coarse_passes(coarse) if looked else None
-    tell(0.4, "depths")
+    tell(0.4, "choosing: a background")
     given = measurement.background is not None
     open_ = looked and not given and overrides.background is None
     smooth = background_of(_trial(problem, coarse, model) if open_ else None, overrides, given=given)
-    tell(0.8, "background")
     estimated = smooth.value == "estimated"
     planes, dropped = planes_of(sparse, depths, overrides)
     between, added = between_of(calibration, depths, planes, overrides)

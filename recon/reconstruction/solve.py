@@ -17,6 +17,7 @@ from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.planes import limit_of, signs_in_words, signs_of_light
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reduction import Reduction
+from recon.reconstruction.residual import residual_in_words
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solvers import OfferedSolver
@@ -133,6 +134,7 @@ class _Solved:
     memory: str | None
     noise_norm: float
     residual: float
+    doubts: list[str]
 
 
 def _solve(
@@ -254,6 +256,7 @@ def _run(
         rest = part.residual(solution, smooth)[0]
         channel, window = part.channels.start, problem.extent.psf_window
         signs = signs_of_light(rest, problem.extent.left_out, channel, window) / limit_of(part)
+    residual = _residual(part, solution, smooth, outcome)
     return _Solved(
         volume=problem.measured(solution, part.channels),
         state=_state(part, solution),
@@ -264,7 +267,8 @@ def _run(
         signs=signs,
         memory=part.memory_used(),
         noise_norm=part.noise_norm,
-        residual=_residual(part, solution, smooth, outcome),
+        residual=residual,
+        doubts=residual_in_words(problem, outcome.history, residual, part.noise_norm),
     )
 
 
@@ -312,7 +316,16 @@ def _together(problem: Problem, offered: OfferedSolver, found: list[_Solved]) ->
         seconds=sum(f.outcome.seconds for f in found),
         background=_stacked([f.background for f in found if f.background is not None], problem.flat),
         empty_planes=empty,
-        warnings=(*problem.warnings, *_uncertified(empty), *signs_in_words(left_out)),
+        warnings=tuple(
+            dict.fromkeys(
+                (
+                    *problem.warnings,
+                    *_uncertified(empty),
+                    *signs_in_words(left_out),
+                    *(w for f in found for w in f.doubts),
+                )
+            )
+        ),
         state=np.concatenate(states) if states else None,
         provenance={
             **problem.provenance(),
