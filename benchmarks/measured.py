@@ -4,7 +4,7 @@ Each section is a function of :data:`SECTIONS` that returns its lines of Markdow
 the page's folder; a section that is run again takes its own place in the page. The data are not part of the
 repository (``DIFFUSERBENCH_DATA``, or ``../shared/data``).
 
-    python benchmarks/measured.py [--only hand usaf] [--out docs/benchmarks]
+    python benchmarks/measured.py [--only hand usaf ...] [--out docs/benchmarks]
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.uncertainty import measured_pairs_held
 from recon import Calibration, Reconstruction, reconstruct
 from recon.base.blocks import block_mean
 from recon.base.threads import get_threads, set_threads
@@ -81,8 +82,8 @@ def psnr(image: Array, reference: Array) -> float:
     return float(20 * np.log10(reference.max() / np.sqrt(np.mean((image - reference) ** 2))))
 
 
-def hand(folder: Path) -> list[str]:
-    """Show the hand by every prior at three binnings, and a copy in colour."""
+def hand(folder: Path, binnings: tuple[int, ...]) -> list[str]:
+    """Show the hand by every prior at some binnings, and the first of them as a copy in colour."""
     lines = [
         "| bin | prior | PSNR to the converged picture, dB | least and last residual, noise | background | "
         "CPU s | verdict |",
@@ -90,7 +91,7 @@ def hand(folder: Path) -> list[str]:
     ]
     results: dict[str, Reconstruction] = {}
     pictures = []
-    for binning in (8, 4, 2):
+    for binning in binnings:
         calibration, image = load("hand", binning)
         reference = reconstruct(
             image,
@@ -107,51 +108,47 @@ def hand(folder: Path) -> list[str]:
                 f"| {binning} | {prior} | {psnr(result.image, reference):.1f} | {residuals(result)} | "
                 f"{background(result, image)} | {seconds:.1f} | {verdict(result)} |"
             )
-            if binning == 4:
+            if binning == binnings[-1]:
                 pictures.append((prior, result.image))
-    calibration, image = load("hand", 8)
+    calibration, image = load("hand", binnings[0])
     colour = np.stack([image * gain for gain in (1.0, 0.7, 0.5)], axis=-1)
     result, seconds = solved(colour, calibration)
     tints = result.image.reshape(-1, 3).sum(axis=0)
     lines += [
         "",
-        f"A copy in colour (gains 1, 0.7, 0.5), bin 8: gains {tints / tints[0]}, {seconds:.1f} CPU s.",
+        f"A copy in colour, gains 1, 0.7, 0.5: found {tints / tints[0]}, {seconds:.1f} CPU s.",
     ]
     pictures.append(("colour", result.image))
-    draw_row(pictures, folder / "measured_hand.jpg")
-    return [
-        *lines,
-        *said(results),
-        "",
-        "![The hand at bin 4 by every prior, and in colour](measured_hand.jpg)",
-    ]
+    picture = f"measured_hand_{binnings[-1]}.jpg"
+    draw_row(pictures, folder / picture)
+    return [*lines, "", *said(results), "", f"![The hand by every prior, and in colour]({picture})"]
 
 
-def usaf(folder: Path) -> list[str]:
-    """Show the tilted target, half and full size, by every prior, and without a background."""
+def usaf(folder: Path, binning: int) -> list[str]:
+    """Show the tilted target by every prior, and by total variation without a background."""
     lines = [
-        f"| size | prior | light in the last {LAST} of 44 planes | depth over x | "
-        "least and last residual, noise | background | choosing, all: s | CPU s | verdict |",
-        "|---|---|---|---|---|---|---|---|---|",
+        f"| prior | light in the last {LAST} of 44 planes | depth over x | least and last residual, noise | "
+        "background | choosing, all: s | CPU s | verdict |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     results: dict[str, Reconstruction] = {}
-    for binning, size in ((2, "half"), (1, "full")):
-        calibration, image = load("usaf", binning)
-        ways: list[tuple[str, dict[str, Any]]] = [(prior, {"prior": prior}) for prior in PRIORS]
-        if binning == 2:
-            ways.append(("tv, `--no-background`", {"estimate_background": False}))
-        for name, options in ways:
-            result, seconds = solved(image, calibration, **options)
-            assert result.choice is not None
-            results[f"{size}, {name}"] = result
-            light = result.volume.sum(axis=(1, 2))
-            lines.append(
-                f"| {size} | {name} | {light[-LAST:].sum() / light.sum():.2f} | {ramp(result.volume):+.2f} | "
-                f"{residuals(result)} | {background(result, image)} | {result.choice.seconds:.1f}, "
-                f"{result.choice.seconds + result.seconds:.1f} | {seconds:.1f} | {verdict(result)} |"
-            )
-    draw_volumes(results, folder / "usaf3d.jpg")
-    return [*lines, *said(results), "", "![The tilted target: every bar in its own depth](usaf3d.jpg)"]
+    calibration, image = load("usaf", binning)
+    ways: dict[str, dict[str, Any]] = {prior: {"prior": prior} for prior in PRIORS}
+    ways["tv, `--no-background`"] = {"estimate_background": False}
+    for name, options in ways.items():
+        result, seconds = solved(image, calibration, **options)
+        assert result.choice is not None
+        results[name] = result
+        light = result.volume.sum(axis=(1, 2))
+        lines.append(
+            f"| {name} | {light[-LAST:].sum() / light.sum():.2f} | {ramp(result.volume):+.2f} | "
+            f"{residuals(result)} | {background(result, image)} | {result.choice.seconds:.1f}, "
+            f"{result.choice.seconds + result.seconds:.1f} | {seconds:.1f} | {verdict(result)} |"
+        )
+        print(lines[-1], flush=True)
+    picture = f"measured_usaf_{binning}.jpg"
+    draw_volumes(results, folder / picture)
+    return [*lines, "", *said(results), "", f"![The target: every bar in its own depth]({picture})"]
 
 
 def ramp(volume: Array) -> float:
@@ -204,6 +201,16 @@ def draw_volumes(results: Mapping[str, Reconstruction], path: Path) -> None:
     figure.savefig(path, dpi=50)
 
 
+def intervals(_: Path) -> list[str]:
+    """Return what 95 % intervals of the pairs' pictures hold of their truths."""
+    return [
+        "What 95 % intervals hold of the pairs' truths (binned 4 x 4), each through the PSF that the other "
+        "six give: columns in [uncertainty.md](uncertainty.md).",
+        "",
+        *measured_pairs_held(4),
+    ]
+
+
 def pyplot() -> Any:
     """Return matplotlib's pyplot, which draws into files only."""
     import matplotlib as mpl
@@ -215,8 +222,11 @@ def pyplot() -> Any:
 
 
 SECTIONS: Mapping[str, tuple[str, Callable[[Path], list[str]]]] = {
-    "hand": ("The hand", hand),
-    "usaf": ("The tilted USAF target", usaf),
+    "hand": ("The hand, bins 8 and 4", lambda folder: hand(folder, (8, 4))),
+    "hand-fine": ("The hand, bin 2", lambda folder: hand(folder, (2,))),
+    "usaf": ("The tilted USAF target, half size", lambda folder: usaf(folder, 2)),
+    "usaf-full": ("The tilted USAF target, full size", lambda folder: usaf(folder, 1)),
+    "intervals": ("How far the pairs' pictures may be off", intervals),
 }
 """By name: a title, and what makes the section."""
 HEAD = """# Measured photographs

@@ -10,6 +10,7 @@ from calibration_routines.optics.screen_pictures import LEAST_MARKS, Levels, Scr
 from calibration_routines.procedure import CalibrationError, Listener
 from calibration_routines.psf.exposure import ExposureOutcome, TooDarkError, auto_expose, hot_pixels
 from instrument.bench.bench import Bench
+from instrument.reconstruction.mosaic import in_colours
 from instrument.runs.run_control import RunControl
 from recon.base.blocks import block_mean
 from recon.camera.registration import register
@@ -64,7 +65,8 @@ class ScreenView:
         """Show levels and return what comes of them, (height, width), counts."""
         self._control.check()
         self.slm.display(levels)
-        image = np.asarray(self._bench.snap().image, np.float32)
+        taken = self._bench.snap()
+        image = in_colours(np.asarray(taken.image, np.float32), taken.metadata.pixel_format)
         grey = image.mean(axis=-1, dtype=np.float32) if image.ndim == 3 else image
         return grey if self._black is None else grey - self._black
 

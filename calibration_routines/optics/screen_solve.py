@@ -19,6 +19,7 @@ from instrument.bench.bench import Bench
 from instrument.files.calibration_file import save_calibration
 from instrument.files.record import RecordFormat
 from instrument.files.slm_image import read_slm_levels
+from instrument.reconstruction.mosaic import in_colours
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from recon.base.blocks import block_mean
@@ -35,7 +36,8 @@ TONE, PICTURE, JUDGED, AGAIN = "tone", "picture", "judged", "tone again"
 TONES = (24, 48, 80, 112, 144, 176, 208, 232, 255)
 """Grey levels whose light is measured."""
 FLICKER, DRIFT = 0.01, 0.02
-"""Change of the screen's light, from frame to frame and over the run, from which on it is told of."""
+"""Change of the screen's light, from frame to frame and from picture to picture or over the run, from which
+on it is told of."""
 _SOLVER = PictureSettings(beyond=0.0, saturated=None, gamma=1.0, rounds=1, psf_iterations=300)
 """Nothing is unknown but the PSF: black is taken off, the tone is measured, and nothing else shines."""
 _SOLVING = 0.8  # of the work; the rest is judging
@@ -150,8 +152,10 @@ class _Frames:
 
     def mean(self, frames: Sequence[int]) -> Floats:
         """Return the mean of some frames, (n_channels, height, width), black taken off, binned."""
+        metadata = self.run.metadata(frames[0])
         light = np.mean([self.run.frame(n) for n in frames], axis=0, dtype=np.float32)
-        light = replace_hot(light - self._dark.at(self.run.metadata(frames[0]).exposure_ms), self._dark.hot)
+        light = replace_hot(light - self._dark.at(metadata.exposure_ms), self._dark.hot)
+        light = in_colours(light, metadata.pixel_format)
         return block_mean(channels_first(light), self._record.asked.binning)
 
     def level(self, label: str) -> list[float]:
@@ -222,6 +226,7 @@ def solve_screen(
         "gamma": tone.gamma,
         "tone": list(zip(tone.levels, tone.light, strict=True)),
         "flicker": frames.flicker(),
+        "wander": float(np.abs(solved.brightness - 1).max()),
         "drift": frames.level(AGAIN)[0] / tones[-1] - 1,
         "misfit": solved.misfit,
         "judged_db": [psnr for psnr, _ in judged],
@@ -243,20 +248,22 @@ def solve_screen(
         },
     )
     path = save_calibration(calibration, run.path / SCREEN.result)
-    return ScreenCalibration(calibration, path, tone, tuple(_findings(quality)))
+    return ScreenCalibration(calibration, path, tone, tuple(findings_of(quality)))
 
 
-def _findings(quality: dict[str, Any]) -> list[str]:
+def findings_of(quality: dict[str, Any]) -> list[str]:
+    """Return what is wrong with the screen's light, or with what the PSF explains, in words."""
     findings = []
     if quality["flicker"] > FLICKER:
         findings.append(
             f"the screen's light changes by {quality['flicker']:.1%} from frame to frame: dim it, so that "
             "the exposure is longer than a few of its refreshes"
         )
-    if abs(quality["drift"]) > DRIFT:
+    changed = max(abs(quality["drift"]), quality["wander"])
+    if changed > DRIFT:
         findings.append(
-            f"the screen's light changed by {quality['drift']:+.1%} over the run: let it warm up, and switch "
-            "off automatic brightness"
+            f"the screen's light, or other light, changed by {changed:.1%} during the run: let it warm up, "
+            "switch off automatic brightness, darken the room"
         )
     if quality["saturated_frames"]:
         findings.append(f"{quality['saturated_frames']} frames have saturated pixels: dim the screen")
@@ -274,8 +281,9 @@ def screen_lines(done: ScreenCalibration) -> list[str]:
     lines = ["SIMULATED: the photographs come from the simulated bench"] if made["simulated"] else []
     lines += [
         f"Screen: {quality['marks']} marks seen where they should be within {quality['registration_px']:.2f} "
-        f"pixels; gamma {quality['gamma']:.2f}; light steady within {quality['flicker']:.2%} from frame to "
-        f"frame and {abs(quality['drift']):.2%} over the run.",
+        f"pixels; gamma {quality['gamma']:.2f}.",
+        f"Light: steady within {quality['flicker']:.2%} from frame to frame, {quality['wander']:.2%} from "
+        f"picture to picture (taken out) and {abs(quality['drift']):.2%} over the run.",
         f"PSF: leaves {quality['misfit']:.1%} of the photographs' standard deviation unexplained.",
     ]
     if quality["judged_db"]:

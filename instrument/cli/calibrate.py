@@ -145,8 +145,8 @@ def _of_files_or_bench(
     if getattr(files, instead.named) is None:
         if useless := given.flags(*of_files):
             raise BenchError(
-                f"{' and '.join(useless)} go with {named}; on the bench pictures are taken. Leave them out, "
-                f"or give {named}."
+                f"Only with {named}: {', '.join(useless)}. On the bench pictures are taken: leave out what "
+                f"is only for files, or give {named}."
             )
         carry_out(routine, options, bench, out, dry_run=dry_run)
         return

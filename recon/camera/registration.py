@@ -156,6 +156,11 @@ def displacement(psf: Array, reference: Array) -> tuple[int, int]:
     return _Correlation(_fine(psf), _fine(reference)).whole_peak()
 
 
+def likeness(psf: Array, reference: Array) -> float:
+    """Return how alike the fine structure of two images (height, width) is where they match best, up to 1."""
+    return _Correlation(_fine(psf), _fine(reference)).height
+
+
 def shifted(image: Array, rows: int, columns: int) -> Array:
     """Return ``image`` (..., height, width) moved by whole pixels; zeros move in."""
     result = np.zeros_like(image)

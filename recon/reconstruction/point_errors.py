@@ -21,7 +21,7 @@ from recon.camera.points import FieldFunctions, PointImages, Points, cleaned, po
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import Reconstruction
-from recon.reconstruction.weights import kind_of
+from recon.reconstruction.weights import is_weighted, kind_of
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
@@ -82,7 +82,8 @@ def points_problem(problem: Problem) -> Problem | None:
     """
     given = problem if problem.reduction is None else problem.reduction.given
     grey = given.n_channels == 1 and given.n_planes == 1
-    if not grey or problem.varies or kind_of(problem.prior_name) != "l1":
+    name = problem.prior_name
+    if not grey or problem.varies or kind_of(name) != "l1" or not is_weighted(name):
         return None
     return replace(given, model=problem.model, smooth=problem.smooth, reduction=None, choice=None)
 

@@ -10,8 +10,8 @@ put in, at each place of the picture, is the error to expect there: the equivari
 Pereyra 2024, AISTATS) in the group of scales. Where the data's spectrum shows more detail than that, as of
 lights on black, all deviations grow to hold it.
 
-What neither the picture nor the data's spectrum shows cannot be known: fine print and threads below the
-camera's resolution are off by more (``docs/benchmarks/uncertainty.md``).
+What neither the picture nor the data's spectrum shows cannot be known: fine threads below the camera's
+resolution may be off by more (``docs/benchmarks/uncertainty.md``).
 """
 
 from __future__ import annotations
@@ -45,11 +45,13 @@ SHRINKS = (2, 4)
 """The least and the most."""
 RINGS = 12
 """Of frequencies, from none to half of one a pixel; those in the corners are one more."""
+FALLS = (-4.0, -1.5)
+"""How steeply a scene's power can fall with frequency: between smooth shades and lights on black."""
 TELLS = 0.5
 """A ring tells of the scene's power where chance moves it by less than this share."""
 SMOOTH_PX = 1.0
 """Variances are averaged over neighbours: 24 errors alone would scatter by 15 %."""
-EXPLAINED = 1.3
+EXPLAINED = 2.0
 """Residual over noise up to which intervals held what they promise (``benchmarks/uncertainty.py``)."""
 
 
@@ -152,10 +154,9 @@ def uncertain(
     finest_px = replicas.finest_px * (1 if solved.choice is None else solved.choice.binning)
     if solved.reduction is not None:
         deviation = solved.reduction.volume(deviation)
-    misfit = max(r / small.noise_norm for r in small.residuals)
     fitted = points_problem(solved)
     points = None if fitted is None else points_of(result, fitted)
-    found = Uncertainty(deviation, REPEATS, misfit, time.monotonic() - began, finest_px, points)
+    found = Uncertainty(deviation, REPEATS, replicas.misfit, time.monotonic() - began, finest_px, points)
     return replace(result, uncertainty=found, warnings=(*result.warnings, *found.doubt))
 
 
@@ -175,6 +176,11 @@ class Replicas:
         That was solved.
     result : Reconstruction
         Its own.
+
+    Attributes
+    ----------
+    misfit : float
+        Residual over noise of the result, of the channel where it is largest.
     """
 
     def __init__(self, problem: Problem, result: Reconstruction) -> None:
@@ -197,6 +203,7 @@ class Replicas:
         rest = np.concatenate([left for _, left in fits])
         self._explained = problem.data - rest
         size = np.sqrt((rest**2).sum(axis=(1, 2)) / np.count_nonzero(problem.valid, axis=(1, 2)))
+        self.misfit = float(size.max())
         # A fit takes some of the noise along.
         self._rest = rest * np.maximum(1, 1 / size)[:, None, None]
 
@@ -238,11 +245,11 @@ class Replicas:
 
         Both data and what the result explains of them have a spectrum. Ring by ring of frequencies, the ratio
         of their powers, the noise taken off, is how much more power the scene has than the result, though no
-        single frequency of it stands out of the noise. Beyond the last ring that tells, it is taken to stay.
+        single frequency of it stands out of the noise. Beyond the last ring that tells, the scene's power is
+        taken to go on as it falls up to there, and the ratio not to fall.
         """
         pictures = _channels_first(self._result.volume)
-        ratios = (ratio for ratio, _ in self._spectra)
-        return np.array([(r - 1) @ _rings(p)[0] / p.size**2 for r, p in zip(ratios, pictures, strict=True)])
+        return np.array([_missing(*s, p) for s, p in zip(self._spectra, pictures, strict=True)])
 
     @property
     def finest_px(self) -> float:
@@ -295,9 +302,26 @@ def _power_ratio(data: tuple[Array, Array], explained: tuple[Array, Array]) -> t
     fit = np.maximum(fit, 1e-12 * fit.max())
     ratio = np.maximum((each - noise) * counts / fit, 1)
     told = np.sqrt(2 / np.maximum(counts, 1)) * seen / fit < TELLS
-    last = RINGS if told.all() else max(int(np.argmin(told)) - 1, 0)
+    told[0] = True  # a few frequencies: chance moves it, whatever the noise
+    last = RINGS if told.all() else int(np.argmin(told)) - 1
     ratio[last + 1 :] = ratio[last]
     return ratio, last
+
+
+def _missing(ratio: Array, last: int, picture: Array) -> float:
+    """Return the mean square of what a picture lacks where the scene's power is so many times its own."""
+    power, counts = _rings(picture)
+    each = np.maximum(ratio * power / np.maximum(counts, 1), 1e-30)
+    if last < RINGS:
+        told = np.arange(min(1, last), last + 1)
+        frequency, density = np.log(np.arange(RINGS + 1) + 0.5), np.log(each[told])
+        fall = -3.0
+        if last > 1:
+            fall = float(np.polyfit(frequency[told], density, 1, w=np.sqrt(counts[told]))[0])
+        fall = float(np.clip(fall, *FALLS))
+        level = float(np.mean(density - fall * frequency[told]))
+        each[last + 1 :] = np.maximum(each[last + 1 :], np.exp(level + fall * frequency[last + 1 :]))
+    return max(float(np.sum(each * counts - power)), 0.0) / picture.size**2
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from recon.reconstruction.reconstruct import given, reconstruct
 from recon.reconstruction.reduction import on_blocks, reduced_calibration
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import Progress
+from recon.streams.fit import CalibrationWatch
 from recon.streams.live_picture import NOISE_ONLY, ComingLevel, Level, LiveOptions, LivePicture
 from recon.streams.pace import Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch
@@ -118,7 +119,8 @@ class LiveReconstructor:
         self._greeted = False
         """Whether the newest scene was shown by a Wiener filter already."""
         self._settled = False
-        self._doubt = ""
+        self._dark = False
+        self._fit = CalibrationWatch(self._given if isinstance(self._given, Calibration) else None)
 
     def _checked(self) -> Problem:
         """Return the problem of a frame that holds nothing: what has no way is refused before the stream."""
@@ -155,7 +157,7 @@ class LiveReconstructor:
         level = self._level_for(frame)
         small = block_mean(frame, level.binning, about_axis=True)
         self._scene = self._watch.see(small)
-        self._doubt = self._doubted(level, frame)
+        self._dark = not self._sees_light(level, frame)
         affordable = self._pace.affordable(level.binning, self.budget_ms)
         cut = self._scene is SceneState.NEW and not self._greeted
         too_slow = affordable < 1 and self._scene is not SceneState.STILL
@@ -246,16 +248,23 @@ class LiveReconstructor:
         self._shape = ()
         self._watch.forget()
         self._follows = self._greeted = self._settled = False
+        self._fit = CalibrationWatch(self._given if isinstance(self._given, Calibration) else None)
 
     # Pieces ----------------------------------------------------------------------------------------
-    def _doubted(self, level: Level, frame: Floats) -> str:
-        """Return why the newest picture is none; have a level that was settled on noise made anew."""
-        if not level.sees_light(self._as_given(self._watch.mean), self._watch.count):
-            return NOISE_ONLY
+    def _sees_light(self, level: Level, frame: Floats) -> bool:
+        """Tell whether there is a scene to see; what was settled on noise is then made anew."""
+        mean = self._as_given(self._watch.mean)
+        if not level.sees_light(mean, self._watch.count):
+            return False
         if not level.lit and self._coming is None:
             self._level = replace(level, lit=True)  # once, also where there is no memory for another
             self._make(level.binning, frame)
-        return ""
+        self._fit.see(
+            lambda: level.problem.with_data(mean.copy()), level.binning, self._scene, self._watch.count
+        )
+        if self._fit.advice and self._fit.advice not in self.warnings:
+            self.warnings = (*self.warnings, self._fit.advice)
+        return True
 
     def _iterate(
         self, level: Level, began: Spent, at_most: int | None, newer: Callable[[], bool]
@@ -420,7 +429,7 @@ class LiveReconstructor:
             else f"brightest {of}"
             if plane is None
             else f"depth {plane} {of}",
-            doubt=self._doubt,
+            doubt=NOISE_ONLY if self._dark else self._fit.doubt,
         )
 
 

@@ -70,7 +70,7 @@ def stream_problem(
         options = replace(options, model="convolution")
     problem = Problem.of(replace(measurement, **known), calibration, options)
     if choosing and isinstance(calibration, Calibration):
-        problem = _with_background(problem, calibration)
+        problem = with_background(problem, calibration)
     if doubt:
         problem = replace(problem, warnings=(*problem.warnings, doubt))
     if options.solver == "auto" and SOLVERS["admm-sensor"].accepts(problem) is None:
@@ -79,7 +79,7 @@ def stream_problem(
     return problem
 
 
-def _with_background(problem: Problem, calibration: Calibration) -> Problem:
+def with_background(problem: Problem, calibration: Calibration) -> Problem:
     """Return a problem with a smooth background where a photograph would have one, and nobody said.
 
     Of pictures: volumes have one unless it is given. All of the calibration's PSFs tell whether there is one.

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.verdict.calibration_check import CalibrationCheck, Fit
 from recon.verdict.cases import OF_VOLUMES, Cases, cases_of, group_of, place_of
 from recon.verdict.evidence import DIVERGED, Evidence
 
@@ -185,15 +186,22 @@ class Verdict:
     """What was measured, see :class:`~recon.verdict.evidence.Evidence`."""
     basis: str = ""
     """By which cases it was judged."""
+    calibration: CalibrationCheck | None = None
+    """Whether the calibration is the photograph's own; None where that was not looked at."""
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """The verdict in plain words: what, which stress limits it, what would help."""
+        if self.calibration is not None and self.calibration.wrong:  # whatever else: that is why
+            first, *rest = self.calibration.sentences
+            return tuple(f"{s}." for s in (f"not reliable: {first}", *rest))
         said = [WORDS[self.region].format(method=self.method)]
         unfinished = self.evidence.get("unsettled", 0.0) >= UNFINISHED
         if unfinished and self.failing is not None and self.failing < LOST:
             said = [FIRST_ITERATIONS]  # that is why; the share of similar cases would contradict it
-        elif self._still_changing:
+        elif self._alike_are_good and self.calibration is not None and self.calibration.fit is Fit.UNTOLD:
+            said = [f"doubtful: {s}" for s in self.calibration.sentences]
+        elif self._alike_are_good:
             said = [STILL_CHANGING]
         elif self.region is Region.UNKNOWN and self.evidence.get("signal", 0.0) >= NOISELESS:
             said = [COMPUTED]
@@ -208,11 +216,20 @@ class Verdict:
         return tuple(f"{s}." for s in said)
 
     @property
-    def _still_changing(self) -> bool:
-        """Whether nothing but the end of the run keeps it from being inside."""
+    def _alike_are_good(self) -> bool:
+        """Whether something else than similar cases keeps it from being inside."""
         if self.region is not Region.NEAR or self.failing is None:
             return False
         return self.failing <= reliable_share(self.method)
+
+    def with_calibration(self, check: CalibrationCheck) -> Verdict:
+        """Return the verdict with what is known of the calibration: with a wrong one it is never inside."""
+        region = self.region
+        if check.wrong:
+            region = Region.OUTSIDE
+        elif check.fit is Fit.UNTOLD and region is Region.INSIDE:
+            region = Region.NEAR
+        return replace(self, region=region, calibration=check)
 
     def as_json(self) -> dict[str, Any]:
         """Return the verdict for a file."""
@@ -224,6 +241,7 @@ class Verdict:
             "findings": [asdict(f) for f in self.findings],
             "evidence": dict(self.evidence),
             "basis": self.basis,
+            "calibration": None if self.calibration is None else self.calibration.as_json(),
         }
 
 

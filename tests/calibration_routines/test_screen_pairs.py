@@ -9,6 +9,7 @@ import pytest
 
 from calibration_routines.optics.screen_pairs import PairFiles, read_pairs, solve_pairs
 from calibration_routines.procedure import Listener
+from instrument.cli import main
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import FileError
 from tests.recon.blind.test_known_pictures import taken
@@ -80,3 +81,15 @@ def test_a_folder_without_proper_pairs_is_refused(pairs: Path, spoil: object, wo
 def test_a_file_instead_of_a_folder_is_refused(pairs: Path) -> None:
     with pytest.raises(FileError, match="is no folder"):
         read_pairs(pairs / "raw_0.npy")
+
+
+def test_the_terminal_takes_pairs_or_the_bench_and_never_mixes_them(
+    pairs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["calibrate", "screen"]
+    assert main([*words, "--pairs", str(pairs), "--dry-run"]) == 0
+    assert "5 pairs of 48 x 56 pixels, 1 channel: 0, 1, 2, 3, 4" in capsys.readouterr().out
+    assert main([*words, "--pairs", str(pairs), "--pictures", "12"]) == 2
+    assert "leave out --pictures" in capsys.readouterr().err
+    assert main([*words, "--gamma", "2.2"]) == 2
+    assert "Only with --pairs: --gamma" in capsys.readouterr().err

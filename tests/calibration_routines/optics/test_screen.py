@@ -18,7 +18,13 @@ from calibration_routines.optics.screen_pictures import (
     field_along,
     random_cells,
 )
-from calibration_routines.optics.screen_solve import PICTURE, TONE, ScreenCalibration, ScreenOptions
+from calibration_routines.optics.screen_solve import (
+    PICTURE,
+    TONE,
+    ScreenCalibration,
+    ScreenOptions,
+    findings_of,
+)
 from calibration_routines.procedure import CalibrationError
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
@@ -92,6 +98,8 @@ def test_a_bench_without_a_screen_and_a_dark_screen_are_said_in_words(tmp_path: 
     without = SMALL[: SMALL.index("\n[slm]")] + SMALL[SMALL.index("\n[scene]") :]
     with small_bench(without) as bench, pytest.raises(BenchError, match=r"has no \[slm\]"):
         ScreenProcedure(ASKED).outlook(bench)
+    with small_bench(template()) as bench, pytest.raises(BenchError, match="is no screen"):
+        ScreenProcedure(ASKED).outlook(bench)
     dark = SMALL.replace("black = 0.001", "black = 0.001\nwhite = 1e-7")
     with small_bench(dark) as bench, pytest.raises(CalibrationError, match="hardly lights the camera"):
         ScreenProcedure(ASKED).carry_out(bench, tmp_path)
@@ -150,3 +158,37 @@ def test_pictures_are_as_asked_and_the_same_for_a_seed() -> None:
     assert not np.array_equal(drawn[PICTURE], other[PICTURE])
     assert 0.1 < (random_cells((60, 60), 0) > 0).mean() < 0.3
     assert len(np.unique(dead_leaves((60, 60), 0))) > 100
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"flicker": 0.05}, "5.0% from frame to frame"),
+        ({"drift": -0.04}, "changed by 4.0% during the run"),
+        ({"wander": 0.03}, "changed by 3.0% during the run"),
+        ({"saturated_frames": 2}, "2 frames have saturated pixels"),
+        ({"judged_db": [11.0]}, "hardly reconstructed"),
+        ({}, None),
+    ],
+)
+def test_what_is_wrong_with_the_light_is_named(changed: dict[str, object], words: str | None) -> None:
+    good = {"flicker": 1e-4, "drift": 0.0, "wander": 0.0, "saturated_frames": 0}
+    said = findings_of({**good, "judged_db": [20.0], "even_db": [10.0], **changed})
+    assert len(said) == (words is not None)
+    assert words is None or words in said[0]
+
+
+@pytest.mark.parametrize(
+    ("typed", "words"),
+    [
+        (["--pairs", "pairs", "--pictures", "5"], "leave out --pictures"),
+        (["--gamma", "2"], "--gamma go with --pairs"),
+    ],
+)
+def test_options_of_bench_and_files_do_not_mix(
+    typed: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = tmp_path / "screen.toml"
+    bench.write_text(SMALL)
+    assert main(["calibrate", "screen", *typed, *([] if "--pairs" in typed else ["-b", str(bench)])]) != 0
+    assert words in capsys.readouterr().err

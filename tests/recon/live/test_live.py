@@ -514,3 +514,19 @@ def test_erased_pixels_are_no_light() -> None:
     reconstructor = live(background=None, erasures=erasures)
     dark = np.random.default_rng(0).normal(20, 2, SHAPE)
     assert reconstructor.feed(dark.astype(np.float32)).doubt == NOISE_ONLY
+
+
+@pytest.mark.parametrize(
+    ("psf", "says"),
+    [(spots_psf(), ""), (spots_psf()[:, ::-1], "calibration"), (spots_psf()[::-1], "calibration")],
+)
+def test_a_calibration_that_does_not_fit_is_said_of_every_picture(psf: np.ndarray, says: str) -> None:
+    reconstructor = LiveReconstructor(
+        np.ascontiguousarray(psf), background=20.0, budget_ms=AMPLE_MS, noise=NOISE, coarsest=1
+    )
+    reconstructor._fit._not_before = 0.0  # at once
+    assert not reconstructor.feed(photograph(0, 1)).doubt
+    reconstructor._fit.wait()
+    picture = reconstructor.feed(photograph(0, 2))
+    assert says in picture.doubt
+    assert bool(says) == bool(picture.doubt)

@@ -194,3 +194,15 @@ def test_that_one_psf_serves_a_field_of_many_is_said() -> None:
     assert said in stream_problem(scene.measurement, scene.calibration).warnings
     asked = stream_problem(scene.measurement, scene.calibration, model="local")
     assert not any("One PSF serves" in text for text in asked.warnings)
+
+
+@pytest.mark.parametrize("stray", [0.0, 2.0])
+def test_stray_light_that_a_photograph_would_have_a_background_for_is_said(stray: float) -> None:
+    scene = make_scene("sparse-picture", size=48, grid=3, aberration=4.0, background=stray, photons=3000.0)
+    reconstructor = LiveReconstructor(scene.calibration, prior="l1", **PACE)
+    reconstructor._fit._not_before = 0.0  # at once
+    reconstructor.feed(scene.measurement)
+    reconstructor._fit.wait()
+    picture = reconstructor.feed(scene.measurement)
+    assert any("--background" in text for text in reconstructor.warnings) == bool(stray)
+    assert not picture.doubt

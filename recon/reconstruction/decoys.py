@@ -1,0 +1,120 @@
+"""How well a calibration and transformed copies of it explain a photograph, in little time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.blocks import block_mean
+from recon.camera.camera_model import CAMERAS
+from recon.camera.registration import likeness
+from recon.camera.transformed import Transformation, transformed
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import Part
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.reduction import on_blocks
+from recon.reconstruction.solvers import SOLVERS
+from recon.solvers.base import StoppingRules
+from recon.types import Calibration
+from recon.verdict.calibration_check import (
+    BETWEEN,
+    FAR,
+    GIVEN,
+    CalibrationCheck,
+    Score,
+    check_of,
+    near_decoys,
+)
+
+Floats = npt.NDArray[np.float32]
+
+LONGEST_PX = 160
+"""Longest side that decoys are tried on, pixels, about: one per cent of it is a caustic's width."""
+MOST_PLANES = 6
+"""Depths that take part, evenly spaced."""
+ITERATIONS, OF_VOLUMES = 20, 10
+"""Of pictures and volumes: a right PSF is far ahead long before they have settled."""
+WEIGHT = 1.0
+"""Of total variation: as large as the noise that the adjoint of a PSF of unit energy passes on."""
+MOST_DECOYS = 11
+"""With farther ones on the side of a near one that is better, each twice as far: to some eight degrees or per
+cent."""
+ALIKE = 0.7
+"""Likeness from which a far decoy tells nothing, as of regular lenslets, which are their own mirror image."""
+
+
+def check_calibration(problem: Problem) -> CalibrationCheck | None:
+    """Let a problem's calibration compete with its decoys on the channel that has most signal.
+
+    One convolution a depth by the central PSFs, as few pixels as still tell one per cent of size; of PSFs
+    that vary over the field only whether they are the photograph's at all. None where the light is patterned
+    or the camera model comes from outside: nothing is known of such.
+    """
+    if problem.patterned or problem.model in CAMERAS:
+        return None
+    channel = int(np.argmax([d[v].std() for d, v in zip(problem.data, problem.valid, strict=True)]))
+    own = slice(channel, channel + 1)
+    psfs = problem.depths.central
+    planes = np.unique(np.linspace(0, len(psfs) - 1, MOST_PLANES).round().astype(int))
+    psfs = _on_sensor(psfs[planes][:, own if psfs.shape[1] > 1 else slice(0, 1)], problem.sensor_shape)
+    factor = max(1, round(max(problem.sensor_shape) / LONGEST_PX))
+    valid = problem.valid[own]
+    photograph = on_blocks(problem.data[own], valid, 1.0, factor, flat=True)
+    if photograph.erasures is not None and np.all(photograph.erasures):
+        factor, photograph = 1, on_blocks(problem.data[own], valid, 1.0, 1, flat=True)
+    psfs = block_mean(psfs, factor, about_axis=True)
+    options = ReconstructionOptions(
+        prior="tv",
+        model="convolution",
+        estimate_background=problem.smooth or problem.n_planes > 1,
+        drop_empty=False,
+    )
+
+    def posed(how: Transformation) -> Problem:
+        copies = Calibration(transformed(psfs, how), np.full((len(psfs), 3), np.nan))
+        if len(psfs) > 1:  # depths by number: they only have to differ
+            copies.source_positions_um[:] = [(0.0, 0.0, 1.0 + z) for z in range(len(psfs))]
+        return Problem.of(photograph, copies, options)
+
+    middle = psfs[len(psfs) // 2, 0]
+    far = [how for how in FAR if likeness(transformed(middle, how), middle) < ALIKE]
+    scores, pixels = {}, 0
+    given = problem.reduction.given if problem.reduction is not None else problem
+    near = () if given.depths.varies else near_decoys(psfs.shape[2:], volume=len(psfs) > 1)
+    for how in (GIVEN, BETWEEN, *near, *far):
+        scores[how], pixels = _score(posed(how))
+    before, best = GIVEN, min((GIVEN, *near), key=lambda how: scores[how].objective)
+    while scores[best].objective < scores[before].objective and len(scores) < MOST_DECOYS:
+        before, best = best, Transformation(scale=best.scale**2, rotation_deg=2 * best.rotation_deg)
+        scores[best], _ = _score(posed(best))
+    return check_of(scores, pixels)
+
+
+def _on_sensor(psfs: Floats, shape: tuple[int, int]) -> Floats:
+    """Return PSFs that were cut to a central window on the sensor's pixels."""
+    whole = np.zeros((*psfs.shape[:2], *shape), np.float32)
+    top, left = (n // 2 - m // 2 for n, m in zip(shape, psfs.shape[2:], strict=True))
+    whole[..., top : top + psfs.shape[2], left : left + psfs.shape[3]] = psfs
+    return whole
+
+
+def _score(problem: Problem) -> tuple[Score, int]:
+    """Reconstruct a problem of one channel in few iterations; return its score and pixels."""
+    sensor = SOLVERS.named("admm-sensor")
+    offered = sensor if sensor.accepts(problem) is None else SOLVERS.named("admm")
+    part = Part(replace(problem, options=replace(problem.options, solver=offered.name)), slice(0, 1))
+    try:
+        part.weight = WEIGHT
+        iterations = ITERATIONS if problem.n_planes == 1 else OF_VOLUMES
+        outcome = offered.make(part, None).run(StoppingRules(iterations=iterations, tolerance=0.0))
+        solution = np.maximum(part.lifted(outcome.solution), 0)
+        background = part.background(solution) if part.removal is not None else None
+        residual = part.residual(solution, background)[part.valid].astype(np.float64)
+    finally:
+        part.close()
+    last = outcome.history[-1]
+    prior = last.objective - 0.5 * last.data_residual**2
+    misfit = float(np.mean(residual**2))
+    return Score(misfit, misfit + 2 * prior / len(residual)), len(residual)

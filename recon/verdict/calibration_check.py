@@ -1,0 +1,177 @@
+"""Whether a calibration belongs to a photograph: whether it explains it better than its own decoys.
+
+A right PSF explains a photograph far better than its own mirror image, and lies at the minimum over small
+turns and sizes. So the given calibration competes with such decoys on the photograph at hand, by few
+iterations on few pixels each (:mod:`recon.reconstruction.decoys`): no simulated case is asked. The score is
+the posterior's logarithm, half the squared residual in units of the noise and the prior; its differences are
+natural logarithms of odds ("nats"). Where a background or noise leaves every PSF able to explain the data,
+the prior still tells, and where it does not either, that is said.
+
+What cannot be told: a PSF that is only displaced casts the same picture, displaced; one that is somewhat
+larger is that of a nearer scene; and so is, in a volume, a depth for another between those calibrated.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recon.camera.transformed import Transformation
+
+GIVEN = Transformation()
+BETWEEN = Transformation(0.37, 0.37)
+"""The calibration itself displaced by part of a pixel, which displaces the picture alone: interpolated as its
+decoys are. The better of the two counts as the given one."""
+FAR = (Transformation(mirrored=True), Transformation(rotation_deg=180.0))
+"""Decoys that have as much light at as many places, and nothing to do with the photograph."""
+EDGE_PX = 0.6
+"""By how much near decoys move a pattern's edge at least, pixels: less tells nothing."""
+TOLD_NATS = 25.0
+"""Odds from which a decoy is the better one: of right calibrations none had more than 4, of those turned by a
+degree all had 40 and more where the photograph tells anything."""
+TOLD_SHARE = 0.002
+"""The same relative to the score: what errors of the model may make of it."""
+FAR_NATS = 200.0
+"""Odds over the best far decoy from which the photograph tells that the pattern is its own: other diffusers'
+had up to 190 where noise and a background let any of them explain it."""
+EXPLAINED = 1.3
+"""Mean squared residual, in units of the noise, from which a calibration that is no better than its far
+decoys is another camera's; below, any pattern explains the photograph."""
+AS_BAD = 0.7
+"""Squared residual beyond the noise relative to the best far decoy's from which it is no better, if its score
+is :data:`AS_UNLIKELY` as well."""
+AS_UNLIKELY = 0.9
+
+
+class Fit(enum.StrEnum):
+    """What a photograph says of a calibration."""
+
+    FITS = "fits"
+    OFF = "off"
+    FOREIGN = "foreign"
+    UNTOLD = "untold"
+
+
+class Score(NamedTuple):
+    """How well a PSF explains a photograph."""
+
+    misfit: float
+    """Mean square of the residual in units of the noise."""
+    objective: float
+    """The same and twice the prior, a pixel."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationCheck:
+    """What became of a calibration among its decoys.
+
+    Attributes
+    ----------
+    fit : Fit
+    scores : mapping
+        By transformation; :data:`GIVEN` is that of the calibration itself.
+    pixels : int
+        That they were taken on.
+    better : Transformation or None
+        The decoy that explains the photograph better, where one does.
+    """
+
+    fit: Fit
+    scores: Mapping[Transformation, Score]
+    pixels: int
+    better: Transformation | None = None
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it is not the photograph's own calibration."""
+        return self.fit in (Fit.OFF, Fit.FOREIGN)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What is wrong with it, and what to do; empty where it fits."""
+        if self.fit is Fit.OFF and self.better is not None:
+            left = (self.scores[self.better].misfit / self.scores[GIVEN].misfit) ** 0.5
+            why = (
+                "one of the two was flipped or turned: give both as the camera saw them"
+                if self.better in FAR
+                else "diffuser or sensor moved since it was made, or the scene lies at another depth: "
+                "--refine-psf fits the PSF to it; else calibrate again, or choose the scene's depth"
+            )
+            return (
+                "the calibration does not fit this photograph: its PSF explains it better "
+                f"{self.better} (the residual falls to {left:.0%})",
+                f"Probably {why}",
+            )
+        if self.fit is Fit.FOREIGN:
+            return (
+                "the calibration does not belong to this photograph: its PSF explains it no better than it "
+                "would mirrored or upside down",
+                "Give the calibration of this camera and diffuser, at this binning and crop and at the "
+                "scene's depth",
+            )
+        if self.fit is Fit.UNTOLD:
+            return (
+                "the photograph does not tell whether the calibration is its own: any PSF would explain it "
+                "as well",
+            )
+        return ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it for a file."""
+        return {
+            "fit": str(self.fit),
+            "better": None if self.better is None else str(self.better),
+            "scores": {str(t): list(s) for t, s in self.scores.items()},
+            "pixels": self.pixels,
+        }
+
+
+def near_decoys(shape: tuple[int, int], *, volume: bool) -> tuple[Transformation, ...]:
+    """Return the decoys that a right calibration on so many pixels beats narrowly.
+
+    Turned by a degree and enlarged by one per cent, by more on few pixels. Of volumes the turned ones alone:
+    another size is another depth.
+    """
+    step = max(0.01, EDGE_PX / (max(shape) / 2))
+    degrees = max(1.0, float(np.rad2deg(step)))
+    turned = (Transformation(rotation_deg=degrees), Transformation(rotation_deg=-degrees))
+    return turned if volume else (*turned, Transformation(scale=1 + step), Transformation(scale=1 - step))
+
+
+def check_of(scores: Mapping[Transformation, Score], pixels: int) -> CalibrationCheck:
+    """Judge a calibration by its score and its decoys'.
+
+    Parameters
+    ----------
+    scores : mapping
+        Of :data:`GIVEN`, :data:`BETWEEN`, near ones and farther, and of the :data:`FAR` ones that do not
+        resemble it: where all do, as of regular lenslets, only the near ones tell.
+    pixels : int
+        Valid ones.
+    """
+    scores = {**scores, GIVEN: min(scores[GIVEN], scores[BETWEEN], key=lambda score: score.objective)}
+    given = scores[GIVEN]
+    decoys = {how: score for how, score in scores.items() if how not in (GIVEN, BETWEEN)}
+    better = min(decoys, key=lambda how: decoys[how].objective)
+    gain = given.objective - decoys[better].objective
+    far = {how: decoys[how] for how in FAR if how in decoys}
+    foreign = _no_better(given, far.values())
+    told = gain * pixels / 2 > TOLD_NATS and gain > TOLD_SHARE * given.objective
+    others = [score for how, score in far.items() if how != better]
+    if told and not (foreign and _no_better(decoys[better], others)):
+        return CalibrationCheck(Fit.OFF, scores, pixels, better)
+    if foreign:
+        return CalibrationCheck(Fit.FOREIGN, scores, pixels)
+    lead = min((s.objective for s in far.values()), default=float("inf")) - given.objective
+    return CalibrationCheck(Fit.FITS if lead * pixels / 2 > FAR_NATS else Fit.UNTOLD, scores, pixels)
+
+
+def _no_better(score: Score, far: Iterable[Score]) -> bool:
+    """Whether a PSF leaves much of the photograph unexplained, and hardly less than far decoys do."""
+    left, objective = np.min([*far, (np.inf, np.inf)], axis=0)
+    as_bad = score.misfit - 1 > AS_BAD * (left - 1) and score.objective > AS_UNLIKELY * objective
+    return score.misfit > EXPLAINED and bool(as_bad)
