@@ -135,6 +135,8 @@ def _print(result: Reconstruction) -> None:
     if result.refinement is not None:
         typer.echo(f"{'Refined PSF':<12}{result.refinement}")
     typer.echo(f"{'Method':<12}{result.solver}, prior {result.prior}{weight}")
+    if chosen := result.provenance.get("weight"):
+        typer.echo(f"{'Weight':<12}{chosen}")
     if memory := result.provenance.get("memory"):
         typer.echo(f"{'Memory':<12}{memory}")
     _print_end(result)
