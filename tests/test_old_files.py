@@ -91,6 +91,10 @@ def test_a_calibration_makes_a_picture(here: Path, command: Command, folder: str
         "86",
         "-n",
         "15",
+        "--solver",  # solver and weight that version chose by itself
+        "admm",
+        "--tau",
+        str(json.loads((here / "results/picture.json").read_text())["tau"]),
         "--out",
         "again.tif",
     )

@@ -41,6 +41,7 @@ from calibration_routines.procedure import (
 )
 from calibration_routines.psf.sweep_plan import DARK
 from instrument.bench.bench import Bench
+from instrument.files.errors import BenchError
 from instrument.plan import Part, Plan
 from instrument.plan.model import Loop
 from instrument.runs.run_control import RunControl
@@ -113,8 +114,13 @@ class ScreenProcedure(Procedure):
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse a bench without a screen; say what will be shown."""
-        height, width = require_slm(bench).shape
-        asked = self.asked
+        screen, asked = require_slm(bench), self.asked
+        height, width = screen.shape
+        if screen.identity.simulated and screen.identity.model != "screen":
+            raise BenchError(
+                f"The SLM of {bench.label} is no screen: it does not glow. To try it, write a bench that has "
+                "one: diffuserbench new screen.toml --screen"
+            )
         frames = asked.dark_frames + asked.average * (len(TONES) + asked.pictures + asked.shapes + 1)
         return Outlook(
             (

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration_routines.optics.beads import MANY_PX
 from calibration_routines.procedure import Checked, Listener, Outcome
 from calibration_routines.psf.analysis import channels_first
 from instrument.files.atomic import require_new
@@ -161,10 +162,13 @@ def look_at_pairs(files: PairFiles) -> tuple[str, ...]:
     assert files.pairs is not None
     pairs = read_pairs(files.pairs, files.dark)
     _, channels, height, width = pairs.photographs.shape
-    return (
+    words = (
         f"{len(pairs.names)} pairs of {height} x {width} pixels, {channels} "
-        f"channel{'s' if channels > 1 else ''}: {', '.join(pairs.names)}",
+        f"channel{'s' if channels > 1 else ''}: {', '.join(pairs.names)}"
     )
+    if height * width <= MANY_PX:
+        return (words,)
+    return words, "Note: pairs of more than a megapixel take long to solve; bin the files beforehand."
 
 
 def solve_pairs(

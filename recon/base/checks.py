@@ -105,7 +105,9 @@ def check_psf(psfs: npt.NDArray[np.float32]) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def require_photograph(data: npt.NDArray[np.float32], psf: npt.NDArray[np.float32]) -> None:
+def require_photograph(
+    data: npt.NDArray[np.float32], psf: npt.NDArray[np.float32], valid: npt.NDArray[np.bool_]
+) -> None:
     """Refuse what no scene gives: the PSF itself for a photograph, and the two swapped.
 
     A photograph is the PSF's pattern many times over, ``|B(f)| / B(0) <= |H(f)| / H(0)`` for light that is
@@ -116,13 +118,15 @@ def require_photograph(data: npt.NDArray[np.float32], psf: npt.NDArray[np.float3
     ----------
     data, psf : ndarray, (n_channels, height, width)
         Background removed; the PSF may have one channel for all.
+    valid : ndarray of bool, as ``data``
+        Pixels that are not erased.
 
     Raises InputError when they are the same image or swapped.
     """
     if min(data.shape[1:]) < LEAST_PX:
         return
     psf = np.broadcast_to(psf, data.shape)
-    lit = psf > np.median(psf)  # background may have been cut off at zero
+    lit = valid & (psf > np.median(psf))  # background may have been cut off at zero
     one, other = data[lit], psf[lit]
     if lit.any() and np.ptp(one) > 0 and np.ptp(other) > 0 and np.corrcoef(one, other)[0, 1] > SAME:
         raise InputError(

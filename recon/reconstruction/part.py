@@ -281,12 +281,14 @@ class Part:
                     )
         return reduce(add, terms)
 
-    def weigh(self, tau: float | None) -> None:
-        """Set the prior's weight: relative to ``max |A^H b|``, or from the noise."""
+    def weigh(self, tau: float | None, times_noise: float | None = None) -> None:
+        """Set the prior's weight: relative to ``max |A^H b|``, else to the noise, else by the table."""
         name = self.problem.prior_name
         if isinstance(self.problem.prior, Prior) or not is_weighted(name):
             return
         peak = self.peak()
+        if tau is None and times_noise is not None and peak > 0:
+            tau = times_noise / peak
         self.tau = default_tau(name, self.problem.camera_class, peak) if tau is None else float(tau)
         self.weight = self.tau * peak
 

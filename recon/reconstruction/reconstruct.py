@@ -81,7 +81,7 @@ def reconstruct(
         measurement = Measurement(measurement)
     problem = Problem.of(replace(measurement, **known), calibration, options)
     if not problem.patterned:
-        require_photograph(problem.data, problem.depths.central[problem.n_planes // 2])
+        require_photograph(problem.data, problem.depths.central[problem.n_planes // 2], problem.valid)
     if options.uncertainty and (reason := refused(problem)) is not None:
         raise InputError(f"{reason[0].upper()}{reason[1:]}.")
     refinement = None

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from recon.base.declare import settled
 from recon.errors import InputError
+from recon.reconstruction.first_look import FirstLook, look_at
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.planes import limit_of, signs_in_words, signs_of_light
@@ -150,16 +151,20 @@ def _solve(
         raise InputError(f"The prior {problem.prior_name} has no weight: leave tau out.")
     channels = parts_of(problem)
     rules = rules_of(problem, offered, len(channels))
+    look = look_at(problem, cancel)
+    if look is not None and rules.time_s is not None:
+        rules = replace(rules, time_s=max(rules.time_s - look.seconds, 1e-9))
     found = []
     for one in channels:
         part = Part(problem, one)
         try:
             channel = f"channel-{one.start}" if len(channels) > 1 or not problem.together else ""
             kept = keeper, "-".join(filter(None, (prefix, channel)))
+            part.weigh(problem.options.tau, None if look is None else look.weight(problem.prior_name))
             found.append(_run(part, offered, rules, warm, on_progress, cancel, kept))
         finally:
             part.close()
-    return _together(problem, offered, found)
+    return _together(problem, offered, found, look)
 
 
 def rules_of(problem: Problem, offered: OfferedSolver, runs: int = 1) -> StoppingRules:
@@ -221,7 +226,6 @@ def _run(
 ) -> _Solved:
     """Solve for some channels."""
     problem, options = part.problem, part.problem.options
-    part.weigh(options.tau)
     shape = part.camera.domain_shape
     start = None if warm is None else problem.start(warm, part.channels, (shape[2], shape[3]))
     solver = offered.make(part, start)
@@ -293,7 +297,9 @@ def _state(part: Part, solution: Array) -> Array | None:
     return state
 
 
-def _together(problem: Problem, offered: OfferedSolver, found: list[_Solved]) -> Reconstruction:
+def _together(
+    problem: Problem, offered: OfferedSolver, found: list[_Solved], look: FirstLook | None
+) -> Reconstruction:
     """Return what all parts gave as one result."""
     signs = [f.signs for f in found if f.signs is not None]
     left_out = np.max(signs, axis=0).tolist() if signs else []
@@ -313,7 +319,7 @@ def _together(problem: Problem, offered: OfferedSolver, found: list[_Solved]) ->
         residuals=tuple(f.residual for f in found),
         histories=tuple(f.outcome.history for f in found),
         stop_reasons=tuple(f.outcome.stop_reason for f in found),
-        seconds=sum(f.outcome.seconds for f in found),
+        seconds=sum(f.outcome.seconds for f in found) + (0.0 if look is None else look.seconds),
         background=_stacked([f.background for f in found if f.background is not None], problem.flat),
         empty_planes=empty,
         warnings=tuple(
@@ -330,6 +336,7 @@ def _together(problem: Problem, offered: OfferedSolver, found: list[_Solved]) ->
         provenance={
             **problem.provenance(),
             **({} if memory is None else {"memory": memory}),
+            **({} if look is None else {"weight": look.in_words(problem.prior_name)}),
             **({"light_in_planes_left_out": left_out} if signs else {}),
         },
     )

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from recon.camera.camera_model import CAMERAS, choose_model
 from recon.errors import InputError
+from recon.reconstruction.first_look import look_at
 from recon.reconstruction.measurement import Floats, Measurement, depths_of
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
@@ -153,8 +154,9 @@ class VideoSolver:
         self._offered = require_steps(problem)
         self._first = self.problem = problem
         self.parts = parts or [Part(problem, channels) for channels in parts_of(problem)]
+        look = look_at(problem)
         for part in self.parts:
-            part.weigh(problem.options.tau)
+            part.weigh(problem.options.tau, None if look is None else look.weight(problem.prior_name))
         self.solvers: list[Any] = [None for _ in self.parts]
         self.iterations = self._calm = 0
         self._cold = True

@@ -13,6 +13,7 @@ import pytest
 
 from recon import Calibration, Geometry, InputError, NoiseModel, reconstruct
 from recon.base.metrics import psnr
+from recon.priors import PRIORS
 from recon.solvers import StopReason
 
 ROOT = Path(__file__).parents[2]
@@ -85,12 +86,13 @@ def test_compilation_is_not_counted_as_solving(method, tmp_path):
 def test_colour_channels_are_solved_each_with_its_psf(shot, shoot):
     other = shoot(seed=7)
     measurement = np.stack([shot.measurement, 3 * other.measurement], axis=-1)
-    both = reconstruct(measurement, np.stack([shot.psf, other.psf], axis=-1), iterations=60, tolerance=0)
+    asked = {"prior": PRIORS["tv"](1.0), "iterations": 60, "tolerance": 0}  # a default weight is that of both
+    both = reconstruct(measurement, np.stack([shot.psf, other.psf], axis=-1), **asked)
     assert both.image.shape == (*shot.truth.shape, 2)
-    alone = reconstruct(shot.measurement, shot.psf, iterations=60, tolerance=0, tau=None)
+    alone = reconstruct(shot.measurement, shot.psf, **asked)
     assert np.linalg.norm(both.image[..., 0] - alone.image) < 1e-3 * np.linalg.norm(alone.image)
     assert psnr(both.image[..., 1] / 3, other.truth) > 24
-    shared = reconstruct(measurement[..., :1], shot.psf, iterations=60, tolerance=0)
+    shared = reconstruct(measurement[..., :1], shot.psf, **asked)
     assert shared.image.shape == (*shot.truth.shape, 1)
     assert shared.image[..., 0] == pytest.approx(alone.image)
 

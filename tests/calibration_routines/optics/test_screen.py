@@ -98,6 +98,8 @@ def test_a_bench_without_a_screen_and_a_dark_screen_are_said_in_words(tmp_path: 
     without = SMALL[: SMALL.index("\n[slm]")] + SMALL[SMALL.index("\n[scene]") :]
     with small_bench(without) as bench, pytest.raises(BenchError, match=r"has no \[slm\]"):
         ScreenProcedure(ASKED).outlook(bench)
+    with small_bench(template()) as bench, pytest.raises(BenchError, match="is no screen"):
+        ScreenProcedure(ASKED).outlook(bench)
     dark = SMALL.replace("black = 0.001", "black = 0.001\nwhite = 1e-7")
     with small_bench(dark) as bench, pytest.raises(CalibrationError, match="hardly lights the camera"):
         ScreenProcedure(ASKED).carry_out(bench, tmp_path)
@@ -174,3 +176,19 @@ def test_what_is_wrong_with_the_light_is_named(changed: dict[str, object], words
     said = findings_of({**good, "judged_db": [20.0], "even_db": [10.0], **changed})
     assert len(said) == (words is not None)
     assert words is None or words in said[0]
+
+
+@pytest.mark.parametrize(
+    ("typed", "words"),
+    [
+        (["--pairs", "pairs", "--pictures", "5"], "leave out --pictures"),
+        (["--gamma", "2"], "--gamma go with --pairs"),
+    ],
+)
+def test_options_of_bench_and_files_do_not_mix(
+    typed: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = tmp_path / "screen.toml"
+    bench.write_text(SMALL)
+    assert main(["calibrate", "screen", *typed, *([] if "--pairs" in typed else ["-b", str(bench)])]) != 0
+    assert words in capsys.readouterr().err

@@ -124,5 +124,7 @@ def test_swapped_and_identical_images_are_refused_before_the_work(seen: tuple[Im
         reconstruct(psf, photograph)
     with pytest.raises(InputError, match="are the same image: give the photograph of the scene"):
         reconstruct(psf + 40, psf)
+    with pytest.raises(InputError, match="are the same image"):
+        reconstruct(psf, psf, erasures=psf > 15_000)
     point = np.random.default_rng(2).poisson(psf).astype(np.float32)
     assert reconstruct(point, psf, iterations=2, judged=False).is_picture  # a point's photograph is none

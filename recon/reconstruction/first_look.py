@@ -1,0 +1,139 @@
+"""How heavy a picture's prior is where nobody says: from a first look at the picture.
+
+The weight of a prior is the noise's variance over the scale of what it counts (the maximum a posteriori of a
+Laplacian prior), so it follows the picture: little for edges far above the noise, and for light on black,
+which non-negativity holds by itself; more where nothing is black, where the picture is faint, and where the
+model leaves more than noise, as with a PSF that is not quite right. A few iterations with a light total
+variation tell these apart.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from recon.priors import Prior
+from recon.reconstruction.part import Part
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.weights import is_weighted, kind_of
+from recon.solvers.base import StoppingRules
+
+ITERATIONS = 12
+"""A quarter of what a picture takes: steepness and light are then within 5 % of what 20 give."""
+WEIGHT = 0.25
+"""Of total variation in the look, in units of the noise."""
+STEEPEST = 2.5
+"""Steepness up to which the laws were fitted: beyond, smaller weights would take ever more iterations."""
+LIT = 0.1
+"""A pixel is lit from this share of the brightest (99.9th percentile)."""
+
+
+@dataclass(frozen=True)
+class Law:
+    """A weight as a function of what a first look found (docs/decisions/0062-weights-from-a-first-look.md).
+
+    Attributes
+    ----------
+    factor : float
+        In units of the noise: of a few lights in the dark, with steps as large as the noise.
+    steepness : float
+        Power of the steepness.
+    lit : float
+        Doublings from a picture that is black to one that is lit everywhere.
+    misfit : float
+        Power of the misfit where it exceeds the noise,
+    most_misfit : float
+        up to this much.
+    most : float
+        Largest weight.
+    """
+
+    factor: float
+    steepness: float
+    lit: float
+    misfit: float
+    most_misfit: float
+    most: float
+
+
+LAWS: Mapping[Literal["tv", "l1"], Law] = {
+    "tv": Law(0.105, -0.55, 4.5, 8.65, 1.275, 8.0),
+    "l1": Law(4.8, -0.58, 2.7, 0.0, 1.0, 32.0),
+}
+"""By what the prior counts; fitted on the scenes of `benchmarks/weights.py --tuning` and on the pairs."""
+
+
+@dataclass(frozen=True)
+class FirstLook:
+    """What a first look at a picture found.
+
+    Attributes
+    ----------
+    steepness : float
+        Mean absolute difference along rows and columns together, in units of the noise.
+    lit : float
+        Share of the pixels that are lit.
+    misfit : float
+        What is left of the data, in units of the noise.
+    seconds : float
+        That it took.
+    """
+
+    steepness: float
+    lit: float
+    misfit: float
+    seconds: float
+
+    def weight(self, prior: str) -> float:
+        """Return the weight of a prior by name, in units of the noise."""
+        law = LAWS[kind_of(prior)]
+        misfit = min(max(self.misfit, 1.0), law.most_misfit) ** law.misfit
+        steepness = float(np.clip(self.steepness, 1e-6, STEEPEST))
+        weight = law.factor * steepness**law.steepness * 2 ** (law.lit * self.lit) * misfit
+        return float(min(weight, law.most))
+
+    def in_words(self, prior: str) -> str:
+        """Say what the weight is, and why."""
+        return (
+            f"{self.weight(prior):.2g} times the noise: a first look found {self.lit:.0%} of the picture "
+            f"lit, steps of {self.steepness:.2g} times the noise between pixels, misfit {self.misfit:.2g}"
+        )
+
+
+def look_at(problem: Problem, cancel: threading.Event | None = None) -> FirstLook | None:
+    """Look at a picture through one PSF; None where a weight is given, or none is asked for.
+
+    Parameters
+    ----------
+    problem : Problem
+    cancel : threading.Event, optional
+        Set it to stop after the iteration in progress.
+    """
+    from recon.solvers.sensor_admm import SensorAdmm
+
+    options = problem.options
+    named = not isinstance(problem.prior, Prior) and is_weighted(problem.prior_name)
+    if options.tau is not None or not named or problem.solver.one_step:
+        return None
+    if not problem.is_plain or problem.patterned:
+        return None
+    # Whatever device and precision the picture is solved with, the weight is the same.
+    light = replace(options, prior="tv", axis_weights=None, device="cpu", precision="float32")
+    part = Part(replace(problem, options=light, precision="float32"), slice(0, problem.n_channels))
+    part.weigh(None, WEIGHT)
+    solver = SensorAdmm(part.picture_operator, part.data, part.prior)
+    outcome = solver.run(StoppingRules(iterations=ITERATIONS, tolerance=0.0), cancel=cancel)
+    rows, columns = problem.window
+    picture = part.lifted(outcome.solution)[:, 0, rows, columns].astype(np.float64)
+    steps = [np.abs(np.diff(picture, axis=axis)).mean() for axis in (1, 2) if picture.shape[axis] > 1]
+    brightest = np.percentile(picture, 99.9)
+    return FirstLook(
+        float(sum(steps)),
+        float(np.mean(picture > LIT * brightest)),
+        outcome.history[-1].data_residual / part.noise_norm,
+        outcome.seconds,
+    )
