@@ -133,7 +133,7 @@ def _print(result: Reconstruction) -> None:
     else:
         typer.echo(f"{'Model':<12}{result.model}: {result.reason}")
     if result.refinement is not None:
-        typer.echo(f"{'PSF':<12}{result.refinement}")
+        typer.echo(f"{'Refined PSF':<12}{result.refinement}")
     typer.echo(f"{'Method':<12}{result.solver}, prior {result.prior}{weight}")
     if chosen := result.provenance.get("weight"):
         typer.echo(f"{'Weight':<12}{chosen}")

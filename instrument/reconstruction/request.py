@@ -29,6 +29,7 @@ from recon.reconstruction.choice import Choice
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem, Stage
+from recon.reconstruction.psf_refinement import refined
 from recon.reconstruction.reconstruct import reconstruct
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choice_for
@@ -90,7 +91,8 @@ class _Request:
         Raises BenchError where it would not be asked for all of it.
         """
         _require_choice("--explain", self.options.model)
-        return choice_for(Problem.of(self._measurement(job), job.calibration, self.options))
+        problem = Problem.of(self._measurement(job), job.calibration, self.options)
+        return choice_for(refined(problem)[0] if self.options.refine_psf else problem)
 
     def _measurement(self, job: Job) -> Measurement:
         """Return a job's photograph with what is known of it."""

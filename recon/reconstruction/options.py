@@ -244,7 +244,7 @@ class ReconstructionOptions:
     )
     refine_psf: bool = option(
         False,
-        help="First fit the PSFs' size and rotation to the photograph itself, judged on held-out pixels.",
+        help="First fit the PSFs' size and rotation to the photograph.",
         label="Refine the PSF",
         group=_CHOICE,
         applies=("picture", "volume"),

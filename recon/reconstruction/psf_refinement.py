@@ -59,10 +59,16 @@ TILES = 4
 """Along each axis of the photograph, judged apart: how much they differ tells how sure the whole is."""
 SEARCH_STEP_PX = 1.0
 """Steps of the search, binned pixels at the pattern's root mean square radius."""
+LEAST_RADIUS_PX = 20.0
+"""Of a pattern, by which the steps go: size and turn of a smaller one hardly matter, and are not overdone."""
 LARGEST = 0.1
 """Change of size, and turn in radians, that are searched."""
 FIT_STEPS_PX = (0.5, 0.3)
 """The same of the two fits, one after the other."""
+LEAST = 1e-12
+"""Mean square of what is left, below which tiles do not differ."""
+TOLD_DEG = 1.0
+"""Standard deviation of the turn, degrees, from which the photograph tells nothing."""
 CERTAIN = 3.0
 """Standard errors by which held-out pixels, and the parameters, must differ for a copy to be the better."""
 
@@ -140,6 +146,8 @@ class Refinement:
         left = f"{self.given:.3g} to {self.found:.3g} times the noise"
         if self.helps:
             return f"fits better {copy}: fine structure left on held-out pixels falls from {left}"
+        if not 0 < self.rotation_error_deg <= TOLD_DEG:
+            return "taken as it is: this photograph does not tell how its PSF is turned"
         return f"taken as it is: {copy} it fits no better for certain ({left} on held-out pixels)"
 
 
@@ -202,7 +210,7 @@ def refine_psf(
     )
     given, found = trials.judged(0 * fit.place), trials.judged(fit.place)
     how, errors = _transformation(fit.place), np.sqrt(np.diag(fit.covariance))
-    ratio = np.log(given / found)
+    ratio = np.log(np.maximum(given, LEAST) / np.maximum(found, LEAST))
     scatter = float(np.std(ratio, ddof=1)) / np.sqrt(len(ratio))
     count(1.0)
     return Refinement(
@@ -212,7 +220,7 @@ def refine_psf(
         float(np.sqrt(given.mean())),
         float(np.sqrt(found.mean())),
         float(np.mean(ratio)) / max(scatter, 1e-12),
-        float(np.sqrt(fit.place @ np.linalg.solve(fit.covariance, fit.place))),
+        float(np.sqrt(fit.place @ np.linalg.pinv(fit.covariance, hermitian=True) @ fit.place)),
         time.perf_counter() - began,
     )
 
@@ -317,7 +325,7 @@ def _radius_px(psfs: Array) -> float:
     light = np.maximum(psfs, 0).sum(axis=(0, 1), dtype=np.float64)
     rows, columns = (np.arange(n) - (n - 1) / 2 for n in light.shape)
     square = rows[:, None] ** 2 + columns**2
-    return max(float(np.sqrt((light * square).sum() / max(light.sum(), 1e-30))), 1.0)
+    return max(float(np.sqrt((light * square).sum() / max(light.sum(), 1e-30))), LEAST_RADIUS_PX)
 
 
 def _copied(depths: Depths, how: Transformation) -> Depths:

@@ -97,3 +97,11 @@ def test_of_volumes_the_rotation_alone_is_fitted() -> None:
     assert found.transformation.scale == 1
     assert abs(found.transformation.rotation_deg) == pytest.approx(3.0, abs=0.3)
     assert "larger" not in str(found)
+
+
+@pytest.mark.parametrize("photograph", [np.zeros((16, 20)), np.full((16, 20), 7.0)])
+def test_a_photograph_that_tells_nothing_says_so(photograph: np.ndarray) -> None:
+    psf = np.random.default_rng(1).random(photograph.shape).astype(np.float32)
+    found = refine_psf(Problem.of(photograph, psf))
+    assert not found.helps
+    assert "does not tell" in str(found)
