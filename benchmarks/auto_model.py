@@ -148,7 +148,8 @@ def summary(rows: list[dict]) -> str:
     gap = float(np.median([r["auto_db"] - r["best_db"] for r in rows]))
     return (
         f"auto is within {WITHIN_DB} dB of the best fixed model on {near} of {len(rows)} scenes "
-        f"({near / len(rows):.0%}; through measured PSFs {near_measured} of {len(measured)}), at a median of {ratio:.2f} times the largest model's time; median "
+        f"({near / len(rows):.0%}; through measured PSFs {near_measured} of {len(measured)}), at a median of "
+        f"{ratio:.2f} times the largest model's time; median "
         f"difference {gap:+.2f} dB."
     )
 

@@ -6,8 +6,8 @@ tuned on with other seeds (tuning list: ``--seed-offset`` 0, 1000, 2000, 3000, 5
 1128, 3101 to 3128 and 5101 to 5128). Those that judge are new, and three of each kind: one more or less is
 chance.
 
-Kinds named ``hand`` and ``usaf`` are rendered through the PSFs of the measured sets, with stray light as it lies
-on their photographs: they need the data (``DIFFUSERBENCH_DATA``, or ``../shared/data``).
+Kinds named ``hand`` and ``usaf`` are rendered through the PSFs of the measured sets, with stray light as it
+lies on their photographs: they need the data (``DIFFUSERBENCH_DATA``, or ``../shared/data``).
 """
 
 from __future__ import annotations
