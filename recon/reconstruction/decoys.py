@@ -23,6 +23,7 @@ from recon.verdict.calibration_check import (
     FAR,
     GIVEN,
     CalibrationCheck,
+    Fit,
     Score,
     check_of,
     near_decoys,
@@ -43,14 +44,17 @@ MOST_DECOYS = 11
 cent."""
 ALIKE = 0.7
 """Likeness from which a far decoy tells nothing, as of regular lenslets, which are their own mirror image."""
+VARIED = 0.35
+"""Difference of a field's PSFs from the central one, relative to it, beyond which that one explains little
+more than any other pattern: with a background right calibrations looked foreign from 0.4 on."""
 
 
 def check_calibration(problem: Problem) -> CalibrationCheck | None:
     """Let a problem's calibration compete with its decoys on the channel that has most signal.
 
     One convolution a depth by the central PSFs, as few pixels as still tell one per cent of size; of PSFs
-    that vary over the field only whether they are the photograph's at all. None where the light is patterned
-    or the camera model comes from outside: nothing is known of such.
+    that vary over the field only whether they are the photograph's at all. None where the light is patterned,
+    the camera model comes from outside, or the PSFs vary too much: nothing is known of such.
     """
     if problem.patterned or problem.model in CAMERAS:
         return None
@@ -89,7 +93,9 @@ def check_calibration(problem: Problem) -> CalibrationCheck | None:
     while scores[best].objective < scores[before].objective and len(scores) < MOST_DECOYS:
         before, best = best, Transformation(scale=best.scale**2, rotation_deg=2 * best.rotation_deg)
         scores[best], _ = _score(posed(best))
-    return check_of(scores, pixels)
+    check = check_of(scores, pixels)
+    too_varied = given.depths.varies and given.depths.field_error > VARIED
+    return None if too_varied and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
 
 
 def _on_sensor(psfs: Floats, shape: tuple[int, int]) -> Floats:

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from recon import Calibration, reconstruct
+from recon import Calibration, Geometry, reconstruct
 from recon.camera.transformed import Transformation, transformed
 from recon.errors import InputError
 from recon.optics.diffuser import smooth_diffuser
@@ -16,9 +16,11 @@ from recon.optics.render import render
 from recon.optics.scene import bar_target, picture
 from recon.optics.wave import WavePropagator
 from recon.reconstruction.decoys import check_calibration
+from recon.reconstruction.options import ReconstructionOptions as Options
 from recon.reconstruction.problem import Problem
 from recon.verdict.calibration_check import BETWEEN, FAR, GIVEN, Fit, Score, check_of, near_decoys
 from recon.verdict.judge import Region, Verdict
+from tests.golden import inputs
 
 Image = npt.NDArray[np.float32]
 GRID = PixelGrid((96, 96), 13.0)
@@ -90,6 +92,15 @@ def test_volumes_are_told_by_turns(seen: tuple[Image, Image]) -> None:
     assert right is not None
     assert right.fit is Fit.FITS
     assert not any(how.scale != 1 for how in right.scores)
+
+
+@pytest.mark.parametrize(("stretch", "found"), [(0.2, Fit.FITS), (0.8, None)])
+def test_psfs_that_vary_much_over_the_field_are_not_accused(stretch: float, found: Fit | None) -> None:
+    grid = inputs.over_field(stretch=stretch)
+    calibration = Calibration(grid["psfs"], grid["positions_um"], geometry=Geometry(10.0, 5.0))
+    photograph = inputs.beads(1, stretch=stretch)
+    check = check_calibration(Problem.of(photograph, calibration, Options(estimate_background=True)))
+    assert (check and check.fit) is found
 
 
 NEAR = near_decoys((160, 160), volume=False)
