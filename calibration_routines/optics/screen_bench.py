@@ -82,7 +82,7 @@ def draw_pictures(
     def drawn(picture: Levels) -> Levels:
         return found.drawn(picture, (corner[0], corner[1]), cell, screen)
 
-    seeds = np.random.SeedSequence(asked.seed).generate_state(asked.pictures + asked.shapes).tolist()
+    seeds = np.random.SeedSequence(asked.seed).generate_state(asked.pictures + asked.judged).tolist()
     tones = [drawn(np.full(cells, level, np.uint8)) for level in TONES]
     levels = {
         DARK: [np.zeros(screen, np.uint8)],
@@ -121,11 +121,11 @@ class ScreenProcedure(Procedure):
                 f"The SLM of {bench.label} is no screen: it does not glow. To try it, write a bench that has "
                 "one: diffuserbench new screen.toml --screen"
             )
-        frames = asked.dark_frames + asked.average * (len(TONES) + asked.pictures + asked.shapes + 1)
+        frames = asked.dark_frames + asked.average * (len(TONES) + asked.pictures + asked.judged + 1)
         return Outlook(
             (
                 f"A screen of {height} x {width} pixels; {SEARCH} photographs to find it, then "
-                f"{asked.pictures} random pictures, {asked.shapes} to judge by and {len(TONES)} grey levels: "
+                f"{asked.pictures} random pictures, {asked.judged} to judge by and {len(TONES)} grey levels: "
                 f"{frames} frames are kept.",
                 "Nothing else may shine: darken the room, and let the screen warm up.",
             )
@@ -166,11 +166,9 @@ ROUTINES = (
         files=FromFiles(
             options=PairFiles,
             named="pairs",
-            uses=("z_um", "channels"),
+            uses=("judged", "z_um", "channels"),
             look=lambda _asked, files: look_at_pairs(files),
-            make=lambda asked, files, out, listener: solve_pairs(
-                files, asked.z_um, not asked.channels, out, listener
-            ),
+            make=lambda asked, files, out, listener: solve_pairs(files, asked, out, listener),
         ),
         examples=(
             "diffuserbench new screen.toml --screen",

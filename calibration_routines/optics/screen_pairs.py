@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.optics.beads import MANY_PX
+from calibration_routines.optics.screen_solve import ScreenOptions
 from calibration_routines.procedure import Checked, Listener, Outcome
 from calibration_routines.psf.analysis import channels_first
 from instrument.files.atomic import require_new
@@ -55,12 +56,6 @@ class PairFiles(Checked):
         most=5,
         help="Exponent that makes a picture's values light.",
         default_words="found",
-        group=_FILES,
-    )
-    judged: int = option(
-        3,
-        least=0,
-        help="Photographs that are left out in turn to judge the calibration.",
         group=_FILES,
     )
     beyond: float = option(
@@ -171,9 +166,7 @@ def look_at_pairs(files: PairFiles) -> tuple[str, ...]:
     return words, "Note: pairs of more than a megapixel take long to solve; bin the files beforehand."
 
 
-def solve_pairs(
-    options: PairFiles, z_um: float | None, one_psf: bool, out: Path | None, listener: Listener
-) -> Outcome:
+def solve_pairs(options: PairFiles, asked: ScreenOptions, out: Path | None, listener: Listener) -> Outcome:
     """Solve the pairs of a folder for the PSF, judge it by photographs left out, and save the calibration.
 
     Raises BenchError when the calibration exists; errors as :func:`read_pairs` and ``psf_from_pictures``.
@@ -183,7 +176,7 @@ def solve_pairs(
     require_new(out, overwrite=False)
     listener.step("reading the pairs")
     pairs = read_pairs(options.pairs, options.dark)
-    settings = PictureSettings(one_psf=one_psf, beyond=options.beyond, gamma=options.gamma)
+    settings = PictureSettings(one_psf=not asked.channels, beyond=options.beyond, gamma=options.gamma)
     listener.step("solving for the PSF")
     solved = psf_from_pictures(
         pairs.photographs,
@@ -191,7 +184,7 @@ def solve_pairs(
         settings,
         on_progress=lambda _words, done: listener.share(done, 1.0),
     )
-    judged = np.unique(np.linspace(0, len(pairs.names) - 1, min(options.judged, len(pairs.names))).round())
+    judged = np.unique(np.linspace(0, len(pairs.names) - 1, min(asked.judged, len(pairs.names))).round())
     left_out: list[LeftOut] = []
     if len(judged) and len(pairs.names) > 2:
         listener.step("judging it by photographs left out")
@@ -205,7 +198,7 @@ def solve_pairs(
         )
     calibration = Calibration(
         psfs=solved.psf[None],
-        source_positions_um=np.array([(0.0, 0.0, np.nan if z_um is None else z_um)]),
+        source_positions_um=np.array([(0.0, 0.0, np.nan if asked.z_um is None else asked.z_um)]),
         geometry=Geometry(pixel_pitch_um=options.pixel_um, diffuser_distance_mm=options.distance_mm),
         quality=_quality(pairs, solved, left_out),
         provenance={

@@ -51,12 +51,12 @@ class ScreenOptions(Checked):
     """What to show and how to photograph it."""
 
     pictures: int = option(16, least=4, help="Random pictures to show.")
-    shapes: int = option(
+    judged: int = option(
         3,
         least=0,
         label="Pictures to judge by",
-        help="Pictures of random shapes, which the PSF is not made from: how they are reconstructed is its "
-        "quality.",
+        help="How these are reconstructed is the PSF's quality: further pictures, of random shapes; with "
+        "files, photographs that are left out in turn.",
     )
     average: int = option(4, least=2, label="Frames a picture", help="Frames a picture, averaged.")
     dark_frames: int = option(8, least=1, help="Frames of the black screen, averaged.", group=RARE)
@@ -209,11 +209,11 @@ def solve_screen(
         *frames.pairs(PICTURE, tone), settings, on_progress=lambda what, done: report(what, _SOLVING * done)
     )
     judged = []
-    if asked.shapes:
+    if asked.judged:
         photographs, pictures = frames.pairs(JUDGED, tone)
         factor = max(1, photographs.shape[2] // _JUDGED_ROWS)
         for number, (photograph, picture) in enumerate(zip(photographs, pictures, strict=True)):
-            report("judging", _SOLVING + (1 - _SOLVING) * number / asked.shapes)
+            report("judging", _SOLVING + (1 - _SOLVING) * number / asked.judged)
             data, psf, truth = (
                 np.moveaxis(block_mean(image, factor, about_axis=True), 0, -1)
                 for image in (photograph, solved.psf, picture)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from calibration_routines.optics.screen_pairs import PairFiles, read_pairs, solve_pairs
+from calibration_routines.optics.screen_solve import ScreenOptions
 from calibration_routines.procedure import Listener
 from instrument.cli import main
 from instrument.files.calibration_file import load_calibration
@@ -27,8 +28,8 @@ def pairs(tmp_path: Path) -> Path:
 
 
 def test_pairs_become_a_calibration_that_says_how_left_out_pictures_fare(pairs: Path, tmp_path: Path) -> None:
-    files = PairFiles(pairs=pairs, judged=1, pixel_um=5.0)
-    done = solve_pairs(files, 2e5, True, tmp_path / "calibration", Listener())
+    files = PairFiles(pairs=pairs, pixel_um=5.0)
+    done = solve_pairs(files, ScreenOptions(judged=1, z_um=2e5), tmp_path / "calibration", Listener())
     assert done.calibration is not None
     found = load_calibration(done.calibration)
     assert found.psfs.shape == (1, 1, 48, 56)
@@ -46,7 +47,7 @@ def test_pictures_that_do_not_belong_to_their_photographs_are_told_of(pairs: Pat
     (pairs / "truth_3.npy").replace(pairs / "keep.npy")
     (pairs / "truth_4.npy").replace(pairs / "truth_3.npy")
     (pairs / "keep.npy").replace(pairs / "truth_4.npy")
-    done = solve_pairs(PairFiles(pairs=pairs, judged=1), None, True, tmp_path / "calibration", Listener())
+    done = solve_pairs(PairFiles(pairs=pairs), ScreenOptions(judged=1), tmp_path / "calibration", Listener())
     assert not done.good
     assert "belong together" in done.verdict[-1]
 

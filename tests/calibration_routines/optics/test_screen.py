@@ -35,7 +35,7 @@ from instrument.runs.runner import RunStatus
 from recon.camera.registration import aligned, register
 from tests.mocks.listeners import Following
 
-ASKED = ScreenOptions(pictures=6, shapes=0, average=2, dark_frames=2, z_um=300e3)
+ASKED = ScreenOptions(pictures=6, judged=0, average=2, dark_frames=2, z_um=300e3)
 SMALL = (
     template("screen")
     .replace("color = false", "color = false\nbinning = 2\nexposure_ms = 20.0")
@@ -182,7 +182,7 @@ def test_what_is_wrong_with_the_light_is_named(changed: dict[str, object], words
     ("typed", "words"),
     [
         (["--pairs", "pairs", "--pictures", "5"], "leave out --pictures"),
-        (["--gamma", "2"], "--gamma go with --pairs"),
+        (["--gamma", "2"], "Only with --pairs: --gamma"),
     ],
 )
 def test_options_of_bench_and_files_do_not_mix(
