@@ -1,6 +1,6 @@
 """How often is a reconstruction called reliable that failed? Verdicts on unseen scenes.
 
-    python benchmarks/verdicts.py --first 5001 --count 200 --out docs/benchmarks/verdicts.md
+    python benchmarks/verdicts.py --first 6001 --count 200 --out docs/benchmarks/verdicts.md
     python benchmarks/verdicts.py --count 0 --keep verdicts.jsonl        judge what was kept once more
     python benchmarks/verdicts.py --first 3000 --count 200 --fit         add cases, and learn from all
 
@@ -33,7 +33,7 @@ from recon.errors import InputError
 from recon.evaluation.content import PICTURES
 from recon.evaluation.measured_sets import MEASURED
 from recon.evaluation.scene import Family, SceneSpec, spec_of
-from recon.evaluation.scene_trial import ITERATIONS, Options, judge, scene_of, solve
+from recon.evaluation.scene_trial import Options, judge, scene_of, solve
 from recon.verdict.calibration_check import CalibrationCheck, Fit
 from recon.verdict.cases import GROUPS, group_of
 from recon.verdict.chance import FEATURES, FEATURES_OF_VOLUMES, SHIPPED, fitted, is_whole, place_of
@@ -42,8 +42,8 @@ from recon.verdict.judge import Region, verdict_on
 from recon.verdict.map import worst
 
 FIRST_SEED = 60_000
-CASES = range(3000, 5000)
-UNSEEN_FROM = 5000
+CASES = range(3000, 6000)
+UNSEEN_FROM = 6000
 CASES_FILE = Path(__file__).with_name("verdict_cases.json")
 CLEAR = 0.7
 """Severity up to which a reconstruction is good beyond doubt, and not merely better than trivial."""
@@ -121,7 +121,7 @@ def run(first: int, count: int, keep: Path) -> None:
             name, auto, _ = method.partition(AUTO)
             options = replace(handled, model="auto", estimate_background=None) if auto else handled
             try:
-                result = solve(scene_of(spec), name, options, ITERATIONS["quick"])
+                result = solve(scene_of(spec), name, options, None)
             except InputError:
                 continue  # refused with a sentence: an image without light
             trial = judge(scene_of(spec), result)

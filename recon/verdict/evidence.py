@@ -21,7 +21,7 @@ from recon.solvers.base import IterationRecord, StoppingRules, StopReason
 Array = npt.NDArray[Any]
 
 NEAR_PX = 2
-"""Shifts up to here belong to the PSF's own sharpness."""
+"""Shifts up to here, or up to the full width of the PSF's autocorrelation, belong to its own sharpness."""
 NO_LESS = 1e-4
 """Least variance of the signal in units of the noise', so that ratios to it stay finite."""
 RING = (0.1, 0.25)
@@ -69,7 +69,7 @@ class Evidence:
     dimming: float
     """Least norm of a depth's PSF relative to the greatest: how much dimmer the farthest points are."""
     ambiguity: float
-    """Greatest correlation of a PSF with itself, three pixels or more apart: near 1 for a regular array."""
+    """Greatest correlation of a PSF with itself, farther apart than it is sharp: near 1 for a regular array."""
     unsettled: float
     """Change of the last iteration over ten times the tolerance, where a limit ended the run; else 0."""
     height: float | None = None
@@ -178,19 +178,25 @@ def _inner(one: Array, other: Array) -> float:
 
 
 def _ambiguity(psf: Array) -> float:
-    """Return the highest side peak of a PSF's autocorrelation, over the mean that any PSF has."""
-    shape = fft.fast_shape([2 * n for n in psf.shape])
+    """Return the highest side peak of a PSF's autocorrelation."""
+    height, width = psf.shape
+    shape = fft.fast_shape([2 * height, 2 * width])
     padded = np.zeros((1, *shape), np.float32)
-    padded[0, : psf.shape[0], : psf.shape[1]] = psf
+    padded[0, :height, :width] = psf
     spectrum = fft.rfft(padded)
     correlation = fft.irfft((spectrum * spectrum.conj()).astype(np.complex64), shape[1])[0]
-    peak = float(correlation[0, 0])
-    if peak <= 0:
+    if (peak := float(correlation[0, 0])) <= 0:
         return 0.0
-    near = NEAR_PX
-    correlation[: near + 1, : near + 1] = correlation[: near + 1, -near:] = 0
-    correlation[-near:, : near + 1] = correlation[-near:, -near:] = 0
-    return float(correlation.max()) / peak
+    near = max(NEAR_PX, _full_width(correlation[:height, 0]), _full_width(correlation[0, :width]))
+    away = correlation[: height + 1].copy()  # the rest is the same, turned
+    away[: near + 1, : near + 1] = away[: near + 1, -near:] = 0
+    return float(away.max()) / peak
+
+
+def _full_width(cut: Array) -> int:
+    """Return the width at half height of a peak at the beginning, above the base that it stands on, pixels."""
+    half = (float(cut[0]) + float(np.median(cut[: len(cut) // 2]))) / 2
+    return 2 * int(np.argmax(cut < half))
 
 
 def averaged(channels: list[Evidence]) -> Evidence:

@@ -61,8 +61,9 @@ NAMED = 0.1
 next to nothing is not asked for."""
 MOST_LIGHT = 10.0
 """By how much more light is supposed to lift what it relieves, at most: a hundred times the light."""
-UNSETTLED = 0.2
-"""``unsettled`` from which a reconstruction is not inside: its last change was twice the tolerance."""
+UNSETTLED = 0.7
+"""``unsettled`` from which a reconstruction is not inside: its last change was seven times the tolerance, and ten
+times are a failure."""
 CLIPPED = 0.02
 """Share of the used pixels at full scale from which that is named first."""
 OF_LIGHT = ("detail", "signal", "height")
