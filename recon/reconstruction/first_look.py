@@ -64,8 +64,8 @@ LAWS: Mapping[Literal["tv", "l1"], Law] = {
     "tv": Law(0.083, -0.95, 3.1, 1.2, 12.0, 8.0),
     "l1": Law(4.8, -0.58, 2.7, 0.0, 1.0, 32.0),
 }
-"""By what the prior counts; fitted on the scenes of `benchmarks/weights.py --tuning` and on the pairs. Of total
-variation nearly the maximum a posteriori's: what is left of the data over the scale of the steps."""
+"""By what the prior counts; fitted on the scenes of `benchmarks/weights.py --tuning` and on the pairs. That
+of total variation is nearly the maximum a posteriori: what is left of the data over the steps' scale."""
 
 
 @dataclass(frozen=True)
