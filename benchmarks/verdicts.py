@@ -10,8 +10,8 @@ read noise, density and size, and every other stress with a chance of one in fiv
 ``recon.verdict.map``, from the truth; the verdict sees the data alone. What is kept is evidence and severity,
 so that verdicts can be made again.
 
-Scenes 3000 to 4999 serve as cases, with 385 older ones (numbers below 2000, made with fixed weights and no
-measured PSFs) in ``benchmarks/verdict_cases.json``; from 5000 on nothing was learned or set.
+Scenes 3000 to 5999 serve as cases in ``benchmarks/verdict_cases.json``, with older volumes (numbers below
+2000, made with fixed weights and no measured PSFs); from 6000 on nothing was learned or set.
 """
 
 from __future__ import annotations

@@ -30,14 +30,13 @@ FLOOR: Mapping[str, float] = {
     "height": 0.5,
     "peaks": 1.0,
     "missed": 0.03,
-    "unsettled": 0.05,
 }
 """Below these nothing can be told from zero, :data:`LEAST` for others; above, ratios count."""
 LEAST = 0.01
 NOTHING = 1e-3
 FEATURES = (
     *("detail", "unexplained", "load", "signal", "erased", "saturated", "ambiguity"),
-    *("grain", "lit", "edges", "residual", "unsettled"),
+    *("grain", "lit", "edges", "residual"),
 )
 """Evidence that is asked of pictures. ``grain`` is that of edges over lit voxels, ``residual`` what is left
 of the data in units of their noise."""

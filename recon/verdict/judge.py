@@ -61,9 +61,11 @@ NAMED = 0.1
 next to nothing is not asked for."""
 MOST_LIGHT = 10.0
 """By how much more light is supposed to lift what it relieves, at most: a hundred times the light."""
+ABOVE_NOISE = 2.0
+"""Residual in units of the noise from which noise is not what limits."""
 UNSETTLED = 0.7
-"""``unsettled`` from which a reconstruction is not inside: its last change was seven times the tolerance, and ten
-times are a failure."""
+"""``unsettled`` from which a reconstruction is not inside: its last change was seven times the tolerance, of
+which ten times are a failure."""
 CLIPPED = 0.02
 """Share of the used pixels at full scale from which that is named first."""
 OF_LIGHT = ("detail", "signal", "height")
@@ -299,7 +301,7 @@ def _relieved(
     """Return the stresses that are worse than in good cases, by what is gained where one is as in those.
 
     More light relieves all that it relieves at once, and the one that lacks most is named for it; what is not
-    explained stays the same share, and so stands out of the noise.
+    explained stays the same share, and so stands out of the noise: where it does already, none is asked for.
     """
     place = place_of(numbers, chances.features)
     lacking = {
@@ -308,8 +310,8 @@ def _relieved(
         if name in BETTER
     }
     lit = {name: numbers[name] for name in OF_LIGHT if name in lacking}
-    dimmest = max(lit, key=lambda name: lacking[name])
-    brighter = min(float(np.exp(max(lacking[dimmest], 0.0))), MOST_LIGHT)
+    dimmest = None if residual_of(numbers) >= ABOVE_NOISE else max(lit, key=lambda name: lacking[name])
+    brighter = 1.0 if dimmest is None else min(float(np.exp(max(lacking[dimmest], 0.0))), MOST_LIGHT)
     findings = []
     for name, lack in lacking.items():
         if lack <= 0 or (name in lit and name != dimmest):
