@@ -319,7 +319,7 @@ class Routine:
         return (self.options,) if self.files is None else (self.options, self.files.options)
 
     def useless(self, *, with_files: bool) -> set[str]:
-        """Return the names of options that say nothing: those of the bench with files, else those of files."""
+        """Return the names of options that say nothing: with files the bench's, else those of files."""
         if self.files is None:
             return set()
         own, of_files = ({field.name for field in fields(options)} for options in self.declared)
