@@ -21,7 +21,7 @@ from instrument.reconstruction.job import (
 )
 from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.reconstruction.preparation import darkest_block
-from instrument.runs.run import STATE
+from instrument.runs.run_files import STATE
 from recon.base.checks import require_noise, select_psf
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.camera.refocus import at_depth
