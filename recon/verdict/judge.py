@@ -182,6 +182,9 @@ class Verdict:
     """By which cases it was judged."""
     decided: str = ""
     """What decided instead of those cases, in words."""
+    held_out: float | None = None
+    """Where nothing else is known: by how much pixels that a shorter run did not see are missed, in units of
+    their noise."""
     calibration: CalibrationCheck | None = None
     """Whether the calibration is the photograph's own; None where that was not looked at."""
 
@@ -198,7 +201,8 @@ class Verdict:
             said += [f"{f.words}. {f.help}" for f in self.findings[:MOST]]
         elif self.region is Region.UNKNOWN and self.basis and not self.decided:
             said += [f"What sets it apart: {f.words}. {f.help}" for f in self.findings[:1]]
-            said += [f"The model leaves {_residual(self.evidence)} unexplained"]
+        if self.region is Region.UNKNOWN and self.decided != COMPUTED:
+            said += [left_unexplained(self.evidence, self.held_out)]
         return tuple(f"{s}." for s in said)
 
     def with_calibration(self, check: CalibrationCheck) -> Verdict:
@@ -220,6 +224,7 @@ class Verdict:
             "findings": [asdict(f) for f in self.findings],
             "evidence": dict(self.evidence),
             "basis": self.basis,
+            "held_out": self.held_out,
             "calibration": None if self.calibration is None else self.calibration.as_json(),
         }
 
@@ -283,6 +288,14 @@ def _region(
     if numbers["unexplained"] >= MOST_UNEXPLAINED or residual_of(numbers) >= MOST_RESIDUAL:
         return Region.NEAR, UNEXPLAINED.format(residual=_residual(numbers))
     return Region.INSIDE, ""
+
+
+def left_unexplained(numbers: Mapping[str, float], held_out: float | None) -> str:
+    """Say how far the data are explained, where no known case tells what that is worth."""
+    said = f"The model leaves {_residual(numbers)} unexplained"
+    if held_out is None:
+        return said
+    return f"{said}; pixels that a shorter run did not see are missed by {held_out:.1f} times the noise"
 
 
 def residual_of(numbers: Mapping[str, float]) -> float:
