@@ -39,27 +39,25 @@ def main() -> None:
     arguments = parser.parse_args()
     set_threads(arguments.threads)
     names, photographs, pictures = measured_pairs()
-    numbers = [names.index(name) for name in arguments.only or names]
     print("| picture | even | before, dB | now, dB | CPU s |\n|---|---|---|---|---|", flush=True)
     found: list[LeftOut] = []
-    for number in numbers:
+    for name in arguments.only or names:
         start = time.process_time()
-        found += leave_out(photographs, pictures, [number], binning=arguments.bin)
-        one, name = found[-1], names[number]
+        found += leave_out(photographs, pictures, names, only=[name], binning=arguments.bin)
+        one = found[-1]
         seconds = time.process_time() - start
         row = f"{name} | {one.flat_db:.1f} | {BEFORE_DB[name]:.1f} | {one.psnr_db:.2f} | {seconds:.0f}"
         print(f"| {row} |", flush=True)
-    before = np.mean([BEFORE_DB[names[one.number]] for one in found])
+    before = np.mean([BEFORE_DB[one.name] for one in found])
     print(f"| mean | | {before:.1f} | {np.mean([one.psnr_db for one in found]):.2f} | |")
     if arguments.out:
-        draw(found, block_mean(pictures, arguments.bin, about_axis=True), arguments.out)
+        shown = block_mean(pictures, arguments.bin, about_axis=True)
+        draw([(shown[names.index(one.name)], one) for one in found], arguments.out)
 
 
-def draw(found: list[LeftOut], pictures: np.ndarray, out: Path) -> None:
+def draw(found: list[tuple[np.ndarray, LeftOut]], out: Path) -> None:
     """Write pictures above, reconstructions below."""
-    columns = [
-        np.vstack([np.moveaxis(pictures[one.number], 0, -1), np.clip(one.image, 0, 1)]) for one in found
-    ]
+    columns = [np.vstack([np.moveaxis(picture, 0, -1), np.clip(one.image, 0, 1)]) for picture, one in found]
     sheet = np.hstack(columns) ** (1 / 1.5)
     scale = min(1.0, 1900 / sheet.shape[1])
     shown = cv2.resize(sheet[..., ::-1], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.optics.beads import MANY_PX
-from calibration_routines.optics.screen_solve import ScreenOptions
+from calibration_routines.optics.screen_solve import DRIFT, ScreenOptions, psf_lines, saved
 from calibration_routines.procedure import Checked, Listener, Outcome
 from calibration_routines.psf.analysis import channels_first
 from instrument.files.atomic import require_new
-from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import FileError
 from instrument.files.images import ImageFile, read_image
 from recon.base.declare import RARE, option
-from recon.blind.known_pictures import PicturePsf, PictureSettings, psf_from_pictures
-from recon.blind.left_out import LeftOut, leave_out
+from recon.blind.known_pictures import PictureSettings, psf_from_pictures
+from recon.blind.left_out import POOR_DB, LeftOut, leave_out
 from recon.types import Calibration, Geometry
 
 Floats = npt.NDArray[np.float32]
@@ -34,7 +30,6 @@ PHOTOGRAPHS, PICTURES = ("raw_", "photograph_"), ("truth_", "picture_")
 _FILES = "With image files"
 _SOLVER = PictureSettings()
 _JUDGED_ROWS = 128  # of the images that left-out photographs are judged on
-_POOR_DB = 3.0  # better than an even picture: with less the PSF explains nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +95,7 @@ def read_pairs(folder: Path, dark: float = 0.0) -> Pairs:
     """Read the pairs of a folder, in the order of their names; pictures are scaled to a peak of 1.
 
     Raises FileError when there are fewer than two pairs, a photograph has no picture or the other way round,
-    or sizes or channels differ.
+    two files have one name, or sizes or channels differ.
     """
     photographs, pictures = (_named(folder, beginnings) for beginnings in (PHOTOGRAPHS, PICTURES))
     alone = sorted(set(photographs) ^ set(pictures))
@@ -133,12 +128,18 @@ def read_pairs(folder: Path, dark: float = 0.0) -> Pairs:
 def _named(folder: Path, beginnings: Sequence[str]) -> dict[str, Path]:
     if not folder.is_dir():
         raise FileError(folder, "is no folder.", "Name the folder that holds the pairs raw_NAME, truth_NAME.")
-    return {
-        file.stem.removeprefix(beginning): file
-        for beginning in beginnings
-        for file in folder.glob(f"{beginning}*")
-        if file.suffix != ".json"
-    }
+    found: dict[str, Path] = {}
+    for beginning in beginnings:
+        for file in sorted(folder.glob(f"{beginning}*")):
+            name = file.stem.removeprefix(beginning)
+            if file.suffix == ".json":
+                continue
+            if name in found:
+                raise FileError(
+                    file, f"has the name {name} of {found[name].name}, too.", "Keep one of the two."
+                )
+            found[name] = file
+    return found
 
 
 def _of_shape(image: ImageFile, first: ImageFile) -> Floats:
@@ -184,68 +185,47 @@ def solve_pairs(options: PairFiles, asked: ScreenOptions, out: Path | None, list
         settings,
         on_progress=lambda _words, done: listener.share(done, 1.0),
     )
-    judged = np.unique(np.linspace(0, len(pairs.names) - 1, min(asked.judged, len(pairs.names))).round())
-    left_out: list[LeftOut] = []
-    if len(judged) and len(pairs.names) > 2:
+    numbers = np.linspace(0, len(pairs.names) - 1, min(asked.judged, len(pairs.names))).round().astype(int)
+    judged: list[LeftOut] = []
+    if len(numbers) and len(pairs.names) > 2:
         listener.step("judging it by photographs left out")
-        left_out = leave_out(
+        judged = leave_out(
             pairs.photographs,
             pairs.pictures,
-            [int(n) for n in judged],
+            pairs.names,
             settings,
+            only=[pairs.names[number] for number in np.unique(numbers)],
             binning=max(1, pairs.photographs.shape[2] // _JUDGED_ROWS),
             on_progress=lambda _words, done: listener.share(done, 1.0),
         )
-    calibration = Calibration(
-        psfs=solved.psf[None],
-        source_positions_um=np.array([(0.0, 0.0, np.nan if asked.z_um is None else asked.z_um)]),
-        geometry=Geometry(pixel_pitch_um=options.pixel_um, diffuser_distance_mm=options.distance_mm),
-        quality=_quality(pairs, solved, left_out),
-        provenance={
-            "made_by": f"diffuserbench {version('diffuserbench')}",
-            "utc": datetime.now(UTC).isoformat(timespec="seconds"),
-            "method": "photographs of known pictures, non-negative least squares",
-            "pairs": str(options.pairs.resolve()),
-            "simulated": pairs.simulated,
+    calibration, path = saved(
+        out,
+        solved,
+        judged,
+        asked.z_um,
+        Geometry(pixel_pitch_um=options.pixel_um, diffuser_distance_mm=options.distance_mm),
+        {
+            "pairs": list(pairs.names),
+            "gamma": solved.gamma,
+            "gains": solved.gains.tolist(),
+            "brightness": solved.brightness.tolist(),
+            "stray": solved.stray.tolist(),
         },
+        {"pairs": str(options.pairs.resolve()), "simulated": pairs.simulated},
     )
-    path = save_calibration(calibration, out)
-    good = not left_out or all(one.psnr_db > one.flat_db + _POOR_DB for one in left_out)
-    return Outcome(
-        verdict=tuple(_lines(pairs, solved, left_out, good)), good=good, calibration=path, result=calibration
-    )
+    good = all(one.psnr_db > one.flat_db + POOR_DB for one in judged)
+    verdict = tuple(_lines(calibration, good))
+    return Outcome(verdict=verdict, good=good, calibration=path, result=calibration)
 
 
-def _quality(pairs: Pairs, solved: PicturePsf, left_out: Sequence[LeftOut]) -> dict[str, Any]:
-    return {
-        "pairs": list(pairs.names),
-        "misfit": solved.misfit,
-        "gamma": solved.gamma,
-        "gains": solved.gains.tolist(),
-        "brightness": solved.brightness.tolist(),
-        "stray": solved.stray.tolist(),
-        "left_out": [
-            {"name": pairs.names[one.number], "psnr_db": one.psnr_db, "even_db": one.flat_db}
-            for one in left_out
-        ],
-    }
-
-
-def _lines(pairs: Pairs, solved: PicturePsf, left_out: Sequence[LeftOut], good: bool) -> list[str]:
-    lines = ["SIMULATED: a photograph comes from the simulated bench"] if pairs.simulated else []
-    lines += [
-        f"The PSF leaves {solved.misfit:.1%} of the photographs' standard deviation unexplained; the "
-        f"pictures' gamma is {solved.gamma:.2f}"
-    ]
-    spread = float(np.abs(solved.brightness - 1).max())
-    if spread > 0.02:
-        lines += [f"The photographs' exposures differ by up to {spread:.0%} from their pictures' (taken out)"]
-    if left_out:
-        lines += ["Photographs left out, reconstructed with the PSF from the others, against their pictures:"]
-        lines += [
-            f"  {pairs.names[one.number]:<12}{one.psnr_db:.1f} dB (an even picture: {one.flat_db:.1f} dB)"
-            for one in left_out
-        ]
+def _lines(calibration: Calibration, good: bool) -> list[str]:
+    quality = calibration.quality
+    lines = ["SIMULATED: a photograph comes from the simulated bench"] * calibration.provenance["simulated"]
+    lines += [f"The pictures' gamma is {quality['gamma']:.2f}."]
+    if quality["wander"] > DRIFT:
+        differ = f"Exposures differ by up to {quality['wander']:.0%} from what the pictures say (taken out)."
+        lines += [differ]
+    lines += psf_lines(quality)
     if not good:
         lines += [
             "Quality: left-out photographs are hardly reconstructed: do photographs and pictures belong "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -24,9 +24,8 @@ from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from recon.base.blocks import block_mean
 from recon.base.declare import RARE, option
-from recon.blind.known_pictures import PictureSettings, psf_from_pictures
-from recon.blind.left_out import fare
-from recon.reconstruction.reconstruct import reconstruct
+from recon.blind.known_pictures import PicturePsf, PictureSettings, psf_from_pictures
+from recon.blind.left_out import POOR_DB, LeftOut, judged_by
 from recon.types import Calibration, Geometry
 
 Floats = npt.NDArray[np.float32]
@@ -42,7 +41,6 @@ _SOLVER = PictureSettings(beyond=0.0, saturated=None, gamma=1.0, rounds=1, psf_i
 """Nothing is unknown but the PSF: black is taken off, the tone is measured, and nothing else shines."""
 _SOLVING = 0.8  # of the work; the rest is judging
 _JUDGED_ROWS = 256  # of the images that are reconstructed to judge by
-_POOR_DB = 3.0  # better than an even picture: with less the PSF explains nothing
 _HOT_SHARE = 1e-3  # of pixels that may be at full scale: hot ones
 
 
@@ -208,50 +206,92 @@ def solve_screen(
     solved = psf_from_pictures(
         *frames.pairs(PICTURE, tone), settings, on_progress=lambda what, done: report(what, _SOLVING * done)
     )
-    judged = []
+    judged: list[LeftOut] = []
     if asked.judged:
         photographs, pictures = frames.pairs(JUDGED, tone)
         factor = max(1, photographs.shape[2] // _JUDGED_ROWS)
-        for number, (photograph, picture) in enumerate(zip(photographs, pictures, strict=True)):
-            report("judging", _SOLVING + (1 - _SOLVING) * number / asked.judged)
-            data, psf, truth = (
-                np.moveaxis(block_mean(image, factor, about_axis=True), 0, -1)
-                for image in (photograph, solved.psf, picture)
-            )
-            image = reconstruct(np.ascontiguousarray(data), np.ascontiguousarray(psf)).image
-            judged.append((fare(image.reshape(truth.shape), truth)[0], fare(np.zeros_like(truth), truth)[0]))
+        for photograph, picture in zip(photographs, pictures, strict=True):
+            report("judging", _SOLVING + (1 - _SOLVING) * len(judged) / asked.judged)
+            name = f"shapes {len(judged) + 1}"
+            judged.append(judged_by(solved.psf, photograph, picture, name, factor))
     quality = {
         "marks": record.map.marks,
         "registration_px": record.map.misfit_px,
         "gamma": tone.gamma,
         "tone": list(zip(tone.levels, tone.light, strict=True)),
         "flicker": frames.flicker(),
-        "wander": float(np.abs(solved.brightness - 1).max()),
         "drift": frames.level(AGAIN)[0] / tones[-1] - 1,
-        "misfit": solved.misfit,
-        "judged_db": [psnr for psnr, _ in judged],
-        "even_db": [even for _, even in judged],
         "saturated_frames": frames.saturated(),
     }
+    made = {"bench": record.bench, "simulated": record.simulated, "run": str(run.path)}
+    calibration, path = saved(
+        run.path / SCREEN.result,
+        solved,
+        judged,
+        asked.z_um,
+        binned(record.geometry, asked.binning),
+        quality,
+        made,
+    )
+    return ScreenCalibration(calibration, path, tone, tuple(findings_of(calibration.quality)))
+
+
+def saved(
+    path: Path,
+    solved: PicturePsf,
+    judged: Sequence[LeftOut],
+    z_um: float | None,
+    geometry: Geometry,
+    quality: dict[str, Any],
+    made: dict[str, Any],
+) -> tuple[Calibration, Path]:
+    """Save a PSF from known pictures as a calibration.
+
+    Parameters
+    ----------
+    path : Path
+        Its folder; CalibrationError as ``save_calibration``.
+    solved : PicturePsf
+    judged : sequence of LeftOut
+        How pictures fare that it was not made from.
+    z_um : float or None
+        Of the pictures, from the diffuser.
+    geometry : Geometry
+    quality, made : dict
+        What is to be kept besides, of how good it is and where it comes from.
+    """
     calibration = Calibration(
         psfs=solved.psf[None],
-        source_positions_um=np.array([(0.0, 0.0, asked.z_um if asked.z_um is not None else np.nan)]),
-        geometry=binned(record.geometry, asked.binning),
-        quality=quality,
+        source_positions_um=np.array([(0.0, 0.0, np.nan if z_um is None else z_um)]),
+        geometry=geometry,
+        quality={
+            **quality,
+            "misfit": solved.misfit,
+            "wander": float(np.abs(solved.brightness - 1).max()),
+            "left_out": [one.to_json() for one in judged],
+        },
         provenance={
             "made_by": f"diffuserbench {version('diffuserbench')}",
             "utc": datetime.now(UTC).isoformat(timespec="seconds"),
-            "method": "random pictures on a screen, non-negative least squares",
-            "bench": record.bench,
-            "simulated": record.simulated,
-            "run": str(run.path),
+            "method": "photographs of known pictures, non-negative least squares",
+            **made,
         },
     )
-    path = save_calibration(calibration, run.path / SCREEN.result)
-    return ScreenCalibration(calibration, path, tone, tuple(findings_of(quality)))
+    return calibration, save_calibration(calibration, path)
 
 
-def findings_of(quality: dict[str, Any]) -> list[str]:
+def psf_lines(quality: Mapping[str, Any]) -> list[str]:
+    """Return what a PSF from known pictures explains, and how others fare with it, in lines."""
+    lines = [f"PSF: leaves {quality['misfit']:.1%} of the photographs' standard deviation unexplained."]
+    if quality["left_out"]:
+        lines += ["Photographs that it was not made from, reconstructed, against their pictures:"]
+    return lines + [
+        f"  {one['name']:<12}{one['psnr_db']:.1f} dB (an even picture: {one['even_db']:.1f} dB)"
+        for one in quality["left_out"]
+    ]
+
+
+def findings_of(quality: Mapping[str, Any]) -> list[str]:
     """Return what is wrong with the screen's light, or with what the PSF explains, in words."""
     findings = []
     if quality["flicker"] > FLICKER:
@@ -267,7 +307,7 @@ def findings_of(quality: dict[str, Any]) -> list[str]:
         )
     if quality["saturated_frames"]:
         findings.append(f"{quality['saturated_frames']} frames have saturated pixels: dim the screen")
-    if any(p < even + _POOR_DB for p, even in zip(quality["judged_db"], quality["even_db"], strict=True)):
+    if any(one["psnr_db"] < one["even_db"] + POOR_DB for one in quality["left_out"]):
         findings.append(
             "pictures that it was not made from are hardly reconstructed with it: did screen, diffuser or "
             "camera move, or did other light change?"
@@ -284,12 +324,6 @@ def screen_lines(done: ScreenCalibration) -> list[str]:
         f"pixels; gamma {quality['gamma']:.2f}.",
         f"Light: steady within {quality['flicker']:.2%} from frame to frame, {quality['wander']:.2%} from "
         f"picture to picture (taken out) and {abs(quality['drift']):.2%} over the run.",
-        f"PSF: leaves {quality['misfit']:.1%} of the photographs' standard deviation unexplained.",
+        *psf_lines(quality),
     ]
-    if quality["judged_db"]:
-        decibels = ", ".join(f"{psnr:.1f}" for psnr in quality["judged_db"])
-        even = np.mean(quality["even_db"])
-        lines += [
-            f"Pictures that it was not made from, reconstructed: {decibels} dB (an even picture: {even:.1f})."
-        ]
     return [*lines, *(f"Quality: {finding}." for finding in done.findings)]

@@ -17,6 +17,8 @@ Floats = npt.NDArray[np.float32]
 Image = npt.NDArray[Any]
 Progress = Callable[[str, float], object]
 
+POOR_DB = 3.0
+"""Better than an even picture: with less a PSF explains nothing."""
 _SHIFT_PX = 4  # that a reconstruction may be off the picture by
 _SOLVING = 0.8  # of the work on a photograph; the rest is its reconstruction
 
@@ -27,20 +29,24 @@ class LeftOut:
 
     Attributes
     ----------
-    number : int
-        Of the photograph, from 0.
+    name : str
+        Of the photograph.
     psnr_db : float
         As :func:`fare` gives it.
     flat_db : float
         What an even picture would have.
     image : ndarray, float32, (height, width, n_channels)
-        The reconstruction, in the picture's brightness.
+        The reconstruction, in the light that the picture shows.
     """
 
-    number: int
+    name: str
     psnr_db: float
     flat_db: float
     image: Floats
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what is kept of it with a calibration."""
+        return {"name": self.name, "psnr_db": self.psnr_db, "even_db": self.flat_db}
 
 
 def fare(image: Image, picture: Image) -> tuple[float, Floats]:
@@ -71,12 +77,37 @@ def fare(image: Image, picture: Image) -> tuple[float, Floats]:
     return best
 
 
+def judged_by(psf: Floats, photograph: Image, light: Image, name: str = "", binning: int = 1) -> LeftOut:
+    """Reconstruct a photograph by default options with a PSF that was not made from it.
+
+    Parameters
+    ----------
+    psf, photograph : ndarray, (n_channels, height, width)
+    light : ndarray, the same shape
+        That it should show, linear.
+    name : str, optional
+        Of the photograph.
+    binning : int
+        Of all beforehand: the score hardly changes, the time with its square.
+
+    Errors as ``reconstruct``.
+    """
+    data, known, truth = (
+        np.ascontiguousarray(np.moveaxis(block_mean(images, binning, about_axis=True), 0, -1))
+        for images in (photograph, psf, light)
+    )
+    result = reconstruct(data, known, judged=False)
+    psnr_db, image = fare(result.image.reshape(truth.shape), truth)
+    return LeftOut(name, psnr_db, fare(np.zeros_like(truth), truth)[0], image)
+
+
 def leave_out(
     photographs: Image,
     pictures: Image,
-    numbers: Sequence[int],
+    names: Sequence[str],
     settings: PictureSettings | None = None,
     *,
+    only: Sequence[str] | None = None,
     binning: int = 1,
     on_progress: Progress | None = None,
 ) -> list[LeftOut]:
@@ -86,11 +117,13 @@ def leave_out(
     ----------
     photographs, pictures : ndarray, (n, n_channels, height, width)
         As :func:`~recon.blind.known_pictures.psf_from_pictures` takes them.
-    numbers : sequence of int
-        Which are left out, one after the other.
+    names : sequence of str
+        Of the photographs.
     settings : PictureSettings, optional
+    only : sequence of str, optional
+        Which are left out, one after the other; default all.
     binning : int
-        Of both beforehand: the score hardly changes, the time with its square.
+        Of both beforehand.
     on_progress : callable, optional
         Called with what is being done and the share done.
 
@@ -98,19 +131,17 @@ def leave_out(
     """
     report = on_progress or (lambda _what, _share: None)
     data, known = (block_mean(images, binning, about_axis=True) for images in (photographs, pictures))
-    found = []
-    for done, number in enumerate(numbers):
-        words = f"photograph {number + 1} left out"
+    found: list[LeftOut] = []
+    left_out = names if only is None else only
+    for name in left_out:
+        words = f"photograph {name} left out"
 
-        def solving(_what: str, share: float, done: int = done, words: str = words) -> None:
-            report(words, (done + _SOLVING * share) / len(numbers))
+        def solving(_what: str, share: float, words: str = words) -> None:
+            report(words, (len(found) + _SOLVING * share) / len(left_out))
 
+        number = list(names).index(name)
         others = np.arange(len(data)) != number
         solved = psf_from_pictures(data[others], known[others], settings, on_progress=solving)
-        report(words, (done + _SOLVING) / len(numbers))
-        photograph, picture = (np.moveaxis(images[number], 0, -1) for images in (data, known))
-        result = reconstruct(np.ascontiguousarray(photograph), np.moveaxis(solved.psf, 0, -1))
-        psnr_db, image = fare(result.image.reshape(picture.shape), picture)
-        flat_db = fare(np.zeros_like(picture), picture)[0]
-        found.append(LeftOut(number, psnr_db, flat_db, image))
+        solving("", 1.0)
+        found.append(judged_by(solved.psf, data[number], known[number] ** solved.gamma, name))
     return found

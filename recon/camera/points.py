@@ -19,7 +19,8 @@ _MARGIN = 4  # pixels around a PSF for the tails of a shift between pixels
 _LARGEST_MOVE_PX = 0.5
 _HALVINGS = 3
 _SAME_PX = 0.7  # points nearer to one another are one
-_WEAKEST = 0.15  # of the median light: what is dimmer is no bead of the slide
+WEAKEST = 0.15
+"""Of the median light: what is dimmer is no bead of a slide."""
 _SURE = 5.0  # times its own noise, for a bead to be believed
 BLOB_PX = 2
 """How far around its brightest pixel a bead's light may lie on the grid."""
@@ -187,8 +188,8 @@ def _fitted(patch: Array, data: Array) -> tuple[float, float]:
     return (inner / energy, inner**2 / energy) if energy > 0 else (0.0, 0.0)
 
 
-def cleaned(camera: PointImages, points: Points, noise: float) -> Points:
-    """Merge points that are one, and drop those too dim to be beads."""
+def cleaned(camera: PointImages, points: Points, noise: float, weakest: float = WEAKEST) -> Points:
+    """Merge points that are one, and drop those dimmer than noise allows or a share of the median light."""
     order = np.argsort(-points.light)
     places: list[Floats] = []
     light: list[float] = []
@@ -202,7 +203,7 @@ def cleaned(camera: PointImages, points: Points, noise: float) -> Points:
     if not light:
         return points
     sure = _SURE * noise / float(np.linalg.norm(camera.patch(np.zeros(2))[0]) + 1e-30)
-    least = max(_WEAKEST * float(np.median(light)), sure)
+    least = max(weakest * float(np.median(light)), sure)
     kept = np.array(light) >= least
     return Points(np.array(places)[kept].reshape(-1, 2), np.array(light)[kept])
 
@@ -222,7 +223,7 @@ def overlooked(camera: PointImages, left: Array, points: Points, noise: float) -
     correlation = np.fft.irfft2(spectra[0] * np.conj(spectra[1]), s=grid) / energy
     reach = [min(n, m // 2) for n, m in zip(left.shape, grid, strict=True)]
     rolled = np.roll(correlation, reach, axis=(0, 1))[: 2 * reach[0], : 2 * reach[1]]
-    least = max(_SURE * noise / np.sqrt(energy), 2 * _WEAKEST * float(np.median(points.light)))
+    least = max(_SURE * noise / np.sqrt(energy), 2 * WEAKEST * float(np.median(points.light)))
     peaks = (rolled == ndimage.maximum_filter(rolled, 5)) & (rolled > least)
     found = np.argwhere(peaks).astype(np.float64) - reach
     distant = [f for f in found if np.hypot(*(points.places - f).T).min() > 2 * _SAME_PX]

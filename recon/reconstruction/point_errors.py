@@ -107,7 +107,7 @@ def points_of(result: Reconstruction, problem: Problem) -> PointErrors:
     found = Points(found.places[:most], found.light[:most] / scale)
     covariance = np.zeros((0, 3, 3))
     for _ in range(ROUNDS):
-        found = _fitted(camera, part, cleaned(camera, found, 0.0))
+        found = _fitted(camera, part, cleaned(camera, found, 0.0, weakest=0.0))
         covariance = _covariance(camera, part, found)
         sure = found.light > SURE * np.sqrt(np.maximum(covariance[:, 2, 2], 0))
         sure &= np.isfinite(covariance).all(axis=(1, 2))

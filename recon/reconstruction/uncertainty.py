@@ -143,10 +143,10 @@ def uncertain(
     replicas = Replicas(solved, small)
     total = np.zeros(small.volume.shape)
     for number in range(REPEATS):
+        total += replicas.squared_error(number, replicas.shrink, cancel)
         if cancel is not None and cancel.is_set():
             words = "No uncertainty: it was interrupted before the repetitions were done."
             return replace(result, warnings=(*result.warnings, words))
-        total += replicas.squared_error(number, replicas.shrink, cancel)
         if on_stage is not None:
             done = number + 1
             on_stage(done / REPEATS, f"uncertainty: repetition {done} of {REPEATS}")
@@ -204,8 +204,11 @@ class Replicas:
         self._explained = problem.data - rest
         size = np.sqrt((rest**2).sum(axis=(1, 2)) / np.count_nonzero(problem.valid, axis=(1, 2)))
         self.misfit = float(size.max())
-        # A fit takes some of the noise along.
+        # A fit takes some of the noise along. Erased pixels have as much: turned, they fall on others.
         self._rest = rest * np.maximum(1, 1 / size)[:, None, None]
+        rng = np.random.default_rng(0)
+        for left, valid in zip(self._rest, problem.valid, strict=True):
+            left[~valid] = rng.choice(left[valid], np.count_nonzero(~valid))
 
     def _placed(self, part: Part, like: Reconstruction) -> Array:
         shape = part.camera.domain_shape

@@ -65,12 +65,17 @@ def _empty(folder: Path) -> None:
         file.unlink()
 
 
+def _double(folder: Path) -> None:
+    np.save(folder / "photograph_2.npy", np.ones((48, 56), np.float32))
+
+
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
         (_remove, "raw_2.npy: has no partner truth_2"),
         (_shrink, r"truth_2.npy: is 4 x 5 grey float32, but raw_0.npy is 48 x 56"),
         (_empty, "holds 0 pairs"),
+        (_double, "photograph_2.npy: has the name 2 of raw_2.npy, too"),
     ],
 )
 def test_a_folder_without_proper_pairs_is_refused(pairs: Path, spoil: object, words: str) -> None:

@@ -167,13 +167,13 @@ def test_pictures_are_as_asked_and_the_same_for_a_seed() -> None:
         ({"drift": -0.04}, "changed by 4.0% during the run"),
         ({"wander": 0.03}, "changed by 3.0% during the run"),
         ({"saturated_frames": 2}, "2 frames have saturated pixels"),
-        ({"judged_db": [11.0]}, "hardly reconstructed"),
+        ({"left_out": [{"psnr_db": 11.0, "even_db": 10.0}]}, "hardly reconstructed"),
         ({}, None),
     ],
 )
 def test_what_is_wrong_with_the_light_is_named(changed: dict[str, object], words: str | None) -> None:
     good = {"flicker": 1e-4, "drift": 0.0, "wander": 0.0, "saturated_frames": 0}
-    said = findings_of({**good, "judged_db": [20.0], "even_db": [10.0], **changed})
+    said = findings_of({**good, "left_out": [{"psnr_db": 20.0, "even_db": 10.0}], **changed})
     assert len(said) == (words is not None)
     assert words is None or words in said[0]
 

@@ -25,10 +25,14 @@ def test_a_measured_picture_left_out_is_reconstructed() -> None:
         names, photographs, pictures = measured_pairs()
     except InputError as missing:
         pytest.skip(str(missing))
-    number = names.index("394")
     said: list[float] = []
     (found,) = leave_out(
-        photographs, pictures, [number], binning=8, on_progress=lambda _words, share: said.append(share)
+        photographs,
+        pictures,
+        names,
+        only=["394"],
+        binning=8,
+        on_progress=lambda _words, share: said.append(share),
     )
     assert found.psnr_db > found.flat_db + 8
     assert said == sorted(said)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from recon import InputError, Measurement, Options, Problem, reconstruct, solve
+from recon.camera.points import FieldFunctions, PointImages, Points
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.point_errors import points_of, points_problem
-from recon.reconstruction.uncertainty import REPEATS, Mosaic, Uncertainty
+from recon.reconstruction.result import Reconstruction
+from recon.reconstruction.uncertainty import REPEATS, Mosaic, Replicas, Uncertainty
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +91,38 @@ def test_an_interruption_leaves_the_picture_and_says_what_is_missing(scene) -> N
     assert "No uncertainty" in found.warnings[-1]
 
 
+def test_an_interruption_within_the_last_repetition_is_one(scene, monkeypatch) -> None:
+    cancel, count = threading.Event(), 0
+
+    def solved(problem: Problem, **known: Any) -> Reconstruction:
+        nonlocal count
+        count += 1
+        if count == REPEATS:
+            cancel.set()
+        return solve(problem, **known)
+
+    monkeypatch.setattr("recon.reconstruction.uncertainty.solve", solved)
+    options = {"iterations": 3, "uncertainty": True, "judged": False}
+    assert reconstruct(scene.measurement, scene.calibration, cancel=cancel, **options).uncertainty is None
+
+
+def test_repetitions_have_noise_where_the_photograph_has_pixels(monkeypatch) -> None:
+    rng = np.random.default_rng(0)
+    image, psf = rng.normal(0, 1, (32, 32)), rng.random((32, 32)).astype(np.float32)
+    erasures = rng.random(image.shape) < 0.75
+    problem = Problem.of(Measurement(image, 1.0, erasures=erasures), psf, Options(iterations=2, judged=False))
+    result = solve(problem)
+    seen = []
+
+    def solved(problem: Problem, **_: object) -> Reconstruction:
+        seen.append(problem.data[problem.valid].std())
+        return result
+
+    monkeypatch.setattr("recon.reconstruction.uncertainty.solve", solved)
+    Replicas(problem, result).squared_error(0, 2)
+    assert seen == pytest.approx([1.0], abs=0.2)
+
+
 def test_colours_have_deviations_each() -> None:
     colour = make_scene("dense-picture", size=32, seed=3, channels=3, colourful=True)
     found = reconstruct(colour.measurement, colour.calibration, iterations=3, uncertainty=True, judged=False)
@@ -127,6 +163,26 @@ def test_points_have_error_bars_that_hold_their_places_and_light() -> None:
     assert (np.abs(error) <= 1.96 * points.deviations[:, :2]).mean() > 0.75
     assert np.abs(error).max() > 0.2 * np.median(points.deviations[:, :2])
     assert f"{len(true)}, placed to" in points.words
+
+
+def test_a_faint_point_among_bright_ones_is_one_and_does_not_spoil_their_error_bars() -> None:
+    rng = np.random.default_rng(0)
+    psf = np.zeros((48, 48), np.float32)
+    psf.flat[rng.choice(psf.size, 60, replace=False)] = 1
+    psf = gaussian_filter(psf, 1)
+    camera = PointImages(psf[None], FieldFunctions(0, np.zeros((1, 2))), psf.shape)
+    places = np.array([[-8.0, -6.0], [5.3, -7.2], [-6.4, 8.1], [7.0, 7.3], [0.2, 0.4]])
+    image = camera.image(Points(places, np.array([1000.0, 1000.0, 1000.0, 1000.0, 100.0])))
+    image += rng.normal(0, 2, image.shape).astype(np.float32)
+    problem = Problem.of(image, psf, Options(prior="l1", model="convolution", judged=False))
+    result = solve(problem)
+    own = points_problem(problem)
+    assert own is not None
+    points = points_of(result, own)
+    assert len(points.light) == len(places)
+    found = points.places - result.grid.centre
+    error = found - places[np.linalg.norm(found[:, None] - places, axis=2).argmin(axis=1)]
+    assert (np.abs(error) < 4 * points.deviations[:, :2]).all()
 
 
 def test_a_black_picture_has_no_points() -> None:
