@@ -168,7 +168,8 @@ ROUTINES = (
             named="pairs",
             uses=("judged", "z_um", "channels"),
             look=lambda _asked, files: look_at_pairs(files),
-            make=lambda asked, files, out, listener: solve_pairs(files, asked, out, listener),
+            make=solve_pairs,
+            folder="calibration-screen",
         ),
         examples=(
             "diffuserbench new screen.toml --screen",

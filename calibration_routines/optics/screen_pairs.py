@@ -16,6 +16,7 @@ from calibration_routines.psf.analysis import channels_first
 from instrument.files.atomic import require_new
 from instrument.files.errors import FileError
 from instrument.files.images import ImageFile, read_image
+from instrument.runs.run_control import RunControl
 from recon.base.declare import RARE, option
 from recon.blind.known_pictures import PictureSettings, psf_from_pictures
 from recon.blind.left_out import POOR_DB, LeftOut, leave_out
@@ -23,8 +24,6 @@ from recon.types import Calibration, Geometry
 
 Floats = npt.NDArray[np.float32]
 
-PAIRS_FOLDER = "calibration-screen"
-"""Where the command line writes the calibration."""
 PHOTOGRAPHS, PICTURES = ("raw_", "photograph_"), ("truth_", "picture_")
 """What names of files begin with, before what a photograph and its picture have in common."""
 _FILES = "With image files"
@@ -67,6 +66,7 @@ class PairFiles(Checked):
         None,
         unit="mm",
         above=0,
+        label="Diffuser to sensor",
         help="From diffuser to sensor.",
         default_words="not known",
         group=_FILES,
@@ -167,14 +167,20 @@ def look_at_pairs(files: PairFiles) -> tuple[str, ...]:
     return words, "Note: pairs of more than a megapixel take long to solve; bin the files beforehand."
 
 
-def solve_pairs(options: PairFiles, asked: ScreenOptions, out: Path | None, listener: Listener) -> Outcome:
+def solve_pairs(
+    asked: ScreenOptions, options: PairFiles, out: Path, control: RunControl, listener: Listener
+) -> Outcome:
     """Solve the pairs of a folder for the PSF, judge it by photographs left out, and save the calibration.
 
     Raises BenchError when the calibration exists; errors as :func:`read_pairs` and ``psf_from_pictures``.
     """
-    out = Path(PAIRS_FOLDER) if out is None else out
     assert options.pairs is not None
     require_new(out, overwrite=False)
+
+    def solving(_words: str, done: float) -> None:
+        control.check()
+        listener.share(done, 1.0)
+
     listener.step("reading the pairs")
     pairs = read_pairs(options.pairs, options.dark)
     settings = PictureSettings(one_psf=not asked.channels, beyond=options.beyond, gamma=options.gamma)
@@ -183,7 +189,7 @@ def solve_pairs(options: PairFiles, asked: ScreenOptions, out: Path | None, list
         pairs.photographs,
         pairs.pictures,
         settings,
-        on_progress=lambda _words, done: listener.share(done, 1.0),
+        on_progress=solving,
     )
     numbers = np.linspace(0, len(pairs.names) - 1, min(asked.judged, len(pairs.names))).round().astype(int)
     judged: list[LeftOut] = []
@@ -196,7 +202,7 @@ def solve_pairs(options: PairFiles, asked: ScreenOptions, out: Path | None, list
             settings,
             only=[pairs.names[number] for number in np.unique(numbers)],
             binning=max(1, pairs.photographs.shape[2] // _JUDGED_ROWS),
-            on_progress=lambda _words, done: listener.share(done, 1.0),
+            on_progress=solving,
         )
     calibration, path = saved(
         out,

@@ -140,18 +140,17 @@ def _of_files_or_bench(
     """Carry a routine out on files where they are named, else on the bench; refuse options of the other."""
     instead = routine.files
     assert instead is not None
-    of_files = {field.name for field in fields(instead.options)}
     named = next(o for o in options_of(instead.options) if o.name == instead.named).flag
     if getattr(files, instead.named) is None:
-        if useless := given.flags(*of_files):
+        if useless := given.flags(*routine.useless(with_files=False)):
             raise BenchError(
                 f"Only with {named}: {', '.join(useless)}. On the bench pictures are taken: leave out what "
                 f"is only for files, or give {named}."
             )
         carry_out(routine, options, bench, out, dry_run=dry_run)
         return
-    others = {field.name for field in fields(routine.options)} - set(instead.uses)
-    if useless := [*given.flags(*others), *(["--bench"] if bench is not None else [])]:
+    others = given.flags(*routine.useless(with_files=True))
+    if useless := [*others, *(["--bench"] if bench is not None else [])]:
         raise BenchError(f"With {named} nothing is photographed: leave out {' and '.join(useless)}.")
     console = Console()
     print_lines(console, instead.look(options, files))
@@ -159,7 +158,7 @@ def _of_files_or_bench(
         console.print("Dry run: nothing was solved.")
         return
     with TerminalListener(console) as listener:
-        done = instead.make(options, files, out, listener)
+        done = instead.make(options, files, out or Path(instead.folder), RunControl(), listener)
     print_outcome(console, done)
 
 

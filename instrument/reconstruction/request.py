@@ -21,7 +21,7 @@ from instrument.reconstruction.job import (
 )
 from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.reconstruction.preparation import darkest_block
-from instrument.runs.run import STATE
+from instrument.runs.run_files import STATE
 from recon.base.checks import require_noise, select_psf
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.camera.refocus import at_depth
@@ -30,7 +30,7 @@ from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.psf_refinement import refined
-from recon.reconstruction.reconstruct import reconstruct
+from recon.reconstruction.reconstruct import reconstruct, require_two_images
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choice_for
 from recon.reconstruction.solve import ITERATIONS
@@ -92,6 +92,7 @@ class _Request:
         """
         _require_choice("--explain", self.options.model)
         problem = Problem.of(self._measurement(job), job.calibration, self.options)
+        require_two_images(problem)
         return choice_for(refined(problem)[0] if self.options.refine_psf else problem)
 
     def _measurement(self, job: Job) -> Measurement:

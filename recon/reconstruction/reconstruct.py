@@ -80,8 +80,7 @@ def reconstruct(
     if not isinstance(measurement, Measurement):
         measurement = Measurement(measurement)
     problem = Problem.of(replace(measurement, **known), calibration, options)
-    if not problem.patterned:
-        require_photograph(problem.data, problem.depths.central[problem.n_planes // 2], problem.valid)
+    require_two_images(problem)
     if options.uncertainty and (reason := refused(problem)) is not None:
         raise InputError(f"{reason[0].upper()}{reason[1:]}.")
     refinement = None
@@ -97,6 +96,12 @@ def reconstruct(
     return (
         judged(result, problem, started=warm is not None) if options.judged else replace(result, basis=None)
     )
+
+
+def require_two_images(problem: Problem) -> None:
+    """Raise InputError where a photograph is its own PSF, or the two are swapped."""
+    if not problem.patterned:
+        require_photograph(problem.data, problem.depths.central, problem.valid)
 
 
 def given(

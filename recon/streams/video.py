@@ -22,7 +22,7 @@ from recon.reconstruction.measurement import Floats, Measurement, depths_of
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.reconstruct import given
+from recon.reconstruction.reconstruct import given, require_two_images
 from recon.reconstruction.selection import choice_for
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver
 from recon.solvers.base import Solver, StoppingRules
@@ -70,6 +70,8 @@ def stream_problem(
         doubt = _by_one_psf(calibration, options)
         options = replace(options, model="convolution")
     problem = Problem.of(replace(measurement, **known), calibration, options)
+    if choosing:
+        require_two_images(problem)
     if choosing and isinstance(calibration, Calibration):
         problem = with_background(problem, calibration)
     if doubt:

@@ -9,10 +9,11 @@ import pytest
 
 from calibration_routines.optics.screen_pairs import PairFiles, read_pairs, solve_pairs
 from calibration_routines.optics.screen_solve import ScreenOptions
-from calibration_routines.procedure import Listener
+from calibration_routines.procedure import Listener, Outcome
 from instrument.cli import main
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import FileError
+from instrument.runs.run_control import RunControl
 from tests.recon.blind.test_known_pictures import taken
 
 
@@ -27,9 +28,13 @@ def pairs(tmp_path: Path) -> Path:
     return folder
 
 
+def solve(files: PairFiles, asked: ScreenOptions, out: Path) -> Outcome:
+    return solve_pairs(asked, files, out, RunControl(), Listener())
+
+
 def test_pairs_become_a_calibration_that_says_how_left_out_pictures_fare(pairs: Path, tmp_path: Path) -> None:
     files = PairFiles(pairs=pairs, pixel_um=5.0)
-    done = solve_pairs(files, ScreenOptions(judged=1, z_um=2e5), tmp_path / "calibration", Listener())
+    done = solve(files, ScreenOptions(judged=1, z_um=2e5), tmp_path / "calibration")
     assert done.calibration is not None
     found = load_calibration(done.calibration)
     assert found.psfs.shape == (1, 1, 48, 56)
@@ -47,7 +52,7 @@ def test_pictures_that_do_not_belong_to_their_photographs_are_told_of(pairs: Pat
     (pairs / "truth_3.npy").replace(pairs / "keep.npy")
     (pairs / "truth_4.npy").replace(pairs / "truth_3.npy")
     (pairs / "keep.npy").replace(pairs / "truth_4.npy")
-    done = solve_pairs(PairFiles(pairs=pairs), ScreenOptions(judged=1), tmp_path / "calibration", Listener())
+    done = solve(PairFiles(pairs=pairs), ScreenOptions(judged=1), tmp_path / "calibration")
     assert not done.good
     assert "belong together" in done.verdict[-1]
 
