@@ -272,7 +272,7 @@ def _run(
         memory=part.memory_used(),
         noise_norm=part.noise_norm,
         residual=residual,
-        doubts=residual_in_words(problem, outcome.history, residual, part.noise_norm),
+        doubts=residual_in_words(problem, outcome, residual, part.noise_norm),
     )
 
 
