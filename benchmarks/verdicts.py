@@ -110,11 +110,16 @@ def scene(index: int) -> tuple[SceneSpec, Options]:
     return spec_of(family, **numbers), handled
 
 
-def run(first: int, count: int, keep: Path) -> None:
-    """Reconstruct scenes and append evidence and severity to a file, but for those that it has."""
+def run(first: int, count: int, keep: Path, most: int) -> None:
+    """Reconstruct scenes and append evidence and severity to a file, but for those that it has.
+
+    Those of more than ``most`` voxels are left out.
+    """
     done = {(e["index"], e["method"]) for e in read(keep)}
     for index in range(first, first + count):
         spec, handled = scene(index)
+        if spec.depths * int(np.prod(spec.shape)) > most:
+            continue
         for method in PICTURE_METHODS if spec.is_picture else VOLUME_METHODS:
             if (index, method) in done:
                 continue
@@ -261,12 +266,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--count", type=int, default=200, help="scenes to add")
     parser.add_argument("--first", type=int, default=UNSEEN_FROM, help="the first one's number")
+    parser.add_argument("--voxels", type=int, default=10**9, help="leave out scenes of more than so many")
     parser.add_argument("--keep", type=Path, default=Path("verdicts.jsonl"))
     parser.add_argument("--fit", action="store_true", help="learn from the cases and those that were kept")
     parser.add_argument("--out", type=Path, help="write the report")
     a = parser.parse_args()
     set_threads(1)
-    run(a.first, a.count, a.keep)
+    run(a.first, a.count, a.keep, a.voxels)
     entries = read(a.keep)
     if a.fit:
         learn(known_cases(entries))

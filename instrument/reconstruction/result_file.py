@@ -37,8 +37,8 @@ WHITE_PERCENTILE = 99.9
 class Outputs:
     """The files of one reconstruction: float32 TIFF, 8-bit preview, settings and history, and optional ones.
 
-    Those are a figure, a float32 TIFF of standard deviations, a table of points, and without a verdict a float32
-    TIFF of what is left of the data. A volume may be an OME-Zarr folder instead of a TIFF.
+    Those are a figure, a float32 TIFF of standard deviations, a table of points, and without a verdict one of
+    what is left of the data. A volume may be an OME-Zarr folder instead of a TIFF.
     """
 
     image: Path
