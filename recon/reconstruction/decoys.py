@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.base.blocks import block_mean
+from recon.base.checks import saturated_share
 from recon.camera.camera_model import CAMERAS
 from recon.camera.registration import likeness
 from recon.camera.transformed import Transformation, transformed
+from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
-from recon.reconstruction.problem import Problem
+from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import on_blocks
 from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.base import StoppingRules
@@ -26,6 +30,7 @@ from recon.verdict.calibration_check import (
     Fit,
     Score,
     check_of,
+    is_told,
     near_decoys,
 )
 
@@ -33,13 +38,21 @@ Floats = npt.NDArray[np.float32]
 
 LONGEST_PX = 160
 """Longest side that decoys are tried on, pixels, about: one per cent of it is a caustic's width."""
+MOST_ERASED, MOST_CLIPPED = 0.75, 0.5
+"""Shares of the blocks of pixels: with more of them erased blocks are smaller; with more of them clipped
+these are not erased, as a few pixels of a dim photograph share its largest count as well."""
 MOST_PLANES = 6
 """Depths that take part, evenly spaced."""
 ITERATIONS, OF_VOLUMES = 20, 10
 """Of pictures and volumes: a right PSF is far ahead long before they have settled."""
 WEIGHT = 1.0
 """Of total variation: as large as the noise that the adjoint of a PSF of unit energy passes on."""
-MOST_DECOYS = 11
+FINE_PX = 3.0
+"""Deviation of the Gaussian whose mean is taken off what is left: slow waves are left by unfinished
+iterations and stray light, and prefer smaller PSFs."""
+TILES = 4
+"""Along each axis of the photograph."""
+MOST_DECOYS = 12
 """With farther ones on the side of a near one that is better, each twice as far: to some eight degrees or per
 cent."""
 ALIKE = 0.7
@@ -49,7 +62,7 @@ VARIED = 0.35
 more than any other pattern: with a background right calibrations looked foreign from 0.4 on."""
 
 
-def check_calibration(problem: Problem) -> CalibrationCheck | None:
+def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> CalibrationCheck | None:
     """Let a problem's calibration compete with its decoys on the channel that has most signal.
 
     One convolution a depth by the central PSFs, as few pixels as still tell one per cent of size; of PSFs
@@ -63,39 +76,64 @@ def check_calibration(problem: Problem) -> CalibrationCheck | None:
     psfs = problem.depths.central
     planes = np.unique(np.linspace(0, len(psfs) - 1, MOST_PLANES).round().astype(int))
     psfs = _on_sensor(psfs[planes][:, own if psfs.shape[1] > 1 else slice(0, 1)], problem.sensor_shape)
-    factor = max(1, round(max(problem.sensor_shape) / LONGEST_PX))
-    valid = problem.valid[own]
-    photograph = on_blocks(problem.data[own], valid, 1.0, factor, flat=True)
-    if photograph.erasures is not None and np.all(photograph.erasures):
-        factor, photograph = 1, on_blocks(problem.data[own], valid, 1.0, 1, flat=True)
+    factor, photograph = _small(problem, own)
     psfs = block_mean(psfs, factor, about_axis=True)
-    options = ReconstructionOptions(
-        prior="tv",
-        model="convolution",
-        estimate_background=problem.smooth or problem.n_planes > 1,
-        drop_empty=False,
-    )
+    volume, lit = len(psfs) > 1, problem.smooth or problem.n_planes > 1
+    done = 0
 
-    def posed(how: Transformation) -> Problem:
+    def scored(how: Transformation, *, background: bool) -> Score:
+        nonlocal done
+        if on_stage is not None:
+            on_stage(done / (2 + len(decoys)), "judging: the calibration among its decoys")
+        done += 1
         copies = Calibration(transformed(psfs, how), np.full((len(psfs), 3), np.nan))
-        if len(psfs) > 1:  # depths by number: they only have to differ
+        if volume:  # depths by number: they only have to differ
             copies.source_positions_um[:] = [(0.0, 0.0, 1.0 + z) for z in range(len(psfs))]
-        return Problem.of(photograph, copies, options)
+        options = ReconstructionOptions(
+            prior="tv", model="convolution", estimate_background=background, drop_empty=False
+        )
+        return _score(Problem.of(photograph, copies, options))
 
     middle = psfs[len(psfs) // 2, 0]
     far = [how for how in FAR if likeness(transformed(middle, how), middle) < ALIKE]
-    scores, pixels = {}, 0
     given = problem.reduction.given if problem.reduction is not None else problem
-    near = () if given.depths.varies else near_decoys(psfs.shape[2:], volume=len(psfs) > 1)
-    for how in (GIVEN, BETWEEN, *near, *far):
-        scores[how], pixels = _score(posed(how))
+    near = () if given.depths.varies else near_decoys(psfs.shape[2:], volume=volume)
+    erased = 0 if photograph.erasures is None else np.count_nonzero(photograph.erasures)
+    decoys, pixels = (*near, *far), int(np.asarray(photograph.image).size - erased)
+    check = _competition(decoys, pixels, partial(scored, background=lit))
+    if check.fit is not Fit.FITS and not lit:
+        # Stray light, or light from beyond the field, which any PSF but the right one may explain better.
+        winner = check.better or GIVEN
+        if is_told(scored(winner, background=True), check.scores[winner], pixels):
+            check = _competition(decoys, pixels, partial(scored, background=True))
+    too_varied = given.depths.varies and given.depths.field_error > VARIED
+    return None if too_varied and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
+
+
+def _competition(
+    decoys: Sequence[Transformation], pixels: int, scored: Callable[[Transformation], Score]
+) -> CalibrationCheck:
+    """Score a calibration, its decoys, and farther ones on the side of a near one that is better."""
+    scores = {how: scored(how) for how in (GIVEN, BETWEEN, *decoys)}
+    near = [how for how in decoys if how not in FAR]
     before, best = GIVEN, min((GIVEN, *near), key=lambda how: scores[how].objective)
     while scores[best].objective < scores[before].objective and len(scores) < MOST_DECOYS:
         before, best = best, Transformation(scale=best.scale**2, rotation_deg=2 * best.rotation_deg)
-        scores[best], _ = _score(posed(best))
-    check = check_of(scores, pixels)
-    too_varied = given.depths.varies and given.depths.field_error > VARIED
-    return None if too_varied and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
+        scores[best] = scored(best)
+    return check_of(scores, pixels)
+
+
+def _small(problem: Problem, own: slice) -> tuple[int, Measurement]:
+    """Return a channel on blocks of pixels, as large ones as erasures and clipped pixels allow."""
+    factor = max(1, round(max(problem.sensor_shape) / LONGEST_PX))
+    counts, valid = problem.measurement.channels()[own], problem.valid[own]
+    if 0 < saturated_share(counts[valid]) * factor**2 < MOST_CLIPPED:
+        valid = valid & (counts < counts[valid].max())
+    while True:
+        photograph = on_blocks(problem.data[own], valid, 1.0, factor, flat=True)
+        if factor == 1 or photograph.erasures is None or np.asarray(photograph.erasures).mean() < MOST_ERASED:
+            return factor, photograph
+        factor //= 2
 
 
 def _on_sensor(psfs: Floats, shape: tuple[int, int]) -> Floats:
@@ -106,8 +144,8 @@ def _on_sensor(psfs: Floats, shape: tuple[int, int]) -> Floats:
     return whole
 
 
-def _score(problem: Problem) -> tuple[Score, int]:
-    """Reconstruct a problem of one channel in few iterations; return its score and pixels."""
+def _score(problem: Problem) -> Score:
+    """Reconstruct a problem of one channel in few iterations."""
     sensor = SOLVERS.named("admm-sensor")
     offered = sensor if sensor.accepts(problem) is None else SOLVERS.named("admm")
     part = Part(replace(problem, options=replace(problem.options, solver=offered.name)), slice(0, 1))
@@ -117,10 +155,23 @@ def _score(problem: Problem) -> tuple[Score, int]:
         outcome = offered.make(part, None).run(StoppingRules(iterations=iterations, tolerance=0.0))
         solution = np.maximum(part.lifted(outcome.solution), 0)
         background = part.background(solution) if part.removal is not None else None
-        residual = part.residual(solution, background)[part.valid].astype(np.float64)
+        residual, valid = part.residual(solution, background)[0].astype(np.float64), part.valid[0]
     finally:
         part.close()
     last = outcome.history[-1]
     prior = last.objective - 0.5 * last.data_residual**2
-    misfit = float(np.mean(residual**2))
-    return Score(misfit, misfit + 2 * prior / len(residual)), len(residual)
+    misfit = float(np.mean(residual[valid] ** 2))
+    return Score(misfit, misfit + 2 * prior / np.count_nonzero(valid), _fine(residual, valid))
+
+
+def _fine(residual: npt.NDArray[np.float64], valid: npt.NDArray[np.bool_]) -> tuple[float, ...]:
+    """Return the mean square of a residual (height, width) less its own local mean, tile by tile."""
+    from scipy.ndimage import gaussian_filter
+
+    known = valid.astype(np.float64)
+    local = gaussian_filter(residual * known, FINE_PX) / np.maximum(gaussian_filter(known, FINE_PX), 1e-6)
+    power = np.where(valid, residual - local, 0) ** 2
+    tile = [np.arange(n) * TILES // n for n in valid.shape]
+    label = (tile[0][:, None] * TILES + tile[1]).ravel()
+    count, total = np.bincount(label, known.ravel()), np.bincount(label, power.ravel())
+    return tuple((total[count > 0] / count[count > 0]).tolist())

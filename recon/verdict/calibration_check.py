@@ -7,6 +7,11 @@ the posterior's logarithm, half the squared residual in units of the noise and t
 natural logarithms of odds ("nats"). Where a background or noise leaves every PSF able to explain the data,
 the prior still tells, and where it does not either, that is said.
 
+Odds alone count noise as the only error. Cameras have others (light from beyond the field, depths between
+those calibrated, a pattern that varies), of which a bright photograph makes thousands of nats. So the tiles
+of a photograph vote as well: one PSF is better than another where it leaves less fine structure tile by tile,
+by more standard errors than tiles differ.
+
 What cannot be told: a PSF that is only displaced casts the same picture, displaced; one that is somewhat
 larger is that of a nearer scene; and so is, in a volume, a depth for another between those calibrated.
 """
@@ -26,7 +31,11 @@ GIVEN = Transformation()
 BETWEEN = Transformation(0.37, 0.37)
 """The calibration itself displaced by part of a pixel, which displaces the picture alone: interpolated as its
 decoys are. The better of the two counts as the given one."""
-FAR = (Transformation(mirrored=True), Transformation(rotation_deg=180.0))
+FAR = (
+    Transformation(mirrored=True),
+    Transformation(rotation_deg=180.0),
+    Transformation(mirrored=True, rotation_deg=180.0),
+)
 """Decoys that have as much light at as many places, and nothing to do with the photograph."""
 EDGE_PX = 0.6
 """By how much near decoys move a pattern's edge at least, pixels: less tells nothing."""
@@ -35,16 +44,19 @@ TOLD_NATS = 25.0
 degree all had 40 and more where the photograph tells anything."""
 TOLD_SHARE = 0.002
 """The same relative to the score: what errors of the model may make of it."""
-FAR_NATS = 200.0
-"""Odds over the best far decoy from which the photograph tells that the pattern is its own: other diffusers'
-had up to 190 where noise and a background let any of them explain it."""
+CERTAIN = 2.0
+"""Standard errors by which tiles must prefer a decoy as well."""
+OWN = 2.5
+"""Standard errors by which tiles prefer the calibration to each of its far decoys where it is surely the
+photograph's own."""
+NOT_OWN = 1.5
+"""The same, up to which it is not: other diffusers' had 1.4 at most, right ones of which the photograph tells
+anything 2 to 100."""
 EXPLAINED = 1.3
-"""Mean squared residual, in units of the noise, from which a calibration that is no better than its far
-decoys is another camera's; below, any pattern explains the photograph."""
-AS_BAD = 0.7
-"""Squared residual beyond the noise relative to the best far decoy's from which it is no better, if its score
-is :data:`AS_UNLIKELY` as well."""
-AS_UNLIKELY = 0.9
+"""Mean squared fine structure that is left, in units of the noise, from which a calibration that is no better
+than its far decoys is another camera's; below, any pattern explains the photograph."""
+LEAST = 1e-12
+"""Mean square below which tiles do not differ."""
 
 
 class Fit(enum.StrEnum):
@@ -63,6 +75,14 @@ class Score(NamedTuple):
     """Mean square of the residual in units of the noise."""
     objective: float
     """The same and twice the prior, a pixel."""
+    fine: tuple[float, ...]
+    """Mean square of the residual less its own local mean, tile by tile of the photograph."""
+
+    def leads(self, other: Score) -> float:
+        """By how many standard errors it leaves less fine structure than another, as tiles differ."""
+        ratio = np.log(np.maximum(other.fine, LEAST) / np.maximum(self.fine, LEAST))
+        scatter = float(np.std(ratio, ddof=1)) / len(ratio) ** 0.5 if len(ratio) > 1 else np.inf
+        return float(np.mean(ratio)) / max(scatter, LEAST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +145,7 @@ class CalibrationCheck:
         return {
             "fit": str(self.fit),
             "better": None if self.better is None else str(self.better),
-            "scores": {str(t): list(s) for t, s in self.scores.items()},
+            "scores": {str(t): [s.misfit, s.objective] for t, s in self.scores.items()},
             "pixels": self.pixels,
         }
 
@@ -157,21 +177,25 @@ def check_of(scores: Mapping[Transformation, Score], pixels: int) -> Calibration
     given = scores[GIVEN]
     decoys = {how: score for how, score in scores.items() if how not in (GIVEN, BETWEEN)}
     better = min(decoys, key=lambda how: decoys[how].objective)
-    gain = given.objective - decoys[better].objective
     far = {how: decoys[how] for how in FAR if how in decoys}
     foreign = _no_better(given, far.values())
-    told = gain * pixels / 2 > TOLD_NATS and gain > TOLD_SHARE * given.objective
-    others = [score for how, score in far.items() if how != better]
-    if told and not (foreign and _no_better(decoys[better], others)):
-        return CalibrationCheck(Fit.OFF, scores, pixels, better)
+    if is_told(decoys[better], given, pixels) and decoys[better].leads(given) > CERTAIN:
+        others = [score for how, score in far.items() if how != better]
+        if not (foreign and _no_better(decoys[better], others)):
+            return CalibrationCheck(Fit.OFF, scores, pixels, better)
     if foreign:
         return CalibrationCheck(Fit.FOREIGN, scores, pixels)
-    lead = min((s.objective for s in far.values()), default=float("inf")) - given.objective
-    return CalibrationCheck(Fit.FITS if lead * pixels / 2 > FAR_NATS else Fit.UNTOLD, scores, pixels)
+    own = all(is_told(given, score, pixels) and given.leads(score) > OWN for score in far.values())
+    return CalibrationCheck(Fit.FITS if own else Fit.UNTOLD, scores, pixels)
+
+
+def is_told(one: Score, other: Score, pixels: int) -> bool:
+    """Whether the odds for one and against another are more than chance and errors of the model make."""
+    gain = other.objective - one.objective
+    return gain * pixels / 2 > TOLD_NATS and gain > TOLD_SHARE * other.objective
 
 
 def _no_better(score: Score, far: Iterable[Score]) -> bool:
-    """Whether a PSF leaves much of the photograph unexplained, and hardly less than far decoys do."""
-    left, objective = np.min([*far, (np.inf, np.inf)], axis=0)
-    as_bad = score.misfit - 1 > AS_BAD * (left - 1) and score.objective > AS_UNLIKELY * objective
-    return score.misfit > EXPLAINED and bool(as_bad)
+    """Whether a PSF leaves much of the photograph unexplained, and no less than one of the far decoys."""
+    lead = min((score.leads(other) for other in far), default=np.inf)
+    return float(np.mean(score.fine)) > EXPLAINED and bool(lead < NOT_OWN)

@@ -104,21 +104,29 @@ def test_psfs_that_vary_much_over_the_field_are_not_accused(stretch: float, foun
 
 
 NEAR = near_decoys((160, 160), volume=False)
-GOOD = {GIVEN: Score(1.2, 1.5), BETWEEN: Score(1.2, 1.5)} | {how: Score(1.6, 2.0) for how in NEAR}
+TILES = 1 + 0.01 * np.random.default_rng(0).normal(size=16)
+
+
+def score(misfit: float, objective: float, unlike: float = 0.0) -> Score:
+    """Return a score whose fine structure is the misfit, in tiles that differ."""
+    return Score(misfit, objective, tuple(misfit * (TILES + unlike * TILES[::-1])))
+
+
+GOOD = {GIVEN: score(1.2, 1.5), BETWEEN: score(1.2, 1.5)} | {how: score(1.6, 2.0, 0.1) for how in NEAR}
 
 
 def test_without_a_far_decoy_the_near_ones_tell() -> None:
     assert check_of(GOOD, 10_000).fit is Fit.FITS
-    assert check_of(GOOD | {NEAR[0]: Score(1.1, 1.4)}, 10_000).better == NEAR[0]
+    assert check_of(GOOD | {NEAR[0]: score(1.1, 1.4, 0.001)}, 10_000).better == NEAR[0]
 
 
 def test_differences_within_the_noise_accuse_nobody() -> None:
-    far = {how: Score(40.0, 45.0) for how in FAR}
-    assert check_of(GOOD | far | {NEAR[0]: Score(1.2, 1.4999)}, 10_000).fit is Fit.FITS
+    far = {how: score(40.0, 45.0, 0.1) for how in FAR}
+    assert check_of(GOOD | far | {NEAR[0]: score(1.2, 1.4999)}, 10_000).fit is Fit.FITS
 
 
 def test_an_untold_calibration_is_doubtful_at_best() -> None:
-    alike = {how: Score(1.2, 1.5) for how in (*NEAR, *FAR)}
+    alike = {how: score(1.2, 1.5) for how in (*NEAR, *FAR)}
     check = check_of(GOOD | alike, 10_000)
     assert check.fit is Fit.UNTOLD
     good = Verdict(Region.INSIDE, "admm tv", 0.0, ()).with_calibration(check)
