@@ -62,7 +62,7 @@ class Law:
 
 LAWS: Mapping[Literal["tv", "l1"], Law] = {
     "tv": Law(0.083, -0.95, 3.1, 1.2, 12.0, 8.0),
-    "l1": Law(4.8, -0.58, 2.7, 0.0, 1.0, 32.0),
+    "l1": Law(1.4, -0.75, 3.6, 2.1, 3.0, 256.0),
 }
 """By what the prior counts; fitted on the scenes of `benchmarks/weights.py --tuning` and on the pairs. That
 of total variation is nearly the maximum a posteriori: what is left of the data over the steps' scale."""
