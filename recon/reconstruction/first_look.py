@@ -129,10 +129,13 @@ def look_at(problem: Problem, cancel: threading.Event | None = None) -> FirstLoo
     # Whatever device and precision the picture is solved with, the weight is the same.
     light = replace(options, prior="tv", axis_weights=None, device="cpu", precision="float32")
     part = Part(replace(problem, options=light, precision="float32"), slice(0, problem.n_channels))
-    passed_on = part.noise_norm / np.sqrt(part.valid.size)
-    part.weigh(None, WEIGHT * passed_on)
-    solver = SensorAdmm(part.picture_operator, part.data, part.prior)
-    outcome = solver.run(StoppingRules(iterations=ITERATIONS, tolerance=0.0), cancel=cancel)
+    try:
+        passed_on = part.noise_norm / np.sqrt(part.valid.size)
+        part.weigh(None, WEIGHT * passed_on)
+        solver = SensorAdmm(part.picture_operator, part.data, part.prior)
+        outcome = solver.run(StoppingRules(iterations=ITERATIONS, tolerance=0.0), cancel=cancel)
+    finally:
+        part.close()
     rows, columns = problem.window
     picture = part.lifted(outcome.solution)[:, 0, rows, columns].astype(np.float64)
     steps = [np.abs(np.diff(picture, axis=axis)).mean() for axis in (1, 2) if picture.shape[axis] > 1]
