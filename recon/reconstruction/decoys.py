@@ -17,7 +17,7 @@ from recon.camera.transformed import Transformation, transformed
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
-from recon.reconstruction.problem import Problem
+from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import on_blocks
 from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.base import StoppingRules
@@ -62,7 +62,7 @@ VARIED = 0.35
 more than any other pattern: with a background right calibrations looked foreign from 0.4 on."""
 
 
-def check_calibration(problem: Problem) -> CalibrationCheck | None:
+def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> CalibrationCheck | None:
     """Let a problem's calibration compete with its decoys on the channel that has most signal.
 
     One convolution a depth by the central PSFs, as few pixels as still tell one per cent of size; of PSFs
@@ -79,8 +79,13 @@ def check_calibration(problem: Problem) -> CalibrationCheck | None:
     factor, photograph = _small(problem, own)
     psfs = block_mean(psfs, factor, about_axis=True)
     volume, lit = len(psfs) > 1, problem.smooth or problem.n_planes > 1
+    done = 0
 
     def scored(how: Transformation, *, background: bool) -> Score:
+        nonlocal done
+        if on_stage is not None:
+            on_stage(done / (2 + len(decoys)), "judging: the calibration among its decoys")
+        done += 1
         copies = Calibration(transformed(psfs, how), np.full((len(psfs), 3), np.nan))
         if volume:  # depths by number: they only have to differ
             copies.source_positions_um[:] = [(0.0, 0.0, 1.0 + z) for z in range(len(psfs))]
