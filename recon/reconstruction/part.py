@@ -101,9 +101,9 @@ class Part:
         """Take another photograph's data.
 
         A background's prior deviation is their root mean square: object and background do not trade places
-        beyond that. Its prior mean is half of theirs in pictures, where it may be none of the light or all,
-        and a prior that does not mind an even object would keep the even part of it; 0 in volumes, where it
-        stands for what PSFs do not tell as well and may be negative.
+        beyond that. Its prior mean is half of theirs in pictures by priors that do not mind an even object
+        and would keep its even part: none of the light may be stray or all. It is 0 with l1, which minds
+        light, and in volumes, where it stands for what PSFs do not tell as well and may be negative.
         """
         self.problem = problem
         self.data = self._measured = problem.data[self._rows].astype(self.dtype, copy=False)
@@ -111,7 +111,7 @@ class Part:
             power = float(np.sum(self.data.astype(np.float64) ** 2))
             pixels = int(np.count_nonzero(self.valid))
             self.removal.restrain(pixels / max(power, pixels))
-            if problem.n_planes == 1:
+            if problem.n_planes == 1 and kind_of(problem.prior_name) == "tv":
                 means = [
                     0.5 * d[v].mean(dtype=np.float64) for d, v in zip(self.data, self.valid, strict=True)
                 ]
