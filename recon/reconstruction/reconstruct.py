@@ -31,7 +31,7 @@ from recon.reconstruction.uncertainty import refused, uncertain
 from recon.solvers.base import Keeper
 from recon.types import Calibration
 from recon.verdict.evidence import evidence_of, not_judged, observations, unsettled_by
-from recon.verdict.judge import NOISELESS, Region, Verdict, method_name, verdict_on
+from recon.verdict.judge import Verdict, method_name, unlike_any, verdict_on
 
 FACTS = tuple(f.name for f in fields(Measurement) if f.name != "image")
 """What is known of a measurement, by the names that :func:`reconstruct` takes them by."""
@@ -148,7 +148,7 @@ def judged(
         try:
             check = check_calibration(problem, on_stage=tell)
             verdict = verdict if check is None else verdict.with_calibration(check)
-            if verdict.region is Region.UNKNOWN and verdict.evidence["signal"] < NOISELESS:
+            if unlike_any(verdict):
                 verdict = replace(verdict, held_out=held_out_error(small, problem))
         except Exception as error:  # noqa: BLE001 - the verdict says what it says without it
             said = (
@@ -156,8 +156,7 @@ def judged(
                 f"The calibration was not checked: {error}",
             )
     tell(1.0, "judged")
-    known = verdict is not None and verdict.region is not Region.UNKNOWN
-    residual = None if known else result.residual
+    residual = result.residual if verdict is None or unlike_any(verdict) else None
     warnings = (*result.warnings, *said)
     return replace(result, verdict=verdict, residual=residual, warnings=warnings, basis=None)
 

@@ -201,7 +201,7 @@ class Verdict:
             said += [f"{f.words}. {f.help}" for f in self.findings[:MOST]]
         elif self.region is Region.UNKNOWN and self.basis and not self.decided:
             said += [f"What sets it apart: {f.words}. {f.help}" for f in self.findings[:1]]
-        if self.region is Region.UNKNOWN and self.decided != COMPUTED:
+        if unlike_any(self):
             said += [left_unexplained(self.evidence, self.held_out)]
         return tuple(f"{s}." for s in said)
 
@@ -288,6 +288,11 @@ def _region(
     if numbers["unexplained"] >= MOST_UNEXPLAINED or residual_of(numbers) >= MOST_RESIDUAL:
         return Region.NEAR, UNEXPLAINED.format(residual=_residual(numbers))
     return Region.INSIDE, ""
+
+
+def unlike_any(verdict: Verdict) -> bool:
+    """Tell whether a photograph's verdict is that no known case is like it."""
+    return verdict.region is Region.UNKNOWN and verdict.decided != COMPUTED
 
 
 def left_unexplained(numbers: Mapping[str, float], held_out: float | None) -> str:
