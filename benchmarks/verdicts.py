@@ -52,6 +52,8 @@ FAMILIES: tuple[Family, ...] = (
     *("microscope", "gradient", "lights", "dense-volume", "sparse-picture"),
 )
 """Of these scenes, in the order of their numbers, two of each."""
+MOST = 10**9
+"""Voxels up to which every scene is taken."""
 DIGITS = 4
 """Of the evidence that is shipped."""
 AUTO = ", auto"
@@ -266,7 +268,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--count", type=int, default=200, help="scenes to add")
     parser.add_argument("--first", type=int, default=UNSEEN_FROM, help="the first one's number")
-    parser.add_argument("--voxels", type=int, default=10**9, help="leave out scenes of more than so many")
+    parser.add_argument("--voxels", type=int, default=MOST, help="leave out scenes of more than so many")
     parser.add_argument("--keep", type=Path, default=Path("verdicts.jsonl"))
     parser.add_argument("--fit", action="store_true", help="learn from the cases and those that were kept")
     parser.add_argument("--out", type=Path, help="write the report")
@@ -280,10 +282,12 @@ def main() -> None:
     numbers = {e["index"] for e in unseen}
     if not unseen:
         return
+    count = max(numbers) - min(numbers) + 1
+    limit = "" if a.voxels == MOST else f" --voxels {a.voxels}"
     report = [
         "# How often verdicts are wrong",
         "",
-        f"    python benchmarks/verdicts.py --first {min(numbers)} --count {max(numbers) - min(numbers) + 1} "
+        f"    python benchmarks/verdicts.py --first {min(numbers)} --count {count}{limit} "
         "--keep verdicts.jsonl --out docs/benchmarks/verdicts.md",
         "",
         f"{datetime.now(UTC):%Y-%m-%d}, {platform.machine()}. {len(numbers)} scenes that nothing was",
