@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import whole_file
+from instrument.files.atomic import refuse_input, whole_file
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, write_image
 from instrument.files.volumes import (
@@ -43,6 +43,14 @@ class StoredResult:
     """What was written beside it; empty for results from elsewhere."""
     deviation: npt.NDArray[np.float32] | None = None
     """Standard deviation of a picture's pixels, as it; None where it was not asked for."""
+
+    @property
+    def inputs(self) -> list[Path]:
+        """The files that it was made of, as far as they are known, and its own."""
+        named = self.record.get("inputs")
+        values = named.values() if isinstance(named, Mapping) else ()
+        named = [value.get("path") if isinstance(value, Mapping) else value for value in values]
+        return [self.path, *(Path(value) for value in named if isinstance(value, str) and value)]
 
     @property
     def simulated(self) -> bool:
@@ -337,6 +345,7 @@ def export_result(
         ``advance(planes done, planes)``; may raise to end the work.
     """
     target = Path(target)
+    refuse_input(target)
     volume = result.volume is not None
     known = VOLUME_SUFFIXES if volume else PICTURE_SUFFIXES
     if not target.name.lower().endswith(known):
