@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon.reconstruction.choice import Decision, Option
+from recon.reconstruction.choice import Decision
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
@@ -119,8 +119,6 @@ def background_of(trial: Trial | None, overrides: Overrides, *, given: bool) -> 
         f"fall by {GAIN:g}, or by {LIGHT_GAIN:.0%} where it is {LIGHT:.0%} of the light)"
     )
     numbers = {"held_out_without": trial.without, "held_out_with": trial.lit, "light": trial.light}
-    other = Option("none" if trial.helps else "estimated", trial.time, float("nan"))
     if trial.helps:
-        down = replace(other, time=1 / trial.time)
-        return Decision("background", "estimated", why, down=down, numbers=numbers)
-    return Decision("background", "none", why, up=other, numbers=numbers)
+        return Decision("background", "estimated", why, down="none", numbers=numbers)
+    return Decision("background", "none", why, up="estimated", numbers=numbers)
