@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy.typing as npt
 from instrument.files.atomic import refuse_input, whole_file
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, write_image
+from instrument.files.reading import parse_json, read_bytes, require_file
 from instrument.files.volumes import (
     VolumeSource,
     is_zarr_name,
@@ -234,8 +234,8 @@ def _record_of(path: Path) -> dict[str, Any]:
     if not beside.is_file():
         return {}
     try:
-        record = json.loads(beside.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        record = parse_json(read_bytes(beside))
+    except (OSError, ValueError) as error:
         raise FileError(beside, f"cannot be read as JSON: {error}.") from error
     # Another program's JSON, or that of another kind of file of ours, is no record of this one.
     return record if isinstance(record, dict) and "grid" in record else {}
@@ -248,15 +248,17 @@ def _is_volume(path: Path, record: Mapping[str, Any]) -> bool:
         import tifffile
 
         try:
+            require_file(path)
             with tifffile.TiffFile(path) as tiff:
                 series = tiff.series[0]
                 return len(series.shape) == 4 or (len(series.shape) == 3 and "S" not in series.axes)
-        except (OSError, IndexError, tifffile.TiffFileError):
+        except Exception:  # noqa: BLE001 - a damaged TIFF raises nearly anything
             return False  # reading it as an image then says what is wrong
     if path.suffix.lower() == ".npy":
         try:
+            require_file(path)
             shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
-        except (OSError, ValueError, EOFError):
+        except Exception:  # noqa: BLE001 - a damaged header raises nearly anything
             return False
         return len(shape) == 4 or (len(shape) == 3 and shape[-1] not in (1, 3, 4))
     return False
@@ -296,8 +298,8 @@ def _is_record(path: Path) -> bool:
         with path.open("rb") as file:
             if b'"diffuserbench ' not in file.read(200):  # the program's name stands first
                 return False
-        record = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+        record = parse_json(read_bytes(path))
+    except (OSError, ValueError, FileError):
         return False  # another program's file
     if not isinstance(record, dict) or not {"grid", "prior", "inputs"} <= record.keys():
         return False

@@ -114,6 +114,9 @@ class FirstLook:
 def look_at(problem: Problem, cancel: threading.Event | None = None) -> FirstLook | None:
     """Look at a picture through one PSF; None where a weight is given, or none is asked for.
 
+    A background that is estimated as well takes no part: it changes nothing of the picture's steps. With l1
+    light then counts as much as it is seen, and the law does not hold.
+
     Parameters
     ----------
     problem : Problem
@@ -124,6 +127,8 @@ def look_at(problem: Problem, cancel: threading.Event | None = None) -> FirstLoo
     named = not isinstance(problem.prior, Prior) and is_weighted(problem.prior_name)
     if options.tau is not None or not named or problem.solver.one_step:
         return None
+    if problem.smooth and kind_of(problem.prior_name) == "tv":
+        problem = replace(problem, smooth=False)
     if not problem.is_plain or problem.patterned:
         return None
     # Whatever device and precision the picture is solved with, the weight is the same.
