@@ -86,7 +86,7 @@ def reconstruct_patterns(request: PatternedRequest, outputs: Outputs, output: Ou
             result = solve_patterned(prepared, watch=show, cancel=cancel)
         _print_end(result)
         write_reconstruction(outputs, result, job, rotate_deg=int(output.rotate_deg))
-        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
+        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.written(result)))}")
     _end(result, "picture")
 
 
