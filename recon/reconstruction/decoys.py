@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -36,15 +36,14 @@ from recon.verdict.calibration_check import (
 
 Floats = npt.NDArray[np.float32]
 
-LONGEST_PX = 160
-"""Longest side that decoys are tried on, pixels, about: one per cent of it is a caustic's width."""
+QUICK, THOROUGH = (100, 10), (160, 20)
+"""Longest side, about, pixels, and iterations (half as many of volumes). Most right ones are far ahead of
+all decoys in the quick way already: only the others are looked at again."""
 MOST_ERASED, MOST_CLIPPED = 0.75, 0.5
 """Shares of the blocks of pixels: with more of them erased blocks are smaller; with more of them clipped
 these are not erased, as a few pixels of a dim photograph share its largest count as well."""
 MOST_PLANES = 6
 """Depths that take part, evenly spaced."""
-ITERATIONS, OF_VOLUMES = 20, 10
-"""Of pictures and volumes: a right PSF is far ahead long before they have settled."""
 WEIGHT = 1.0
 """Of total variation: as large as the noise that the adjoint of a PSF of unit energy passes on."""
 FINE_PX = 3.0
@@ -71,64 +70,95 @@ def check_calibration(problem: Problem) -> CalibrationCheck | None:
     """
     if problem.patterned or problem.model in CAMERAS:
         return None
-    channel = int(np.argmax([d[v].std() for d, v in zip(problem.data, problem.valid, strict=True)]))
-    own = slice(channel, channel + 1)
-    psfs = problem.depths.central
-    planes = np.unique(np.linspace(0, len(psfs) - 1, MOST_PLANES).round().astype(int))
-    psfs = _on_sensor(psfs[planes][:, own if psfs.shape[1] > 1 else slice(0, 1)], problem.sensor_shape)
-    factor, photograph = _small(problem, own)
-    psfs = block_mean(psfs, factor, about_axis=True)
-    volume, lit = len(psfs) > 1, problem.smooth or problem.n_planes > 1
-
-    def scored(how: Transformation, *, background: bool) -> Score:
-        copies = Calibration(transformed(psfs, how), np.full((len(psfs), 3), np.nan))
-        if volume:  # depths by number: they only have to differ
-            copies.source_positions_um[:] = [(0.0, 0.0, 1.0 + z) for z in range(len(psfs))]
-        options = ReconstructionOptions(
-            prior="tv", model="convolution", estimate_background=background, drop_empty=False
-        )
-        return _score(Problem.of(photograph, copies, options))
-
-    middle = psfs[len(psfs) // 2, 0]
-    far = [how for how in FAR if likeness(transformed(middle, how), middle) < ALIKE]
-    given = problem.reduction.given if problem.reduction is not None else problem
-    near = () if given.depths.varies else near_decoys(psfs.shape[2:], volume=volume)
-    erased = 0 if photograph.erasures is None else np.count_nonzero(photograph.erasures)
-    decoys, pixels = (*near, *far), int(np.asarray(photograph.image).size - erased)
-    check = _competition(decoys, pixels, partial(scored, background=lit))
-    if check.fit is not Fit.FITS and not lit:
-        # Stray light, or light from beyond the field, which any PSF but the right one may explain better.
+    (few_px, quick), (more_px, thorough) = QUICK, THOROUGH
+    small, lit = _small(problem, few_px), problem.smooth or problem.n_planes > 1
+    check = _competition(small, partial(small.score, iterations=quick, background=lit))
+    if check.sure:
+        return check
+    if not lit:
+        more = _small(problem, more_px)
+        check = _competition(more, partial(more.score, iterations=thorough, background=False))
+        # Stray light, or light from beyond the field, which any PSF but the right one may explain better?
         winner = check.better or GIVEN
-        if is_told(scored(winner, background=True), check.scores[winner], pixels):
-            check = _competition(decoys, pixels, partial(scored, background=True))
+        score = partial(more.score, iterations=thorough, background=True)
+        lit = check.fit is not Fit.FITS and is_told(score(winner), check.scores[winner], more.pixels)
+        check = _competition(small, partial(small.score, iterations=quick, background=True)) if lit else check
+    if lit and not check.sure:
+        check = _competition(small, partial(small.score, iterations=thorough, background=True))
+    given = problem.reduction.given if problem.reduction is not None else problem
     too_varied = given.depths.varies and given.depths.field_error > VARIED
     return None if too_varied and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
 
 
-def _competition(
-    decoys: Sequence[Transformation], pixels: int, scored: Callable[[Transformation], Score]
-) -> CalibrationCheck:
+@dataclass(frozen=True, slots=True)
+class _Small:
+    """A channel of a photograph on few pixels, and the central PSFs (n_z, 1, height, width) there."""
+
+    photograph: Measurement
+    psfs: Floats
+    varies: bool
+    """Whether the calibration has other PSFs over the field."""
+
+    @property
+    def pixels(self) -> int:
+        """That are not erased."""
+        erasures = self.photograph.erasures
+        return int(np.size(self.photograph.image) - (0 if erasures is None else np.count_nonzero(erasures)))
+
+    def decoys(self) -> tuple[Transformation, ...]:
+        """Return those that differ from the PSFs: near ones where one PSF serves the field, then far ones."""
+        middle = self.psfs[len(self.psfs) // 2, 0]
+        far = [how for how in FAR if likeness(transformed(middle, how), middle) < ALIKE]
+        near = () if self.varies else near_decoys(self.psfs.shape[2:], volume=len(self.psfs) > 1)
+        return (*near, *far)
+
+    def score(self, how: Transformation, *, iterations: int, background: bool) -> Score:
+        """Reconstruct through transformed PSFs in few iterations."""
+        copies = Calibration(transformed(self.psfs, how), np.full((len(self.psfs), 3), np.nan))
+        if len(self.psfs) > 1:  # depths by number: they only have to differ
+            copies.source_positions_um[:] = [(0.0, 0.0, 1.0 + z) for z in range(len(self.psfs))]
+            iterations = -(-iterations // 2)
+        options = ReconstructionOptions(
+            prior="tv", model="convolution", estimate_background=background, drop_empty=False
+        )
+        return _score(Problem.of(self.photograph, copies, options), iterations)
+
+
+def _competition(small: _Small, scored: Callable[[Transformation], Score]) -> CalibrationCheck:
     """Score a calibration, its decoys, and farther ones on the side of a near one that is better."""
-    scores = {how: scored(how) for how in (GIVEN, BETWEEN, *decoys)}
+    decoys = small.decoys()
+    scores = {how: scored(how) for how in (GIVEN, *decoys)}
+    check = check_of(scores, small.pixels)
+    if check.sure:
+        return check
+    scores[BETWEEN] = scored(BETWEEN)
     near = [how for how in decoys if how not in FAR]
     before, best = GIVEN, min((GIVEN, *near), key=lambda how: scores[how].objective)
     while scores[best].objective < scores[before].objective and len(scores) < MOST_DECOYS:
         before, best = best, Transformation(scale=best.scale**2, rotation_deg=2 * best.rotation_deg)
         scores[best] = scored(best)
-    return check_of(scores, pixels)
+    return check_of(scores, small.pixels)
 
 
-def _small(problem: Problem, own: slice) -> tuple[int, Measurement]:
-    """Return a channel on blocks of pixels, as large ones as erasures and clipped pixels allow."""
-    factor = max(1, round(max(problem.sensor_shape) / LONGEST_PX))
+def _small(problem: Problem, longest_px: int) -> _Small:
+    """Return the channel that has most signal on blocks of pixels, as large ones as erasures allow."""
+    channel = int(np.argmax([d[v].std() for d, v in zip(problem.data, problem.valid, strict=True)]))
+    own = slice(channel, channel + 1)
+    psfs = problem.depths.central
+    planes = np.unique(np.linspace(0, len(psfs) - 1, MOST_PLANES).round().astype(int))
+    psfs = _on_sensor(psfs[planes][:, own if psfs.shape[1] > 1 else slice(0, 1)], problem.sensor_shape)
+    factor = max(1, round(max(problem.sensor_shape) / longest_px))
     counts, valid = problem.measurement.channels()[own], problem.valid[own]
     if 0 < saturated_share(counts[valid]) * factor**2 < MOST_CLIPPED:
-        valid = valid & (counts < counts[valid].max())
+        valid = valid & (counts < counts[valid].max())  # a clipped pattern is no pattern's own
     while True:
         photograph = on_blocks(problem.data[own], valid, 1.0, factor, flat=True)
-        if factor == 1 or photograph.erasures is None or np.asarray(photograph.erasures).mean() < MOST_ERASED:
-            return factor, photograph
+        erased = photograph.erasures
+        if factor == 1 or erased is None or np.asarray(erased).mean() < MOST_ERASED:
+            break
         factor //= 2
+    given = problem.reduction.given if problem.reduction is not None else problem
+    return _Small(photograph, block_mean(psfs, factor, about_axis=True), given.depths.varies)
 
 
 def _on_sensor(psfs: Floats, shape: tuple[int, int]) -> Floats:
@@ -139,14 +169,13 @@ def _on_sensor(psfs: Floats, shape: tuple[int, int]) -> Floats:
     return whole
 
 
-def _score(problem: Problem) -> Score:
-    """Reconstruct a problem of one channel in few iterations."""
+def _score(problem: Problem, iterations: int) -> Score:
+    """Reconstruct a problem of one channel and score it."""
     sensor = SOLVERS.named("admm-sensor")
     offered = sensor if sensor.accepts(problem) is None else SOLVERS.named("admm")
     part = Part(replace(problem, options=replace(problem.options, solver=offered.name)), slice(0, 1))
     try:
         part.weight = WEIGHT
-        iterations = ITERATIONS if problem.n_planes == 1 else OF_VOLUMES
         outcome = offered.make(part, None).run(StoppingRules(iterations=iterations, tolerance=0.0))
         solution = np.maximum(part.lifted(outcome.solution), 0)
         background = part.background(solution) if part.removal is not None else None

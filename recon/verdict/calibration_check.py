@@ -106,6 +106,15 @@ class CalibrationCheck:
     better: Transformation | None = None
 
     @property
+    def sure(self) -> bool:
+        """Whether it fits and is certainly ahead of all its near decoys, too."""
+        given = self.scores[GIVEN]
+        near = (score for how, score in self.scores.items() if how not in (GIVEN, BETWEEN, *FAR))
+        return self.fit is Fit.FITS and all(
+            is_told(given, score, self.pixels) and given.leads(score) > CERTAIN for score in near
+        )
+
+    @property
     def wrong(self) -> bool:
         """Whether it is not the photograph's own calibration."""
         return self.fit in (Fit.OFF, Fit.FOREIGN)
@@ -168,13 +177,14 @@ def check_of(scores: Mapping[Transformation, Score], pixels: int) -> Calibration
     Parameters
     ----------
     scores : mapping
-        Of :data:`GIVEN`, :data:`BETWEEN`, near ones and farther, and of the :data:`FAR` ones that do not
-        resemble it: where all do, as of regular lenslets, only the near ones tell.
+        Of :data:`GIVEN`, :data:`BETWEEN` where it was tried, near ones and farther, and of the :data:`FAR`
+        ones that do not resemble it: where all do, as of regular lenslets, only the near ones tell.
     pixels : int
         Valid ones.
     """
-    scores = {**scores, GIVEN: min(scores[GIVEN], scores[BETWEEN], key=lambda score: score.objective)}
-    given = scores[GIVEN]
+    as_given = (scores[how] for how in (GIVEN, BETWEEN) if how in scores)
+    given = min(as_given, key=lambda score: score.objective)
+    scores = {**scores, GIVEN: given}
     decoys = {how: score for how, score in scores.items() if how not in (GIVEN, BETWEEN)}
     better = min(decoys, key=lambda how: decoys[how].objective)
     far = {how: decoys[how] for how in FAR if how in decoys}
