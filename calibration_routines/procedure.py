@@ -255,7 +255,7 @@ class Purpose(Generic[T]):
         """Return the runner of a plan whose run has the record; errors as ``prepare``."""
         runner = prepare(bench, plan, folder, on_progress=listener.frame, control=control)
         with discarded(runner):
-            self.format.write(runner.path / self.file, plain(record))
+            runner.keep_text(self.file, self.format.text(plain(record)))
         return runner
 
 

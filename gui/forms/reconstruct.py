@@ -23,7 +23,6 @@ from instrument.reconstruction.options import InputOptions, OutputOptions, Sourc
 from instrument.reconstruction.request import (
     PictureRequest,
     VolumeRequest,
-    done_share,
     request_of,
 )
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
@@ -292,16 +291,17 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
     keeper = checkpoint_for(work.kept_in, prepared, request)
     context.report(SoFar(0.0, "Solving …", prepared))
     history: list[IterationRecord] = []
+    share, note = 0.0, ""
 
     def watch(record: IterationRecord, present: Callable[[], npt.NDArray[np.float32]]) -> None:
         history.append(record)
-        share = done_share(request.options, record)
-        note = f"iteration {record.iteration}, change {record.change:.1e}"
         # Of a picture its only plane.
         context.offer(lambda: SoFar(share, note, prepared, np.array(present().max(axis=0)), tuple(history)))
 
-    def stage(share: float, what: str) -> None:
-        context.offer(lambda: SoFar(share, what, prepared, None, tuple(history)))
+    def stage(done: float, what: str) -> None:
+        nonlocal share, note
+        share, note = done, what
+        context.offer(lambda: SoFar(done, what, prepared, None, tuple(history)))
 
     if isinstance(request, VolumeRequest):
         volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_stage=stage)

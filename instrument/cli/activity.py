@@ -16,7 +16,7 @@ from instrument.files.volumes import is_zarr_name
 from instrument.reconstruction.activity import ActivitySettings, find_activity, write_activity
 from instrument.reconstruction.options import InputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.video_files import VideoPictures
-from instrument.runs.run import STATE
+from instrument.runs.run_files import STATE
 from recon.base.declare import option
 from recon.reconstruction.options import ReconstructionOptions
 

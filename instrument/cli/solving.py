@@ -14,12 +14,7 @@ from instrument.reconstruction.checkpointing import checkpoint_for, settle_check
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.options import OutputOptions
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned, solve_patterned
-from instrument.reconstruction.request import (
-    PictureRequest,
-    VolumeRequest,
-    done_share,
-    iteration_limit,
-)
+from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
 from instrument.reconstruction.video import (
     PreparedVideo,
@@ -51,18 +46,13 @@ def reconstruct_photograph(
         outputs.check(planes * job.measurement.size, overwrite=output.force)
         _print_job(job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench")
         keeper = checkpoint_for(output.checkpoint, job, request)
-        total = iteration_limit(request.options) or 1000
         what = "volume" if is_volume else "picture"
-        with one_task(what, total) as advance, first_interrupt_cancels() as cancel:
-
-            def show(record: IterationRecord, _picture: object) -> None:
-                share = done_share(request.options, record)
-                advance(round(total * share), note=f"change {record.change:.1e}")
+        with one_task(what, 100) as advance, first_interrupt_cancels() as cancel:
 
             def stage(share: float, what: str) -> None:
-                advance(round(total * share), note=what)
+                advance(round(100 * share), note=what)
 
-            result = request.solve(job, watch=show, cancel=cancel, keeper=keeper, on_stage=stage)
+            result = request.solve(job, cancel=cancel, keeper=keeper, on_stage=stage)
         _print(result)
         if is_volume:
             write_volume(outputs, result, job)

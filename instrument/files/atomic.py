@@ -109,7 +109,12 @@ def make_folder(path: Path) -> None:
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Write a mapping as a JSON file, atomically."""
-    write_bytes(path, (json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+    write_bytes(path, json_text(data).encode())
+
+
+def json_text(data: Mapping[str, Any]) -> str:
+    """Return a mapping as the text of a JSON file."""
+    return json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def check_writable(path: Path | str, n_bytes: int = 0) -> None:

@@ -21,7 +21,8 @@ from instrument.plan.abilities import SPARE_BYTES
 from instrument.runs.acquire import free_bytes, record_of
 from instrument.runs.finish import end_run
 from instrument.runs.log import Gap
-from instrument.runs.run import FinishReason, Run, RunError
+from instrument.runs.run import FinishReason, Run
+from instrument.runs.run_files import RunError
 from instrument.runs.writer import FrameToStore, RunWriter
 from recon.base.declare import option, with_overrides
 

@@ -171,7 +171,7 @@ class BackgroundRemoval(Projection):
     Attributes
     ----------
     taken : float
-        Share of the data's smooth part that :meth:`forward` takes out.
+        Share of the data's smooth part that :meth:`forward` takes out; changes with :meth:`restrain`.
     """
 
     def __init__(
@@ -183,7 +183,7 @@ class BackgroundRemoval(Projection):
         restraint: float = 0.0,
     ) -> None:
         super().__init__(shape, shape, dtype)
-        self.restraint, self.taken = restraint, 1 - float(np.sqrt(restraint / (1 + restraint)))
+        self.restrain(restraint)
         _, height, width = shape
         ny, nx = min(n_frequencies[0], height), min(n_frequencies[1], width)
         self._rows, self._columns = _cosines(ny, height), _cosines(nx, width)
@@ -202,6 +202,10 @@ class BackgroundRemoval(Projection):
     def basis(self, channel: int) -> tuple[Array, Array, Array]:
         """Return what :meth:`background` computes with: cosines along y and x, inverse Gram matrix."""
         return self._rows, self._columns, self._inverse[channel]
+
+    def restrain(self, restraint: float) -> None:
+        """Set how much the background's squared norm counts."""
+        self.restraint, self.taken = restraint, 1 - float(np.sqrt(restraint / (1 + restraint)))
 
     def background(self, y: Array) -> Array:
         """Return the background for data ``y``, on all pixels."""

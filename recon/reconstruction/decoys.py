@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import count
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from recon.camera.transformed import Transformation, transformed
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
-from recon.reconstruction.problem import Problem
+from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import on_blocks
 from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.base import StoppingRules
@@ -51,9 +51,9 @@ FINE_PX = 3.0
 iterations and stray light, and prefer smaller PSFs."""
 TILES = 4
 """Along each axis of the photograph."""
-MOST_DECOYS = 12
-"""With farther ones on the side of a near one that is better, each twice as far: to some eight degrees or per
-cent."""
+DECOYS, MOST_DECOYS = 8, 12
+"""Usually; and with farther ones on the side of a near one that is better, each twice as far: to some eight
+degrees or per cent."""
 ALIKE = 0.7
 """Likeness from which a far decoy tells nothing, as of regular lenslets, which are their own mirror image."""
 VARIED = 0.35
@@ -61,7 +61,7 @@ VARIED = 0.35
 more than any other pattern: with a background right calibrations looked foreign from 0.4 on."""
 
 
-def check_calibration(problem: Problem) -> CalibrationCheck | None:
+def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> CalibrationCheck | None:
     """Let a problem's calibration compete with its decoys on the channel that has most signal.
 
     One convolution a depth by the central PSFs, as few pixels as still tell one per cent of size; of PSFs
@@ -70,21 +70,32 @@ def check_calibration(problem: Problem) -> CalibrationCheck | None:
     """
     if problem.patterned or problem.model in CAMERAS:
         return None
+    done = count(1)
+
+    def scored(small: _Small, iterations: int, *, lit: bool, how: Transformation) -> Score:
+        if on_stage is not None:  # how many there will be depends on what they say
+            on_stage(1 - DECOYS / (DECOYS + next(done)), "judging: the calibration among its decoys")
+        return small.score(how, iterations=iterations, background=lit)
+
+    def compete(small: _Small, iterations: int, *, lit: bool) -> CalibrationCheck:
+        return _competition(small, lambda how: scored(small, iterations, lit=lit, how=how))
+
     (few_px, quick), (more_px, thorough) = QUICK, THOROUGH
-    small, lit = _small(problem, few_px), problem.smooth or problem.n_planes > 1
-    check = _competition(small, partial(small.score, iterations=quick, background=lit))
+    few, lit = _small(problem, few_px), problem.smooth or problem.n_planes > 1
+    check = compete(few, quick, lit=lit)
     if check.sure:
         return check
     if not lit:
         more = _small(problem, more_px)
-        check = _competition(more, partial(more.score, iterations=thorough, background=False))
+        check = compete(more, thorough, lit=False)
         # Stray light, or light from beyond the field, which any PSF but the right one may explain better?
         winner = check.better or GIVEN
-        score = partial(more.score, iterations=thorough, background=True)
-        lit = check.fit is not Fit.FITS and is_told(score(winner), check.scores[winner], more.pixels)
-        check = _competition(small, partial(small.score, iterations=quick, background=True)) if lit else check
+        lit = check.fit is not Fit.FITS and is_told(
+            scored(more, thorough, lit=True, how=winner), check.scores[winner], more.pixels
+        )
+        check = compete(few, quick, lit=True) if lit else check
     if lit and not check.sure:
-        check = _competition(small, partial(small.score, iterations=thorough, background=True))
+        check = compete(few, thorough, lit=True)
     given = problem.reduction.given if problem.reduction is not None else problem
     too_varied = given.depths.varies and given.depths.field_error > VARIED
     return None if too_varied and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check

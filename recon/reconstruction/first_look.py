@@ -75,19 +75,23 @@ class FirstLook:
     Attributes
     ----------
     steepness : float
-        Mean absolute difference along rows and columns together, in units of the noise.
+        Mean absolute difference along rows and columns together, in units of the noise passed on.
     lit : float
         Share of the pixels that are lit.
     misfit : float
         What its picture leaves of the data, in units of the noise.
     seconds : float
         That it took.
+    passed_on : float
+        Noise that the adjoint passes on, in units of the noise: less than 1 where pixels are erased, which
+        is as if there were less light, not more noise.
     """
 
     steepness: float
     lit: float
     misfit: float
     seconds: float
+    passed_on: float = 1.0
 
     def weight(self, prior: str) -> float:
         """Return the weight of a prior by name, in units of the noise."""
@@ -95,7 +99,7 @@ class FirstLook:
         misfit = min(max(self.misfit, 1.0), law.most_misfit) ** law.misfit
         steepness = float(np.clip(self.steepness, 1e-6, STEEPEST))
         weight = law.factor * steepness**law.steepness * 2 ** (law.lit * self.lit) * misfit
-        return float(min(weight, law.most))
+        return float(min(weight, law.most)) * self.passed_on
 
     def in_words(self, prior: str) -> str:
         """Say what the weight is, and why."""
@@ -125,16 +129,21 @@ def look_at(problem: Problem, cancel: threading.Event | None = None) -> FirstLoo
     # Whatever device and precision the picture is solved with, the weight is the same.
     light = replace(options, prior="tv", axis_weights=None, device="cpu", precision="float32")
     part = Part(replace(problem, options=light, precision="float32"), slice(0, problem.n_channels))
-    part.weigh(None, WEIGHT)
-    solver = SensorAdmm(part.picture_operator, part.data, part.prior)
-    outcome = solver.run(StoppingRules(iterations=ITERATIONS, tolerance=0.0), cancel=cancel)
+    try:
+        passed_on = part.noise_norm / np.sqrt(part.valid.size)
+        part.weigh(None, WEIGHT * passed_on)
+        solver = SensorAdmm(part.picture_operator, part.data, part.prior)
+        outcome = solver.run(StoppingRules(iterations=ITERATIONS, tolerance=0.0), cancel=cancel)
+    finally:
+        part.close()
     rows, columns = problem.window
     picture = part.lifted(outcome.solution)[:, 0, rows, columns].astype(np.float64)
     steps = [np.abs(np.diff(picture, axis=axis)).mean() for axis in (1, 2) if picture.shape[axis] > 1]
     brightest = np.percentile(picture, 99.9)
     return FirstLook(
-        float(sum(steps)),
+        float(sum(steps)) * passed_on,
         float(np.mean(picture > LIT * brightest)),
         float(np.linalg.norm(part.residual(part.lifted(outcome.solution), None))) / part.noise_norm,
         outcome.seconds,
+        passed_on,
     )

@@ -81,7 +81,11 @@ class Part:
         self.tau: float | None = None
         self.weight = 0.0
         self._removed: BackgroundRemoval | None = None
-        self.removal = self._background() if problem.smooth else None
+        self.removal = (
+            BackgroundRemoval(self.valid.shape, BACKGROUND_FREQUENCIES, self.valid, self.dtype)
+            if problem.smooth
+            else None
+        )
         given = problem.options.memory_gib
         self._limit = None if given is None else int(given * memory.GIB)
         self.set_data(problem)
@@ -91,20 +95,18 @@ class Part:
             window, _ = window_of("sensor", shape, (psf[2], psf[3]))
             self.camera = PatternedCamera(self.camera, problem.measurement.light(), window)
 
-    def _background(self) -> BackgroundRemoval:
-        """Return what takes a background out that is not much larger than the data.
-
-        Its prior deviation is their root mean square: object and background do not trade places beyond that.
-        """
-        power = float(np.sum(self.problem.data[self._rows].astype(np.float64) ** 2))
-        pixels = int(np.count_nonzero(self.valid))
-        restraint = pixels / max(power, pixels)
-        return BackgroundRemoval(self.valid.shape, BACKGROUND_FREQUENCIES, self.valid, self.dtype, restraint)
-
     def set_data(self, problem: Problem) -> None:
-        """Take another photograph's data."""
+        """Take another photograph's data.
+
+        A background's prior deviation is their root mean square: object and background do not trade places
+        beyond that.
+        """
         self.problem = problem
         self.data = self._measured = problem.data[self._rows].astype(self.dtype, copy=False)
+        if self.removal is not None:
+            power = float(np.sum(self.data.astype(np.float64) ** 2))
+            pixels = int(np.count_nonzero(self.valid))
+            self.removal.restrain(pixels / max(power, pixels))
 
     @property
     def _rows(self) -> slice:

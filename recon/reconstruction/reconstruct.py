@@ -15,9 +15,11 @@ from recon.base.declare import with_overrides
 from recon.camera.camera_model import CAMERAS
 from recon.errors import InputError
 from recon.priors import PRIORS
+from recon.reconstruction.course import Course
 from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import parts_of
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.psf_refinement import refined
 from recon.reconstruction.result import Reconstruction
@@ -68,8 +70,8 @@ def reconstruct(
     keeper : Keeper, optional
         Keeps the solvers' state, and has them go on from what was kept of the same reconstruction.
     on_stage : callable, optional
-        ``on_stage(share, what)`` as what goes before and after the iterations goes on: fitting the PSF
-        (``refine_psf``), choosing, the repetitions of ``uncertainty``.
+        ``on_stage(share, what)``: how much of all is done, 0 to 1, which never falls: fitting the PSF
+        (``refine_psf``), choosing, the iterations, the repetitions of ``uncertainty``, judging.
     **overrides
         Single options by their names: ``reconstruct(image, psf, prior="l1", iterations=50)``.
 
@@ -83,19 +85,20 @@ def reconstruct(
     require_two_images(problem)
     if options.uncertainty and (reason := refused(problem)) is not None:
         raise InputError(f"{reason[0].upper()}{reason[1:]}.")
-    refinement = None
+    course, refinement = Course(options, on_stage), None
     if options.refine_psf:
-        problem, refinement = refined(problem, on_stage=on_stage, cancel=cancel)
-    problem = choose(problem, on_stage=on_stage)
-    result = solve(problem, warm=warm, on_progress=on_progress, cancel=cancel, keeper=keeper)
+        problem, refinement = refined(problem, on_stage=course.stage("refine"), cancel=cancel)
+    problem = choose(problem, on_stage=course.stage("choose"))
+    watch = course.iterations(on_progress, len(parts_of(problem)))
+    result = solve(problem, warm=warm, on_progress=watch, cancel=cancel, keeper=keeper)
     if options.uncertainty:
-        result = uncertain(result, problem, on_stage=on_stage, cancel=cancel)
+        result = uncertain(result, problem, on_stage=course.stage("uncertainty"), cancel=cancel)
     if refinement is not None:
         provenance = {**result.provenance, "psf_refinement": refinement.to_json()}
         result = replace(result, refinement=refinement, provenance=provenance)
-    return (
-        judged(result, problem, started=warm is not None) if options.judged else replace(result, basis=None)
-    )
+    if not options.judged:
+        return replace(result, basis=None)
+    return judged(result, problem, started=warm is not None, on_stage=course.stage("judge"))
 
 
 def require_two_images(problem: Problem) -> None:
@@ -118,7 +121,9 @@ def _defaults() -> ReconstructionOptions:
     return ReconstructionOptions()
 
 
-def judged(result: Reconstruction, problem: Problem, *, started: bool = False) -> Reconstruction:
+def judged(
+    result: Reconstruction, problem: Problem, *, started: bool = False, on_stage: Stage | None = None
+) -> Reconstruction:
     """Return the result with a verdict on whether to trust it and whether the calibration is its own.
 
     At the cost of about two iterations, and of a hundred on few pixels.
@@ -130,9 +135,23 @@ def judged(result: Reconstruction, problem: Problem, *, started: bool = False) -
         That was solved.
     started : bool
         Whether it was started from another result.
+    on_stage : callable, optional
+        ``on_stage(share, what)`` as it goes on.
     """
     problem, small = result.basis or (problem, result)
+    tell = on_stage or (lambda *_: None)
+    tell(0.0, "judging the result")
     verdict, said = _verdict(small, problem, started=started)
+    if verdict is not None:
+        try:
+            check = check_calibration(problem, on_stage=tell)
+            verdict = verdict if check is None else verdict.with_calibration(check)
+        except Exception as error:  # noqa: BLE001 - the verdict says what it says without it
+            said = (
+                *said,
+                f"The calibration was not checked: {error}",
+            )
+    tell(1.0, "judged")
     return replace(result, verdict=verdict, warnings=(*result.warnings, *said), basis=None)
 
 
@@ -171,8 +190,6 @@ def _verdict(
             ),
             points=not picture,
         )
-        verdict = verdict_on(evidence, method_name(result.solver, result.prior, volume=not picture))
-        check = check_calibration(problem)
-        return (verdict if check is None else verdict.with_calibration(check)), ()
+        return verdict_on(evidence, method_name(result.solver, result.prior, volume=not picture)), ()
     except Exception as error:  # noqa: BLE001 - the result may be hours of work: it is worth more than this
         return None, (not_judged(error),)

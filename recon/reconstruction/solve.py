@@ -153,7 +153,7 @@ def _solve(
     rules = rules_of(problem, offered, len(channels))
     look = look_at(problem, cancel)
     if look is not None and rules.time_s is not None:
-        rules = replace(rules, time_s=max(rules.time_s - look.seconds, 1e-9))
+        rules = replace(rules, time_s=max(rules.time_s - look.seconds / len(channels), 1e-9))
     found = []
     for one in channels:
         part = Part(problem, one)
@@ -272,7 +272,7 @@ def _run(
         memory=part.memory_used(),
         noise_norm=part.noise_norm,
         residual=residual,
-        doubts=residual_in_words(problem, outcome.history, residual, part.noise_norm),
+        doubts=residual_in_words(problem, outcome, residual, part.noise_norm),
     )
 
 

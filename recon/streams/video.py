@@ -85,19 +85,20 @@ def stream_problem(
 def with_background(problem: Problem, calibration: Calibration) -> Problem:
     """Return a problem with a smooth background where a photograph would have one, and nobody said.
 
-    Of pictures: volumes have one unless it is given. All of the calibration's PSFs tell whether there is one.
+    All of the calibration's PSFs tell whether there is one.
     """
     options, model = problem.options, problem.model
     said = options.estimate_background is not None or problem.measurement.background is not None
-    if said or problem.n_planes > 1 or problem.patterned or model in CAMERAS:
+    if said or problem.patterned or model in CAMERAS:
         return problem
     asked = replace(options, model="auto", choose=Overrides(model=model, binning=1, channels="all"))
     choice = choice_for(Problem.of(problem.measurement, calibration, asked))
+    if choice.background != problem.smooth:
+        options = replace(options, estimate_background=choice.background)
+        problem = Problem.of(problem.measurement, problem.calibration, options)
     if not choice.background:
         return problem
     (why,) = (d.why for d in choice.decisions if d.name == "background")
-    options = replace(options, estimate_background=True)
-    problem = Problem.of(problem.measurement, problem.calibration, options)
     said_so = f"A smooth background is estimated in each frame: {why}."
     return replace(problem, warnings=(*problem.warnings, said_so))
 

@@ -27,6 +27,20 @@ def test_light_on_black_weighs_less_than_a_full_picture():
         assert lights.weight(prior) < slope.weight(prior) / 2
 
 
+@pytest.mark.parametrize("erased", [0.4, 0.8])
+def test_erased_pixels_make_less_light_not_more_noise(erased):
+    looks = []
+    for share in (0.0, erased):
+        scene = make_scene("filaments", size=64, photons=3000.0, erased=share)
+        photograph = Measurement(scene.measurement, erasures=scene.erasures, noise=scene.noise)
+        asked = ReconstructionOptions(model="convolution")
+        looks.append(look_at(Problem.of(photograph, scene.calibration, asked)))
+    whole, holes = looks
+    kept = np.sqrt(1 - erased)
+    assert holes.passed_on == pytest.approx(kept, rel=0.05)
+    assert holes.steepness == pytest.approx(kept * whole.steepness, rel=0.35)
+
+
 def test_the_weight_does_not_depend_on_solver_precision_or_prior_of_its_kind():
     look = seen("lights")
     for options in ({"solver": "admm-sensor"}, {"precision": "float64"}, {"prior": "tv-isotropic"}):

@@ -137,10 +137,17 @@ def test_what_has_no_uncertainty_is_refused_before_the_work() -> None:
 
 
 def test_sentences_say_how_to_read_it() -> None:
-    found = Uncertainty(np.ones((1, 2, 2), np.float32), 6, 1.0, 0.0, 2.0)
+    found = Uncertainty(np.ones((1, 2, 2), np.float32), 6, 1.0, 0.0, 2.0, 1.5, 0.5)
     assert "1.96" in found.sentences[0]
-    assert not found.doubt
-    assert "3.0 times the noise" in replace(found, misfit=3.0).doubt[0]
+    assert found.trusted
+    for other, why in (
+        ({"misfit": 3.0}, "3.0 times the noise"),
+        ({"resolved_px": 5.8}, "resolves 5.8 pixels"),
+        ({"resolved_px": np.nan}, "Bin the images"),
+        ({"steepness": 2.0}, "points of light"),
+    ):
+        (doubt,) = replace(found, **other).doubt
+        assert why in doubt
 
 
 def test_points_have_error_bars_that_hold_their_places_and_light() -> None:
