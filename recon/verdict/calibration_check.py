@@ -46,6 +46,10 @@ TOLD_SHARE = 0.002
 """The same relative to the score: what errors of the model may make of it."""
 CERTAIN = 2.0
 """Standard errors by which tiles must prefer a decoy as well."""
+FLIPPED = 6.0
+"""The same for one that is far: of 20 mirrored 16 had 7 to 100, right ones up to 4.9."""
+SPEAKS_NATS = 150.0
+"""Odds among all that were tried from which a photograph has its say on foreign ones."""
 OWN = 2.5
 """Standard errors by which tiles prefer the calibration to each of its far decoys where it is surely the
 photograph's own."""
@@ -188,8 +192,11 @@ def check_of(scores: Mapping[Transformation, Score], pixels: int) -> Calibration
     decoys = {how: score for how, score in scores.items() if how not in (GIVEN, BETWEEN)}
     better = min(decoys, key=lambda how: decoys[how].objective)
     far = {how: decoys[how] for how in FAR if how in decoys}
-    foreign = _no_better(given, far.values())
-    if is_told(decoys[better], given, pixels) and decoys[better].leads(given) > CERTAIN:
+    objectives = [score.objective for score in (given, *decoys.values())]
+    speaks = (max(objectives) - min(objectives)) * pixels / 2 > SPEAKS_NATS
+    foreign = speaks and _no_better(given, far.values())
+    certain = FLIPPED if better in far else CERTAIN
+    if is_told(decoys[better], given, pixels) and decoys[better].leads(given) > certain:
         others = [score for how, score in far.items() if how != better]
         if not (foreign and _no_better(decoys[better], others)):
             return CalibrationCheck(Fit.OFF, scores, pixels, better)
