@@ -56,6 +56,8 @@ photograph's own."""
 NOT_OWN = 1.5
 """The same, up to which it is not: other diffusers' had 1.4 at most, right ones of which the photograph tells
 anything 2 to 100."""
+LIKELIER = 0.01
+"""Score of all far decoys relative to the calibration's beyond one, from which it is not called foreign."""
 EXPLAINED = 1.3
 """Mean squared fine structure that is left, in units of the noise, from which a calibration that is no better
 than its far decoys is another camera's; below, any pattern explains the photograph."""
@@ -213,6 +215,8 @@ def is_told(one: Score, other: Score, pixels: int) -> bool:
 
 
 def _no_better(score: Score, far: Iterable[Score]) -> bool:
-    """Whether a PSF leaves much of the photograph unexplained, and no less than one of the far decoys."""
-    lead = min((score.leads(other) for other in far), default=np.inf)
-    return float(np.mean(score.fine)) > EXPLAINED and bool(lead < NOT_OWN)
+    """Whether a PSF leaves much of the photograph unexplained, and is not ahead of all far decoys."""
+    others = list(far)
+    lead = min((score.leads(other) for other in others), default=np.inf)
+    likelier = all(other.objective > (1 + LIKELIER) * score.objective for other in others)
+    return float(np.mean(score.fine)) > EXPLAINED and bool(lead < NOT_OWN) and not likelier
