@@ -9,16 +9,15 @@ from itertools import count
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.blocks import block_mean
 from recon.base.checks import saturated_share
-from recon.camera.camera_model import CAMERAS
+from recon.camera.camera_model import CAMERAS, ModelName
 from recon.camera.registration import likeness
 from recon.camera.transformed import Transformation, transformed
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem, Stage
-from recon.reconstruction.reduction import on_blocks
+from recon.reconstruction.reduction import on_blocks, reduced_calibration
 from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.base import StoppingRules
 from recon.types import Calibration
@@ -58,15 +57,16 @@ ALIKE = 0.7
 """Likeness from which a far decoy tells nothing, as of regular lenslets, which are their own mirror image."""
 VARIED = 0.35
 """Difference of a field's PSFs from the central one, relative to it, beyond which that one explains little
-more than any other pattern: with a background right calibrations looked foreign from 0.4 on."""
+more than any other pattern: then all of them are tried, or, where one was chosen, nobody is accused."""
 
 
 def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> CalibrationCheck | None:
     """Let a problem's calibration compete with its decoys on the channel that has most signal.
 
-    One convolution a depth by the central PSFs, as few pixels as still tell one per cent of size; of PSFs
-    that vary over the field only whether they are the photograph's at all. None where the light is patterned,
-    the camera model comes from outside, or the PSFs vary too much: nothing is known of such.
+    One convolution a depth by the central PSFs, on as few pixels as still tell one per cent of size; of PSFs
+    that vary over the field only whether they are the photograph's at all, and by all of them where they vary
+    much. None where the light is patterned, the camera model comes from outside, or one PSF was chosen of a
+    field that varies much: nothing is known of such.
     """
     if problem.patterned or problem.model in CAMERAS:
         return None
@@ -96,19 +96,20 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
         check = compete(few, quick, lit=True) if lit else check
     if lit and not check.sure:
         check = compete(few, thorough, lit=True)
-    given = problem.reduction.given if problem.reduction is not None else problem
-    too_varied = given.depths.varies and given.depths.field_error > VARIED
-    return None if too_varied and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
+    given = _given(problem).depths
+    one = given.varies and not problem.depths.varies and given.field_error > VARIED
+    return None if one and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
 
 
 @dataclass(frozen=True, slots=True)
 class _Small:
-    """A channel of a photograph on few pixels, and the central PSFs (n_z, 1, height, width) there."""
+    """A channel of a photograph on few pixels, and its calibration there: one PSF a depth, or a field's."""
 
     photograph: Measurement
-    psfs: Floats
+    calibration: Calibration
     varies: bool
-    """Whether the calibration has other PSFs over the field."""
+    """Whether there are other PSFs over the field; near decoys of one convolution then tell nothing."""
+    model: ModelName
 
     @property
     def pixels(self) -> int:
@@ -118,21 +119,24 @@ class _Small:
 
     def decoys(self) -> tuple[Transformation, ...]:
         """Return those that differ from the PSFs: near ones where one PSF serves the field, then far ones."""
-        middle = self.psfs[len(self.psfs) // 2, 0]
+        psfs = self.calibration.psfs
+        middle = psfs[len(psfs) // 2, 0]
         far = [how for how in FAR if likeness(transformed(middle, how), middle) < ALIKE]
-        near = () if self.varies else near_decoys(self.psfs.shape[2:], volume=len(self.psfs) > 1)
+        near = () if self.varies else near_decoys(psfs.shape[2:], volume=len(psfs) > 1)
         return (*near, *far)
 
     def score(self, how: Transformation, *, iterations: int, background: bool) -> Score:
         """Reconstruct through transformed PSFs in few iterations."""
-        copies = Calibration(transformed(self.psfs, how), np.full((len(self.psfs), 3), np.nan))
-        if len(self.psfs) > 1:  # depths by number: they only have to differ
-            copies.source_positions_um[:] = [(0.0, 0.0, 1.0 + z) for z in range(len(self.psfs))]
-            iterations = -(-iterations // 2)
-        options = ReconstructionOptions(
-            prior="tv", model="convolution", estimate_background=background, drop_empty=False
+        positions = self.calibration.source_positions_um.copy()
+        positions[:, 1::-1] = positions[:, 1::-1] @ how.matrix.T  # (x, y) is (column, row)
+        copies = replace(
+            self.calibration, psfs=transformed(self.calibration.psfs, how), source_positions_um=positions
         )
-        return _score(Problem.of(self.photograph, copies, options), iterations)
+        options = ReconstructionOptions(
+            prior="tv", model=self.model, estimate_background=background, drop_empty=False
+        )
+        problem = Problem.of(self.photograph, copies, options)
+        return _score(problem, iterations if problem.n_planes == 1 else -(-iterations // 2))
 
 
 def _competition(small: _Small, scored: Callable[[Transformation], Score]) -> CalibrationCheck:
@@ -155,9 +159,6 @@ def _small(problem: Problem, longest_px: int) -> _Small:
     """Return the channel that has most signal on blocks of pixels, as large ones as erasures allow."""
     channel = int(np.argmax([d[v].std() for d, v in zip(problem.data, problem.valid, strict=True)]))
     own = slice(channel, channel + 1)
-    psfs = problem.depths.central
-    planes = np.unique(np.linspace(0, len(psfs) - 1, MOST_PLANES).round().astype(int))
-    psfs = _on_sensor(psfs[planes][:, own if psfs.shape[1] > 1 else slice(0, 1)], problem.sensor_shape)
     factor = max(1, round(max(problem.sensor_shape) / longest_px))
     counts, valid = problem.measurement.channels()[own], problem.valid[own]
     if 0 < saturated_share(counts[valid]) * factor**2 < MOST_CLIPPED:
@@ -168,8 +169,23 @@ def _small(problem: Problem, longest_px: int) -> _Small:
         if factor == 1 or erased is None or np.asarray(erased).mean() < MOST_ERASED:
             break
         factor //= 2
-    given = problem.reduction.given if problem.reduction is not None else problem
-    return _Small(photograph, block_mean(psfs, factor, about_axis=True), given.depths.varies)
+    depths = problem.depths
+    planes = np.unique(np.linspace(0, problem.n_planes - 1, MOST_PLANES).round().astype(int))
+    if local := depths.varies and depths.field_error > VARIED:
+        calibration = reduced_calibration(problem.calibration, 1, tuple(planes.tolist()))
+    else:  # depths by number: they only have to differ
+        places = np.column_stack([np.zeros((len(planes), 2)), 1.0 + np.arange(len(planes))])
+        calibration = Calibration(depths.central[planes], places)
+    psfs = calibration.psfs[:, own if calibration.psfs.shape[1] > 1 else slice(0, 1)]
+    calibration = replace(calibration, psfs=_on_sensor(psfs, problem.sensor_shape), background=None)
+    calibration = reduced_calibration(calibration, factor, None)
+    varies = _given(problem).depths.varies
+    return _Small(photograph, calibration, varies, "local" if local else "convolution")
+
+
+def _given(problem: Problem) -> Problem:
+    """Return a problem as it was before it was reduced."""
+    return problem if problem.reduction is None else problem.reduction.given
 
 
 def _on_sensor(psfs: Floats, shape: tuple[int, int]) -> Floats:
