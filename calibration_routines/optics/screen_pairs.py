@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -191,16 +192,18 @@ def solve_pairs(
         settings,
         on_progress=solving,
     )
-    numbers = np.linspace(0, len(pairs.names) - 1, min(asked.judged, len(pairs.names))).round().astype(int)
+    kept = [n for n in range(len(pairs.names)) if n not in solved.foreign]
+    names = [pairs.names[n] for n in kept]
     judged: list[LeftOut] = []
-    if len(numbers) and len(pairs.names) > 2:
+    if asked.judged and len(kept) > 2:
         listener.step("judging it by photographs left out")
+        numbers = np.linspace(0, len(kept) - 1, min(asked.judged, len(kept))).round().astype(int)
         judged = leave_out(
-            pairs.photographs,
-            pairs.pictures,
-            pairs.names,
-            settings,
-            only=[pairs.names[number] for number in np.unique(numbers)],
+            pairs.photographs[kept],
+            pairs.pictures[kept],
+            names,
+            replace(settings, foreign=False, gamma=solved.gamma),
+            only=[names[number] for number in np.unique(numbers)],
             binning=max(1, pairs.photographs.shape[2] // _JUDGED_ROWS),
             on_progress=solving,
         )
@@ -211,31 +214,40 @@ def solve_pairs(
         asked.z_um,
         Geometry(pixel_pitch_um=options.pixel_um, diffuser_distance_mm=options.distance_mm),
         {
-            "pairs": list(pairs.names),
+            "pairs": names,
+            "foreign": [pairs.names[n] for n in solved.foreign],
             "gamma": solved.gamma,
             "gains": solved.gains.tolist(),
-            "brightness": solved.brightness.tolist(),
-            "stray": solved.stray.tolist(),
+            "brightness": solved.brightness[kept].tolist(),
+            "stray": solved.stray[kept].tolist(),
         },
         {"pairs": str(options.pairs.resolve()), "simulated": pairs.simulated},
     )
-    good = all(one.psnr_db > one.flat_db + POOR_DB for one in judged)
-    verdict = tuple(_lines(calibration, good))
-    return Outcome(verdict=verdict, good=good, calibration=path, result=calibration)
+    findings = _findings(calibration.quality)
+    verdict = (*_lines(calibration), *(f"Quality: {finding}" for finding in findings))
+    return Outcome(verdict=verdict, good=not findings, calibration=path, result=calibration)
 
 
-def _lines(calibration: Calibration, good: bool) -> list[str]:
+def _lines(calibration: Calibration) -> list[str]:
     quality = calibration.quality
     lines = ["SIMULATED: a photograph comes from the simulated bench"] * calibration.provenance["simulated"]
     lines += [f"The pictures' gamma is {quality['gamma']:.2f}."]
     if quality["wander"] > DRIFT:
         differ = f"Exposures differ by up to {quality['wander']:.0%} from what the pictures say (taken out)."
         lines += [differ]
-    lines += psf_lines(quality)
-    if not good:
-        lines += [
-            "Quality: left-out photographs are hardly reconstructed: do photographs and pictures belong "
-            "together, are the pictures neither flipped nor shifted, and is one of their pixels one of the "
-            "photographs'?"
+    return lines + psf_lines(quality)
+
+
+def _findings(quality: Mapping[str, Any]) -> list[str]:
+    findings = []
+    if quality["foreign"]:
+        findings += [
+            f"left out: {', '.join(quality['foreign'])}, as the others fit far better without. Is that "
+            "the picture that was photographed, neither flipped nor shifted?"
         ]
-    return lines
+    if any(one["psnr_db"] < one["even_db"] + POOR_DB for one in quality["left_out"]):
+        findings += [
+            "photographs left out are hardly reconstructed: do photographs and pictures belong together, are "
+            "the pictures neither flipped nor shifted, and is one of their pixels one of the photographs'?"
+        ]
+    return findings

@@ -37,7 +37,7 @@ TONES = (24, 48, 80, 112, 144, 176, 208, 232, 255)
 FLICKER, DRIFT = 0.01, 0.02
 """Change of the screen's light, from frame to frame and from picture to picture or over the run, from which
 on it is told of."""
-_SOLVER = PictureSettings(beyond=0.0, saturated=None, gamma=1.0, rounds=1, psf_iterations=300)
+_SOLVER = PictureSettings(beyond=0.0, saturated=None, gamma=1.0, foreign=False, rounds=1, psf_iterations=300)
 """Nothing is unknown but the PSF: black is taken off, the tone is measured, and nothing else shines."""
 _SOLVING = 0.8  # of the work; the rest is judging
 _JUDGED_ROWS = 256  # of the images that are reconstructed to judge by
@@ -267,7 +267,7 @@ def saved(
         quality={
             **quality,
             "misfit": solved.misfit,
-            "wander": float(np.abs(solved.brightness - 1).max()),
+            "wander": float(np.nanmax(np.abs(solved.brightness - 1))),
             "left_out": [one.to_json() for one in judged],
         },
         provenance={

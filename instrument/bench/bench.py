@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Self, cast
 
 from drivers.camera import Camera
+from drivers.common.checked import checked
 from drivers.device import Device, SharedPart
 from drivers.errors import DeviceLostError, LimitError
 from drivers.frame import Frame, FrameMetadata
@@ -49,7 +50,7 @@ class Bench:
             name: shared.part(shared.options) for name, shared in config.shared.items()
         }
         self.devices: Mapping[Kind, Device] = {
-            kind: device.driver(
+            kind: checked(device.driver)(
                 device.options, self.shared[device.driver.Shared.table] if device.driver.Shared else None
             )
             for kind, device in config.devices.items()

@@ -35,7 +35,7 @@ _OF_THE_WINDOW = ("PySide6", "shiboken6", "pyqtgraph")
     )
 )
 def new(
-    file: Annotated[Path, typer.Argument(help="The file to write.")] = Path("bench.toml"),
+    out: Annotated[Path, typer.Argument(help="The file to write.", metavar="FILE")] = Path("bench.toml"),
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
     display: Annotated[bool, typer.Option("--display", help="A holographic display instead.")] = False,
     led_microscope: Annotated[
@@ -49,9 +49,9 @@ def new(
     from instrument.bench.config_file import DEFAULT_NAME, template
     from instrument.files.atomic import require_new, write_text
 
-    if file.is_dir():
-        raise FileError(file, "is a folder.", f"Name a file in it, e.g. {file / DEFAULT_NAME}")
-    require_new(file, overwrite=force)
+    if out.is_dir():
+        raise FileError(out, "is a folder.", f"Name a file in it, e.g. {out / DEFAULT_NAME}")
+    require_new(out, overwrite=force)
     if display + led_microscope + screen > 1:
         raise BenchError("Give one of --display, --led-microscope and --screen.")
     name, what = "default", "bench, with every key explained"
@@ -61,9 +61,9 @@ def new(
         name, what = "led_microscope", "LED array microscope"
     if screen:
         name, what = "screen", "camera before a monitor"
-    write_text(file, template(name))
-    typer.echo(f"Wrote {file}: a SIMULATED {what}.")
-    typer.echo(f"Next: diffuserbench check{'' if file == Path(DEFAULT_NAME) else f' --bench {file}'}")
+    write_text(out, template(name))
+    typer.echo(f"Wrote {out}: a SIMULATED {what}.")
+    typer.echo(f"Next: diffuserbench check{'' if out == Path(DEFAULT_NAME) else f' --bench {out}'}")
 
 
 @check_app.command(

@@ -132,7 +132,7 @@ def export(
     run: Annotated[
         Path, typer.Argument(metavar="RUN|RESULT", help="The run's folder; or a reconstruction's file.")
     ],
-    target: Annotated[
+    out: Annotated[
         Path,
         typer.Argument(
             metavar="TARGET",
@@ -149,7 +149,7 @@ def export(
     """
     if _is_result(run):
         given.refuse("a reconstruction", "reconstruction")
-        _export_result(run, target)
+        _export_result(run, out)
         return
     found = Run.open(run)
     wanted = set(range(found.n_frames)[options.frames or slice(None)])
@@ -157,8 +157,8 @@ def export(
         wanted &= {step.index for step in found.steps(options.label)}
     indices = [index for index in sorted(found.records) if index in wanted]
     with one_task("Frames") as advance:
-        export_run(found, target, indices, frames_per_s=options.frames_per_s, on_progress=advance)
-    typer.echo(f"Wrote {len(indices)} frames: {target}")
+        export_run(found, out, indices, frames_per_s=options.frames_per_s, on_progress=advance)
+    typer.echo(f"Wrote {len(indices)} frames: {out}")
     if absent := len(wanted) - len(indices):
         typer.echo(f"Warning: {absent} frames that are not in the run were left out.", err=True)
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import whole_file, whole_folder
 from instrument.files.errors import FileError
+from instrument.files.reading import folder_bytes, require_file, require_plausible
 
 if TYPE_CHECKING:
     from recon.reconstruction.result import Grid
@@ -331,8 +332,12 @@ def _open_zarr(path: Path) -> VolumeSource:
         multiscale = group.attrs["ome"]["multiscales"][0]
         names = [axis["name"] for axis in multiscale["axes"]]
         arrays = [group[dataset["path"]] for dataset in multiscale["datasets"]]
-    except (OSError, KeyError, IndexError, TypeError, ValueError) as error:
-        raise FileError(path, f"is no OME-Zarr 0.5 image: {error!r}.") from error
+        for array in arrays:
+            require_plausible(path, array.nbytes, folder_bytes(path))
+    except FileError:
+        raise
+    except Exception as error:
+        raise FileError(path, f"is no OME-Zarr 0.5 image: {error!r:.200}.") from error
     if names not in (["z", "y", "x"], ["c", "z", "y", "x"]):
         raise FileError(path, f"has the axes {', '.join(names)}; a volume has z, y, x, or c before them.")
 
@@ -348,8 +353,9 @@ def _open_zarr(path: Path) -> VolumeSource:
 
 def _open_npy(path: Path) -> VolumeSource:
     try:
+        require_file(path)
         return volume_in_memory(np.load(path, mmap_mode="r", allow_pickle=False), path)
-    except (ValueError, EOFError, OSError) as error:
+    except Exception as error:
         raise FileError(path, f"is no plain .npy array: {error}.") from error
 
 
@@ -357,11 +363,20 @@ def _open_tiff(path: Path) -> VolumeSource:
     """Map the file where it lies in one piece, else read it page by page."""
     import tifffile
 
+    tiff = None
     try:
+        stored = require_file(path)
         tiff = tifffile.TiffFile(path)
-    except (OSError, tifffile.TiffFileError) as error:
-        raise FileError(path, f"is no TIFF: {error}.") from error
-    series: Any = tiff.series[0]
+        series: Any = tiff.series[0]
+        require_plausible(path, series.size * series.dtype.itemsize, stored)
+    except FileError:
+        if tiff is not None:
+            tiff.close()
+        raise
+    except Exception as error:
+        if tiff is not None:
+            tiff.close()
+        raise FileError(path, f"is no TIFF, or a damaged one: {error!r:.200}.") from error
     axes = series.axes.replace("S", "C")
     if len(axes) == 3 and axes.endswith("YX"):
         axes = "ZYX"  # a stack of pages from elsewhere: whatever its axis is called, it is the depth
@@ -373,7 +388,10 @@ def _open_tiff(path: Path) -> VolumeSource:
         )
     if series.dataoffset is not None and series.dtype.byteorder in ("=", "|", "<"):
         tiff.close()
-        mapped = tifffile.memmap(path, mode="r")
+        try:
+            mapped = tifffile.memmap(path, mode="r")
+        except Exception as error:
+            raise FileError(path, f"is damaged: {error!r:.200}.") from error
         return volume_in_memory(np.moveaxis(mapped, 1, -1) if axes == "ZCYX" else mapped, path)
     per_plane = shape.get("C", 1) if axes == "ZCYX" else 1
 

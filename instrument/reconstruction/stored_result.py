@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,9 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import whole_file
+from instrument.files.atomic import refuse_input, whole_file
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, write_image
+from instrument.files.reading import parse_json, read_bytes, require_file
 from instrument.files.volumes import (
     VolumeSource,
     is_zarr_name,
@@ -43,6 +43,14 @@ class StoredResult:
     """What was written beside it; empty for results from elsewhere."""
     deviation: npt.NDArray[np.float32] | None = None
     """Standard deviation of a picture's pixels, as it; None where it was not asked for."""
+
+    @property
+    def inputs(self) -> list[Path]:
+        """The files that it was made of, as far as they are known, and its own."""
+        named = self.record.get("inputs")
+        values = named.values() if isinstance(named, Mapping) else ()
+        named = [value.get("path") if isinstance(value, Mapping) else value for value in values]
+        return [self.path, *(Path(value) for value in named if isinstance(value, str) and value)]
 
     @property
     def simulated(self) -> bool:
@@ -226,8 +234,8 @@ def _record_of(path: Path) -> dict[str, Any]:
     if not beside.is_file():
         return {}
     try:
-        record = json.loads(beside.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        record = parse_json(read_bytes(beside))
+    except (OSError, ValueError) as error:
         raise FileError(beside, f"cannot be read as JSON: {error}.") from error
     # Another program's JSON, or that of another kind of file of ours, is no record of this one.
     return record if isinstance(record, dict) and "grid" in record else {}
@@ -240,15 +248,17 @@ def _is_volume(path: Path, record: Mapping[str, Any]) -> bool:
         import tifffile
 
         try:
+            require_file(path)
             with tifffile.TiffFile(path) as tiff:
                 series = tiff.series[0]
                 return len(series.shape) == 4 or (len(series.shape) == 3 and "S" not in series.axes)
-        except (OSError, IndexError, tifffile.TiffFileError):
+        except Exception:  # noqa: BLE001 - a damaged TIFF raises nearly anything
             return False  # reading it as an image then says what is wrong
     if path.suffix.lower() == ".npy":
         try:
+            require_file(path)
             shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
-        except (OSError, ValueError, EOFError):
+        except Exception:  # noqa: BLE001 - a damaged header raises nearly anything
             return False
         return len(shape) == 4 or (len(shape) == 3 and shape[-1] not in (1, 3, 4))
     return False
@@ -288,8 +298,8 @@ def _is_record(path: Path) -> bool:
         with path.open("rb") as file:
             if b'"diffuserbench ' not in file.read(200):  # the program's name stands first
                 return False
-        record = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+        record = parse_json(read_bytes(path))
+    except (OSError, ValueError, FileError):
         return False  # another program's file
     if not isinstance(record, dict) or not {"grid", "prior", "inputs"} <= record.keys():
         return False
@@ -337,6 +347,7 @@ def export_result(
         ``advance(planes done, planes)``; may raise to end the work.
     """
     target = Path(target)
+    refuse_input(target)
     volume = result.volume is not None
     known = VOLUME_SUFFIXES if volume else PICTURE_SUFFIXES
     if not target.name.lower().endswith(known):

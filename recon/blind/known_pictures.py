@@ -9,15 +9,15 @@ non-negative least squares (FISTA), first on binned images.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from recon.base import fft
 from recon.base.blocks import block_mean, enlarged
-from recon.camera.base import Array, Composition, LinearOperator, Projection, estimate_norm
+from recon.blind.psf_step import BeadMixer
+from recon.camera.base import Array, Composition, Projection, estimate_norm
 from recon.camera.convolution import Convolution, field_of
 from recon.camera.factors import Erasures
 from recon.errors import InputError
@@ -31,6 +31,10 @@ _COARSE_PX = 64  # rows of the coarsest images
 _NORM_MARGIN = 1.1  # the power iteration's norm is a lower bound
 _WORTH = 0.1  # of the misfit, that another exponent than 1 has to take away
 _LARGEST_STEP, _GAMMAS = 0.3, (0.3, 4.0)  # of the exponent
+_FOREIGN, _FEW = 0.03, 3.0
+"""Part of the others' misfit that goes with a photograph that does not show its picture: at least, and over
+the square of their number, as a PSF from few fits them better than that from one more, anyway."""
+_FOREIGN_PX, _FOREIGN_ITERATIONS = 32, 60  # rows of images that this is told from, and iterations of the PSF
 _FLATTEST = 1e-3  # relative deviation of a photograph or picture that shows something
 
 
@@ -50,6 +54,9 @@ class PictureSettings:
     gamma : float or None
         Exponent that makes a picture's values light; None: 1, or what is found where that explains clearly
         more.
+    foreign : bool
+        Leave out photographs that do not show their pictures, told by how much better the others fit without
+        them; of three or more.
     rounds : int
         How often PSF and unknown light are solved in turn, at each scale; half as often at the finest.
     psf_iterations, light_iterations : int
@@ -61,6 +68,7 @@ class PictureSettings:
     beyond: float = 0.18
     saturated: float | None = 0.97
     gamma: float | None = 1.0
+    foreign: bool = True
     rounds: int = 4
     psf_iterations: int = 200
     light_iterations: int = 30
@@ -86,6 +94,9 @@ class PicturePsf:
         Exponent that makes a picture's values light.
     misfit : float
         What is left of the photographs' standard deviation.
+    foreign : tuple of int
+        Photographs, from 0, that do not show their pictures and were left out; their brightness and stray
+        light are NaN.
     """
 
     psf: Floats
@@ -95,6 +106,7 @@ class PicturePsf:
     light: Floats
     gamma: float
     misfit: float
+    foreign: tuple[int, ...] = ()
 
 
 def psf_from_pictures(
@@ -125,6 +137,9 @@ def psf_from_pictures(
     _check(data, known, settings)
     report = on_progress or (lambda _what, _share: None)
     known = known / known.max()
+    foreign = foreign_photographs(data, known, settings) if settings.foreign else ()
+    kept = np.setdiff1d(np.arange(len(data)), foreign)
+    data, known = data[kept], known[kept]
     factors = [1]
     while data.shape[2] // (2 * factors[-1]) >= _COARSE_PX:
         factors.append(2 * factors[-1])
@@ -151,7 +166,47 @@ def psf_from_pictures(
         scale.solve(share)
         found = scale
     assert found is not None
-    return found.result()
+    result = found.result()
+    if not foreign:
+        return result
+    brightness = np.full(len(kept) + len(foreign), np.nan)
+    stray, light = (
+        np.full((len(brightness), *values.shape[1:]), np.nan, np.float32)
+        for values in (result.stray, result.light)
+    )
+    for every, own in ((brightness, result.brightness), (stray, result.stray), (light, result.light)):
+        every[kept] = own
+    return replace(result, brightness=brightness, stray=stray, light=light, foreign=foreign)
+
+
+def foreign_photographs(data: Floats, known: Floats, settings: PictureSettings) -> tuple[int, ...]:
+    """Return which photographs do not show their pictures: without them the others are explained far better.
+
+    Parameters
+    ----------
+    data, known : ndarray, float32, (n, n_channels, height, width)
+        Photographs and pictures, these with a peak of 1.
+    settings : PictureSettings
+    """
+    factor = max(1, data.shape[2] // _FOREIGN_PX)
+    data, known = (block_mean(stack, factor, about_axis=True) for stack in (data, known))
+    quick = replace(settings, gamma=settings.gamma or 1.0, psf_iterations=_FOREIGN_ITERATIONS)
+
+    def left(numbers: Sequence[int]) -> npt.NDArray[np.float64]:
+        """Return what is left of each photograph's energy with the PSF from some of them."""
+        estimate = _Estimate(data[numbers], known[numbers], quick)
+        estimate.solve(lambda _what, _share: None)
+        return estimate.left
+
+    kept = list(range(len(data)))
+    while len(kept) > 2:
+        whole = left(kept)
+        gone = [left([*kept[:k], *kept[k + 1 :]]).sum() / np.delete(whole, k).sum() for k in range(len(kept))]
+        worst = int(np.argmin(gone))
+        if 1 - np.sqrt(gone[worst]) < max(_FOREIGN, _FEW / len(kept) ** 2):
+            break
+        del kept[worst]
+    return tuple(sorted(set(range(len(data))) - set(kept)))
 
 
 def _gamma_worth_having(data: Floats, known: Floats, settings: PictureSettings) -> float:
@@ -182,7 +237,12 @@ class _Estimate:
         self.brightness = np.ones(count)
         self.psf = np.zeros((1 if settings.one_psf else self.channels, *self.sensor), np.float32)
         self.gains = np.ones(self.channels)
-        self.misfit = np.inf
+        self.left = np.full(count, np.inf)
+
+    @property
+    def misfit(self) -> float:
+        """What is left of the photographs' standard deviation."""
+        return float(np.sqrt(self.left.sum()) / np.linalg.norm(self._even_removed(self.data)))
 
     def _where_unknown(self, known: Floats) -> npt.NDArray[np.bool_]:
         """Return where there may be light that the pictures do not tell of: beyond them, where saturated."""
@@ -229,7 +289,8 @@ class _Estimate:
         scene = self.scene()
         for k in range(len(self.psf)):
             part = slice(None) if len(self.psf) == 1 else slice(k, k + 1)
-            seen = KnownScenes(scene[:, part].reshape(-1, *self.field), self.sensor)
+            light = scene[:, part].reshape(-1, *self.field)
+            seen = BeadMixer(np.ones((1, *self.field), np.float32), light, self.sensor, self.sensor)
             camera = Composition(EvenRemoved(seen.range_shape, seen.range_shape, np.float32), seen)
             target = camera.outer.forward(self.data[:, part].reshape(seen.range_shape))
             step = 1 / (_NORM_MARGIN * estimate_norm(camera, 15)) ** 2
@@ -250,7 +311,7 @@ class _Estimate:
                 self.brightness = self.brightness * ratio / ratio.mean()
                 self.light *= (ratio / ratio.mean())[:, None, None, None].astype(np.float32)
         model = self._even_removed(self.seen(self.scene()))
-        self.misfit = float(np.linalg.norm(model - data) / np.linalg.norm(data))
+        self.left = ((model - data) ** 2).sum(axis=(1, 2, 3), dtype=np.float64)
 
     def solve_gamma(self) -> None:
         """Fit the pictures' exponent: a Gauss-Newton step, each photograph's brightness free."""
@@ -317,60 +378,6 @@ class EvenRemoved(Projection):
         means = x.mean(axis=(1, 2), keepdims=True, dtype=np.float64).astype(self.dtype)
         left: Array = np.subtract(x, means, out=out)
         return left
-
-
-class KnownScenes(LinearOperator):
-    """The map from one PSF (1, height, width) to photographs (n, height, width) of fixed scenes.
-
-    Parameters
-    ----------
-    scenes : ndarray, float32, (n, field height, field width)
-        Everything that can reach the sensor (:func:`~recon.camera.convolution.field_of`), not negative.
-    sensor : (int, int)
-        Of photographs and PSF.
-    """
-
-    def __init__(self, scenes: Floats, sensor: tuple[int, int]) -> None:
-        super().__init__((1, *sensor), (len(scenes), *sensor), np.float32)
-        self._grid = fft.fast_shape(field_of(sensor, sensor)[0])
-        padded = np.zeros((len(scenes), *self._grid), np.float32)
-        padded[:, : scenes.shape[1], : scenes.shape[2]] = scenes
-        self._spectra = fft.rfft(padded)
-        self._power = float((scenes.sum(axis=(1, 2), dtype=np.float64) ** 2).sum())
-        self._image = np.empty((1, *self._grid), np.float32)
-        self._rows = np.empty((len(scenes), sensor[0], self._grid[1]), np.float32)
-        self._work = np.empty_like(self._spectra)
-
-    def forward(self, x: Array, out: Array | None = None) -> Array:
-        """Convolve each scene with the PSF."""
-        height, width = self.domain_shape[1:]
-        self._image[...] = 0
-        self._image[:, :height, :width] = x
-        np.multiply(self._spectra, fft.rfft(self._image), out=self._work)
-        rows = fft.irfft_strip(self._work, height - 1, self._rows)
-        seen = rows[:, :, width - 1 : 2 * width - 1]
-        return seen.copy() if out is None else _into(out, seen)
-
-    def adjoint(self, y: Array, out: Array | None = None) -> Array:
-        """Correlate each photograph with its scene, and sum."""
-        height, width = self.domain_shape[1:]
-        self._rows[...] = 0
-        self._rows[:, :, width - 1 : 2 * width - 1] = y
-        fft.rfft_strip(self._rows, height - 1, self._work)
-        fft.multiply(self._work, self._spectra, conjugate=True)
-        total = self._work.sum(axis=0, keepdims=True)
-        back = fft.irfft(total, self._grid[1], out=self._image)[:, :height, :width]
-        return back.copy() if out is None else _into(out, back)
-
-    @property
-    def norm_bound(self) -> float:
-        """Root of the sum of the scenes' squared light: no frequency has more, as nothing is negative."""
-        return float(np.sqrt(self._power))
-
-
-def _into(out: Array, values: Array) -> Array:
-    out[...] = values
-    return out
 
 
 def _check(data: Floats, known: Floats, settings: PictureSettings) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
+from recon.camera.base import LinearOperator
 from recon.camera.convolution import field_of
 from recon.camera.points import FieldFunctions, Points
 
@@ -26,41 +27,60 @@ _ABOVE_NOISE = 3.0  # standard deviations: fainter pixels would sum to a haze of
 _LEAST_PX = 4  # pixels in one piece
 
 
-class Mixer:
-    """A linear map from PSFs to images in which each image is a sum of the PSFs' convolutions, cropped.
+class Mixer(LinearOperator):
+    """The map from PSFs to images in which each image is a sum of the PSFs' convolutions, cropped.
 
-    Subclasses fill ``_spectra``: of what image ``i`` has of PSF ``k``, (n_images, n_psfs, *spectrum).
+    Subclasses fill ``_spectra``, of what image ``i`` has of PSF ``k``: (n_images, n_psfs, *spectrum); and
+    ``lipschitz``, a bound of the squared norm.
     """
 
-    _spectra: npt.NDArray[np.complex64]
+    lipschitz: float
 
-    def __init__(self, psf_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> None:
-        self._psf, self._sensor = psf_shape, sensor_shape
+    def __init__(
+        self, counts: tuple[int, int], psf_shape: tuple[int, int], sensor_shape: tuple[int, int]
+    ) -> None:
+        n_images, n_psfs = counts
+        super().__init__((n_psfs, *psf_shape), (n_images, *sensor_shape), np.float32)
         self._grid = fft.fast_shape(field_of(sensor_shape, psf_shape)[0])
+        self._spectra = np.empty((*counts, *fft.spectrum_shape(self._grid)), np.complex64)
+        self._seen = np.empty((n_images, *self._spectra.shape[2:]), np.complex64)
+        self._rows = np.empty((n_images, sensor_shape[0], self._grid[1]), np.float32)
 
-    def forward(self, psfs: Numbers) -> Array:
+    def forward(self, x: Numbers, out: Array | None = None) -> Array:
         """Return images (n_images, height, width) of PSFs (n_psfs, psf height, psf width)."""
-        padded = np.zeros((len(psfs), *self._grid), np.float32)
-        padded[:, : self._psf[0], : self._psf[1]] = psfs
+        _, height, width = self.domain_shape
+        padded = np.zeros((len(x), *self._grid), np.float32)
+        padded[:, :height, :width] = x
         spectra = fft.rfft(padded)
-        seen = np.stack([np.einsum("kyx,kyx->yx", row, spectra) for row in self._spectra])
-        return np.ascontiguousarray(fft.irfft(seen, self._grid[1])[self._window])
+        for row, seen in zip(self._spectra, self._seen, strict=True):
+            np.einsum("kyx,kyx->yx", row, spectra, out=seen)
+        rows = fft.irfft_strip(self._seen, height - 1, self._rows)
+        return _into(out, rows[:, :, width - 1 : width - 1 + self.range_shape[2]])
 
-    def adjoint(self, images: Numbers) -> Array:
+    def adjoint(self, y: Numbers, out: Array | None = None) -> Array:
         """Return the exact transpose."""
-        padded = np.zeros((len(images), *self._grid), np.float32)
-        padded[self._window] = images
-        spectra = np.conj(fft.rfft(padded))
+        _, height, width = self.domain_shape
+        self._rows[...] = 0
+        self._rows[:, :, width - 1 : width - 1 + self.range_shape[2]] = y
+        fft.rfft_strip(self._rows, height - 1, self._seen)
+        np.conj(self._seen, out=self._seen)
         total = np.zeros(self._spectra.shape[1:], np.complex64)
-        for row, image in zip(self._spectra, spectra, strict=True):
+        for row, image in zip(self._spectra, self._seen, strict=True):
             total += row * image
         back = fft.irfft(np.conj(total), self._grid[1])
-        return np.ascontiguousarray(back[:, : self._psf[0], : self._psf[1]])
+        return _into(out, back[:, :height, :width])
 
     @property
-    def _window(self) -> tuple[slice, slice, slice]:
-        (top, left), (height, width) = ((n - 1 for n in self._psf), self._sensor)
-        return slice(None), slice(top, top + height), slice(left, left + width)
+    def norm_bound(self) -> float:
+        """Root of ``lipschitz``."""
+        return float(np.sqrt(self.lipschitz))
+
+
+def _into(out: Array | None, values: Array) -> Array:
+    if out is None:
+        return values.copy()
+    out[...] = values
+    return out
 
 
 class PointMixer(Mixer):
@@ -88,10 +108,9 @@ class PointMixer(Mixer):
         psf_shape: tuple[int, int],
         sensor_shape: tuple[int, int],
     ) -> None:
-        super().__init__(psf_shape, sensor_shape)
+        super().__init__((len(beads), functions.count), psf_shape, sensor_shape)
         _, centre = field_of(sensor_shape, psf_shape)
         f_y, f_x = np.fft.fftfreq(self._grid[0]), np.fft.rfftfreq(self._grid[1])
-        self._spectra = np.empty((len(beads), functions.count, len(f_y), len(f_x)), np.complex64)
         for points, out in zip(beads, self._spectra, strict=True):
             weights = functions.at(points.places) * points.light[:, None]
             rows = np.exp(-2j * np.pi * np.outer(points.places[:, 0] + centre[0], f_y)).astype(np.complex64)

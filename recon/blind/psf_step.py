@@ -109,9 +109,8 @@ class BeadMixer(Mixer):
         psf_shape: tuple[int, int],
         sensor_shape: tuple[int, int],
     ) -> None:
-        super().__init__(psf_shape, sensor_shape)
+        super().__init__((len(beads), len(weights)), psf_shape, sensor_shape)
         field_shape, _ = field_of(sensor_shape, psf_shape)
-        self._spectra = np.empty((len(beads), len(weights), *fft.spectrum_shape(self._grid)), np.complex64)
         padded = np.zeros((len(weights), *self._grid), np.float32)
         sums = np.empty((len(beads), len(weights)))
         for i, image in enumerate(beads):

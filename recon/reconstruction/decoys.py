@@ -15,11 +15,9 @@ from recon.camera.registration import likeness
 from recon.camera.transformed import Transformation, transformed
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.part import Part
+from recon.reconstruction.pilot import fine_structure, pilot, tile_means
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import on_blocks, reduced_calibration
-from recon.reconstruction.solvers import SOLVERS
-from recon.solvers.base import StoppingRules
 from recon.types import Calibration
 from recon.verdict.calibration_check import (
     BETWEEN,
@@ -45,11 +43,6 @@ MOST_PLANES = 6
 """Depths that take part, evenly spaced."""
 WEIGHT = 1.0
 """Of total variation: as large as the noise that the adjoint of a PSF of unit energy passes on."""
-FINE_PX = 3.0
-"""Deviation of the Gaussian whose mean is taken off what is left: slow waves are left by unfinished
-iterations and stray light, and prefer smaller PSFs."""
-TILES = 4
-"""Along each axis of the photograph."""
 DECOYS, MOST_DECOYS = 8, 12
 """Usually; and with farther ones on the side of a near one that is better, each twice as far: to some eight
 degrees or per cent."""
@@ -198,31 +191,10 @@ def _on_sensor(psfs: Floats, shape: tuple[int, int]) -> Floats:
 
 def _score(problem: Problem, iterations: int) -> Score:
     """Reconstruct a problem of one channel and score it."""
-    sensor = SOLVERS.named("admm-sensor")
-    offered = sensor if sensor.accepts(problem) is None else SOLVERS.named("admm")
-    part = Part(replace(problem, options=replace(problem.options, solver=offered.name)), slice(0, 1))
-    try:
-        part.weight = WEIGHT
-        outcome = offered.make(part, None).run(StoppingRules(iterations=iterations, tolerance=0.0))
-        solution = np.maximum(part.lifted(outcome.solution), 0)
-        background = part.background(solution) if part.removal is not None else None
-        residual, valid = part.residual(solution, background)[0].astype(np.float64), part.valid[0]
-    finally:
-        part.close()
-    last = outcome.history[-1]
+    found = pilot(problem, iterations, weight=WEIGHT)
+    valid, last = problem.valid[0], found.outcome.history[-1]
     prior = last.objective - 0.5 * last.data_residual**2
-    misfit = float(np.mean(residual[valid] ** 2))
-    return Score(misfit, misfit + 2 * prior / np.count_nonzero(valid), _fine(residual, valid))
-
-
-def _fine(residual: npt.NDArray[np.float64], valid: npt.NDArray[np.bool_]) -> tuple[float, ...]:
-    """Return the mean square of a residual (height, width) less its own local mean, tile by tile."""
-    from scipy.ndimage import gaussian_filter
-
-    known = valid.astype(np.float64)
-    local = gaussian_filter(residual * known, FINE_PX) / np.maximum(gaussian_filter(known, FINE_PX), 1e-6)
-    power = np.where(valid, residual - local, 0) ** 2
-    tile = [np.arange(n) * TILES // n for n in valid.shape]
-    label = (tile[0][:, None] * TILES + tile[1]).ravel()
-    count, total = np.bincount(label, known.ravel()), np.bincount(label, power.ravel())
-    return tuple((total[count > 0] / count[count > 0]).tolist())
+    left = found.left[0].astype(np.float64)
+    misfit = float(np.mean(left[valid] ** 2))
+    fine = tile_means(fine_structure(left, valid) ** 2, valid)
+    return Score(misfit, misfit + 2 * prior / np.count_nonzero(valid), tuple(fine.tolist()))

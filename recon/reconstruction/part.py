@@ -62,7 +62,8 @@ class Part:
     camera : LinearOperator
         Domain (n_channels, n_z, grid height, grid width), range (n_channels, height, width).
     data : ndarray, (n_channels, height, width)
-        In units of the noise, and in the precision of the arithmetic.
+        In units of the noise, and in the precision of the arithmetic; less what a background is expected to
+        be, where one is estimated.
     valid : ndarray of bool, as ``data``
     removal : BackgroundRemoval or None
         What takes a smooth background out of the data, where one is estimated.
@@ -81,6 +82,7 @@ class Part:
         self.tau: float | None = None
         self.weight = 0.0
         self._removed: BackgroundRemoval | None = None
+        self._usual: Array = np.zeros((1, 1, 1), self.dtype)
         self.removal = (
             BackgroundRemoval(self.valid.shape, BACKGROUND_FREQUENCIES, self.valid, self.dtype)
             if problem.smooth
@@ -99,7 +101,9 @@ class Part:
         """Take another photograph's data.
 
         A background's prior deviation is their root mean square: object and background do not trade places
-        beyond that.
+        beyond that. Its prior mean is half of theirs in pictures by priors that do not mind an even object
+        and would keep its even part: none of the light may be stray or all. It is 0 with l1, which minds
+        light, and in volumes, where it stands for what PSFs do not tell as well and may be negative.
         """
         self.problem = problem
         self.data = self._measured = problem.data[self._rows].astype(self.dtype, copy=False)
@@ -107,6 +111,12 @@ class Part:
             power = float(np.sum(self.data.astype(np.float64) ** 2))
             pixels = int(np.count_nonzero(self.valid))
             self.removal.restrain(pixels / max(power, pixels))
+            if problem.n_planes == 1 and kind_of(problem.prior_name) == "tv":
+                means = [
+                    0.5 * d[v].mean(dtype=np.float64) for d, v in zip(self.data, self.valid, strict=True)
+                ]
+                self._usual = np.asarray(means, self.dtype)[:, None, None]
+                self.data = np.where(self.valid, self.data - self._usual, 0)
 
     @property
     def _rows(self) -> slice:
@@ -310,7 +320,7 @@ class Part:
         """Return the smooth background that goes with a solution, in units of the noise, as ``data``."""
         if self.removal is None:
             raise ValueError("No background was asked for.")
-        return self.removal.background(self.data - self.camera.forward(solution))
+        return self._usual + self.removal.background(self.data - self.camera.forward(solution))
 
     def residual(self, solution: Array, background: Array | None) -> Array:
         """Return what a solution and its background leave of the data, as ``data``; 0 where erased."""

@@ -13,9 +13,8 @@ from recon.analysis.correlation import autocorrelate
 from recon.camera.camera_model import Depths, ModelName
 from recon.camera.spatially_varying import SpatiallyVarying
 from recon.reconstruction.part import Part
+from recon.reconstruction.pilot import pilot
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.solvers import SOLVERS
-from recon.solvers import StoppingRules
 
 Array = npt.NDArray[Any]
 
@@ -60,22 +59,16 @@ def coarse_copy(problem: Problem, model: ModelName, prior: str, *, background: b
 
 def _coarse_pass(problem: Problem) -> tuple[npt.NDArray[np.float64], float]:
     """Return the planes' shares of the light of a problem of one channel, and the background's."""
-    part = Part(problem, slice(0, 1))
-    try:
-        part.weigh(None)
-        solver = SOLVERS["admm"].make(part, None)
-        outcome = solver.run(StoppingRules(iterations=COARSE_ITERATIONS, tolerance=0.0))
-        solution = part.lifted(outcome.solution)
-        smooth = part.background(solution)[0]
-        volume = np.abs(np.asarray(solution[0], np.float64))
-    finally:
-        part.close()
+    found = pilot(problem, COARSE_ITERATIONS)
+    assert found.background is not None
     psfs = problem.levelled[0].central
-    per_plane = volume.sum(axis=(1, 2)) * psfs[:, 0].sum(axis=(1, 2), dtype=np.float64)
+    per_plane = found.solution[0].sum(axis=(1, 2), dtype=np.float64) * psfs[:, 0].sum(
+        axis=(1, 2), dtype=np.float64
+    )
     valid = problem.valid[0]
-    light = float(problem.data[0][valid].mean(dtype=np.float64))
+    mean = float(problem.data[0][valid].mean(dtype=np.float64))
     share = per_plane / max(float(per_plane.sum()), 1e-30)
-    return share, 0.0 if light <= 0 else float(smooth[valid].mean()) / light
+    return share, 0.0 if mean <= 0 else float(found.background[0][valid].mean()) / mean
 
 
 @dataclass(frozen=True)

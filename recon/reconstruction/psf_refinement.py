@@ -32,12 +32,10 @@ from recon.camera.varying_psfs import FieldOfPsfs
 from recon.errors import InputError
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.part import Part
+from recon.reconstruction.pilot import fine_structure, pilot, tile_means
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import reduced_calibration
-from recon.reconstruction.solvers import SOLVERS
 from recon.reconstruction.weights import kind_of
-from recon.solvers import StoppingRules
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
@@ -53,10 +51,6 @@ HELD_SHARE = 0.1
 """Of the pixels, for the fit, and as many again for the judgement."""
 BETWEEN_PX = 0.37
 """By how much all copies are displaced."""
-FINE_PX = 3.0
-"""Deviation of the Gaussian whose mean is taken off what is left, binned pixels."""
-TILES = 4
-"""Along each axis of the photograph, judged apart: how much they differ tells how sure the whole is."""
 SEARCH_STEP_PX = 1.0
 """Steps of the search, binned pixels at the pattern's root mean square radius."""
 LEAST_RADIUS_PX = 20.0
@@ -263,11 +257,9 @@ class _Trials:
             model = "local" if varies else "convolution"
         self._problem = replace(self._problem, model=model)
         self._data = image / self._problem.noise[0]
-        self._known = known.astype(np.float32)
+        self._known = known
         self._iterations = iterations if self._problem.is_plain else iterations // LARGE
         self._done: dict[tuple[float, ...], tuple[Floats, Floats]] = {}
-        rows, columns = (np.minimum(np.arange(n) * TILES // n, TILES - 1) for n in image.shape)
-        self._tile = TILES * rows[:, None] + columns
         self.radius_px = _radius_px(self._problem.depths.central)
 
     def fitted(self, place: Floats) -> Floats:
@@ -282,35 +274,15 @@ class _Trials:
         key = tuple(np.round(place, 9))
         if key not in self._done:
             square = self._left(_transformation(place)) ** 2
-            self._done[key] = self._by_tile(square, self._fit), self._by_tile(square, self._judge)
+            self._done[key] = tile_means(square, self._fit), tile_means(square, self._judge)
         return self._done[key]
-
-    def _by_tile(self, square: Array, where: Array) -> Floats:
-        tile, n = self._tile[where], TILES**2
-        count = np.bincount(tile, minlength=n)
-        mean: Floats = np.bincount(tile, square[where], n) / np.maximum(count, 1)
-        return mean[count > 0]
 
     def _left(self, how: Transformation) -> Array:
         """Return the fine structure that a copy of the PSFs leaves of the photograph, (height, width)."""
-        from scipy.ndimage import gaussian_filter
-
         problem = replace(self._problem, depths=_copied(self._problem.depths, how))
-        part = Part(problem, slice(0, 1))
-        try:
-            part.weigh(None)
-            solver = SOLVERS.named("admm-sensor" if problem.is_plain else "admm").make(part, None)
-            outcome = solver.run(StoppingRules(iterations=self._iterations, tolerance=0.0))
-            solution = part.lifted(outcome.solution)
-            rest = self._data - part.camera.forward(solution)[0]
-            if problem.smooth:
-                rest -= part.background(solution)[0]
-        finally:
-            part.close()
-        rest *= self._known
-        share = np.maximum(gaussian_filter(self._known, FINE_PX), 1e-3)
-        fine: Array = (rest - gaussian_filter(rest, FINE_PX) / share) * self._known
-        return fine
+        found = pilot(problem, self._iterations)
+        left = found.left[0] + np.where(problem.valid[0], 0, self._data)  # what is erased is to be predicted
+        return fine_structure(left, self._known)
 
 
 def _binned(image: Array, valid: Array, factor: int) -> tuple[Array, npt.NDArray[np.bool_]]:

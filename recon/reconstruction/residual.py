@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 
 from recon.reconstruction.background import MODEL_ERROR
 from recon.reconstruction.problem import Problem
@@ -16,6 +19,22 @@ rises to 1.3 as the prior takes hold, the USAF target's without a background to 
 is where splittings of exact data begin, and all may rise to the usual error of a model."""
 FALLING, EARLIER = 0.98, 10
 """Of so many iterations earlier: a last residual below it had not come to its end."""
+NEGATIVE = 0.25
+"""Share of the data's mean below zero from which on a background is said to be negative."""
+
+
+def background_in_words(problem: Problem, background: npt.NDArray[Any] | None) -> list[str]:
+    """Return a warning where a background (shaped as the data, units of the noise) is no light."""
+    if background is None:
+        return []
+    share = float(background.mean()) / max(abs(float(problem.data[problem.valid].mean())), 1e-30)
+    if share > -NEGATIVE:
+        return []
+    return [
+        f"The background came out negative ({share:.2f} of the data's light), which no light is: the PSFs "
+        "may stand on an offset, or lack light at their edges, and the object has as much more. See whether "
+        "their dark frame is right; --positive-background keeps it above zero."
+    ]
 
 
 def residual_in_words(problem: Problem, outcome: Outcome, residual: float, noise: float) -> list[str]:

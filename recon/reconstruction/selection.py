@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.camera_model import ModelName
+from recon.camera.camera_model import CAMERAS, ModelName
 from recon.errors import InputError
-from recon.reconstruction.background import Trial, background_of, trial_of
+from recon.reconstruction.background import FLOOR, Trial, background_of, floor, trial_of
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import channels_of, merged
 from recon.reconstruction.measurement import Measurement
@@ -63,7 +63,7 @@ def choose(
     -------
     Problem
         With ``choice`` (the reasons, and what one step up and down would cost) and ``reduction`` (the way
-        back). The same problem where the options ask for a model.
+        back). Where the options ask for a model the same problem, in pictures with a background if it helps.
 
     Raises InputError when the input is unusable, or a choice was asked for that cannot be had.
     """
@@ -75,8 +75,29 @@ def choose(
                 f"Choices are about what model='auto' chooses; they do not go with model={problem.model!r}. "
                 "Leave one of the two out."
             )
-        return problem
+        return with_background(problem, problem.calibration) if problem.n_planes == 1 else problem
     return reduced(choice_for(problem, on_stage), problem)
+
+
+def with_background(problem: Problem, calibration: Calibration) -> Problem:
+    """Return a problem of a given model with a smooth background where ``auto`` would have one; nobody said.
+
+    All of the calibration's PSFs tell whether there is one.
+    """
+    options, model = problem.options, problem.model
+    said = options.estimate_background is not None or problem.measurement.background is not None
+    if said or problem.patterned or model in CAMERAS:
+        return problem
+    asked = replace(options, model="auto", choose=Overrides(model=model, binning=1, channels="all"))
+    choice = choice_for(Problem.of(problem.measurement, calibration, asked))
+    if choice.background != problem.smooth:
+        options = replace(options, estimate_background=choice.background)
+        problem = Problem.of(problem.measurement, problem.calibration, options)
+    if not choice.background:
+        return problem
+    (why,) = (d.why for d in choice.decisions if d.name == "background")
+    said_so = f"A smooth background is estimated as well: {why}."
+    return replace(problem, warnings=(*problem.warnings, said_so))
 
 
 def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
@@ -103,7 +124,10 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     picture = problem.n_planes == 1
     scale = candidates(depths)
     looked = not picture or len(scale) > 1  # else one PSF is all there is
-    coarse = _coarse(data, valid, calibration, problem.options.z_um) if looked else []
+    given = measurement.background is not None
+    unsaid = not given and overrides.background is None
+    lit = unsaid and (looked or all(floor(d[v]) >= FLOOR for d, v in zip(data, valid, strict=True)))
+    coarse = _coarse(data, valid, calibration, problem.options.z_um) if looked or lit else []
     costs = {m: camera_cost(coarse[0], m) for m in scale} if len(scale) > 1 else {}
     tell(0.2, "choosing: where light is")
     contrast = None if kind == "l1" or picture else _contrast(data, valid, deviation)
@@ -111,8 +135,7 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     sparse = coarse_passes(coarse) if looked else None
     tell(0.4, "choosing: a background")
     given = measurement.background is not None
-    open_ = looked and not given and overrides.background is None
-    smooth = background_of(_trial(problem, coarse, model) if open_ else None, overrides, given=given)
+    smooth = background_of(_trial(problem, coarse, model) if lit else None, overrides, given=given)
     estimated = smooth.value == "estimated"
     planes, dropped = planes_of(sparse, depths, overrides)
     between, added = between_of(calibration, depths, planes, overrides)

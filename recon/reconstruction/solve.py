@@ -18,7 +18,7 @@ from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.planes import limit_of, signs_in_words, signs_of_light
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reduction import Reduction
-from recon.reconstruction.residual import residual_in_words
+from recon.reconstruction.residual import background_in_words, residual_in_words
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solvers import OfferedSolver
@@ -272,7 +272,10 @@ def _run(
         memory=part.memory_used(),
         noise_norm=part.noise_norm,
         residual=residual,
-        doubts=residual_in_words(problem, outcome, residual, part.noise_norm),
+        doubts=[
+            *residual_in_words(problem, outcome, residual, part.noise_norm),
+            *background_in_words(problem, smooth),
+        ],
     )
 
 

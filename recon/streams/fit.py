@@ -11,8 +11,8 @@ from typing import NamedTuple
 from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reduction import reduced_calibration
+from recon.reconstruction.selection import with_background
 from recon.streams.stillness import SceneState
-from recon.streams.video import with_background
 from recon.types import Calibration
 
 SHARE = 0.1

@@ -15,15 +15,15 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.camera_model import CAMERAS, choose_model
+from recon.camera.camera_model import choose_model
 from recon.errors import InputError
 from recon.reconstruction.first_look import look_at
 from recon.reconstruction.measurement import Floats, Measurement, depths_of
-from recon.reconstruction.options import Overrides, ReconstructionOptions
+from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import given, require_two_images
-from recon.reconstruction.selection import choice_for
+from recon.reconstruction.selection import with_background
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver
 from recon.solvers.base import Solver, StoppingRules
 from recon.solvers.sensor_admm import SensorAdmm
@@ -80,27 +80,6 @@ def stream_problem(
         problem = replace(problem, options=replace(options, solver="admm-sensor"))
     problem.solver  # noqa: B018 - refuses at once what it has no way for
     return problem
-
-
-def with_background(problem: Problem, calibration: Calibration) -> Problem:
-    """Return a problem with a smooth background where a photograph would have one, and nobody said.
-
-    All of the calibration's PSFs tell whether there is one.
-    """
-    options, model = problem.options, problem.model
-    said = options.estimate_background is not None or problem.measurement.background is not None
-    if said or problem.patterned or model in CAMERAS:
-        return problem
-    asked = replace(options, model="auto", choose=Overrides(model=model, binning=1, channels="all"))
-    choice = choice_for(Problem.of(problem.measurement, calibration, asked))
-    if choice.background != problem.smooth:
-        options = replace(options, estimate_background=choice.background)
-        problem = Problem.of(problem.measurement, problem.calibration, options)
-    if not choice.background:
-        return problem
-    (why,) = (d.why for d in choice.decisions if d.name == "background")
-    said_so = f"A smooth background is estimated in each frame: {why}."
-    return replace(problem, warnings=(*problem.warnings, said_so))
 
 
 def _by_one_psf(calibration: Calibration | npt.ArrayLike, options: ReconstructionOptions) -> str:

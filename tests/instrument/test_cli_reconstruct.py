@@ -477,3 +477,19 @@ def test_uncertainty_is_written_beside_the_picture_and_read_back(capsys: pytest.
     Path("out-deviation.tif").unlink()
     assert open_result(Path("out.tif")).deviation is None
     assert main([*asked, "--volume", "psf.tif"]) == 2
+
+
+def test_no_output_replaces_an_input_however_it_is_called(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.read_bytes() for path in here.iterdir() if path.is_file()}
+    photo = here / "raw.tif"
+    (here / "link.tif").symlink_to(photo)
+    os.link(photo, here / "hard.tif")
+    (here / "psfs").mkdir()
+    (here / "psfs" / "psf.tif").write_bytes(before[here / "psf.tif"])
+    words = ["reconstruct", "--psf", "psfs/psf.tif", "--image", "raw.tif", "--force", "--out"]
+    for out in ("raw.tif", "./psfs/../raw.tif", str(photo), "link.tif", "hard.tif", "psfs/psf.tif"):
+        assert main([*words, out]) == 2
+        assert "no output replaces an input" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in before} == before

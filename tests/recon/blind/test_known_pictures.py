@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage, signal
 
-from recon.blind.known_pictures import KnownScenes, PicturePsf, PictureSettings, psf_from_pictures
-from recon.camera.convolution import field_of
+from recon.blind.known_pictures import PicturePsf, PictureSettings, psf_from_pictures
 from recon.errors import InputError
 
 SHAPE = (48, 56)
@@ -71,18 +70,18 @@ def test_light_beyond_the_pictures_and_above_their_peak_is_told_from_the_psf(
     assert 1 - _alike(ignorant.psf[0], truth) > 2 * (1 - _alike(result.psf[0], truth))
 
 
-def test_scenes_are_convolved_cropped_and_the_adjoint_is_exact() -> None:
-    rng = np.random.default_rng(1)
-    sensor, field = (6, 7), field_of((6, 7), (6, 7))[0]
-    scenes = rng.random((3, *field)).astype(np.float32)
-    camera = KnownScenes(scenes, sensor)
-    psf, images = rng.random((1, *sensor)), rng.random((3, *sensor))
-    seen = camera(psf)
-    for image, scene in zip(seen, scenes, strict=True):
-        np.testing.assert_allclose(image, signal.convolve2d(scene, psf[0], mode="valid"), rtol=1e-5)
-    assert np.vdot(seen, images) == pytest.approx(np.vdot(psf, camera.H(images)), rel=1e-5)
-    matrix = np.stack([camera(np.reshape(unit, (1, *sensor))).ravel() for unit in np.eye(42)], axis=1)
-    assert np.linalg.norm(matrix, 2) <= camera.norm_bound
+def test_a_photograph_that_does_not_show_its_picture_is_left_out_and_named(
+    found: tuple[PicturePsf, np.ndarray],
+) -> None:
+    result, truth = found
+    assert result.foreign == ()
+    data, pictures, _ = taken()
+    pictures[1] = pictures[1, :, ::-1]
+    spoiled = psf_from_pictures(data, pictures, QUICK)
+    assert spoiled.foreign == (1,)
+    assert _alike(spoiled.psf[0], truth) > 0.97
+    assert np.isnan(spoiled.brightness[1])
+    assert np.isfinite(np.delete(spoiled.brightness, 1)).all()
 
 
 @pytest.mark.parametrize(
