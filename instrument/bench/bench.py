@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Self, cast
 
 from drivers.camera import Camera
+from drivers.common.answers import STOP_ANSWER_S, within
 from drivers.common.checked import checked
 from drivers.device import Device, SharedPart
 from drivers.errors import DeviceLostError, LimitError
@@ -305,7 +306,7 @@ class Bench:
 
     def _close_device(self, device: Device) -> None:
         self._opened.discard(device)
-        device.close()
+        within(2 * STOP_ANSWER_S, device.name, "closing", device.close)
 
     def _safe_steps(self) -> list[SafeStep]:
         blanks = self.slm is not None and cast(SlmTable, self.config.devices["slm"].settings).blank_when_safe

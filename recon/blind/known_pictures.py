@@ -20,6 +20,7 @@ from recon.blind.psf_step import BeadMixer
 from recon.camera.base import Array, Composition, Projection, estimate_norm
 from recon.camera.convolution import Convolution, field_of
 from recon.camera.factors import Erasures
+from recon.camera.varying_psfs import bounding_window
 from recon.errors import InputError
 from recon.priors import NonNegativity
 from recon.solvers import Fista, StoppingRules
@@ -48,6 +49,7 @@ class PictureSettings:
         One PSF for all channels, which differ in brightness: a diffuser hardly disperses. Else one a channel.
     beyond : float
         How far beyond the pictures' field there may be light, in parts of the sensor's height; 0: nowhere.
+        What is black at the edges of all pictures counts as beyond.
     saturated : float or None
         Part of the pictures' peak from which on a pixel is known to be at least so bright, as in photographs
         through a lens. None: pictures say all, as those that were drawn.
@@ -245,14 +247,21 @@ class _Estimate:
         return float(np.sqrt(self.left.sum()) / np.linalg.norm(self._even_removed(self.data)))
 
     def _where_unknown(self, known: Floats) -> npt.NDArray[np.bool_]:
-        """Return where there may be light that the pictures do not tell of: beyond them, where saturated."""
+        """Return where there may be light that the pictures do not tell of: beyond them, where saturated.
+
+        Black rows and columns at the edges of all pictures are beyond them.
+        """
         reach = round(self.settings.beyond * self.sensor[0])
         around = np.zeros(self.field, bool)
         around[tuple(slice(max(w.start - reach, 0), w.stop + reach) for w in self.window)] = True
+        lit = known.max(axis=(0, 1)) > _FLATTEST
         around[self.window] = False
+        if reach:
+            around[self.window] = True
+            around[self.window][bounding_window(lit)] = False
         unknown = np.broadcast_to(around, self.known.shape).copy()
         if self.settings.saturated is not None:
-            unknown[:, :, *self.window] = known >= self.settings.saturated
+            unknown[:, :, *self.window] |= known >= self.settings.saturated
         return unknown
 
     def _as_light(self, pictures: Array) -> Floats:

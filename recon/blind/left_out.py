@@ -116,7 +116,7 @@ def leave_out(
     Parameters
     ----------
     photographs, pictures : ndarray, (n, n_channels, height, width)
-        As :func:`~recon.blind.known_pictures.psf_from_pictures` takes them.
+        As :func:`~recon.blind.known_pictures.psf_from_pictures` takes them; judged for a peak of 1.
     names : sequence of str
         Of the photographs.
     settings : PictureSettings, optional
@@ -131,6 +131,7 @@ def leave_out(
     """
     report = on_progress or (lambda _what, _share: None)
     data, known = (block_mean(images, binning, about_axis=True) for images in (photographs, pictures))
+    known = known / known.max()
     found: list[LeftOut] = []
     left_out = names if only is None else only
     for name in left_out:
