@@ -78,9 +78,10 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
     check = compete(few, quick, lit=lit)
     if check.sure:
         return check
+    dark = None
     if not lit:
         more = _small(problem, more_px)
-        check = compete(more, thorough, lit=False)
+        dark = check = compete(more, thorough, lit=False)
         # Stray light, or light from beyond the field, which any PSF but the right one may explain better?
         winner = check.better or GIVEN
         lit = check.fit is not Fit.FITS and is_told(
@@ -89,6 +90,11 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
         check = compete(few, quick, lit=True) if lit else check
     if lit and not check.sure:
         check = compete(few, thorough, lit=True)
+    if dark is not None and dark.fit is Fit.OFF and check.fit is Fit.UNTOLD:
+        # A background explains much; where odds still are for a decoy, what was certain without one stands.
+        best = min(check.scores, key=lambda how: check.scores[how].objective)
+        if best not in (GIVEN, BETWEEN) and is_told(check.scores[best], check.scores[GIVEN], check.pixels):
+            check = replace(check, fit=Fit.OFF, better=best)
     given = _given(problem).depths
     one = given.varies and not problem.depths.varies and given.field_error > VARIED
     return None if one and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
