@@ -260,8 +260,8 @@ def main() -> None:
         f"{datetime.now(UTC):%Y-%m-%d}, {platform.machine()}; a check takes {seconds:.2f} s of processor\n"
         "time (median), others at work beside it. What the check of decoys says (decisions\n"
         "[0063](../decisions/0063-decoys.md), [0072](../decisions/0072-tiles-vote-on-a-calibration.md)).\n"
-        "A PSF that is moved moves the picture and fits as well: no photograph tells it. What cannot be told is\n"
-        f"doubtful at best.\n\n{text}\n"
+        "A PSF that is moved moves the picture and fits as well: no photograph tells it. What cannot be\n"
+        f"told is doubtful at best.\n\n{text}\n"
     )
     print(text)
     if a.out is not None:
