@@ -211,6 +211,15 @@ def intervals(_: Path) -> list[str]:
     ]
 
 
+def pairs(_: Path) -> list[str]:
+    """Point to where the pairs are reconstructed and judged."""
+    return [
+        "Seven colour photographs of a screen with their truths and no PSF: each through the PSF that the "
+        "other six give, figures and pictures in [calibrate-screen.md](calibrate-screen.md) "
+        "(`python benchmarks/calibrate_screen.py`)."
+    ]
+
+
 def pyplot() -> Any:
     """Return matplotlib's pyplot, which draws into files only."""
     import matplotlib as mpl
@@ -226,6 +235,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Path], list[str]]]] = {
     "hand-fine": ("The hand, bin 2", lambda folder: hand(folder, (2,))),
     "usaf": ("The tilted USAF target, half size", lambda folder: usaf(folder, 2)),
     "usaf-full": ("The tilted USAF target, full size", lambda folder: usaf(folder, 1)),
+    "pairs": ("The pairs", pairs),
     "intervals": ("How far the pairs' pictures may be off", intervals),
 }
 """By name: a title, and what makes the section."""
@@ -253,10 +263,10 @@ def main() -> None:
             f"{datetime.datetime.now(datetime.UTC):%d %B %Y}, {os.cpu_count()} CPUs, load "
             f"{os.getloadavg()[0]:.0f}, threads: {asked.threads}, Python {platform.python_version()}."
         )
-        own = "\n".join([f"## {title}", when, "", *section(asked.out), ""])
+        own = "\n".join([f"## {title}", when, "", *section(asked.out), "", ""])
         place = re.compile(rf"^## {re.escape(title)}\n.*?(?=^## |\Z)", re.MULTILINE | re.DOTALL)
         text = place.sub(lambda _, own=own: own, text) if place.search(text) else f"{text.rstrip()}\n\n{own}"
-        page.write_text(text)
+        page.write_text(f"{text.rstrip()}\n")
         print(own, flush=True)
 
 
