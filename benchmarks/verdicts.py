@@ -1,6 +1,6 @@
 """How often is a reconstruction called reliable that failed? Verdicts on unseen scenes.
 
-    python benchmarks/verdicts.py --first 5001 --count 200 --out docs/benchmarks/verdicts.md
+    python benchmarks/verdicts.py --first 6001 --count 200 --out docs/benchmarks/verdicts.md
     python benchmarks/verdicts.py --count 0 --keep verdicts.jsonl        judge what was kept once more
     python benchmarks/verdicts.py --first 3000 --count 200 --fit         add cases, and learn from all
 
@@ -10,8 +10,8 @@ read noise, density and size, and every other stress with a chance of one in fiv
 ``recon.verdict.map``, from the truth; the verdict sees the data alone. What is kept is evidence and severity,
 so that verdicts can be made again.
 
-Scenes 3000 to 4999 serve as cases, with 385 older ones (numbers below 2000, made with fixed weights and no
-measured PSFs) in ``benchmarks/verdict_cases.json``; from 5000 on nothing was learned or set.
+Scenes 3000 to 5999 serve as cases in ``benchmarks/verdict_cases.json``, with older volumes (numbers below
+2000, made with fixed weights and no measured PSFs); from 6000 on nothing was learned or set.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from recon.errors import InputError
 from recon.evaluation.content import PICTURES
 from recon.evaluation.measured_sets import MEASURED
 from recon.evaluation.scene import Family, SceneSpec, spec_of
-from recon.evaluation.scene_trial import ITERATIONS, Options, judge, scene_of, solve
+from recon.evaluation.scene_trial import Options, judge, scene_of, solve
 from recon.verdict.calibration_check import CalibrationCheck, Fit
 from recon.verdict.cases import GROUPS, group_of
 from recon.verdict.chance import FEATURES, FEATURES_OF_VOLUMES, SHIPPED, fitted, is_whole, place_of
@@ -42,8 +42,8 @@ from recon.verdict.judge import Region, verdict_on
 from recon.verdict.map import worst
 
 FIRST_SEED = 60_000
-CASES = range(3000, 5000)
-UNSEEN_FROM = 5000
+CASES = range(3000, 6000)
+UNSEEN_FROM = 6000
 CASES_FILE = Path(__file__).with_name("verdict_cases.json")
 CLEAR = 0.7
 """Severity up to which a reconstruction is good beyond doubt, and not merely better than trivial."""
@@ -52,6 +52,8 @@ FAMILIES: tuple[Family, ...] = (
     *("microscope", "gradient", "lights", "dense-volume", "sparse-picture"),
 )
 """Of these scenes, in the order of their numbers, two of each."""
+MOST = 10**9
+"""Voxels up to which every scene is taken."""
 DIGITS = 4
 """Of the evidence that is shipped."""
 AUTO = ", auto"
@@ -110,18 +112,23 @@ def scene(index: int) -> tuple[SceneSpec, Options]:
     return spec_of(family, **numbers), handled
 
 
-def run(first: int, count: int, keep: Path) -> None:
-    """Reconstruct scenes and append evidence and severity to a file, but for those that it has."""
+def run(first: int, count: int, keep: Path, most: int) -> None:
+    """Reconstruct scenes and append evidence and severity to a file, but for those that it has.
+
+    Those of more than ``most`` voxels are left out.
+    """
     done = {(e["index"], e["method"]) for e in read(keep)}
     for index in range(first, first + count):
         spec, handled = scene(index)
+        if spec.depths * int(np.prod(spec.shape)) > most:
+            continue
         for method in PICTURE_METHODS if spec.is_picture else VOLUME_METHODS:
             if (index, method) in done:
                 continue
             name, auto, _ = method.partition(AUTO)
             options = replace(handled, model="auto", estimate_background=None) if auto else handled
             try:
-                result = solve(scene_of(spec), name, options, ITERATIONS["quick"])
+                result = solve(scene_of(spec), name, options, None)
             except InputError:
                 continue  # refused with a sentence: an image without light
             trial = judge(scene_of(spec), result)
@@ -261,12 +268,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--count", type=int, default=200, help="scenes to add")
     parser.add_argument("--first", type=int, default=UNSEEN_FROM, help="the first one's number")
+    parser.add_argument("--voxels", type=int, default=MOST, help="leave out scenes of more than so many")
     parser.add_argument("--keep", type=Path, default=Path("verdicts.jsonl"))
     parser.add_argument("--fit", action="store_true", help="learn from the cases and those that were kept")
     parser.add_argument("--out", type=Path, help="write the report")
     a = parser.parse_args()
     set_threads(1)
-    run(a.first, a.count, a.keep)
+    run(a.first, a.count, a.keep, a.voxels)
     entries = read(a.keep)
     if a.fit:
         learn(known_cases(entries))
@@ -274,10 +282,12 @@ def main() -> None:
     numbers = {e["index"] for e in unseen}
     if not unseen:
         return
+    count = max(numbers) - min(numbers) + 1
+    limit = "" if a.voxels == MOST else f" --voxels {a.voxels}"
     report = [
         "# How often verdicts are wrong",
         "",
-        f"    python benchmarks/verdicts.py --first {min(numbers)} --count {max(numbers) - min(numbers) + 1} "
+        f"    python benchmarks/verdicts.py --first {min(numbers)} --count {count}{limit} "
         "--keep verdicts.jsonl --out docs/benchmarks/verdicts.md",
         "",
         f"{datetime.now(UTC):%Y-%m-%d}, {platform.machine()}. {len(numbers)} scenes that nothing was",

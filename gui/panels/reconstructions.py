@@ -154,7 +154,8 @@ class ReconstructionsPanel(Panel):
         else:
             assert result.image is not None
             self.viewers.setCurrentWidget(self.picture)
-            self.picture.show_picture(result.image, pitch_um=result.pitch_um, deviation=result.deviation)
+            beside = {"Deviation": result.deviation, "Residual": result.residual}
+            self.picture.show_picture(result.image, pitch_um=result.pitch_um, beside=beside)
 
     def _close_result(self) -> None:
         self.volume.release()

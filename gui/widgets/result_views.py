@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -53,12 +54,12 @@ class FactsView(QTextBrowser):
 
 
 class PictureView(QWidget):
-    """Shows one picture, (height, width) or (height, width, 3), or how far it may be off."""
+    """Shows one picture, (height, width) or (height, width, 3), or what was found beside it."""
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.picture: npt.NDArray[np.float32] | None = None
-        self.deviation: npt.NDArray[np.float32] | None = None
+        self.beside: dict[str, npt.NDArray[np.float32]] = {}
         self.turned_deg = 0
         self.pitch_um: float | None = None
         self.image = _ScaledImage()
@@ -68,8 +69,11 @@ class PictureView(QWidget):
         self.turn = button("Turn 90°", tip, self.turn_by_90)
         tip = "Show the whole picture (the wheel zooms, dragging moves)"
         self.whole = button("Whole", tip, self.image.whole)
-        tip = "The picture, or its pixels' standard deviation: 95 % intervals are plus and minus 1.96 of it"
-        self.which = choice(("Picture", "Deviation"), tip, lambda _: self._chosen())
+        tip = (
+            "The picture, its pixels' standard deviation (95 % intervals are plus and minus 1.96 of it), or "
+            "what is left of the photograph, in units of its noise"
+        )
+        self.which = choice(("Picture",), tip, lambda _: self._chosen())
         self.which.setVisible(False)
         self.image.setMinimumSize(70, 50)
         self.hovered = self.image.hovered
@@ -77,13 +81,13 @@ class PictureView(QWidget):
 
     @property
     def shown(self) -> npt.NDArray[np.float32] | None:
-        """The picture, or its deviation, as it is turned now."""
+        """The picture, or what is shown instead, as it is turned now."""
         values = self._values
         return None if values is None else np.rot90(values, self.turned_deg // 90)
 
     @property
     def _values(self) -> npt.NDArray[np.float32] | None:
-        return self.picture if self.deviation is None or not self.which.currentIndex() else self.deviation
+        return self.beside.get(self.which.currentText(), self.picture)
 
     def show_picture(
         self,
@@ -91,13 +95,15 @@ class PictureView(QWidget):
         *,
         pitch_um: float | None = None,
         keep_levels: bool = False,
-        deviation: npt.NDArray[np.float32] | None = None,
+        beside: Mapping[str, npt.NDArray[np.float32] | None] = MappingProxyType({}),
     ) -> None:
-        """Show a picture; ``pitch_um``: a pixel's size in the object's plane, ``deviation``: shaped as it."""
-        self.picture, self.deviation = picture, deviation
+        """Show a picture and what goes with it; ``pitch_um``: a pixel's size in the object's plane."""
+        self.picture = picture
+        self.beside = {name: values for name, values in beside.items() if values is not None}
         with QSignalBlocker(self.which):
-            self.which.setCurrentIndex(0)
-        self.which.setVisible(deviation is not None)
+            self.which.clear()
+            self.which.addItems(["Picture", *self.beside])
+        self.which.setVisible(bool(self.beside))
         self.image.pitch_um = pitch_um
         self.levels.set_image(picture, keep_levels=keep_levels)
         self._show()

@@ -86,7 +86,7 @@ def reconstruct_patterns(request: PatternedRequest, outputs: Outputs, output: Ou
             result = solve_patterned(prepared, watch=show, cancel=cancel)
         _print_end(result)
         write_reconstruction(outputs, result, job, rotate_deg=int(output.rotate_deg))
-        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
+        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.written(result)))}")
     _end(result, "picture")
 
 
@@ -96,7 +96,7 @@ def _print_choice(choice: Choice) -> None:
         typer.echo(line)
     typer.echo(
         f"{'Chosen in':<12}{choice.seconds:.1f} s; --choose NAME=VALUE overrules any of it, --tolerance and "
-        "--iterations the end. Times and errors of a step are rough estimates"
+        "--iterations the end"
     )
 
 

@@ -37,8 +37,8 @@ WHITE_PERCENTILE = 99.9
 class Outputs:
     """The files of one reconstruction: float32 TIFF, 8-bit preview, settings and history, and optional ones.
 
-    Those are a figure, a float32 TIFF of standard deviations, and a table of points. A volume may be an
-    OME-Zarr folder instead of a TIFF.
+    Those are a figure, a float32 TIFF of standard deviations, a table of points, and without a verdict one of
+    what is left of the data. A volume may be an OME-Zarr folder instead of a TIFF.
     """
 
     image: Path
@@ -47,6 +47,7 @@ class Outputs:
     figure: Path | None = None
     deviation: Path | None = None
     points: Path | None = None
+    residual: Path | None = None
 
     @classmethod
     def named(
@@ -59,7 +60,8 @@ class Outputs:
         if volume and is_zarr_name(out):
             if not (stem := stem_of(out)):
                 raise FileError(out, "has no name before its suffix.", "Call it volume.ome.zarr, say.")
-            return cls(out, out.with_name(f"{stem}.png"), out.with_name(f"{stem}.json"))
+            record, residual = out.with_name(f"{stem}.json"), out.with_name(f"{stem}-residual.tif")
+            return cls(out, out.with_name(f"{stem}.png"), record, residual=residual)
         if out.suffix.lower() not in (".tif", ".tiff"):
             raise FileError(
                 out,
@@ -72,22 +74,25 @@ class Outputs:
             raise FileError(figure, "a figure is written as .png, .pdf or .svg.")
         deviation = out.with_name(f"{out.stem}-deviation{out.suffix}") if uncertainty else None
         points = out.with_name(f"{out.stem}-points.csv") if uncertainty else None
-        outputs = cls(out, out.with_suffix(".png"), out.with_suffix(".json"), figure, deviation, points)
+        residual = out.with_name(f"{out.stem}-residual{out.suffix}")
+        preview, record = out.with_suffix(".png"), out.with_suffix(".json")
+        outputs = cls(out, preview, record, figure, deviation, points, residual)
         if figure in outputs.files()[:3]:
             raise FileError(out.with_suffix(".png"), "is the preview; give the figure another name.")
         return outputs
 
     def files(self) -> tuple[Path, ...]:
         """Return every file that will be written."""
-        files = self.image, self.preview, self.record, self.figure, self.deviation, self.points
+        files = self.image, self.preview, self.record, self.figure, self.deviation, self.points, self.residual
         return tuple(p for p in files if p is not None)
 
     def written(self, result: Reconstruction) -> tuple[Path, ...]:
-        """Return the files that a result was written to: points are not in every picture."""
+        """Return the files that a result was written to: points and residual are not in every one."""
         found = result.uncertainty
         left_out = (
             None if found is not None else self.deviation,
             None if found is not None and found.points is not None else self.points,
+            None if result.residual is not None else self.residual,
         )
         return tuple(p for p in self.files() if p not in left_out)
 
@@ -126,12 +131,21 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
         write_image(outputs.deviation, deviation, {"simulated": job.simulated, "record": outputs.record.name})
         if outputs.points is not None and result.uncertainty.points is not None:
             write_text(outputs.points, _table(result.uncertainty.points, result.grid, rotate_deg))
+    _write_residual(outputs, result, job, rotate_deg)
     record = reconstruction_record(result, job, volume=False) | {
         "uncertainty": _of_uncertainty(result.uncertainty, outputs),
+        "residual": None if result.residual is None else outputs.written(result)[-1].name,
         "rotated_deg": rotate_deg,
         "preview": {"white": white, "white_percentile": WHITE_PERCENTILE, "black": 0.0},
     }
     write_json(outputs.record, record)
+
+
+def _write_residual(outputs: Outputs, result: Reconstruction, job: Job, rotate_deg: int = 0) -> None:
+    """Write what is left of the data, in units of their noise, where no verdict says what that is worth."""
+    if outputs.residual is not None and result.residual is not None:
+        about = {"simulated": job.simulated, "record": outputs.record.name}
+        write_image(outputs.residual, np.rot90(result.residual, rotate_deg // 90), about)
 
 
 def picture_grid(grid: Grid) -> dict[str, Any]:
@@ -263,4 +277,5 @@ def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
     else:
         write_volume_tiff(outputs.image, result.volume, result.volume.shape, result.grid)
     save_figure(volume_figure(result, simulated=job.simulated), outputs.preview)
+    _write_residual(outputs, result, job)
     write_json(outputs.record, reconstruction_record(result, job, volume=True))

@@ -43,6 +43,8 @@ class StoredResult:
     """What was written beside it; empty for results from elsewhere."""
     deviation: npt.NDArray[np.float32] | None = None
     """Standard deviation of a picture's pixels, as it; None where it was not asked for."""
+    residual: npt.NDArray[np.float32] | None = None
+    """What is left of the data, in units of their noise; None where a verdict says what it is worth."""
 
     @property
     def inputs(self) -> list[Path]:
@@ -194,12 +196,13 @@ def open_result(path: Path | str) -> StoredResult:
     if is_zarr_name(path) or path.is_dir() or _is_volume(path, record):
         return StoredResult(path, None, open_volume(path), record)
     pixels = read_image(path).pixels
-    return StoredResult(path, np.asarray(pixels, np.float32), None, record, _deviation_of(path, record))
+    deviation = _beside(path, (record.get("uncertainty") or {}).get("file"))
+    residual = _beside(path, record.get("residual"))
+    return StoredResult(path, np.asarray(pixels, np.float32), None, record, deviation, residual)
 
 
-def _deviation_of(path: Path, record: Mapping[str, Any]) -> npt.NDArray[np.float32] | None:
-    """Read the standard deviations that were written beside a picture; None where they are no more."""
-    name = (record.get("uncertainty") or {}).get("file")
+def _beside(path: Path, name: str | None) -> npt.NDArray[np.float32] | None:
+    """Read what was written beside a picture; None where it is no more."""
     beside = path.with_name(Path(str(name)).name)
     if name is None or not beside.is_file():
         return None

@@ -123,6 +123,9 @@ class Reconstruction:
         Whether to trust it, from the data alone; None where nobody asked for one.
     uncertainty : Uncertainty or None
         How far it may be off, pixel by pixel; None where nobody asked for it.
+    residual : ndarray, float32, shaped as the measurement, or None
+        What is left of the data, in units of their noise, 0 where there are none; None where a verdict says
+        what the result is worth, or none was asked for.
     choice : Choice or None
         What was chosen and why, where the program chose (``model="auto"``).
     refinement : Refinement or None
@@ -155,6 +158,7 @@ class Reconstruction:
     warnings: tuple[str, ...] = ()
     verdict: Verdict | None = None
     uncertainty: Uncertainty | None = None
+    residual: npt.NDArray[np.float32] | None = None
     choice: Choice | None = None
     refinement: Refinement | None = None
     state: npt.NDArray[Any] | None = None

@@ -135,6 +135,7 @@ class _Solved:
     memory: str | None
     noise_norm: float
     residual: float
+    rest: Array | None
     doubts: list[str]
 
 
@@ -260,7 +261,10 @@ def _run(
         rest = part.residual(solution, smooth)[0]
         channel, window = part.channels.start, problem.extent.psf_window
         signs = signs_of_light(rest, problem.extent.left_out, channel, window) / limit_of(part)
-    residual = _residual(part, solution, smooth, outcome)
+    rest = _rest(part, solution, smooth, outcome)
+    residual = float("nan") if rest is None else float(np.linalg.norm(rest))
+    if outcome.history:
+        residual = outcome.history[-1].data_residual
     return _Solved(
         volume=problem.measured(solution, part.channels),
         state=_state(part, solution),
@@ -272,6 +276,7 @@ def _run(
         memory=part.memory_used(),
         noise_norm=part.noise_norm,
         residual=residual,
+        rest=rest,
         doubts=[
             *residual_in_words(problem, outcome, residual, part.noise_norm),
             *background_in_words(problem, smooth),
@@ -279,16 +284,14 @@ def _run(
     )
 
 
-def _residual(part: Part, solution: Array, background: Array | None, outcome: Outcome) -> float:
-    """Return the norm of what a run leaves of the data, in units of the noise.
+def _rest(part: Part, solution: Array, background: Array | None, outcome: Outcome) -> Array | None:
+    """Return what a run leaves of the data, in units of the noise; None where nobody judges by it.
 
     A solution in one step fits whatever there is, with negative light where the model is wrong: without it.
     """
-    if outcome.history:
-        return outcome.history[-1].data_residual
     if not part.problem.options.judged:
-        return float("nan")
-    return float(np.linalg.norm(part.residual(np.maximum(solution, 0), background)))
+        return None
+    return part.residual(solution if outcome.history else np.maximum(solution, 0), background)
 
 
 def _state(part: Part, solution: Array) -> Array | None:
@@ -324,6 +327,7 @@ def _together(
         stop_reasons=tuple(f.outcome.stop_reason for f in found),
         seconds=sum(f.outcome.seconds for f in found) + (0.0 if look is None else look.seconds),
         background=_stacked([f.background for f in found if f.background is not None], problem.flat),
+        residual=_stacked([f.rest for f in found if f.rest is not None], problem.flat),
         empty_planes=empty,
         warnings=tuple(
             dict.fromkeys(

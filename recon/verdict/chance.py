@@ -1,7 +1,7 @@
 """The chance that a reconstruction has failed, by what the data alone tell.
 
-A logistic regression on the logarithms of the evidence, their squares and products, fitted to reconstructions
-of scenes whose truth is known. How far a place lies from the middle of those, in their own scatter, tells
+A logistic regression on the logarithms of the evidence and their squares, fitted to reconstructions of scenes
+whose truth is known. How far a place lies from the middle of those, in their own scatter, tells
 whether they know anything of it.
 """
 
@@ -48,18 +48,20 @@ FEATURES_OF_VOLUMES = (
 does not throw onto the sensor."""
 DERIVED = ("grain", "residual", "missed")
 """What follows from other evidence, and is not kept with it."""
-MOST = 3.0
-"""Standard deviations beyond which more counts no more."""
+MOST = 1.5
+"""Standard deviations beyond which more counts no more: measured volumes are larger than any case."""
 BLUNT = 0.1
 """Variance added to the cases' scatter, relative: a direction that none varies in tells nothing by itself."""
 ALIKE = 0.1
 """Least deviation of a feature: a tenth more or less is no difference."""
-FOLDS = 10
-PENALTIES = (2.0, 4.0, 8.0, 16.0)
-"""Of the coefficients' squares: the one with which cases left out are the least surprising is taken."""
+FOLDS, SPLITS = 10, 4
+"""Parts of the cases that are left out in turn, and how often they are parted anew."""
+PENALTIES, BENT = (1.0, 2.0, 4.0, 8.0), 4.0
+"""Of the coefficients' squares, that with which cases left out are the least surprising, and how much greater
+it is for those of the squared steps."""
 ALLOWED = 0.04
 """Share of failures among those called reliable that the threshold is set for; of unseen 5 % are allowed."""
-HIGHEST = 0.15
+HIGHEST = 0.3
 """Chance of failing up to which anything may be called reliable."""
 STEPS = 30
 
@@ -77,7 +79,7 @@ class Chances:
     typical: Floats
     """(n_features,): the median of the good cases."""
     coefficients: Floats
-    """(1 + n_features (n_features + 3) / 2,): of :func:`_terms`."""
+    """(1 + 2 n_features,): of :func:`_terms`."""
     precision: Floats
     """(n_features, n_features): inverse of the cases' scatter, in units of ``spread``."""
     far: float
@@ -171,9 +173,10 @@ def fitted(features: Sequence[str], places: Floats, severities: Floats, scenes: 
     centre, spread = places.mean(axis=0), np.maximum(places.std(axis=0), ALIKE)
     steps = (places - centre) / spread
     terms, failed = _terms(np.clip(steps, -MOST, MOST)), (severities >= 1).astype(np.float64)
-    groups, fold = np.unique(scenes, return_inverse=True)
-    fold = np.random.default_rng(0).permutation(len(groups))[fold] % FOLDS
-    chances = {penalty: _left_out(terms, failed, fold, penalty) for penalty in PENALTIES}
+    groups, group = np.unique(scenes, return_inverse=True)
+    rng = np.random.default_rng(0)
+    folds = [rng.permutation(len(groups))[group] % FOLDS for _ in range(SPLITS)]
+    chances = {p: np.mean([_left_out(terms, failed, fold, p) for fold in folds], 0) for p in PENALTIES}
     penalty = min(chances, key=lambda p: -float(np.sum(np.log(np.abs(1 - failed - chances[p])))))
     unseen = chances[penalty]
     order = np.argsort(unseen)
@@ -199,10 +202,8 @@ def fitted(features: Sequence[str], places: Floats, severities: Floats, scenes: 
 
 
 def _terms(steps: Floats) -> Floats:
-    """Return 1, the steps, their squares and products: (..., n) to (..., 1 + n (n + 3) / 2)."""
-    first, second = np.triu_indices(steps.shape[-1])
-    products = steps[..., first] * steps[..., second]
-    return np.concatenate([np.ones((*steps.shape[:-1], 1)), steps, products], axis=-1)
+    """Return 1, the steps and their squares: (..., n) to (..., 1 + 2 n)."""
+    return np.concatenate([np.ones((*steps.shape[:-1], 1)), steps, steps**2], axis=-1)
 
 
 def _logistic(logits: Floats) -> Floats:
@@ -220,8 +221,7 @@ def _left_out(terms: Floats, failed: Floats, fold: npt.NDArray[np.int_], penalty
 
 def _regressed(terms: Floats, failed: Floats, strength: float) -> Floats:
     """Return the ridge regression's coefficients by Newton's method; steps are halved until it descends."""
-    penalty = np.full(terms.shape[1], strength)
-    penalty[0] = 1e-3
+    penalty = np.concatenate([[1e-3], strength * np.repeat([1.0, BENT], terms.shape[1] // 2)])
 
     def objective(at: Floats) -> float:
         logits = terms @ at

@@ -61,8 +61,11 @@ NAMED = 0.1
 next to nothing is not asked for."""
 MOST_LIGHT = 10.0
 """By how much more light is supposed to lift what it relieves, at most: a hundred times the light."""
-UNSETTLED = 0.2
-"""``unsettled`` from which a reconstruction is not inside: its last change was twice the tolerance."""
+ABOVE_NOISE = 2.0
+"""Residual in units of the noise from which noise is not what limits."""
+UNSETTLED = 0.7
+"""``unsettled`` from which a reconstruction is not inside: its last change was seven times the tolerance, of
+which ten times are a failure."""
 CLIPPED = 0.02
 """Share of the used pixels at full scale from which that is named first."""
 OF_LIGHT = ("detail", "signal", "height")
@@ -179,6 +182,9 @@ class Verdict:
     """By which cases it was judged."""
     decided: str = ""
     """What decided instead of those cases, in words."""
+    held_out: float | None = None
+    """Where nothing else is known: by how much pixels that a shorter run did not see are missed, in units of
+    their noise."""
     calibration: CalibrationCheck | None = None
     """Whether the calibration is the photograph's own; None where that was not looked at."""
 
@@ -195,7 +201,8 @@ class Verdict:
             said += [f"{f.words}. {f.help}" for f in self.findings[:MOST]]
         elif self.region is Region.UNKNOWN and self.basis and not self.decided:
             said += [f"What sets it apart: {f.words}. {f.help}" for f in self.findings[:1]]
-            said += [f"The model leaves {_residual(self.evidence)} unexplained"]
+        if unlike_any(self):
+            said += [left_unexplained(self.evidence, self.held_out)]
         return tuple(f"{s}." for s in said)
 
     def with_calibration(self, check: CalibrationCheck) -> Verdict:
@@ -217,6 +224,7 @@ class Verdict:
             "findings": [asdict(f) for f in self.findings],
             "evidence": dict(self.evidence),
             "basis": self.basis,
+            "held_out": self.held_out,
             "calibration": None if self.calibration is None else self.calibration.as_json(),
         }
 
@@ -282,6 +290,19 @@ def _region(
     return Region.INSIDE, ""
 
 
+def unlike_any(verdict: Verdict) -> bool:
+    """Tell whether a photograph's verdict is that no known case is like it."""
+    return verdict.region is Region.UNKNOWN and verdict.decided != COMPUTED
+
+
+def left_unexplained(numbers: Mapping[str, float], held_out: float | None) -> str:
+    """Say how far the data are explained, where no known case tells what that is worth."""
+    said = f"The model leaves {_residual(numbers)} unexplained"
+    if held_out is None:
+        return said
+    return f"{said}; pixels that a shorter run did not see are missed by {held_out:.1f} times the noise"
+
+
 def residual_of(numbers: Mapping[str, float]) -> float:
     """Return what is left of the data, in units of their noise."""
     return float((1 + (numbers["signal"] * numbers["unexplained"]) ** 2) ** 0.5)
@@ -298,7 +319,7 @@ def _relieved(
     """Return the stresses that are worse than in good cases, by what is gained where one is as in those.
 
     More light relieves all that it relieves at once, and the one that lacks most is named for it; what is not
-    explained stays the same share, and so stands out of the noise.
+    explained stays the same share, and so stands out of the noise: where it does already, none is asked for.
     """
     place = place_of(numbers, chances.features)
     lacking = {
@@ -307,8 +328,8 @@ def _relieved(
         if name in BETTER
     }
     lit = {name: numbers[name] for name in OF_LIGHT if name in lacking}
-    dimmest = max(lit, key=lambda name: lacking[name])
-    brighter = min(float(np.exp(max(lacking[dimmest], 0.0))), MOST_LIGHT)
+    dimmest = None if residual_of(numbers) >= ABOVE_NOISE else max(lit, key=lambda name: lacking[name])
+    brighter = 1.0 if dimmest is None else min(float(np.exp(max(lacking[dimmest], 0.0))), MOST_LIGHT)
     findings = []
     for name, lack in lacking.items():
         if lack <= 0 or (name in lit and name != dimmest):
