@@ -218,8 +218,8 @@ def measured_pairs_held(binning: int) -> Iterator[str]:
     """
     names, photographs, pictures = measured_pairs()
     data, truths = (block_mean(stack, binning, about_axis=True) for stack in (photographs, pictures))
-    yield "| pair | misfit | held | width |"
-    yield "|---|---|---|---|"
+    yield "| pair | misfit | held | width | trusted |"
+    yield "|---|---|---|---|---|"
     for number, name in enumerate(names):
         others = [k for k in range(len(names)) if k != number]
         psf = psf_from_pictures(data[others], truths[others]).psf
@@ -239,7 +239,8 @@ def measured_pairs_held(binning: int) -> Iterator[str]:
             deviation = found.deviation[0, ..., channel]
             held += float(np.mean(np.abs(off) <= 1.96 * deviation)) / len(truths[number])
             size, error = size + float(np.sum(deviation**2)), error + float(np.sum(off**2))
-        yield f"| {name} | {found.misfit:.2f} | {held:.3f} | {np.sqrt(size / error):.2f} |"
+        width, trusted = np.sqrt(size / error), "yes" if found.trusted else "no"
+        yield f"| {name} | {found.misfit:.2f} | {held:.3f} | {width:.2f} | {trusted} |"
 
 
 def _fitted(truth: Array, picture: Array) -> Array:

@@ -104,7 +104,7 @@ class ReconstructForm(QWidget):
         self.start = button(
             "Reconstruct", tip, lambda: self._ask(self.asked), shortcut="Ctrl+Return", primary=True
         )
-        tip = "Say what model auto would choose, why, and what one step up or down would cost"
+        tip = "Say what model auto would choose, why, and what one step up or down would be"
         self.explain = button("Explain", tip, lambda: self._ask(self.questioned))
         tip = "End after the iteration in progress; what there is then is kept"
         self.stop = button("Stop and keep", tip, self.stopped, enabled=False)

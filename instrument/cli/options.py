@@ -171,12 +171,12 @@ def _inputs(values: object) -> list[Path]:
         return [values]
     if isinstance(values, list | tuple):
         return [path for entry in values for path in _inputs(entry)]
-    fields = values if isinstance(values, dict) else vars(values) if _is_options(values) else {}
-    return [path for name, value in fields.items() if name not in _WRITTEN for path in _inputs(value)]
-
-
-def _is_options(value: object) -> bool:
-    return hasattr(type(value), "__dataclass_fields__") and not isinstance(value, Given)
+    if isinstance(values, dict):
+        named = values
+    else:  # an options object, which may have slots
+        declared = () if isinstance(values, Given) else getattr(type(values), "__dataclass_fields__", ())
+        named = {name: getattr(values, name) for name in declared}
+    return [path for name, value in named.items() if name not in _WRITTEN for path in _inputs(value)]
 
 
 def _as_named(o: Option, words: Container[str]) -> Option:

@@ -96,7 +96,7 @@ def _print_choice(choice: Choice) -> None:
         typer.echo(line)
     typer.echo(
         f"{'Chosen in':<12}{choice.seconds:.1f} s; --choose NAME=VALUE overrules any of it, --tolerance and "
-        "--iterations the end. Times and errors of a step are rough estimates"
+        "--iterations the end"
     )
 
 

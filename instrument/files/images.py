@@ -260,6 +260,8 @@ def _decode_with_opencv(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tupl
     loudness = cv2.utils.logging.setLogLevel(
         cv2.utils.logging.LOG_LEVEL_SILENT
     )  # a damaged file is told of once, in our words
+    if data.startswith(_PNG_MAGIC) and not _png_is_whole(data):
+        raise FileError(path, "is a damaged PNG: its parts are longer than the file, or out of order.")
     shape = _shape_by_header(data)
     if shape is not None:
         reading.require_plausible(path, 8 * math.prod(shape), len(data))
@@ -275,6 +277,20 @@ def _decode_with_opencv(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tupl
         array = array[..., [2, 1, 0, *range(3, array.shape[-1])]]
     lossy = ("JPEG is lossy and usually gamma-coded: prefer raw frames",) if data[:2] == b"\xff\xd8" else ()
     return array, lossy
+
+
+def _png_is_whole(data: bytes) -> bool:
+    """Whether a PNG's parts fit into it: OpenCV takes memory for what each says it has."""
+    place = len(_PNG_MAGIC)
+    first = True
+    while place + 12 <= len(data):
+        length, kind = struct.unpack(">I4s", data[place : place + 8])
+        if first != (kind == b"IHDR") or place + 12 + length > len(data):
+            return False
+        if kind == b"IEND":
+            return True
+        first, place = False, place + 12 + length
+    return False
 
 
 def _shape_by_header(data: bytes) -> tuple[int, int] | None:

@@ -282,8 +282,8 @@ class VolumeSource:
         try:
             with self._lock:
                 voxels = np.asarray(read(z, y, x), np.float32)
-        except (OSError, ValueError) as error:
-            raise FileError(self.path, f"cannot be read at plane {z}: {error}.") from error
+        except Exception as error:
+            raise FileError(self.path, f"cannot be read at plane {z}: {error!s:.200}.") from error
         # A damaged voxel must not make the whole view blank.
         voxels = np.nan_to_num(voxels, nan=0.0, posinf=0.0, neginf=0.0)
         return voxels[..., 0] if self.n_channels == 1 else voxels
@@ -334,6 +334,8 @@ def _open_zarr(path: Path) -> VolumeSource:
         arrays = [group[dataset["path"]] for dataset in multiscale["datasets"]]
         for array in arrays:
             require_plausible(path, array.nbytes, folder_bytes(path))
+            if len(array.shape) != len(names) or 0 in array.shape:
+                raise FileError(path, f"holds an array of shape {array.shape} for {len(names)} axes.")
     except FileError:
         raise
     except Exception as error:

@@ -65,12 +65,17 @@ class FrameRecord:
     def from_json(cls, line: Mapping[str, Any]) -> FrameRecord:
         """Return what :meth:`to_json` wrote."""
         unknown: dict[str, Any] = {}
+        metadata = value_of(FrameMetadata, line["metadata"], unknown)
+        if not all(isinstance(number, int) for number in (*metadata.roi, metadata.binning)):
+            raise TypeError(f"region {metadata.roi} and binning {metadata.binning!r} are no whole numbers")
+        if metadata.binning < 1:
+            raise ValueError(f"there is no binning {metadata.binning}")
         return cls(
             index=int(line["index"]),
             n_bytes=int(line["n_bytes"]),
             crc32=int(line["crc32"], 16),
             average=int(line["average"]),
-            metadata=value_of(FrameMetadata, line["metadata"], unknown),
+            metadata=metadata,
             unknown=unknown,
         )
 

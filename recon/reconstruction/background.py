@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.reconstruction.choice import Decision, Option
+from recon.reconstruction.choice import Decision
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.pilot import Pilot, pilot
 from recon.reconstruction.problem import Problem
@@ -52,14 +52,11 @@ class Trial:
         Root mean square error there, in units of noise and usual error of the model.
     light : float
         Mean of the background relative to that of the data.
-    time : float
-        Processor time of an iteration with a background relative to one without.
     """
 
     without: float
     lit: float
     light: float
-    time: float
 
     @property
     def helps(self) -> bool:
@@ -74,8 +71,7 @@ def trial_of(channels: Sequence[Problem]) -> Trial:
     without, lit = (
         float(np.sqrt(np.mean([getattr(t, side) ** 2 for t in tried]))) for side in ("without", "lit")
     )
-    light, time = (float(np.mean([getattr(t, side) for t in tried])) for side in ("light", "time"))
-    return Trial(without, lit, light, time)
+    return Trial(without, lit, float(np.mean([t.light for t in tried])))
 
 
 def _tried(problem: Problem) -> Trial:
@@ -91,19 +87,19 @@ def _tried(problem: Problem) -> Trial:
         problem, data=np.where(seen, data, 0)[None], valid=seen[None], noise=problem.noise * unit
     )
 
-    def tried(smooth: bool, weight: float | None) -> tuple[Pilot, float, float]:
+    def tried(smooth: bool, weight: float | None) -> tuple[Pilot, float]:
         own = replace(coarse, smooth=smooth)
         count = PLAIN_ITERATIONS if own.is_plain else ITERATIONS
         found = pilot(own, count, weight=weight, solver="admm")
         left = found.left[0] + np.where(seen, 0, data)  # what was not seen is to be predicted
         error = float(np.sqrt(np.mean(left[unseen].astype(np.float64) ** 2)))
-        return found, error, found.outcome.seconds / count
+        return found, error
 
-    lit, with_it, slow = tried(True, None)
-    _, without, fast = tried(False, lit.weight)  # one prior for both: less light has less of it
+    lit, with_it = tried(True, None)
+    _, without = tried(False, lit.weight)  # one prior for both: less light has less of it
     assert lit.background is not None
     light = float(lit.background[0][valid].mean()) / max(float(data[valid].mean()), 1e-30)
-    return Trial(without, with_it, light, slow / max(fast, 1e-9))
+    return Trial(without, with_it, light)
 
 
 def background_of(trial: Trial | None, overrides: Overrides, *, given: bool) -> Decision:
@@ -119,8 +115,6 @@ def background_of(trial: Trial | None, overrides: Overrides, *, given: bool) -> 
         f"fall by {GAIN:g}, or by {LIGHT_GAIN:.0%} where it is {LIGHT:.0%} of the light)"
     )
     numbers = {"held_out_without": trial.without, "held_out_with": trial.lit, "light": trial.light}
-    other = Option("none" if trial.helps else "estimated", trial.time, float("nan"))
     if trial.helps:
-        down = replace(other, time=1 / trial.time)
-        return Decision("background", "estimated", why, down=down, numbers=numbers)
-    return Decision("background", "none", why, up=other, numbers=numbers)
+        return Decision("background", "estimated", why, down="none", numbers=numbers)
+    return Decision("background", "none", why, up="estimated", numbers=numbers)

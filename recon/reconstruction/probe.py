@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -71,32 +70,12 @@ def _coarse_pass(problem: Problem) -> tuple[npt.NDArray[np.float64], float]:
     return share, 0.0 if mean <= 0 else float(found.background[0][valid].mean()) / mean
 
 
-@dataclass(frozen=True)
-class CameraCost:
-    """What one forward and adjoint of the coarse copy's camera cost.
-
-    Attributes
-    ----------
-    seconds : float
-        Processor time.
-    fft_pixels : int
-        Pixels transformed: the same at any time, to choose by. 0 for one convolution.
-    """
-
-    seconds: float
-    fft_pixels: int
-
-
-def camera_cost(problem: Problem, model: ModelName) -> CameraCost:
-    """Measure a forward and an adjoint of the coarse copy's camera."""
+def camera_cost(problem: Problem, model: ModelName) -> int:
+    """Return the pixels that the coarse copy's camera transforms; 0 for one convolution."""
     part = Part(coarse_copy(problem, model, "nonnegative", background=False), slice(0, 1))
     try:
         camera = part.camera
-        camera.adjoint(camera.forward(np.zeros(camera.domain_shape, np.float32)))
-        began = time.process_time()
-        camera.adjoint(camera.forward(np.zeros(camera.domain_shape, np.float32)))
-        seconds = max(time.process_time() - began, 1e-6)
-        return CameraCost(seconds, camera.fft_pixels if isinstance(camera, SpatiallyVarying) else 0)
+        return camera.fft_pixels if isinstance(camera, SpatiallyVarying) else 0
     finally:
         part.close()
 

@@ -8,11 +8,10 @@ import numpy as np
 
 from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR, TOLERATED, Depths, ModelName, choose_model
 from recon.camera.varying_psfs import principal_psfs
-from recon.reconstruction.choice import ERROR_SCALE, Decision, Option, left_out_db, loss_db
+from recon.reconstruction.choice import Decision
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.probe import (
     ACCEPTED,
-    CameraCost,
     acceptance_px,
     psf_window,
     resolution_px,
@@ -20,8 +19,6 @@ from recon.reconstruction.probe import (
 from recon.verdict.cases import shipped_maps
 from recon.verdict.map import PRECISION
 
-VARYING_COST = 3.0
-"""Operator applications an iteration of conjugate gradients, relative to a convolution."""
 HIDDEN, HIDDEN_VARIATION = 4.0, 0.4
 """Volumes by total variation: the PSFs' relative differences times the data's contrast in units of its
 noise, and the differences themselves, up to which one convolution serves. Below, in 16 dim volumes, the true
@@ -35,7 +32,7 @@ def candidates(depths: Depths) -> tuple[ModelName, ...]:
 
 
 def model_of(
-    depths: Depths, overrides: Overrides, contrast: float | None, costs: Mapping[ModelName, CameraCost]
+    depths: Depths, overrides: Overrides, contrast: float | None, costs: Mapping[ModelName, int]
 ) -> tuple[ModelName, Decision]:
     """Decide on the camera model, with its neighbours on the scale convolution, low-rank, local.
 
@@ -61,7 +58,7 @@ def model_of(
         why = "as asked"
     elif model != "convolution":
         differ = f"PSFs differ by {variation:.1%} over the field"
-        share = costs["lowrank"].fft_pixels / max(costs["local"].fft_pixels, 1)
+        share = costs["lowrank"] / max(costs["local"], 1)
         components = f"{differ}; {rank} component{'s' if rank > 1 else ''} tell all but {LOW_RANK_ERROR:.0%}"
         if contrast is not None and contrast * variation <= HIDDEN and variation <= HIDDEN_VARIATION:
             model = "convolution"
@@ -83,19 +80,12 @@ def model_of(
     if not varying:
         return model, Decision("model", model, why, numbers=numbers, overruled=asked, open=False)
     numbers |= {"rank": float(rank), "rank_error": low.error}
-    loss = {"convolution": loss_db(variation), "lowrank": loss_db(low.error), "local": 0.0}
 
-    def cost(m: ModelName) -> float:
-        kind, applications = ("convolution", 1.0) if m == "convolution" else ("varying", VARYING_COST)
-        return costs[m].seconds * applications * USUAL_ITERATIONS[kind]
-
-    def step(by: int) -> Option | None:
+    def step(by: int) -> str | None:
         place = scale.index(model) + by
-        if not 0 <= place < len(scale):
-            return None
-        return Option(scale[place], cost(scale[place]) / cost(model), loss[scale[place]] - loss[model])
+        return scale[place] if 0 <= place < len(scale) else None
 
-    return model, Decision("model", model, why, loss[model], step(1), step(-1), asked, numbers)
+    return model, Decision("model", model, why, step(1), step(-1), asked, numbers)
 
 
 LEAST_SIDE = 20
@@ -125,17 +115,11 @@ def binning_of(depths: Depths, overrides: Overrides, *, whole: bool) -> Decision
         )
     if not whole and not asked and fitting > 1:
         why = f"erased pixels are not averaged with others; else {why}"
-    up = None if binning == 1 else Option(str(binning - 1), (binning / (binning - 1)) ** 2, 0.0)
-    down = None
-    if side // (binning + 1) >= 16:
-        down = Option(
-            str(binning + 1),
-            (binning / (binning + 1)) ** 2,
-            loss_db(max(SAMPLES * (binning + 1) / sharpest - 1, 0.0) * ERROR_SCALE),
-        )
+    up = None if binning == 1 else str(binning - 1)
+    down = str(binning + 1) if side // (binning + 1) >= 16 else None
     numbers = {"binning": float(binning), "autocorrelation_px": sharpest}
     value = f"{binning} x {binning}"
-    return Decision("binning", value, why, 0.0, up, down, asked, numbers, open=binning > 1)
+    return Decision("binning", value, why, up, down, asked, numbers, open=binning > 1)
 
 
 def field_of(
@@ -187,16 +171,11 @@ def field_of(
         reach = None
     modelled = extent[0] * extent[1] if reach is None else min(np.pi * reach**2, extent[0] * extent[1])
     share = modelled / ((2 * height - 1) * (2 * width - 1))
-    up = None if share > 0.99 else Option(largest, 1 / share, 0.0)
-    down = None
-    if height * width < modelled:
-        # An even object beyond the sensor's own throws as much light onto the sensor as the part of the PSFs
-        # that this one throws beside it: light in the wrong place.
-        lost = float((window[0] / (2 * height) + window[1] / (2 * width)) / 2)
-        down = Option(f"{height} x {width}", height * width / modelled, left_out_db(lost))
+    up = None if share > 0.99 else largest
+    down = f"{height} x {width}" if height * width < modelled else None
     numbers = {"share_of_largest": share}
     value = f"{extent[0]} x {extent[1]} pixels" + ("" if reach is None else f", {reach:.0f} about the axis")
-    return window, reach, Decision("field", value, why, 0.0, up, down, asked, numbers)
+    return window, reach, Decision("field", value, why, up, down, asked, numbers)
 
 
 STRAY_SHARE = 0.2
@@ -215,10 +194,7 @@ def is_stray(share: float) -> bool:
 
 
 def iterations_of(tolerance: float, overrides: Overrides, *, plain: bool) -> Decision:
-    """Say why to stop at a change an iteration, with what stopping later and earlier would be.
-
-    The steps are rules of thumb of the scenes tuned on; ``plain`` as in :func:`field_of`.
-    """
+    """Say why to stop at a change an iteration; ``plain`` as in :func:`field_of`."""
     asked = overrides.tolerance is not None
     seen = "pictures were seen to be within 0.2 dB of the end there"
     usual = "where this solver stops by default" if plain else seen
@@ -226,8 +202,8 @@ def iterations_of(tolerance: float, overrides: Overrides, *, plain: bool) -> Dec
         "iterations",
         f"until they change by less than {tolerance:g}",
         "as asked" if asked else usual,
-        up=Option(f"until {tolerance / 10:g}", 3.0, 0.2),
-        down=Option(f"until {tolerance * 3:g}", 0.5, -0.5),
+        up=f"until {tolerance / 10:g}",
+        down=f"until {tolerance * 3:g}",
         overruled=asked,
         numbers={"tolerance": tolerance},
         open=False,
@@ -237,8 +213,6 @@ def iterations_of(tolerance: float, overrides: Overrides, *, plain: bool) -> Dec
 METHOD = "admm tv"
 """Of the map; it is ADMM that reconstructs what is chosen here. The map is of pictures; those of volumes are
 ADMM as well, with sums as long for each of their planes."""
-DOUBLE_COST = 2.0
-"""Time of float64 relative to float32: transforms move twice the bytes."""
 
 
 def drift(iterations: int, pixels: int) -> float:
@@ -274,11 +248,8 @@ def precision_of(overrides: Overrides, iterations: int, pixels: int) -> Decision
         f"by the stability map float32 differs from float64 by at most {expected:.0e} of the picture after "
         f"{iterations} iterations on {pixels} pixels ({PRECISION:.0%} is a failure)"
     )
-    loss = 0.0 - 10 * float(np.log10(1 + expected**2))
     numbers = {"expected_difference": expected}
     value = overrides.precision or ("float64" if expected > PRECISION else "float32")
-    if value == "float64":
-        down = Option("float32", 1 / DOUBLE_COST, loss)
-        return Decision("precision", value, why, 0.0, None, down, asked, numbers)
-    up = Option("float64", DOUBLE_COST, abs(loss))
-    return Decision("precision", value, why, loss, up, None, asked, numbers, open=False)
+    double = value == "float64"
+    up, down = (None, "float32") if double else ("float64", None)
+    return Decision("precision", value, why, up, down, asked, numbers, open=double)

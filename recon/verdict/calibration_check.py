@@ -46,12 +46,18 @@ TOLD_SHARE = 0.002
 """The same relative to the score: what errors of the model may make of it."""
 CERTAIN = 2.0
 """Standard errors by which tiles must prefer a decoy as well."""
+FLIPPED = 6.0
+"""The same for one that is far: of 20 mirrored 16 had 7 to 100, right ones up to 4.9."""
+SPEAKS_NATS = 150.0
+"""Odds among all that were tried from which a photograph has its say on foreign ones."""
 OWN = 2.5
 """Standard errors by which tiles prefer the calibration to each of its far decoys where it is surely the
 photograph's own."""
 NOT_OWN = 1.5
 """The same, up to which it is not: other diffusers' had 1.4 at most, right ones of which the photograph tells
 anything 2 to 100."""
+LIKELIER = 0.01
+"""Score of all far decoys relative to the calibration's beyond one, from which it is not called foreign."""
 EXPLAINED = 1.3
 """Mean squared fine structure that is left, in units of the noise, from which a calibration that is no better
 than its far decoys is another camera's; below, any pattern explains the photograph."""
@@ -104,6 +110,15 @@ class CalibrationCheck:
     scores: Mapping[Transformation, Score]
     pixels: int
     better: Transformation | None = None
+
+    @property
+    def sure(self) -> bool:
+        """Whether it fits and is certainly ahead of all its near decoys, too."""
+        given = self.scores[GIVEN]
+        near = (score for how, score in self.scores.items() if how not in (GIVEN, BETWEEN, *FAR))
+        return self.fit is Fit.FITS and all(
+            is_told(given, score, self.pixels) and given.leads(score) > CERTAIN for score in near
+        )
 
     @property
     def wrong(self) -> bool:
@@ -168,18 +183,22 @@ def check_of(scores: Mapping[Transformation, Score], pixels: int) -> Calibration
     Parameters
     ----------
     scores : mapping
-        Of :data:`GIVEN`, :data:`BETWEEN`, near ones and farther, and of the :data:`FAR` ones that do not
-        resemble it: where all do, as of regular lenslets, only the near ones tell.
+        Of :data:`GIVEN`, :data:`BETWEEN` where it was tried, near ones and farther, and of the :data:`FAR`
+        ones that do not resemble it: where all do, as of regular lenslets, only the near ones tell.
     pixels : int
         Valid ones.
     """
-    scores = {**scores, GIVEN: min(scores[GIVEN], scores[BETWEEN], key=lambda score: score.objective)}
-    given = scores[GIVEN]
+    as_given = (scores[how] for how in (GIVEN, BETWEEN) if how in scores)
+    given = min(as_given, key=lambda score: score.objective)
+    scores = {**scores, GIVEN: given}
     decoys = {how: score for how, score in scores.items() if how not in (GIVEN, BETWEEN)}
     better = min(decoys, key=lambda how: decoys[how].objective)
     far = {how: decoys[how] for how in FAR if how in decoys}
-    foreign = _no_better(given, far.values())
-    if is_told(decoys[better], given, pixels) and decoys[better].leads(given) > CERTAIN:
+    objectives = [score.objective for score in (given, *decoys.values())]
+    speaks = (max(objectives) - min(objectives)) * pixels / 2 > SPEAKS_NATS
+    foreign = speaks and _no_better(given, far.values())
+    certain = FLIPPED if better in far else CERTAIN
+    if is_told(decoys[better], given, pixels) and decoys[better].leads(given) > certain:
         others = [score for how, score in far.items() if how != better]
         if not (foreign and _no_better(decoys[better], others)):
             return CalibrationCheck(Fit.OFF, scores, pixels, better)
@@ -196,6 +215,8 @@ def is_told(one: Score, other: Score, pixels: int) -> bool:
 
 
 def _no_better(score: Score, far: Iterable[Score]) -> bool:
-    """Whether a PSF leaves much of the photograph unexplained, and no less than one of the far decoys."""
-    lead = min((score.leads(other) for other in far), default=np.inf)
-    return float(np.mean(score.fine)) > EXPLAINED and bool(lead < NOT_OWN)
+    """Whether a PSF leaves much of the photograph unexplained, and is not ahead of all far decoys."""
+    others = list(far)
+    lead = min((score.leads(other) for other in others), default=np.inf)
+    likelier = all(other.objective > (1 + LIKELIER) * score.objective for other in others)
+    return float(np.mean(score.fine)) > EXPLAINED and bool(lead < NOT_OWN) and not likelier

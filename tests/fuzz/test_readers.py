@@ -11,7 +11,7 @@ import pytest
 
 from instrument.bench.config_file import load_config
 from instrument.files.errors import BenchError
-from instrument.files.images import read_image
+from instrument.files.images import read_image, write_image
 from instrument.files.volumes import open_volume
 from instrument.plan.model import load_plan
 from instrument.reconstruction.stored_result import open_result
@@ -56,7 +56,9 @@ def test_what_claims_more_than_it_holds_is_refused_before_memory_is_taken(tmp_pa
         archive.writestr("a.txt", "no array")
     with pytest.raises(BenchError, match="no plain"):
         read_image(tmp_path / "text.npz")
-    png = bytearray(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (60000).to_bytes(4, "big") * 2 + bytes(30))
+    write_image(tmp_path / "a.png", np.zeros((4, 4), np.uint8))
+    png = bytearray((tmp_path / "a.png").read_bytes())
+    png[16:24] = (60000).to_bytes(4, "big") * 2
     (tmp_path / "a.png").write_bytes(png)
     with pytest.raises(BenchError, match="made to fill the memory"):
         read_image(tmp_path / "a.png")

@@ -63,9 +63,7 @@ def test_empty_planes_are_left_out_and_come_back_empty(beads, chosen_beads):
 def test_what_is_left_out_is_said(chosen_beads):
     planes = decision(chosen_beads.choice, "planes")
     assert 0 < planes.numbers["light_left_out"] <= 0.02
-    assert -1 < planes.error_db < 0
-    assert planes.up is not None
-    assert planes.up.error_db == -planes.error_db
+    assert planes.up == "all 6"
 
 
 def test_light_in_many_depths_keeps_them():
@@ -259,9 +257,7 @@ def test_every_choice_says_why_and_can_be_overruled(beads):
     free = choose(beads.measurement, beads.calibration, prior="l1")
     assert free.model != "convolution"
     model = decision(free, "model")
-    assert model.down is not None
-    assert model.down.time < 1
-    assert model.down.error_db < 0
+    assert model.down in ("convolution", "lowrank")
     assert all(d.why for d in free.decisions)
     assert any(line.lstrip().startswith("one step down") for line in free.lines())
 

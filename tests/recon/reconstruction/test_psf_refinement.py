@@ -105,3 +105,12 @@ def test_a_photograph_that_tells_nothing_says_so(photograph: np.ndarray) -> None
     found = refine_psf(Problem.of(photograph, psf))
     assert not found.helps
     assert "does not tell" in str(found)
+
+
+def test_a_fit_whose_numbers_nobody_knows_is_not_taken(right: tuple[Refinement, list[float]]) -> None:
+    better = replace(right[0], certainty=9.0, significance=9.0)
+    assert better.helps
+    for unknown in ({"rotation_error_deg": 40.0}, {"scale_error": 4.0}):
+        lost = replace(better, **unknown)
+        assert not lost.helps
+        assert "does not tell" in str(lost)
