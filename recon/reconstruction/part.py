@@ -48,6 +48,11 @@ class Reshaped(LinearOperator):
         return self.own.norm_bound
 
 
+def expects_background(problem: Problem) -> bool:
+    """Whether a background of this problem has a prior mean: see :meth:`Part.set_data`."""
+    return problem.n_planes == 1 and kind_of(problem.prior_name) == "tv"
+
+
 class Part:
     """Operator, data and prior of the channels that are solved together.
 
@@ -111,7 +116,7 @@ class Part:
             power = float(np.sum(self.data.astype(np.float64) ** 2))
             pixels = int(np.count_nonzero(self.valid))
             self.removal.restrain(pixels / max(power, pixels))
-            if problem.n_planes == 1 and kind_of(problem.prior_name) == "tv":
+            if expects_background(problem):
                 means = [
                     0.5 * d[v].mean(dtype=np.float64) for d, v in zip(self.data, self.valid, strict=True)
                 ]

@@ -198,9 +198,20 @@ def judged(
                 f"The calibration was not checked: {error}",
             )
     tell(1.0, "judged")
+    uncertainty = result.uncertainty
+    if uncertainty is not None and verdict is not None and verdict.calibration is not None:
+        uncertainty = replace(uncertainty, wrong_calibration=verdict.calibration.wrong)
+        said = (*said, *(doubt for doubt in uncertainty.doubt if doubt not in result.warnings))
     residual = result.residual if verdict is None or unlike_any(verdict) else None
     warnings = (*result.warnings, *said)
-    return replace(result, verdict=verdict, residual=residual, warnings=warnings, basis=None)
+    return replace(
+        result,
+        verdict=verdict,
+        residual=residual,
+        uncertainty=uncertainty,
+        warnings=warnings,
+        basis=None,
+    )
 
 
 def _verdict(

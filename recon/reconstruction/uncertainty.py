@@ -83,6 +83,8 @@ class Uncertainty:
         Mean slope of the picture relative to its mean, 1 / pixel.
     points : PointErrors or None
         Of grey pictures by a prior that counts light (l1): their points, with error bars.
+    wrong_calibration : bool
+        Whether the verdict found that the calibration does not fit the photograph.
     """
 
     deviation: Floats
@@ -93,6 +95,7 @@ class Uncertainty:
     resolved_px: float
     steepness: float
     points: PointErrors | None = None
+    wrong_calibration: bool = False
 
     @property
     def trusted(self) -> bool:
@@ -113,6 +116,8 @@ class Uncertainty:
     def doubt(self) -> tuple[str, ...]:
         """Why not to trust it; empty where it can be."""
         said = []
+        if self.wrong_calibration:
+            said.append("the calibration does not fit this photograph, which they take for right")
         if self.misfit > EXPLAINED:
             said.append(
                 f"the data are off the model by {self.misfit:.1f} times the noise, so that the picture is "
