@@ -5,8 +5,6 @@ The folder's format is in docs/reference/run-folder.md.
 
 from __future__ import annotations
 
-import fcntl
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -18,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
+from drivers.registry.claim import is_locked
 from instrument.files.errors import FileError
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import value_of
@@ -416,18 +415,8 @@ class Run:
         return [index for index in FrameArray.indices(self.path / FRAMES) if index not in known]
 
     def is_locked(self) -> bool:
-        """Whether some program has the run open for writing."""
-        try:
-            handle = os.open(self.path / LOCK, os.O_RDONLY)
-        except FileNotFoundError:
-            return False
-        try:
-            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        finally:
-            os.close(handle)
-        return False
+        """Whether some program has the run open for writing: its folder is locked, or its file ``lock``."""
+        return is_locked(self.path) or is_locked(self.path / LOCK)
 
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r}, {self.condition}, {len(self.records)} of {self.n_frames} frames)"

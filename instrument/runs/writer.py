@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
 import platform
 import re
@@ -24,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
+from drivers.registry.claim import lock
 from instrument.files.atomic import json_text, make_folder, sync_folder, write_bytes, write_json
 from instrument.files.record import plain
 from instrument.plan import Plan
@@ -145,10 +145,10 @@ class RunWriter:
         What :meth:`reopen` did to the run's files, in words; None in a new run.
     """
 
-    def __init__(self, path: Path, lock: int) -> None:
+    def __init__(self, path: Path, held: contextlib.ExitStack) -> None:
         self.path = path
         self.mended: tuple[str, ...] | None = None
-        self._lock = lock
+        self._held = held
         try:
             run = Run.open(path)
             self._state = dict(run.state)
@@ -159,7 +159,7 @@ class RunWriter:
             self._array: FrameArray | None = run.array if run.has_frames else None
             self._log = AppendOnlyLog(path / LOG)
         except BaseException:
-            os.close(lock)
+            held.close()
             raise
 
     @classmethod
@@ -208,13 +208,13 @@ class RunWriter:
                 copies = (log_line({"kind": "file", "name": n, "text": text}) for n, text in texts.items())
                 write_bytes(draft / LOG, b"".join(copies))
                 write_bytes(draft / LOCK, b"")
-                lock = lock_run(draft)
+                held = lock_run(draft)
                 draft.rename(path)
             except BaseException:
                 shutil.rmtree(draft, ignore_errors=True)
                 raise
             sync_folder(parent)
-        return cls(path, lock)
+        return cls(path, held)
 
     @classmethod
     def reopen(cls, path: Path | str) -> RunWriter:
@@ -224,16 +224,16 @@ class RunWriter:
         """
         path = Run.open(path).path
         with _disk(path, "cannot be continued"):
-            lock = lock_run(path)
+            held = lock_run(path)
             try:
                 for leftover in path.glob(".*"):  # of a write that a crash cut off
                     if leftover.is_file():
                         leftover.unlink()
                 mended = mend_files(path)
             except BaseException:
-                os.close(lock)
+                held.close()
                 raise
-            writer = cls(path, lock)
+            writer = cls(path, held)
             writer.mended = tuple(mended)
         return writer
 
@@ -318,9 +318,7 @@ class RunWriter:
         self._log.close()
         if self._array is not None:
             self._array.close()
-        if self._lock >= 0:
-            lock, self._lock = self._lock, -1
-            os.close(lock)
+        self._held.close()
 
     def __enter__(self) -> Self:
         return self
@@ -364,15 +362,25 @@ def plan_with_copies(plan: Plan, folder: Path) -> Plan:
     return plan.with_slm_images(copies.__getitem__)
 
 
-def lock_run(path: Path) -> int:
-    """Return a handle that holds the run's lock until it is closed or the process ends, however it ends."""
-    handle = os.open(path / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(handle)
-        raise RunError(path, "another program is writing to this run.", "Wait until it ends.") from None
-    return handle
+def lock_run(path: Path) -> contextlib.ExitStack:
+    """Hold a run's locks until they are closed or the process ends, however it ends.
+
+    The folder itself is locked, so that nothing is given away with a deleted file; so is the file ``lock``,
+    for file systems that lock files only and for programs from before.
+    """
+    with contextlib.ExitStack() as held:
+        for what, flags in ((path, os.O_RDONLY), (path / LOCK, os.O_RDWR | os.O_CREAT)):
+            handle = os.open(what, flags | os.O_CLOEXEC, 0o644)
+            held.callback(os.close, handle)
+            try:
+                free = lock(handle)
+            except OSError:
+                if what != path:
+                    raise
+                continue
+            if not free:
+                raise RunError(path, "another program is writing to this run.", "Wait until it ends.")
+        return held.pop_all()
 
 
 def dated_name(label: str) -> str:

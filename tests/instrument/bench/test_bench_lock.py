@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
+import secrets
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import pytest
 
 from drivers.device import Device, DriverOptions, port_claim
-from drivers.registry.claim import Claim, DeviceBusyError
+from drivers.errors import DeviceError
+from drivers.registry.claim import PLACE_VARIABLE, Claim, DeviceBusyError
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config, template
 from tests.mocks.devices import MockWorld
@@ -30,8 +32,7 @@ sys.stdin.read()
 
 @pytest.fixture
 def own_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setenv(PLACE_VARIABLE, str(tmp_path / "locks"))
 
 
 def bench_on(*ports: str) -> Bench:
@@ -40,13 +41,13 @@ def bench_on(*ports: str) -> Bench:
     return Bench(parse_config(text, None))
 
 
-def other_program(resource: str) -> subprocess.Popen[str]:
+def other_program(resource: str, **environment: str) -> subprocess.Popen[str]:
     process = subprocess.Popen(
         [sys.executable, "-c", HOLDER, resource],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "held\n"
@@ -70,6 +71,43 @@ def test_the_second_program_is_refused_before_it_touches_anything() -> None:
         holder.communicate()
     with bench_on("none", "/dev/ttyMOCK1", "none").open():
         pass
+
+
+def test_programs_know_of_each_other_whatever_folder_for_temporary_files_they_have(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(PLACE_VARIABLE)
+    resource = f"port of this test {secrets.token_hex(8)}"
+    (tmp_path / "other").mkdir()
+    holder = other_program(resource, TMPDIR=str(tmp_path / "other"))
+    try:
+        with pytest.raises(DeviceBusyError, match=f"process {holder.pid}"):
+            Claim(resource, "stage")
+    finally:
+        holder.kill()
+        holder.communicate()
+    Claim(resource, "stage").release()  # what a killed program leaves keeps nobody out
+
+
+def test_who_holds_a_device_is_said_when_it_is_a_child_of_a_program_that_ended_or_elsewhere(
+    tmp_path: Path,
+) -> None:
+    claim = Claim("port a", "stage")
+    (path,) = (tmp_path / "locks").iterdir()
+    for change, words in (
+        ({"pid": 2**22 + 1}, "which has ended"),
+        ({"host": "box"}, "process [0-9]+ on box"),
+    ):
+        path.write_text(json.dumps(json.loads(path.read_text()) | change))
+        with pytest.raises(DeviceBusyError, match=words):
+            Claim("port a", "stage")
+    claim.release()
+
+
+def test_a_folder_of_locks_that_cannot_serve_is_said(tmp_path: Path) -> None:
+    (tmp_path / "locks").touch()
+    with pytest.raises(DeviceError, match=r"cannot be kept in .*locks: not a folder.*chmod 1777"):
+        Claim("port a", "stage")
 
 
 def test_two_benches_of_one_program_exclude_each_other_too(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import DeviceError
+from drivers.registry import claim
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.plan import Part, Plan, PlanError, SourcePoints, StagePoints
@@ -148,6 +150,22 @@ def test_a_run_is_continued_by_one_program_only(tmp_path: Path) -> None:
     path = aborted_run(tmp_path)
     with open_mock_bench() as bench, RunWriter.reopen(path), pytest.raises(RunError, match="another program"):
         prepare_resume(bench, path)
+
+
+@pytest.mark.parametrize("first", ["folder", "lock"])
+def test_a_second_writer_is_kept_out_by_either_lock(tmp_path: Path, first: str) -> None:
+    """By the folder's when the file was deleted, by the file's where an older program holds no other."""
+    path = aborted_run(tmp_path)
+    handle = os.open(path if first == "folder" else path / "lock", os.O_RDONLY)
+    assert claim.lock(handle)
+    if first == "folder":
+        (path / "lock").unlink()
+    with pytest.raises(RunError, match="another program"):
+        RunWriter.reopen(path)
+    assert Run.open(path).is_locked()
+    os.close(handle)
+    assert not Run.open(path).is_locked()
+    RunWriter.reopen(path).close()
 
 
 def test_a_camera_that_is_another_one_is_refused_and_the_run_stays_free(
