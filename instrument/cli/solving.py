@@ -174,7 +174,8 @@ def _end(result: Reconstruction, what: str) -> None:
 def reconstruct_to_video(request: VideoRequest, *, force: bool) -> None:
     """Prepare or take up again, solve with a progress bar, finish; exit code 130 where interrupted."""
     video = request.video
-    require_crew(workers=video.workers, scheduler=video.scheduler)  # before anything is written
+    # Before anything is written:
+    require_crew(workers=video.workers, scheduler=video.scheduler, owner=video.scheduler_owner)
     prepared = prepare_video(request, force=force)
     for name, text in prepared.notes.items():
         typer.echo(f"{name:<12}{text}")

@@ -286,3 +286,10 @@ class VideoOptions:
         applies=("video",),
         group=RARE,
     )
+    scheduler_owner: str | None = option(
+        None,
+        help="Whose scheduler it is, if it is not yours: a user of this machine, or of another one.",
+        metavar="NAME",
+        applies=("video",),
+        group=RARE,
+    )

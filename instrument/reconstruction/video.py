@@ -163,8 +163,8 @@ def solve_video(
 ) -> bool:
     """Solve what is left, as the options say: in this process, on processes here, or on a cluster.
 
-    Raises BenchError when there is no Dask or no scheduler; FileError or OSError when a frame cannot be read
-    or a picture written.
+    Raises BenchError when there is no Dask or no scheduler, or one of somebody else; FileError or OSError
+    when a frame cannot be read or a picture written.
 
     Returns
     -------
@@ -177,7 +177,8 @@ def solve_video(
         if video.workers is None and video.scheduler is None:
             in_process(folder, output, prepared.left, on_progress, cancel)
         else:
-            with cluster(workers=video.workers, scheduler=video.scheduler) as client:
+            crew = cluster(workers=video.workers, scheduler=video.scheduler, owner=video.scheduler_owner)
+            with crew as client:
                 on_cluster(client, folder, output, prepared.left, on_progress, cancel)
     except CancelledError:
         return False

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import ipaddress
 import logging
+import os
+import pwd
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -17,6 +20,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -207,32 +211,54 @@ def on_cluster(
 
 
 @contextlib.contextmanager
-def cluster(*, workers: int | None = None, scheduler: str | None = None) -> Iterator[Any]:
+def cluster(
+    *, workers: int | None = None, scheduler: str | None = None, owner: str | None = None
+) -> Iterator[Any]:
     """Give a client of a cluster: a new one of ``workers`` processes here, or that of a scheduler's address.
 
-    Raises BenchError when Dask is not installed, or there is no scheduler at the address.
+    The new one listens on this machine's loopback only, and speaks with nobody who does not hold the keys
+    that are made for it and kept in memory (TLS, both sides). A scheduler is spoken with when it is known
+    whose it is (:func:`_require_owner`).
+
+    Raises BenchError when Dask is not installed, there is no scheduler at the address, or it is another's.
     """
     distributed = _dask()
     if scheduler is not None:
-        with _client_of(distributed, scheduler) as client:
+        with _client_of(distributed, scheduler, owner) as client:
             yield client
         return
+    try:
+        security = distributed.Security.temporary()
+    except ImportError as error:
+        raise BenchError(
+            "Workers need keys that keep others out, and the package cryptography, which makes them, is not "
+            "installed: pip install 'diffuserbench[cluster]'."
+        ) from error
     with (
         distributed.LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            protocol="tls://",
+            security=security,
+            dashboard_address=None,
+            silence_logs=50,
         ) as local,
         distributed.Client(local) as client,
     ):
         yield client
 
 
-def require_crew(*, workers: int | None = None, scheduler: str | None = None) -> None:
+def require_crew(
+    *, workers: int | None = None, scheduler: str | None = None, owner: str | None = None
+) -> None:
     """Raise what :func:`cluster` would, before any work is begun; does nothing without a cluster."""
     if workers is None and scheduler is None:
         return
     distributed = _dask()
     if scheduler is not None:
-        _client_of(distributed, scheduler).close()
+        _client_of(distributed, scheduler, owner).close()
 
 
 def _dask() -> Any:
@@ -247,11 +273,81 @@ def _dask() -> Any:
     return distributed
 
 
-def _client_of(distributed: Any, scheduler: str) -> Any:
+def _client_of(distributed: Any, scheduler: str, owner: str | None) -> Any:
+    _require_owner(scheduler, owner)
     try:
         return distributed.Client(scheduler, timeout=CONNECT_S)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        raise _no_scheduler(scheduler, str(error)) from error
+
+
+def _no_scheduler(scheduler: str, found: str) -> BenchError:
+    return BenchError(
+        f"No Dask scheduler answers at {scheduler}: {found}. Start one with "
+        "'dask scheduler --host 127.0.0.1', and workers that see the same files with 'dask worker ADDRESS'."
+    )
+
+
+def _require_owner(scheduler: str, owner: str | None) -> None:
+    """Refuse a scheduler that is another's or may be, unless ``owner`` names whose it is.
+
+    Who has a scheduler can run anything in the programs that speak with it. With ``tls://`` Dask's own
+    configuration says which certificates both sides need. Of a port of this machine the kernel says whose it
+    is (``/proc/net/tcp``). Of any other address nothing does.
+
+    Raises BenchError.
+    """
+    url = urlsplit(scheduler if "://" in scheduler else f"tcp://{scheduler}")
+    try:
+        host, port = url.hostname, url.port
+    except ValueError as error:
+        raise _no_scheduler(scheduler, str(error)) from error
+    if host is None or port is None:
+        raise _no_scheduler(scheduler, "an address has the form tcp://HOST:PORT")
+    if url.scheme == "tls":
+        return
+    users: set[str] = set()
+    if host == "localhost" or _is_loopback(host):
+        users = _listening(port)
+        if not users:
+            raise _no_scheduler(scheduler, f"nothing of this machine listens at port {port}")
+        if users == {_user(os.getuid())} and owner is None:
+            return
+    if owner is None or (users and users != {owner}):
+        of = f"{' and '.join(sorted(users))}'s" if users else "one that nothing says the owner of"
+        named = f", not {owner}'s" if owner is not None else ""
         raise BenchError(
-            f"No Dask scheduler answers at {scheduler}: {error}. Start one with 'dask scheduler', and "
-            "workers that see the same files with 'dask worker ADDRESS'."
-        ) from error
+            f"The scheduler at {scheduler} is {of}{named}, and who has it can run programs in your name. "
+            "Use one of your own, or tls:// with certificates in Dask's configuration, or name whom you "
+            "trust with --scheduler-owner NAME."
+        )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _listening(port: int) -> set[str]:
+    """Return the users whose programs listen at a TCP port of this machine."""
+    users = set()
+    for table in ("tcp", "tcp6"):
+        with contextlib.suppress(FileNotFoundError):  # not Linux, or without IPv6
+            for line in Path("/proc/net", table).read_text().splitlines()[1:]:
+                _, local, _, state, _, _, _, uid, *_ = line.split()
+                if state == _LISTEN and int(local.rsplit(":", 1)[1], 16) == port:
+                    users.add(_user(int(uid)))
+    return users
+
+
+_LISTEN = "0A"
+"""``TCP_LISTEN`` of the kernel's tables."""
+
+
+def _user(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)

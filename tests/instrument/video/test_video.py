@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pickle
 import shutil
 import signal
+import socket
 import threading
 import time
 from dataclasses import replace
@@ -307,7 +309,22 @@ def test_blocks_solved_together_hold_no_other_solver(
 
 
 @pytest.mark.slow
+def test_a_cluster_here_takes_work_from_its_owner_only() -> None:
+    pytest.importorskip("cryptography", reason="a cluster's keys need cryptography")
+    distributed = pytest.importorskip("distributed")
+    with cluster(workers=1) as client:
+        addresses = [client.scheduler_info()["address"], *client.scheduler_info()["workers"]]
+        assert all(address.startswith("tls://127.0.0.1:") for address in addresses)
+        assert client.submit(abs, -1).result() == 1
+        for scheme, security in (("tcp", None), ("tls", distributed.Security.temporary())):
+            address = addresses[0].replace("tls", scheme)
+            with pytest.raises(OSError):  # noqa: PT011 # which, is Dask's
+                distributed.Client(address, security=security, timeout=1)
+
+
+@pytest.mark.slow
 def test_the_same_on_a_cluster_that_loses_a_worker(recording: Path, video: Path, tmp_path: Path) -> None:
+    pytest.importorskip("cryptography", reason="a cluster's keys need cryptography")
     wanted = request(recording, tmp_path)
     prepared = prepare_video(wanted)
     reports: list[BlockReport] = []
@@ -331,6 +348,39 @@ def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("instrument.reconstruction.video_work.CONNECT_S", 1)
     with pytest.raises(BenchError, match="No Dask scheduler answers"), cluster(scheduler="tcp://127.0.0.1:9"):
         pass
+
+
+def test_a_scheduler_of_somebody_else_is_refused_unless_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    class Dask:
+        @staticmethod
+        def Client(address: str, **_: object) -> contextlib.AbstractContextManager[str]:
+            asked.append(address)
+            return contextlib.nullcontext(address)
+
+    monkeypatch.setattr(block_module, "_dask", lambda: Dask)
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        address = f"tcp://localhost:{listener.getsockname()[1]}"
+        with cluster(scheduler=address):
+            assert asked == [address]
+        with pytest.raises(BenchError, match="not eve's"), cluster(scheduler=address, owner="eve"):
+            pass
+        monkeypatch.setattr(block_module, "_listening", lambda _: {"eve"})
+        with pytest.raises(BenchError, match=r"is eve's.*--scheduler-owner"), cluster(scheduler=address):
+            pass
+        with cluster(scheduler=address, owner="eve"):
+            pass
+    with pytest.raises(BenchError, match="nothing says the owner of"), cluster(scheduler="10.0.0.1:8786"):
+        pass
+    with cluster(scheduler="tcp://10.0.0.1:8786", owner="ann"), cluster(scheduler="tls://10.0.0.1:8786"):
+        pass
+    for wrong in ("tcp://", "tcp://a:b", "x" * 9):
+        with pytest.raises(BenchError, match="No Dask scheduler"), cluster(scheduler=wrong):
+            pass
+    assert len(asked) == 4
 
 
 def test_an_unknown_scheduler_leaves_nothing_behind(
