@@ -7,7 +7,8 @@ failures of any type come as a DeviceError; the bench uses no other. What a diff
 exposure              10 % or 0.2 ms, whichever is more: cameras count in lines and tenths of milliseconds
 gain                  25 % or 0.5, whichever is more: some have steps of 2 dB
 binning, format, ...  none; a region lies within the one asked for
-place of an axis      3 times its resolution, read once more after the move
+place of an axis      3 times its resolution, read once more after the move; of a homed stage at any
+                      time, 100 times its travel beyond its ends
 pattern, SLM image    none
 ====================  ==============================================================================
 
@@ -33,12 +34,12 @@ from drivers.errors import DeviceError
 from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import LedArray, LedPattern
 from drivers.slm import Slm
-from drivers.stage import Stage
+from drivers.stage import Stage, StageAxis
 
 _log = logging.getLogger(__name__)
 _D = TypeVar("_D", bound=type[Device])
 _T = TypeVar("_T")
-_RESOLUTIONS = 3
+_RESOLUTIONS, _TRAVELS = 3, 100
 _REMEDY = "Its readings cannot be trusted: check the device, its firmware and its driver."
 
 
@@ -133,6 +134,12 @@ def _arrived(stage: Stage, target: Mapping[str, float], said: Mapping[str, float
         raise _refuse(stage, wanted, ", ".join(f"{name} = {place:g}" for name, place in strays.items()))
 
 
+def _is_nowhere(axis: StageAxis, place: float) -> bool:
+    """Return whether a place is far beyond an axis' ends, however close a user has set them."""
+    far = _TRAVELS * (axis.upper_limit - axis.lower_limit)
+    return not axis.lower_limit - far <= place <= axis.upper_limit + far
+
+
 class _CheckedCamera(Camera):
     def set_exposure_ms(self, exposure_ms: float) -> float:
         said = super().set_exposure_ms(exposure_ms)  # type: ignore[safe-super]
@@ -189,6 +196,10 @@ class _CheckedStage(Stage):
         missing = [axis.name for axis in self.axes if not math.isfinite(said.get(axis.name, math.nan))]
         if missing:
             raise _refuse(self, "its place", f"nothing, or no number, for {', '.join(missing)}: {said}")
+        if (far := [axis for axis in self.axes if _is_nowhere(axis, said[axis.name])]) and self.is_homed:
+            places = ", ".join(f"{axis.name} = {said[axis.name]:g}" for axis in far)
+            ranges = ", ".join(f"{axis.lower_limit:g} to {axis.upper_limit:g}" for axis in far)
+            raise _refuse(self, f"its place, which is within {ranges}", places)
         return said
 
     def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:

@@ -131,6 +131,11 @@ def test_a_stage_that_does_not_move_is_found_out() -> None:
     stage.move_to({"x_um": 0.2})  # within three times its resolution of where it stands
     with pytest.raises(DeviceError, match="no number, for x_um, z_um"):
         made(Lost).position()
+    stage._position["z_um"] = 9.9e9  # type: ignore[attr-defined]
+    with pytest.raises(
+        DeviceError, match=r"its place, which is within 0 to 1e\+06 and says z_um = 9\.9e\+09"
+    ):
+        stage.position()
     with pytest.raises(DeviceError, match="was asked for homing and says that it is not homed"):
         made(NeverHome).home()
 

@@ -1,0 +1,317 @@
+"""A fault at every call of every device, and what became of light, motion, run, exit code and words.
+
+    python benchmarks/fault_table.py                       every call, every fault, all work: hours
+    python benchmarks/fault_table.py --every 7 run snap    a sample
+
+Each trial is a process of its own that carries out a command of the terminal on the simulated bench. The
+device call with the trial's number (counted at the driver, whoever makes it)
+
+=========  =======================================================================================
+exception  raises an error that is no DeviceError, as a faulty driver's does
+hang       does not return
+nan        returns what it did, with every number in it NaN
+garbage    returns what it did, with every number a large one and every picture a fraction of itself
+unplugged  raises DeviceLostError, as does every later call of that device
+=========  =======================================================================================
+
+Of each is printed whether the light was off and motion stopped in the end (``said``: the device could no
+longer be told, and the program says so), what the run calls itself and whether ``verify`` finds it sound, the
+exit code, and the sentence. Where a call that hangs is not given up, the trial gets Ctrl-C after some
+seconds (``held up``). A fault that changes nothing that is used is ``harmless``: exit code 0, light off, the
+run complete. Exit status 1 when anything else was found than that.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import io
+import math
+import os
+import pickle
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import numpy as np
+
+from benchmarks.crash_test import BENCH, PLAN, runs_in
+from drivers.camera import Camera
+from drivers.device import Device
+from drivers.errors import DeviceLostError
+from drivers.led_array import LedArray
+from drivers.simulated.camera import SimulatedCamera
+from drivers.simulated.led_array import SimulatedLedArray
+from drivers.simulated.slm import SimulatedSlm
+from drivers.simulated.stage import SimulatedStage
+from drivers.slm import Slm
+from drivers.stage import Stage
+from instrument.cli import main
+from instrument.runs.inspection import verify
+from instrument.runs.run import Run, RunCondition
+
+DRIVERS = {SimulatedCamera: Camera, SimulatedStage: Stage, SimulatedLedArray: LedArray, SimulatedSlm: Slm}
+"""Each with the interface whose methods are called."""
+FAULTS = ("exception", "hang", "nan", "garbage", "unplugged")
+WORK = {
+    "run": ["run", "plan.json", "--out", "runs"],
+    "record": ["record", "--source", "--frames", "6", "--out", "runs"],
+    "snap": ["snap", "--source", "--out", "a.tif", "--force"],
+    "sweep": ["calibrate", "axial", "--z-min", "20", "--average", "1", "--dark-frames", "1", "--out", "runs"],
+}
+SOON_S = 1.0
+"""What the waits for a device that hangs are shortened to."""
+HELD_UP_S, END_S = 7.0, 25.0
+"""When a trial gets Ctrl-C, and when it is killed."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a trial came to."""
+
+    call: str
+    light: str
+    motion: str
+    run: str
+    code: int | None
+    said: str
+    held_up: bool
+
+    @property
+    def judged(self) -> str:
+        """``ok``, ``harmless``, ``held up``, or what is wrong."""
+        wrong = [
+            what
+            for what, found in (
+                ("light on", self.light == "ON"),
+                ("moving", self.motion == "MOVING"),
+                ("killed", self.code is None),
+                ("traceback", "Traceback" in self.said),
+                ("no words", self.code != 0 and not self.said.strip()),
+                ("run " + self.run, "unsound" in self.run or self.run in ("running", "crashed")),
+                ("complete, yet an error", self.code not in (0, None) and self.run == "completed, not last"),
+            )
+            if found
+        ]
+        if wrong:
+            return ", ".join(wrong).upper()
+        return "harmless" if self.code == 0 else "held up" if self.held_up else "ok"
+
+
+class Faulty:
+    """Counts the outermost calls of drivers' methods, and has one of them go wrong."""
+
+    def __init__(self, number: int, fault: str) -> None:
+        self.number, self.fault = number, fault
+        self.calls: list[str] = []
+        self.devices: dict[str, Device] = {}
+        self._lost: set[str] = set()
+        self._inside = threading.local()
+
+    def install(self) -> None:
+        """Wrap the public methods of the simulated drivers, before a bench is made of them."""
+        for driver, interface in DRIVERS.items():
+            for name in (name for name in dir(interface) if not name.startswith("_")):
+                method = getattr(driver, name)
+                if isinstance(method, FunctionType) and name not in ("check", "limits", "claims"):
+                    setattr(driver, name, self._wrapped(name, method))
+
+    def _wrapped(self, name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(method)
+        def call(device: Device, *args: Any, **named: Any) -> Any:
+            if getattr(self._inside, "deep", False):
+                return method(device, *args, **named)
+            self._inside.deep = True
+            try:
+                return self._outermost(name, method, device, args, named)
+            finally:
+                self._inside.deep = False
+
+        return call
+
+    def _outermost(self, name: str, method: Callable[..., Any], device: Any, args: Any, named: Any) -> Any:
+        self.devices[device.kind] = device
+        here = len(self.calls)
+        self.calls.append(f"{device.kind}.{name}")
+        if device.kind in self._lost or (here == self.number and self.fault == "unplugged"):
+            self._lost.add(device.kind)
+            device._is_open = False
+            raise DeviceLostError(device.name, "was unplugged.", "Plug it in.")
+        if here != self.number:
+            return method(device, *args, **named)
+        if self.fault == "exception":
+            raise ZeroDivisionError("a mistake of the driver's")
+        if self.fault == "hang":
+            threading.Event().wait()
+        return changed(method(device, *args, **named), math.nan if self.fault == "nan" else 9.9e9)
+
+    def lit(self) -> bool:
+        """Whether the LED array shines, whatever it says."""
+        array = self.devices.get("led_array")
+        return array is not None and not array._pattern.is_dark  # type: ignore[attr-defined]
+
+    def moving(self) -> bool:
+        """Whether the stage moves, whatever it says."""
+        stage = self.devices.get("stage")
+        return stage is not None and stage.carriage.is_moving  # type: ignore[attr-defined]
+
+
+def changed(value: Any, number: float) -> Any:
+    """Return a driver's answer with ``number`` for its numbers; what has none stays."""
+    if isinstance(value, float):
+        return number
+    if isinstance(value, dict):
+        return {key: changed(item, number) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return value[:1] if math.isfinite(number) else value
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {
+            f.name: changed(getattr(value, f.name), number) for f in dataclasses.fields(value) if f.init
+        }
+        with contextlib.suppress(Exception):
+            return type(value)(**fields)
+    return value
+
+
+def soon() -> None:
+    """Shorten the waits for a device that hangs."""
+    from drivers.common import stream
+    from instrument.bench import bench, photograph, safety
+
+    for module in (stream, bench, safety):
+        setattr(module, "STOP_ANSWER_S", SOON_S)  # noqa: B010 # its type is final
+    setattr(photograph, "CALL_MARGIN_S", SOON_S)  # noqa: B010
+    SimulatedCamera.longest_silence_s = SOON_S
+
+
+def prepare(folder: Path) -> None:
+    """Make a folder with nothing but a bench and a plan in it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    (folder / "bench.toml").write_text(BENCH + '[slm]\ndriver = "simulated"\n')
+    (folder / "plan.json").write_text(PLAN.to_json())
+
+
+def trial(work: str, number: int, fault: str, folder: Path) -> tuple[Outcome, list[str]]:
+    """Carry out one command in a process of its own, with one fault."""
+    prepare(folder)
+    process = os.fork()
+    if process == 0:
+        code = 70
+        try:
+            os.chdir(folder)
+            for handle, name in ((1, "out"), (2, "err")):
+                os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT), handle)
+            faulty = Faulty(number, fault)
+            faulty.install()
+            soon()
+            code = main(WORK[work])
+            (folder / "state").write_bytes(pickle.dumps((faulty.calls, faulty.lit(), faulty.moving())))
+        except BaseException:  # noqa: BLE001 - shown, and the process ends here whatever it was
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+    status, held_up = _wait(process)
+    said = (folder / "err").read_text() if (folder / "err").is_file() else ""
+    calls, lit, moving = [], True, True
+    if (folder / "state").is_file():
+        calls, lit, moving = pickle.loads((folder / "state").read_bytes())
+    outcome = Outcome(
+        call=calls[number] if 0 <= number < len(calls) else "",
+        light=("said" if "may be on" in said else "ON") if lit else "off",
+        motion=("said" if "may be moving" in said else "MOVING") if moving else "stopped",
+        run=_run_in(folder),
+        code=None if os.WIFSIGNALED(status) else os.WEXITSTATUS(status),
+        said=said,
+        held_up=held_up,
+    )
+    return outcome, calls
+
+
+def _wait(process: int) -> tuple[int, bool]:
+    """Wait for a trial; after some time Ctrl-C, and SIGKILL."""
+    began_s, held_up = time.monotonic(), False
+    while True:
+        done, status = os.waitpid(process, os.WNOHANG)
+        if done:
+            return status, held_up
+        passed_s = time.monotonic() - began_s
+        if passed_s > HELD_UP_S and not held_up:
+            held_up = True
+            os.kill(process, signal.SIGINT)
+        if passed_s > END_S:
+            os.kill(process, signal.SIGKILL)
+        time.sleep(0.02)
+
+
+def _run_in(folder: Path) -> str:
+    """Return what the run says of itself, and whether it is sound."""
+    runs = runs_in(folder / "runs") if (folder / "runs").is_dir() else []
+    if not runs:
+        return "none"
+    run = Run.open(runs[0])
+    if not verify(run).is_sound:
+        return f"{run.condition}, unsound"
+    whole = run.condition is RunCondition.COMPLETED and run.plan is not None and bool(run.missing())
+    return f"{run.condition}, unsound" if whole else str(run.condition)
+
+
+def table(work: str, faults: list[str], every: int, seed: int, folder: Path) -> Counter[str]:
+    """Print a row for each fault at each chosen call; return how often each judgement was made."""
+    whole, calls = trial(work, -1, "none", folder)
+    if whole.code != 0 or whole.light != "off":
+        raise SystemExit(f"{work} itself failed ({whole.code}):\n{whole.said}")
+    first = random.Random(seed).randrange(every)
+    counts: Counter[str] = Counter()
+    for number in range(first, len(calls), every):
+        for fault in faults:
+            found, _ = trial(work, number, fault, folder)
+            counts[found.judged] += 1
+            words = [line for line in found.said.splitlines() if "SIMULATED" not in line and line.strip()]
+            sentence = next((line.strip() for line in words if "(simulated):" in line), "".join(words[:1]))
+            print(
+                f"{work:<7}{number:>4} {calls[number]:<28}{fault:<10}{found.judged:<12}light {found.light:<5}"
+                f"motion {found.motion:<8}run {found.run:<11}exit {found.code!s:<5}{sentence}",
+                flush=True,
+            )
+    print(f"{work}: {len(calls)} calls; " + ", ".join(f"{n} {what}" for what, n in sorted(counts.items())))
+    return counts
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """Print the tables; return 1 when anything was unsafe, dishonest or without words."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("work", nargs="*", choices=[*WORK, []], help="commands [default: all]")
+    parser.add_argument("--every", type=int, default=1, help="of so many calls one")
+    parser.add_argument("--seed", type=int, default=0, help="which of them")
+    parser.add_argument("--fault", action="append", choices=FAULTS, help="faults [default: all]")
+    asked = parser.parse_args(arguments)
+    counts: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as within:
+        folder = Path(within, "trial")
+        prepare(folder)
+        quiet = contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO())
+        with contextlib.chdir(folder), quiet[0], quiet[1]:
+            main(WORK["snap"])  # what is imported and compiled here, no trial waits for
+        for work in asked.work or WORK:
+            counts += table(work, asked.fault or list(FAULTS), asked.every, asked.seed, folder)
+    return 1 if set(counts) - {"ok", "harmless", "held up"} else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(run())
