@@ -208,14 +208,14 @@ class RunsPanel(Panel):
             for number, listed in enumerate(summaries):
                 texts = (
                     listed.path.name,
-                    listed.condition.value if listed.condition is not None else "UNREADABLE",
+                    listed.became,
                     f"{listed.stored} of {listed.frames}",
                     "recording" if listed.is_recording else "plan",
                     "SIMULATED" if listed.is_simulated else "",
                 )
                 for place, text in enumerate(texts):
                     tip = listed.problem or (str(listed.path) if place == 0 else text)
-                    warns = place == 1 and listed.condition is not RunCondition.COMPLETED
+                    warns = place == 1 and listed.became != RunCondition.COMPLETED
                     self.table.setItem(number, place, cell(text, tip, warns=warns))
             self.table.setCurrentCell(chosen, 0) if chosen >= 0 else self.table.clearSelection()
         if chosen >= 0 and self._wanted is not None:

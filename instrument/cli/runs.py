@@ -54,11 +54,11 @@ def list_runs(
     for path in paths:
         found = summary(path)
         if found.condition is None:
-            table.add_row(path.name, "UNREADABLE", "", "", found.problem)
+            table.add_row(path.name, found.became, "", "", found.problem)
             continue
         kind = "recording" if found.is_recording else "plan"
         mark = "SIMULATED" if found.is_simulated else ""
-        table.add_row(path.name, found.condition, f"{found.stored} of {found.frames}", kind, mark)
+        table.add_row(path.name, found.became, f"{found.stored} of {found.frames}", kind, mark)
     Console(width=None if Console().is_terminal else 160).print(table, markup=False)
 
 

@@ -194,6 +194,16 @@ class RunSummary:
     is_recording: bool = False
     is_simulated: bool = False
     problem: str = ""
+    is_damaged: bool = False
+    """Whether a small file is not as it was written, or an image is gone or of another size; only ``verify``
+    reads the images."""
+
+    @property
+    def became(self) -> str:
+        """What became of it, with a mark when it is damaged."""
+        if self.condition is None:
+            return "UNREADABLE"
+        return f"{self.condition}, DAMAGED" if self.is_damaged else str(self.condition)
 
 
 def run_paths(folder: Path) -> list[Path]:
@@ -216,6 +226,7 @@ def summary(path: Path) -> RunSummary:
             run.plan is None,
             run.is_simulated,
             run.error,
+            not run.is_being_written and not verify(run, read=False).is_sound,
         )
     except RunError as error:
         return RunSummary(path, problem=error.problem)

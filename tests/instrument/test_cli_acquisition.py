@@ -280,6 +280,12 @@ def test_list_says_what_cannot_be_read(here: Path, capsys: pytest.CaptureFixture
     state = copy / "state.json"
     state.write_text(state.read_text().replace('"version": 1', '"version": 99'))
     assert main(["list"]) == 0
-    assert "UNREADABLE" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "UNREADABLE" in said
+    assert "DAMAGED" not in said
+    image = run.array.chunk_path(0)
+    image.write_bytes(image.read_bytes()[:-1])
+    assert main(["list"]) == 0
+    assert "completed, DAMAGED" in capsys.readouterr().out
     assert main(["list", "no-such-folder"]) == 2
     assert "no-such-folder: is no folder" in capsys.readouterr().err
