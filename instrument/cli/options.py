@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import inspect
 import typing
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -148,6 +148,11 @@ def flat(function: Callable[..., None]) -> Callable[..., None]:
                 {named[key].name: named[key] for key in given},
                 {named[key].name: _as_typed(named[key], value) for key, value in given.items()},
             )
+        if outputs := _outputs(values):
+            from instrument.runs.run import refuse_own_files
+
+            for output in outputs:
+                refuse_own_files(output)
         with protecting(_inputs(values)):
             function(**values)
 
@@ -165,18 +170,28 @@ _WRITTEN = ("out", "figure", "checkpoint", "capture", "picture")
 """Parameters that name what a command writes; every other path is an input."""
 
 
-def _inputs(values: object) -> list[Path]:
+def _inputs(values: Mapping[str, object]) -> list[Path]:
     """Return the paths in a command's parameters, in options objects and lists too, but those it writes."""
+    return [path for name, path in _paths(values) if name not in _WRITTEN]
+
+
+def _outputs(values: Mapping[str, object]) -> list[Path]:
+    """Return the paths in a command's parameters that it writes."""
+    return [path for name, path in _paths(values) if name in _WRITTEN]
+
+
+def _paths(values: object, called: str = "") -> Iterator[tuple[str, Path]]:
+    """Give every path in a command's parameters with the parameter's name."""
     if isinstance(values, Path):
-        return [values]
-    if isinstance(values, list | tuple):
-        return [path for entry in values for path in _inputs(entry)]
-    if isinstance(values, dict):
-        named = values
-    else:  # an options object, which may have slots
+        yield called, values
+    elif isinstance(values, list | tuple):
+        for entry in values:
+            yield from _paths(entry, called)
+    else:  # an options object may have slots
         declared = () if isinstance(values, Given) else getattr(type(values), "__dataclass_fields__", ())
-        named = {name: getattr(values, name) for name in declared}
-    return [path for name, value in named.items() if name not in _WRITTEN for path in _inputs(value)]
+        named = values if isinstance(values, dict) else {name: getattr(values, name) for name in declared}
+        for name, value in named.items():
+            yield from _paths(value, name)
 
 
 def _as_named(o: Option, words: Container[str]) -> Option:

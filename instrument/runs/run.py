@@ -26,12 +26,15 @@ from instrument.runs.log import FrameRecord, Gap, Lost, Unlisted, read_lines
 from instrument.runs.run_files import (
     BENCH,
     FRAMES,
+    KEPT,
     LOCK,
     LOG,
     PLAN,
     PROVENANCE,
     RUN_STATE,
+    SLM_IMAGES,
     STATE,
+    UNCHANGING,
     RunError,
     RunFiles,
 )
@@ -425,6 +428,22 @@ class Run:
 def is_run(path: Path) -> bool:
     """Whether a folder is a run's, even where one of its files is gone."""
     return (path / STATE).is_file() or ((path / LOG).is_file() and (path / PROVENANCE).is_file())
+
+
+def refuse_own_files(path: Path) -> None:
+    """Refuse to have something else written to a file that a run consists of; results beside them may be.
+
+    Raises RunError naming the run.
+    """
+    for folder in path.resolve().parents:
+        if is_run(folder):
+            own = path.resolve().relative_to(folder).parts[0]
+            if own in (*UNCHANGING, STATE, LOG, LOCK, FRAMES, SLM_IMAGES, KEPT):
+                raise RunError(
+                    folder,
+                    f"is a run, and {own} is part of it; no output replaces it.",
+                    "Choose another name.",
+                )
 
 
 def _fields(line: Mapping[str, Any]) -> dict[str, Any]:

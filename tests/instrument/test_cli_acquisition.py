@@ -11,6 +11,7 @@ import pytest
 from instrument.cli import main
 from instrument.plan import Plan
 from instrument.plan.model import load_plan, plan_toml, save_plan
+from instrument.runs.inspection import verify
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.writer import RunWriter
 from tests.mocks.devices import MockCamera, MockStage
@@ -268,6 +269,16 @@ def _is_writable(folder: Path) -> bool:
         return False
     (folder / "probe").unlink()
     return True
+
+
+def test_no_output_is_written_to_a_runs_own_files(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "plan.toml"]) == 0
+    run = the_run(here)
+    for name in ("log.jsonl", "state.json", "frames.ome.zarr/c/0/0/0", "kept/a.tif", "slm"):
+        assert main(["snap", "--dark", "--force", "--out", str(run.path / name)]) == 2
+        assert "is part of it; no output replaces it" in capsys.readouterr().err
+    assert verify(Run.open(run.path)).is_sound
+    assert main(["snap", "--dark", "--out", str(run.path / "beside.tif")]) == 0
 
 
 def test_list_says_what_cannot_be_read(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
