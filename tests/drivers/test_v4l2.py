@@ -168,9 +168,9 @@ def test_device_times_are_ends_of_exposures() -> None:
         kernel.start_of_exposure = at_start
         with camera_on(kernel) as camera:
             camera.set_exposure_ms(20.0)
-            metadata = camera.snap().metadata
-        assert metadata.device_time_ns is not None
-        times.append(metadata.host_time_ns - metadata.device_time_ns)
+            snaps = [camera.snap().metadata for _ in range(5)]
+        assert all(m.device_time_ns is not None for m in snaps)
+        times.append(min(m.host_time_ns - (m.device_time_ns or 0) for m in snaps))  # one may be held up
     assert all(-1e5 < late < 20e6 for late in times)  # a start taken for an end would be 20 ms late
 
 
