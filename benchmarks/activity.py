@@ -1,6 +1,6 @@
 """Neurons that fire and beads that flow: what a reconstructed video tells of them, and where it breaks.
 
-    python benchmarks/activity.py [--frames 240] [--out FOLDER]
+    python benchmarks/activity.py [--frames 240] [--out FOLDER] [--nothing]
 
 Light is cast lenslet by lenslet from points at continuous places (recon/evaluation/lenslets.py): no grid, no
 convolution. Neurons: clouds of points with a resting light of 0.5 to 1.5 and calcium transients (dF/F up to
@@ -8,7 +8,8 @@ convolution. Neurons: clouds of points with a resting light of 0.5 to 1.5 and ca
 change; all bleach by a third, photon and read noise. The video is reconstructed with warm starts and
 searched as ``diffuserbench activity`` does; a region is a neuron's when it lies within 3 pixels. Beads:
 drift along a channel, fastest in its middle, bleach, and drift across it by two pixels in all; found as the
-peaks of each picture and linked from frame to frame.
+peaks of each picture and linked from frame to frame. ``--nothing``: scenes that stand or move, in which
+nothing is active and no region may be found.
 """
 
 from __future__ import annotations
@@ -28,8 +29,10 @@ from scipy.optimize import linear_sum_assignment
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from recon.base.threads import set_threads
+from recon.errors import InputError
 from recon.evaluation.lenslets import LensletCamera, build_camera
-from recon.streams.activity import aligned, baseline, change, fading, find_regions, motion
+from recon.streams.activity import aligned, baseline, change, fading, floor_of, motion
+from recon.streams.regions import find_regions, noise_of
 from recon.streams.video import BLOCK, VideoSolver, stream_problem
 
 SHAPE = (128, 160)
@@ -144,14 +147,19 @@ def neurons(  # noqa: PLR0913 - what its table varies
     if align:
         pictures = aligned(pictures, found_motion)
     fade = fading(pictures)
-    dff = change(pictures, baseline(pictures, 100, fade=fade))
-    regions = find_regions(dff)
+    base = baseline(pictures, 100, fade=fade)
+    floor = floor_of(pictures)
+    dff = change(pictures, base, floor)
+    search = find_regions(
+        pictures - base, noise=noise_of(pictures), moved=None if found_motion.is_still else found_motion
+    )
+    regions = search.regions
     centre = np.array(SHAPE) // 2
     traces = []
     for region in regions:
         light = region.trace(pictures)[:, None, None]
         level = baseline(light, 100, fade=fade)
-        traces.append(((light - level) / np.maximum(level, 1e-30))[:, 0, 0])
+        traces.append(change(light, level, floor)[:, 0, 0])
     distance = np.array([[np.hypot(*(np.array(r.centre) - centre - p)) for p in places] for r in regions])
     correlations = []
     if len(regions):
@@ -164,7 +172,7 @@ def neurons(  # noqa: PLR0913 - what its table varies
     for (row, column), course in zip(inside, active, strict=True):
         light = pictures[:, row - 2 : row + 3, column - 2 : column + 3].mean(axis=(1, 2))[:, None, None]
         level = baseline(light, 100, fade=fade)
-        trace = ((light - level) / np.maximum(level, 1e-30))[:, 0, 0]
+        trace = change(light, level, floor)[:, 0, 0]
         at_place.append(float(np.corrcoef(trace, course)[0, 1]) if trace.std() > 0 else 0.0)
     figures = {
         "found": len(correlations),
@@ -222,6 +230,83 @@ def flow(frames: int, count: int, photons: float, warm: int = 6, seed: int = 0):
         "pure_share": float(np.mean([p >= 0.95 for p in pure])) if pure else 0.0,
     }
     return figures, pictures, tracks
+
+
+STILL_SHAPE = (64, 80)
+
+
+def nothing(kind: str, frames: int, photons: float, speed: float, seed: int = 0) -> dict:
+    """Simulate a scene in which nothing is active, reconstruct and search it; return figures.
+
+    ``speed``: pixels a frame; of a swaying sheet its amplitude, of a period of 50 frames.
+    """
+    rng = np.random.default_rng(seed)
+    camera = build_camera(STILL_SHAPE, seed=1)
+    psf = camera.light([[0, 0, camera.focus_um, 1.0]])
+    times = np.arange(frames)
+    if kind == "static":
+        cells = np.repeat(rng.uniform(-0.4, 0.4, (12, 2)) * STILL_SHAPE, 10, axis=0)
+        places = np.concatenate(
+            [cells + rng.normal(0, 1, cells.shape), rng.uniform(-0.5, 0.5, (400, 2)) * STILL_SHAPE]
+        )
+        light = np.repeat([0.1, 0.02], [len(cells), 400])
+    elif "sheet" in kind and "edge" not in kind:
+        places, light = rng.uniform(-1, 1, (2000, 2)) * STILL_SHAPE, rng.gamma(0.5, 1, 2000)
+    elif kind == "edge of a sheet":
+        y, x = np.mgrid[-40:40:1.5, -60:60:1.5]
+        places = np.column_stack([y.ravel(), x.ravel()]) + rng.normal(0, 0.2, (y.size, 2))
+        light = np.ones(len(places))
+    else:
+        places, light = np.array([[3.3, -4.1]]), np.array([float(kind == "point")])
+    way = np.zeros((frames, 2))
+    if kind == "sheet":
+        way = (times - times.mean())[:, None] * speed * np.array([0.3, 1.0])
+    elif kind == "swaying sheet":
+        way[:, 1] = speed * np.sin(2 * np.pi * times / 50)
+    clean = []
+    for t in times:
+        there = places + way[t]
+        seen = (np.abs(there) < 0.75 * np.array(STILL_SHAPE)).all(axis=1)
+        if kind == "edge of a sheet":
+            seen = there[:, 1] < speed * (t - frames / 2)
+        fixed = not way.any() and kind != "edge of a sheet"
+        clean.append(clean[0] if fixed and clean else camera.light(points(camera, there[seen], light[seen])))
+    brightest = max(float(np.max(clean)), 1e-30)
+    pictures = solve(psf, [expose(one / brightest, photons, rng) for one in clean], warm=6)
+    found = motion(pictures)
+    figures = {
+        "scene": kind,
+        "frames": frames,
+        "photons": photons,
+        "speed": speed,
+        "motion_px": found.largest_px,
+    }
+    fade = fading(pictures)
+    base = baseline(pictures, 300, fade=fade)
+    try:
+        floor = floor_of(pictures)
+    except InputError as error:
+        return {**figures, "regions": 0, "refused": str(error)}
+    moved = None if found.is_still else found
+    search = find_regions(pictures - base, noise=noise_of(pictures), moved=moved)
+    return {
+        **figures,
+        "largest_dff": float(change(pictures, base, floor).max()),
+        "faded": 1 - float(fade[-1]),
+        "regions": len(search.regions),
+        **search.left_out,
+    }
+
+
+NOTHING_ACTIVE = (
+    *(("point", frames, photons, 0.0) for frames in (60, 120) for photons in (3e2, 3e3, 1e5)),
+    *(("static", frames, photons, 0.0) for frames in (30, 120) for photons in (3e2, 3e3, 1e5)),
+    ("noise", 120, 3e3, 0.0),
+    *(("sheet", 120, photons, speed) for speed in (0.03, 0.1, 0.3, 1.0) for photons in (3e2, 3e3)),
+    *(("swaying sheet", 120, photons, speed) for speed in (0.3, 2.0) for photons in (3e2, 3e3)),
+    *(("edge of a sheet", 120, photons, speed) for speed in (0.3, 1.0) for photons in (3e2, 3e3)),
+)
+"""Scene, frames, photons in the brightest pixel, pixels a frame."""
 
 
 def _peaks(picture: np.ndarray) -> np.ndarray:
@@ -321,11 +406,18 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=240)
     parser.add_argument("--sweeps", nargs="*", default=list(SWEEPS))
     parser.add_argument("--no-beads", action="store_true")
+    parser.add_argument("--nothing", action="store_true", help="only scenes in which nothing is active")
     parser.add_argument("--out", type=Path, default=Path("activity-benchmark"))
     options = parser.parse_args()
     options.out.mkdir(exist_ok=True)
     set_threads(1)
     print(f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, {os.cpu_count()} cores, {platform.machine()}")
+    if options.nothing:
+        for seed in (0, 1):
+            for case in NOTHING_ACTIVE:
+                figures = nothing(*case, seed=seed)
+                print({k: round(v, 3) if isinstance(v, float) else v for k, v in figures.items()}, flush=True)
+        return
     default = neurons(options.frames, **DEFAULT)
     print("default", default[0], flush=True)
     rows = [{"swept": "", **DEFAULT, **default[0]}]

@@ -5,16 +5,22 @@ them with seeds 101 to 128, 701 to 728 and 801 to 828 had shown which miss, so t
 tuned on with other seeds (tuning list: ``--seed-offset`` 0, 1000, 2000, 3000, 5000; this list: seeds 1101 to
 1128, 3101 to 3128 and 5101 to 5128). Those that judge are new, and three of each kind: one more or less is
 chance.
+
+Kinds named ``hand`` and ``usaf`` are rendered through the PSFs of the measured sets, with stray light as it
+lies on their photographs: they need the data (``DIFFUSERBENCH_DATA``, or ``../shared/data``).
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from recon.evaluation.scene import Family, SceneSpec, spec_of
+from recon.evaluation.scene import FAMILIES, Family, SceneSpec, spec_of
 
 P, S, B, D, M = "dense-picture", "sparse-picture", "beads", "dense-volume", "microscope"
-FAMILY_PRIOR = {P: "tv", S: "tv", B: "l1", D: "tv", M: "tv"}
+FAMILY_PRIOR = {family: "l1" if family == B else "tv" for family in FAMILIES}
+
+HAND = {"optics": "hand", "size": (45, 60), "field": 0.65}
+USAF = {"optics": "usaf", "size": (45, 53), "field": 0.65}
 
 TUNING: tuple[tuple[str, SceneSpec], ...] = tuple(
     (name, spec_of(family, seed=seed, **changes))
@@ -47,6 +53,12 @@ TUNING: tuple[tuple[str, SceneSpec], ...] = tuple(
             ("t-microscope-dim", M, {"size": 40, "depths": 5, "grid": 3, "photons": 400.0}),
             ("t-dense-wider", P, {"grid": 5, "field": 1.35, "fall_off_deg": 26.0}),
             ("t-dense-wide-bright", P, {"grid": 5, "field": 1.3, "fall_off_deg": 23.0, "photons": 8000.0}),
+            ("t-hand-text", "text", {**HAND, "grid": 3, "aberration": 0.1}),
+            ("t-hand-stray", "filaments", {**HAND, "grid": 3, "background": 0.4}),
+            ("t-usaf-texture", "texture", {**USAF, "grid": 3, "fall_off_deg": 20.0}),
+            ("t-usaf-saturated", S, {**USAF, "grid": 3, "saturation": 0.8, "drift_scale": 0.003}),
+            ("t-usaf-beads", B, {**USAF, "depths": 6, "grid": 1, "background": 0.4}),
+            ("t-usaf-volume", D, {**USAF, "depths": 5, "grid": 3, "aberration": 0.05}),
         ],
         start=1,
     )
@@ -85,6 +97,16 @@ _KINDS: tuple[tuple[str, Family, dict[str, Any]], ...] = (
     ("microscope-dim", M, {"size": 40, "depths": 5, "grid": 3, "photons": 250.0}),
     ("microscope-thin", M, {"size": 40, "depths": 6, "grid": 3, "layers": (0.3, 0.5)}),
     ("microscope-clean", M, {"size": 40, "depths": 5, "grid": 3, "background": 0.0}),
+    # Through measured PSFs.
+    ("hand-text", "text", {**HAND, "grid": 3}),
+    ("hand-dense", P, {**HAND, "grid": 3, "aberration": 0.08, "photons": 2000.0}),
+    ("hand-stray", "sparse-picture", {**HAND, "grid": 3, "background": 0.6, "calibration_photons": 3000.0}),
+    ("hand-drift", "filaments", {**HAND, "grid": 3, "drift_scale": 0.004, "photons": 1500.0}),
+    ("usaf-gradient", "gradient", {**USAF, "grid": 3, "fall_off_deg": 18.0}),
+    ("usaf-lights", "lights", {**USAF, "grid": 3, "aberration": 0.1, "saturation": 0.9}),
+    ("usaf-beads", B, {**USAF, "depths": 6, "grid": 1}),
+    ("usaf-beads-stray", B, {**USAF, "depths": 6, "grid": 3, "background": 0.8, "aberration": 0.05}),
+    ("usaf-volume", D, {**USAF, "depths": 5, "grid": 3, "aberration": 0.05, "photons": 2000.0}),
 )
 
 ROUNDS = 3

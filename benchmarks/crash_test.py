@@ -167,7 +167,7 @@ def look(runs: list[Path], promised: set[int], kept: dict[int, bytes], tally: Ta
         tally.problems.append(f"{runs[0]}: {error!r}")
         return
     tally.moments[str(run.condition)] += 1
-    tally.torn += run.torn_bytes > 0
+    tally.torn += any(bad.is_torn for bad in run.bad_lines)
     tally.stored_at_kill.append(len(run.records))
     lost = promised - set(run.records)
     damaged = [index for index in run.records if run.verify(index) is not None]

@@ -18,7 +18,8 @@ from calibration_routines.procedure import (
 )
 from instrument.bench.bench import Bench
 from instrument.plan import Plan, check, estimate
-from instrument.runs.acquire import abilities_of, acquire, prepare_resume
+from instrument.runs.acquire import abilities_of, acquire, prepare_resume, settle_recording
+from instrument.runs.inspection import verify
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import discarded
@@ -50,23 +51,26 @@ class ResumeProcedure(Procedure):
     run: Path
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
-        """Say what is left to do, by the run's log; its frames are read when it goes on."""
+        """Say what is left to do, by the run's log and files; its frames are read when it goes on."""
         found = Run.open(self.run)
         abilities = replace(abilities_of(bench, self.run), stage_homed=True)
+        looked = verify(found, read=False)
+        words = str(looked).splitlines()
         if found.plan is None:
-            return Outlook(("A recording cannot go on.",))
-        todo = found.missing()
-        words = f"{found.condition}: {len(found.records)} of {found.n_frames} frames are stored"
+            return Outlook((*words, looked.remedy() or "A recording cannot go on."))
+        todo = looked.todo
         if not todo:
-            return Outlook((words,))
+            return Outlook(tuple(words))
         # What is left is held against the run's own camera settings once they are restored (prepare_resume).
         cost = estimate(found.plan, abilities, todo=todo, start=found.start)
-        return replace(outlook_of(bench, found.plan, self.run, [words]), cost=cost)
+        return replace(outlook_of(bench, found.plan, self.run, words), cost=cost)
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Verify what is stored, take the rest, and make the calibration, response or surface."""
         found, routine = Run.open(self.run), routine_of(self.run)
-        if found.plan is not None and (found.condition is not RunCondition.COMPLETED or found.missing()):
+        if found.plan is None:
+            return mended_recording(self.run, listener)
+        if found.condition is not RunCondition.COMPLETED or not verify(found, listener.share).is_sound:
             home_if_needed(bench, listener, found.plan)
             listener.step("verifying the frames")
             runner, findings = prepare_resume(
@@ -74,6 +78,8 @@ class ResumeProcedure(Procedure):
             )
             with discarded(runner):
                 listener.said(f"Found {findings}")
+                for words in runner.mended:
+                    listener.said(words)
                 if routine is not None and routine.watch is not None:
                     routine.watch(bench, runner, listener)
                 listener.step(found.label)
@@ -84,6 +90,18 @@ class ResumeProcedure(Procedure):
             for words in frames.verdict:
                 listener.said(words)
         return finished(found, bench, control, listener) or frames
+
+
+def mended_recording(path: Path, listener: Listener) -> Outcome:
+    """Mend a recording's files, and mark what is missing or damaged as lost."""
+    listener.step("verifying the frames")
+    before = Run.open(path)
+    done = settle_recording(path, listener.share)
+    run = Run.open(path)
+    verdict = f"a recording, {before.condition}; there is nothing to go on with."
+    if done:
+        verdict = f"a recording, {run.condition}, with {len(run.records)} of {run.n_frames} frames."
+    return Outcome(verdict=(*done, verdict), good=True, runs=(path,), result=run)
 
 
 def routine_of(run: Path) -> Routine | None:

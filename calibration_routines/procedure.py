@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -22,6 +22,7 @@ from instrument.runs.acquire import abilities_of, prepare
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Runner, RunStatus, discarded
+from instrument.runs.writer import dated_name, free_name
 from recon.base.declare import options_of
 from recon.base.option_text import size
 from recon.base.registry import Registry
@@ -254,8 +255,26 @@ class Purpose(Generic[T]):
         """Return the runner of a plan whose run has the record; errors as ``prepare``."""
         runner = prepare(bench, plan, folder, on_progress=listener.frame, control=control)
         with discarded(runner):
-            self.format.write(runner.path / self.file, plain(record))
+            runner.keep_text(self.file, self.format.text(plain(record)))
         return runner
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FromFiles:
+    """How a routine's result is made of files instead of on a bench."""
+
+    options: type[Any]
+    """Frozen dataclass with declared fields: the files, and what is not known of them."""
+    named: str
+    """Its field that names them; None there: the bench."""
+    uses: tuple[str, ...]
+    """The routine's options that matter with files, too."""
+    look: Callable[[Any, Any], Sequence[str]]
+    """Takes the routine's options and the files, says what would be done; raises what is wrong with them."""
+    make: Callable[[Any, Any, Path, RunControl, Listener], Outcome]
+    """Takes the same, where the result goes, who ends it and who follows."""
+    folder: str
+    """Where the result goes when nothing else is said."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -288,10 +307,60 @@ class Routine:
     listener."""
     watch: Callable[[Bench, Runner, Listener], None] | None = None
     """Makes the runner of such a run that goes on look at its frames as from its beginning."""
+    files: FromFiles | None = None
     file: str = ""
     """Where the command line writes the result when nothing else is said, of options with an ``out``."""
     command: str = "calibrate"
     """The command that it is part of."""
+
+    @property
+    def declared(self) -> tuple[type[Any], ...]:
+        """All classes of options: its own, and those of files."""
+        return (self.options,) if self.files is None else (self.options, self.files.options)
+
+    def useless(self, *, with_files: bool) -> set[str]:
+        """Return the names of options that say nothing: with files the bench's, else those of files."""
+        if self.files is None:
+            return set()
+        own, of_files = ({field.name for field in fields(options)} for options in self.declared)
+        return own - set(self.files.uses) if with_files else of_files - {self.files.named}
+
+    def asked(self, values: Mapping[str, Any]) -> Procedure:
+        """Return the procedure that options by name, of all classes, ask for; errors as these classes."""
+        own, *others = (
+            kind(**{field.name: values[field.name] for field in fields(kind) if field.name in values})
+            for kind in self.declared
+        )
+        if self.files is None or getattr(others[0], self.files.named) is None:
+            return self.procedure(own)
+        return OfFiles(self.name, own, others[0])
+
+
+@dataclass(frozen=True, slots=True)
+class OfFiles(Procedure):
+    """A routine's result made of files; the bench only says where results go."""
+
+    routine: str
+    asked: Any
+    files: Any
+    out: Path | None = None
+    """Where the result goes; None: dated, beside the runs."""
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Look at the files; raises what is wrong with them."""
+        return Outlook(tuple(self._how.look(self.asked, self.files)))
+
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
+        """Make the result."""
+        beside = bench.config.data_folder if folder is None else folder
+        out = self.out or free_name(beside, dated_name(f"{self.routine} calibration"))
+        return self._how.make(self.asked, self.files, out, control, listener)
+
+    @property
+    def _how(self) -> FromFiles:
+        how = routines[self.routine].files
+        assert how is not None
+        return how
 
 
 _MODULES = (
@@ -300,6 +369,7 @@ _MODULES = (
     "optics.angular",
     "optics.dpc",
     "optics.beads",
+    "optics.screen_bench",
     "display.slm_calibration",
     "display.mask_alignment",
 )

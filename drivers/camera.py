@@ -58,6 +58,9 @@ class Camera(Device):
     Settings may not be changed while a sequence runs, except exposure and gain.
     """
 
+    trigger_modes: tuple[TriggerMode, ...] = ("free_run", "software")
+    """What ``set_trigger_mode`` takes; ``"free_run"`` is always among them."""
+
     # What the sensor is ------------------------------------------------------------------------
     @property
     @abstractmethod

@@ -51,7 +51,7 @@ class ProcedurePanel(Panel):
         self.run = ProcedureRun(session, self)
         self.outlook: Outlook | None = None
         """Of the form as it stands, once it was checked."""
-        self.views = {routine.name: OptionsForm([routine.options]) for routine in self.routines}
+        self.views = {routine.name: OptionsForm(routine.declared) for routine in self.routines}
         self.choice = choice([routine.title for routine in self.routines], "What to do")
         self.choice.setAccessibleName("Routine")
         self.stack = QStackedWidget()
@@ -125,7 +125,7 @@ class ProcedurePanel(Panel):
         if values is None:
             return None
         try:
-            return self.routine.procedure(self.routine.options(**values))
+            return self.routine.asked(values)
         except BenchError as error:
             self.show_problem(error)
             return None
@@ -145,7 +145,8 @@ class ProcedurePanel(Panel):
             self._again = True
             return
         self.outlook, self._unchecked = None, False
-        missing = [kind for kind in ("camera", *self.routine.needs) if not self.session.is_open(kind)]
+        needed = () if self._with_files else ("camera", *self.routine.needs)
+        missing = [kind for kind in needed if not self.session.is_open(kind)]
         if missing:
             names = " and ".join(map(name_of, missing))
             self._say(f"The bench has no {names} that is open.", wrong=True)
@@ -238,7 +239,18 @@ class ProcedurePanel(Panel):
         self.about.setText(f"{self.routine.help.removesuffix('.')}.")
         self._typed()
 
+    @property
+    def _with_files(self) -> bool:
+        """Whether the form names files, so that nothing is taken on the bench."""
+        files = self.routine.files
+        try:
+            return files is not None and self.view.value(files.named) is not None
+        except BenchError:
+            return False
+
     def _typed(self) -> None:
+        if self.routine.files is not None:
+            self.view.hide_fields(self.routine.useless(with_files=self._with_files))
         self.run_bar.set_startable("It is being checked.")
         self._rest.start()
 

@@ -150,7 +150,8 @@ QPushButton#stop:hover, QPushButton#stop:focus {{ border: 2px solid {c.text}; pa
 QPushButton#primary {{ background: {c.accent}; color: {c.window}; border: none; font-weight: 600;
   padding: 5px 14px; }}
 QPushButton#primary:disabled {{ background: {c.field}; color: {c.dim}; }}
-QLabel#simulated {{ background: {c.warning}; color: {c.window}; font-weight: 800; padding: 3px 10px;
+QLabel#simulated, QLabel#caution {{ background: {c.warning}; color: {c.window}; font-weight: 800;
+  padding: 3px 10px;
   border-radius: 4px; letter-spacing: 1px; }}
 QFrame#jog-pad {{ background: {c.field}; border: 1px dashed {c.line}; border-radius: 5px; }}
 QFrame#jog-pad[active="true"] {{ border: 2px solid {c.accent}; }}

@@ -91,6 +91,10 @@ def test_a_calibration_makes_a_picture(here: Path, command: Command, folder: str
         "86",
         "-n",
         "15",
+        "--solver",  # solver and weight that version chose by itself
+        "admm",
+        "--tau",
+        str(json.loads((here / "results/picture.json").read_text())["tau"]),
         "--out",
         "again.tif",
     )
@@ -112,7 +116,8 @@ def test_a_calibration_makes_a_volume(here: Path, command: Command) -> None:
     )
     command("reconstruct", *given, "-n", "8", "--out", "again.tif")
     old, new = tifffile.imread(here / "results/volume.tif"), tifffile.imread(here / "again.tif")
-    assert np.linalg.norm(new - old) < 0.02 * np.linalg.norm(old)
+    # Its background was not restrained then (decision 0059).
+    assert np.linalg.norm(new - old) < 0.15 * np.linalg.norm(old)
 
 
 def test_a_recording_becomes_a_video(here: Path, command: Command) -> None:

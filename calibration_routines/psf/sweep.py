@@ -53,6 +53,7 @@ from instrument.bench.photograph import Snapshot
 from instrument.files.atomic import write_text
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError
+from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain, value_of
 from instrument.plan import Step
 from instrument.runs.acquire import acquire
@@ -349,7 +350,7 @@ def read_retakes(run: Path) -> list[Retake]:
     if not path.exists():
         return []
     try:
-        return value_of(list[Retake], json.loads(path.read_text(encoding="utf-8")))
+        return value_of(list[Retake], parse_json(read_bytes(path)))
     except (OSError, LookupError, TypeError, ValueError) as error:
         raise CalibrationError(
             f"{path} cannot be read ({error}): it was changed or damaged. Without it the sweep's first takes "

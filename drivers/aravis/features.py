@@ -9,7 +9,8 @@ from typing import Any
 
 from drivers.common.drops import FrameNumberCounter
 from drivers.device import DeviceIdentity, FoundDevice
-from drivers.errors import DeviceError, DeviceLostError, LimitError
+from drivers.errors import DeviceError, DeviceLostError
+from drivers.genicam.features import FIRMWARE, FeatureKind, Features
 
 REMEDY = (
     "Debian: sudo apt install gir1.2-aravis-0.8 python3-gi, then .ci/link-gi; see "
@@ -104,21 +105,8 @@ def found_cameras() -> tuple[FoundDevice, ...]:
     return tuple(found)
 
 
-FeatureValue = str | bool | int | float
-
-EXPOSURE = ("ExposureTime", "ExposureTimeAbs")
-"""SFNC's name and the one of cameras before it; both count microseconds."""
-GAIN = ("Gain", "GainAbs", "GainRaw")
-BLACK_LEVEL = ("BlackLevel", "BlackLevelAbs", "BlackLevelRaw")
-FRAME_RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
-FRAME_RATE_ENABLE = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
-FRAME_TRIGGERS = ("FrameStart", "FrameTrigger", "AcquisitionStart")
-FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
-AUTOMATICS = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto")
-
-
-class Features:
-    """Reads and writes features of an open device.
+class AravisFeatures(Features):
+    """Features through Aravis.
 
     Parameters
     ----------
@@ -128,24 +116,19 @@ class Features:
         Its device.
     name : str
         The device as error messages name it.
-    error : type
-        What the library's calls raise.
     on_lost : callable
         Called with the error when the device turns out to be gone.
     """
 
+    listed_by = "arv-tool-0.8 --name DEVICE_ID features"
+
     def __init__(
-        self,
-        aravis: Any,
-        device: Any,
-        name: str,
-        error: type[Exception],
-        on_lost: Callable[[DeviceLostError], None],
+        self, aravis: Any, device: Any, name: str, on_lost: Callable[[DeviceLostError], None]
     ) -> None:
+        super().__init__(name)
         self._aravis = aravis
         self._device = device
-        self._name = name
-        self._error = error
+        self._error = library_error()
         self._on_lost = on_lost
 
     @contextlib.contextmanager
@@ -166,7 +149,7 @@ class Features:
             codes.NOT_CONTROLLER,
         ):
             lost = DeviceLostError(
-                self._name,
+                self.name,
                 f"does not answer any more ({error.message}).",
                 "Check cable and power; another program may have taken it over. Then open it again.",
             )
@@ -174,13 +157,12 @@ class Features:
             return lost
         if here and error.code == codes.PROTOCOL_ERROR_ACCESS_DENIED:
             return DeviceError(
-                self._name,
+                self.name,
                 f"did not {doing}: access denied ({error.message}).",
                 "Another program controls it: close that one.",
             )
-        return DeviceError(self._name, f"did not {doing}: {error.message}.")
+        return DeviceError(self.name, f"did not {doing}: {error.message}.")
 
-    # Which there are -------------------------------------------------------------------------------
     def find(self, *names: str) -> str | None:
         """Return the first of some names that the camera has now; None when it has none of them."""
         for name in names:
@@ -193,10 +175,22 @@ class Features:
                     raise lost from error
         return None
 
+    def kind(self, name: str) -> FeatureKind | None:
+        """Return what a feature is."""
+        node, aravis = self._device.get_feature(name), self._aravis
+        if node is None:
+            return None
+        kinds: tuple[tuple[Any, FeatureKind], ...] = (
+            (aravis.GcEnumeration, "choice"),
+            (aravis.GcCommand, "command"),
+            (aravis.GcBoolean, "switch"),
+            (aravis.GcFloat | aravis.GcInteger, "number"),
+        )
+        return next((kind for node_type, kind in kinds if isinstance(node, node_type)), "text")
+
     def _is_float(self, name: str) -> bool:
         return isinstance(self._device.get_feature(name), self._aravis.GcFloat)
 
-    # Numbers ---------------------------------------------------------------------------------------
     def number(self, name: str) -> float:
         """Read a whole or real number."""
         with self.words(f"say its {name}"):
@@ -214,84 +208,40 @@ class Features:
         return float(low), float(high)
 
     def increment(self, name: str) -> int:
-        """Return the steps of a whole number."""
+        """Return the steps of a whole number; 0 of a real one."""
+        if self._is_float(name):
+            return 0
         with self.words(f"say the steps of its {name}"):
             return max(1, int(self._device.get_integer_feature_increment(name)))
 
-    def set_number(self, name: str, value: float) -> float:
-        """Set a number (a whole one to the nearest of its steps); returns what it reads afterwards."""
-        with self.words(f"take {value:g} for its {name}"):
-            if self._is_float(name):
-                self._device.set_float_feature_value(name, value)
-            else:
-                low, high = self.bounds(name)
-                step = self.increment(name)
-                whole = int(low) + round((value - low) / step) * step
-                self._device.set_integer_feature_value(name, min(max(whole, int(low)), int(high)))
-        return self.number(name)
+    def _write_number(self, name: str, value: float) -> None:
+        if self._is_float(name):
+            self._device.set_float_feature_value(name, value)
+        else:
+            self._device.set_integer_feature_value(name, int(value))
 
     def unit(self, name: str) -> str:
         """Return the unit that the camera's description gives a number; empty where it gives none."""
         return self._device.get_feature(name).get_unit() or ""
 
-    # Words and commands ----------------------------------------------------------------------------
     def text(self, name: str) -> str:
-        """Read a text or the entry of an enumeration."""
+        """Read a feature of any kind as text."""
         with self.words(f"say its {name}"):
-            return str(self._device.get_string_feature_value(name))
+            return str(self._device.get_feature(name).get_value_as_string())
 
     def entries(self, name: str) -> tuple[str, ...]:
         """Return the entries that an enumeration offers now."""
         with self.words(f"say what its {name} offers"):
             return tuple(self._device.dup_available_enumeration_feature_values_as_strings(name))
 
-    def choose(self, name: str, entry: str) -> str:
-        """Choose the entry of an enumeration; returns what it reads afterwards."""
-        offered = self.entries(name)
-        if entry not in offered:
-            raise LimitError(
-                self._name, f"has no {name} {entry!r}.", f"It offers {', '.join(offered) or 'none'}."
-            )
-        with self.words(f"take {entry} for its {name}"):
-            self._device.set_string_feature_value(name, entry)
-        return self.text(name)
+    def _write_text(self, name: str, value: str) -> None:
+        self._device.set_string_feature_value(name, value)
 
-    def execute(self, name: str) -> None:
-        """Execute a command."""
-        with self.words(f"execute {name}"):
-            self._device.execute_command(name)
+    def _write_switch(self, name: str, value: bool) -> None:
+        self._device.set_boolean_feature_value(name, value)
 
-    def set_any(self, name: str, value: FeatureValue) -> None:
-        """Set a feature of any kind by what its description says it is.
-
-        Raises LimitError: no such feature, or a value it does not take.
-        """
-        node = self._device.get_feature(name)
-        if node is None:
-            raise LimitError(
-                self._name, f"has no feature {name!r}.", "arv-tool-0.8 --name DEVICE_ID features lists them."
-            )
-        aravis = self._aravis
-        if isinstance(node, aravis.GcEnumeration):
-            self.choose(name, str(value))
-        elif isinstance(node, aravis.GcCommand):
-            self.execute(name)
-        elif isinstance(node, aravis.GcBoolean):
-            with self.words(f"take {value} for its {name}"):
-                self._device.set_boolean_feature_value(name, bool(value))
-        elif isinstance(node, aravis.GcFloat | aravis.GcInteger) and not isinstance(value, str):
-            low, high = self.bounds(name)
-            if not low <= value <= high:
-                raise LimitError(self._name, f"takes no {name} {value:g}.", f"It takes {low:g} to {high:g}.")
-            self.set_number(name, value)
-        else:
-            with self.words(f"take {value!r} for its {name}"):
-                self._device.set_string_feature_value(name, str(value))
-
-    def any_text(self, name: str) -> str:
-        """Read a feature of any kind as text."""
-        with self.words(f"say its {name}"):
-            return str(self._device.get_feature(name).get_value_as_string())
+    def _execute(self, name: str) -> None:
+        self._device.execute_command(name)
 
 
 def identity_of(camera: Any, features: Features) -> DeviceIdentity:

@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 from drivers.camera import Camera, Roi, TriggerMode
 from drivers.device import DeviceIdentity
@@ -64,7 +64,6 @@ class KeptSettings(Camera):
     What was set comes back when the device is opened again after it was lost.
     """
 
-    trigger_modes: ClassVar[tuple[TriggerMode, ...]] = ("free_run", "software")
     _identity: DeviceIdentity
     _exposure_ms: float
     _gain: float

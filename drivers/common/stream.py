@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
+from drivers.common.answers import STOP_ANSWER_S, within
 from drivers.common.stream_reader import StreamReader, Subscription
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import Frame
@@ -116,6 +117,8 @@ class FrameStream:
         self._thread: threading.Thread | None = None
         self._subscriptions: list[Subscription] = []
         self._clock_offset_ns: int | None = None
+        self._asked_s: float | None = None
+        self._answer_limit_s = 0.0
 
     # Starting and ending -------------------------------------------------------------------------
     def start(self) -> Self:
@@ -126,6 +129,9 @@ class FrameStream:
         # Two beyond the ring: one being filled, one for a reader that has just taken the oldest.
         self._pool = BufferPool(self.n_buffers + 2, shape, dtype)
         self._scratch: Pixels = np.empty(shape, dtype)
+        self._answer_limit_s = (
+            self.camera.longest_silence_s + 3 * self.camera.exposure_ms / 1e3 + STOP_ANSWER_S
+        )
         self.camera.start_sequence(self.n_buffers)
         self._running = True
         self._thread = threading.Thread(
@@ -143,15 +149,29 @@ class FrameStream:
         """
         self._end()
         if self._thread is not None:
-            self.camera.stop_sequence()
+            name = self.camera.name
+            within(STOP_ANSWER_S, name, "ending its sequence", self.camera.stop_sequence)
             if self._thread is not threading.current_thread():
-                self._thread.join()
+                within(STOP_ANSWER_S, name, "handing out a frame", self._thread.join)
         subscriptions, self._subscriptions = self._subscriptions, []
         errors = [error for error in (s.join() for s in subscriptions) if error is not None]
         with self.changed:
             self.ring.clear()
         if errors:
             raise errors[0]
+
+    def require_answer(self) -> None:
+        """Refuse to wait on for a driver that hangs: its call for the next frame should long have returned.
+
+        Raises DeviceTimeoutError.
+        """
+        asked_s = self._asked_s
+        if asked_s is not None and time.monotonic() - asked_s > self._answer_limit_s:
+            raise DeviceTimeoutError(
+                self.camera.name,
+                f"hangs: its driver has not come back from waiting for {self._answer_limit_s:g} s.",
+                "Unplug it or switch it off and on, then start the program again.",
+            )
 
     @property
     def is_running(self) -> bool:
@@ -199,7 +219,10 @@ class FrameStream:
             newest = self.ring[-1].frame if self.ring else None
         if self.error is not None:
             raise self.error
-        return newest if newest is not than else None
+        if newest is not than:
+            return newest
+        self.require_answer()
+        return None
 
     def fresh(self, since_ns: int | None = None, timeout_s: float | None = None) -> Frame:
         """Return a frame that was exposed wholly after a moment: after a move, a change of light.
@@ -267,7 +290,7 @@ class FrameStream:
         try:
             while self._running:
                 buffer = self._buffer()
-                began_s = time.monotonic()
+                began_s = self._asked_s = time.monotonic()
                 try:
                     metadata = self.camera.next_frame_into(
                         self._scratch if buffer is None else buffer, _POLL_S
@@ -280,7 +303,7 @@ class FrameStream:
                             error.device, f"has sent no frame for {silent_s:.1f} s.", error.remedy
                         ) from error
                     continue
-                silent_s = 0.0
+                silent_s, self._asked_s = 0.0, None
                 self._note_clock(metadata.device_time_ns, metadata.host_time_ns)
                 with self.changed:
                     self.dropped += metadata.dropped_before

@@ -18,12 +18,17 @@ from drivers.slm import Slm, read_only
 Side = Annotated[int, Field(ge=1, le=8192)]
 
 
-class SlmOptions(DriverOptions):
-    """Options of the simulated SLM in ``bench.toml``."""
+class PanelOptions(DriverOptions):
+    """Options of whatever shows grey levels."""
 
     shape: tuple[Side, Side] = Field((1080, 1920), description="[height, width] in pixels.")
     pixel_pitch_um: float = Field(8.0, gt=0, description="Pixel pitch.")
     settle_ms: float = Field(30.0, ge=0, description="From a confirmed image to settled optics.")
+
+
+class SlmOptions(PanelOptions):
+    """Options of the simulated SLM in ``bench.toml``."""
+
     phase_at_full_level_rad: float = Field(
         2 * np.pi * 255 / 256, gt=0, description="Phase at grey level 255."
     )
@@ -32,17 +37,17 @@ class SlmOptions(DriverOptions):
     )
 
 
-class SimulatedSlm(SimulatedDevice, Slm):
-    """A phase SLM whose grey levels turn into phase by a look-up table that may be off."""
+class SimulatedPanel(SimulatedDevice, Slm):
+    """Shows grey levels; what light makes of them is up to each kind."""
 
     kind = "slm"
     Shared: ClassVar[type[Surroundings]] = SimulatedWorld
-    model = "phase SLM"
-    Options = SlmOptions
+    Options: ClassVar[type[PanelOptions]]
+    options: PanelOptions
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         self._join(shared)
-        self.options = options = SlmOptions.of(options)
+        self.options = options = self.Options.of(options)
         self._closing = threading.Event()
         self._displayed = np.zeros(options.shape, np.uint8)
 
@@ -97,6 +102,14 @@ class SimulatedSlm(SimulatedDevice, Slm):
     def displayed(self) -> npt.NDArray[np.uint8]:
         """The grey levels shown now, read only."""
         return read_only(self._displayed)
+
+
+class SimulatedSlm(SimulatedPanel):
+    """A phase SLM whose grey levels turn into phase by a look-up table that may be off."""
+
+    model = "phase SLM"
+    Options = SlmOptions
+    options: SlmOptions
 
     @property
     def phase_rad(self) -> npt.NDArray[np.float32]:

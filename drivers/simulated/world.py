@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import cv2
@@ -136,6 +137,7 @@ class SimulatedWorld(Surroundings):
         self._scene = make_scene(options, preset, self.distance_um)
         self._scene_number = 0
         self._scene_light: SceneLight | None = None
+        self._screen: tuple[Scene, ...] = ()
 
     # What the devices do to the world ---
     def carry_source(self, carrier: Callable[[], Position]) -> None:
@@ -149,6 +151,13 @@ class SimulatedWorld(Surroundings):
     def light_scene(self, light: SceneLight | None) -> None:
         """Light the scene by LEDs (None: by none); besides, it glows while ``scene_lit``."""
         self._scene_light = light
+
+    def light_screen(self, *shown: Scene) -> None:
+        """Let a screen glow with all that is given, whatever else is lit; nothing given: it is off.
+
+        What stays the same is best given as the same object: its light is computed once.
+        """
+        self._screen = shown
 
     @property
     def source_position_um(self) -> Position:
@@ -233,6 +242,11 @@ class SimulatedWorld(Surroundings):
             light = self.psf(self.source_position_um, hue, binning) * np.float32(brightness)
         with self._lock:
             scene, number = self._scene, self._scene_number
+        for shown in self._screen:
+            picture = self._cached(
+                ("screen", shown, weights, binning), partial(self._render, shown, weights, binning)
+            )
+            light = picture if light is None else light + picture
         if self.scene_lit and scene is not None:
             seen = product(self._glow(self.options.scene_rgb), weights)
             picture = self._cached(
@@ -265,7 +279,9 @@ class SimulatedWorld(Surroundings):
         glow = self.emission
         x, y, z = self.source_position_um
         place = (round(x, 3), round(y, 3), round(z, 3)) if any(glow) else None
-        key = (place, glow, self._scene_number if self.scene_lit else None)
+        key: tuple[Any, ...] = (place, glow, self._scene_number if self.scene_lit else None)
+        if self._screen:
+            key = (*key, "screen", *self._screen)
         return key if self._scene_light is None else (*key, self._scene_number, self._scene_light)
 
     # The scene and the truth about it ---

@@ -20,7 +20,11 @@ from instrument.files.errors import BenchError
 from instrument.reconstruction.checkpointing import checkpoint_for, require_kept, settle_checkpoint
 from instrument.reconstruction.job import Job as Prepared
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
-from instrument.reconstruction.request import PictureRequest, VolumeRequest, done_share, request_of
+from instrument.reconstruction.request import (
+    PictureRequest,
+    VolumeRequest,
+    request_of,
+)
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
 from recon.base.declare import Imports, expression, option, options_of
 from recon.priors import PRIORS
@@ -100,7 +104,7 @@ class ReconstructForm(QWidget):
         self.start = button(
             "Reconstruct", tip, lambda: self._ask(self.asked), shortcut="Ctrl+Return", primary=True
         )
-        tip = "Say what model auto would choose, why, and what one step up or down would cost"
+        tip = "Say what model auto would choose, why, and what one step up or down would be"
         self.explain = button("Explain", tip, lambda: self._ask(self.questioned))
         tip = "End after the iteration in progress; what there is then is kept"
         self.stop = button("Stop and keep", tip, self.stopped, enabled=False)
@@ -149,7 +153,9 @@ class ReconstructForm(QWidget):
 
         Raises FileError when the name does not end as it must.
         """
-        return Outputs.named(self.options.value("out"), volume=self.kind == VOLUME)
+        volume = self.kind == VOLUME
+        uncertainty = bool(self.options.value("uncertainty")) and not volume
+        return Outputs.named(self.options.value("out"), volume=volume, uncertainty=uncertainty)
 
     def as_python(self) -> str:
         """Return lines that make this reconstruction; errors as :meth:`work`."""
@@ -285,20 +291,24 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
     keeper = checkpoint_for(work.kept_in, prepared, request)
     context.report(SoFar(0.0, "Solving …", prepared))
     history: list[IterationRecord] = []
+    share, note = 0.0, ""
 
     def watch(record: IterationRecord, present: Callable[[], npt.NDArray[np.float32]]) -> None:
         history.append(record)
-        share = done_share(request.options, record)
-        note = f"iteration {record.iteration}, change {record.change:.1e}"
         # Of a picture its only plane.
         context.offer(lambda: SoFar(share, note, prepared, np.array(present().max(axis=0)), tuple(history)))
 
+    def stage(done: float, what: str) -> None:
+        nonlocal share, note
+        share, note = done, what
+        context.offer(lambda: SoFar(done, what, prepared, None, tuple(history)))
+
     if isinstance(request, VolumeRequest):
-        volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper)
+        volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_stage=stage)
         write_volume(outputs, volume, prepared)
         settled = settle_checkpoint(keeper, volume.stop_reasons)
     else:
-        picture = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper)
+        picture = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_stage=stage)
         write_reconstruction(outputs, picture, prepared, rotate_deg=work.rotate_deg)
         settled = settle_checkpoint(keeper, [picture.stop_reason])
     return Written(outputs.image, settled)
@@ -323,7 +333,8 @@ def lines_of(work: ReconstructionWork) -> str:
             "result = request.solve(job, keeper=keeper)",
         ]
         settled.append(f"settle_checkpoint(keeper, {reasons})")
-    named = f"Outputs.named({expression(work.outputs.image, imports)}{', volume=True' if volume else ''})"
+    kind = ", volume=True" if volume else ", uncertainty=True" if work.outputs.deviation is not None else ""
+    named = f"Outputs.named({expression(work.outputs.image, imports)}{kind})"
     turned = f", rotate_deg={work.rotate_deg}" if work.rotate_deg and not volume else ""
     lines.append(f"{write}({named}, result, job{turned})")
     return "\n".join([*imports.lines(), "", *lines, *settled, ""])

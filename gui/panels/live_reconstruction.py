@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,12 +22,12 @@ from gui.widgets.building import button, choice, every, fill, in_row, label, off
 from gui.widgets.dialogues import elided, path_field
 from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
-from instrument.bench.photograph import LightState, light_of
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.files.errors import BenchError, duration
 from instrument.live.live import LiveResult
 from instrument.reconstruction.job import find_calibration
 from recon.base.declare import Imports, expression, options_of
+from recon.camera.camera_model import members_of_depths
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS
@@ -261,6 +262,11 @@ class LiveReconstructionPanel(Panel):
             return
         if self.follower.problem:
             elided(self.status, self.follower.problem)
+            self._call_old("the preview has ended, see below")
+            return
+        if self._shown is not None and self.session.live.stream is None:
+            age_s = (time.monotonic_ns() - self._shown.metadata.host_time_ns) / 1e9
+            self._call_old(f"no frame has come for {duration(age_s)}")
             return
         result = self.follower.newest()
         if result is None or result is self._shown:
@@ -271,11 +277,14 @@ class LiveReconstructionPanel(Panel):
         self._log_new(() if how is None else how.warnings)
         rate = "" if how is None or not how.pictures_per_s > 0 else f", {how.pictures_per_s:.1f} pictures/s"
         passed = "" if how is None else f", {how.passed_over} frames passed over"
-        dark = light_of(self.session.bench) is LightState.DARK
-        warning = "Nothing is lit: this is a picture of noise. " if dark else ""
-        self.status.setText(
-            f"{warning}latency {result.latency_ms:.0f} ms{rate}{passed}\n{result.picture.quality}"
-        )
+        self.view.caution_against(result.picture.doubt)
+        self.status.setText(f"latency {result.latency_ms:.0f} ms{rate}{passed}\n{result.picture.quality}")
+
+    def _call_old(self, why: str) -> None:
+        """Say over the picture that it stays while no other comes: of frames, or of the preview."""
+        if self._shown is not None:
+            doubt = self._shown.picture.doubt
+            self.view.caution_against(". ".join(filter(None, (f"Old picture: {why}", doubt))))
 
     def _log_new(self, warnings: tuple[str, ...]) -> None:
         """Write each warning into the log once."""
@@ -293,6 +302,7 @@ class LiveReconstructionPanel(Panel):
         if not on:
             self._end_preview()
             self.status.setText("The preview is off.")
+            self._call_old("the preview is off")
 
     def _end_preview(self) -> None:
         self.session.jobs.watch("Ending the preview", lambda _: self.follower.stop())
@@ -336,6 +346,7 @@ class LiveReconstructionPanel(Panel):
         job = self.session.jobs.compute("Refining the newest frame", work)
         self._refining = job
         self.refine_button.setText("■ End")
+        self.view.caution_against("" if self._shown is None else self._shown.picture.doubt)
         self.status.setText(f"Refining frame {frame.metadata.frame_id} …")
         job.progressed.connect(self._refined_so_far)
         job.succeeded.connect(self._refined)
@@ -370,6 +381,7 @@ def _calibration_of(run: Path) -> Path | None:
 
 def _depths_um(calibration: Calibration) -> list[float]:
     """Return the depths to choose from, ascending; none where there is but one, or none is known."""
-    depths = np.unique(calibration.source_positions_um[:, 2])
-    depths = depths[np.isfinite(depths)]
-    return [float(z_um) for z_um in depths] if len(depths) > 1 else []
+    z_um = calibration.source_positions_um[:, 2]
+    groups = members_of_depths(calibration.source_positions_um)  # a stage does not come back to the same z
+    depths = sorted(float(z_um[group[0]]) for group in groups if np.isfinite(z_um[group[0]]))
+    return depths if len(depths) > 1 else []

@@ -22,6 +22,7 @@ from gui.widgets.building import button, fill, in_row, label, split, tabs
 from gui.widgets.dialogues import Question, choose_path
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
+from instrument.files.atomic import protecting
 from instrument.files.calibration_file import calibrated_depths_um, newest_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import write_image
@@ -153,7 +154,8 @@ class ReconstructionsPanel(Panel):
         else:
             assert result.image is not None
             self.viewers.setCurrentWidget(self.picture)
-            self.picture.show_picture(result.image, pitch_um=result.pitch_um)
+            beside = {"Deviation": result.deviation, "Residual": result.residual}
+            self.picture.show_picture(result.image, pitch_um=result.pitch_um, beside=beside)
 
     def _close_result(self) -> None:
         self.volume.release()
@@ -221,6 +223,10 @@ class ReconstructionsPanel(Panel):
         turned = self.picture.turned_deg
 
         def write(context: JobContext) -> list[Path]:
+            with protecting(result.inputs):
+                return write_views(context)
+
+        def write_views(context: JobContext) -> list[Path]:
             if views is None:
                 advance = partial(_report_share, context)
                 export_result(result, target, rotate_deg=turned, overwrite=overwrite, advance=advance)

@@ -32,7 +32,8 @@ from gui.widgets.building import (
     text_view,
 )
 from gui.widgets.image_view import ImageView, usual_levels
-from instrument.runs.inspection import RunSummary, run_paths, summary
+from instrument.bench.photograph import Progress
+from instrument.runs.inspection import RunSummary, Verification, run_paths, summary, verify
 from instrument.runs.run import Run, RunCondition
 from recon.base.declare import Imports, expression
 
@@ -75,12 +76,13 @@ class RunsPanel(Panel):
         self._stored: list[int] = []
         self._can_resume = False
         self._reader = NewestOnly(session.jobs, "Reading a run")
+        self._verifier = NewestOnly(session.jobs, "Verifying a run")
         self._lister = NewestOnly(session.jobs, "Reading the list of runs")
         self._wanted: Path | None = None
         self._make_list()
         self._make_details()
         left = fill(QWidget(), self.where, (self.table, 1), margins=(0, 0, 6, 0))
-        foot = in_row((self.bar, 1), in_column(self.use_button, self.folder_button, None))
+        foot = in_row((self.bar, 1), in_column(self.use_button, self.verify_button, self.folder_button, None))
         top = fill(QWidget(), (self.view, 1), self.slider, self.frame_words, margins=(6, 0, 0, 0))
         below = fill(QWidget(), (self.about, 1), foot, margins=(6, 0, 0, 0))
         right = split(top, below, sizes=[480, 260], down=True)
@@ -129,6 +131,7 @@ class RunsPanel(Panel):
         self._can_resume = opened.can_resume and run.condition is not RunCondition.RUNNING
         self.bar.set_startable("" if self._can_resume else "There is nothing to go on with.")
         self.folder_button.setEnabled(True)
+        self.verify_button.setEnabled(True)
         self.use_button.setEnabled(opened.is_usable)
         self._show_frame(middle)
 
@@ -190,6 +193,8 @@ class RunsPanel(Panel):
         self.folder_button = button("Open folder", tip, self._open_folder, enabled=False)
         tip = "Reconstruct photographs with this run's calibration"
         self.use_button = button("Reconstruct with it…", tip, self._use, enabled=False)
+        tip = "Read every frame and hold it against its checksum; changes nothing"
+        self.verify_button = button("Verify", tip, self._verify, enabled=False)
 
     # Inside --------------------------------------------------------------------------------------
     def _show_list(self, summaries: list[RunSummary]) -> None:
@@ -227,6 +232,7 @@ class RunsPanel(Panel):
 
     def _close_run(self, why: str) -> None:
         self._reader.forget()
+        self._verifier.forget()
         self.opened, self._opening, self._stored = None, None, []
         self.view.clear()
         self.slider.setEnabled(False)
@@ -235,6 +241,7 @@ class RunsPanel(Panel):
         self._can_resume = False
         self.bar.set_startable("No run is open.")
         self.folder_button.setEnabled(False)
+        self.verify_button.setEnabled(False)
         self.use_button.setEnabled(False)
 
     def _show_frame(self, number: int) -> None:
@@ -257,6 +264,20 @@ class RunsPanel(Panel):
         if self.opened is not None:
             self.session.handed_on.emit("reconstructions", self.opened.path / SWEEP.result)
 
+    def _verify(self) -> None:
+        """Read every frame of the run that is shown; ends early where another run is opened."""
+        if self.opened is None:
+            return
+        path = self.opened.path
+        self.verify_button.setEnabled(False)
+        self.about.setPlainText(f"Reading every frame of {path.name} …")
+
+        def watch(_: int, __: int) -> None:
+            if self.session.is_closing or self.opened is None or self.opened.path != path:
+                raise InterruptedError
+
+        self._verifier.ask(lambda: _look_into(path, read=True, on_progress=watch), self._show_run)
+
     def _open_folder(self) -> None:
         if self.opened is not None:
             QDesktopServices.openUrl(QUrl.fromLocalFile(str(self.opened.path)))
@@ -269,13 +290,18 @@ class RunsPanel(Panel):
         self.read_folder()
 
 
-def _look_into(path: Path) -> _Opened | str:
-    """Read a run; the reason where it cannot be read."""
+def _look_into(path: Path, *, read: bool = False, on_progress: Progress | None = None) -> _Opened | str:
+    """Read a run, and with ``read`` every frame of it; the reason where it cannot be read."""
     try:
         run = Run.open(path)
-        whole = run.condition is RunCondition.COMPLETED and not run.missing()
-        can_resume = run.plan is not None and (not whole or lacks_result(run.path))
-        return _Opened(run, sorted(run.records), _about(run), can_resume, (path / SWEEP.result).is_dir())
+        looked = verify(run, on_progress, read=read)
+        left = bool(looked.remedy()) or run.condition is RunCondition.CRASHED
+        whole = run.plan is None or run.condition is RunCondition.COMPLETED
+        can_resume = left or not whole or lacks_result(run.path)
+        about = _about(run, looked)
+        if read:
+            about.insert(2, f"{looked.frames} frames read back: {'sound' if looked.is_sound else 'DAMAGED'}")
+        return _Opened(run, sorted(run.records), about, can_resume, (path / SWEEP.result).is_dir())
     except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is shown
         return str(error)
 
@@ -304,12 +330,14 @@ def _axis_words(axis: str, value: float) -> str:
     return f"{name} {value:g} {unit.replace('um', 'µm')}" if name else f"{axis} {value:g}"
 
 
-def _about(run: Run) -> list[str]:
+def _about(run: Run, looked: Verification) -> list[str]:
     """Return what is known of a run, a line each."""
     lines = [str(run.path), f"{run.condition}: {len(run.records)} of {run.n_frames} frames"]
     lines[1] += "  SIMULATED" if run.is_simulated else ""
     if run.error:
         lines.append(run.error)
+    lines += [f"DAMAGED: {line}" for line in looked.lines()]
+    lines += [looked.remedy().replace("diffuserbench resume", "Resume")] if looked.remedy() else []
     if run.plan is not None:
         parts: dict[str, int] = {}
         for part in run.plan.parts:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QEvent, QObject, QPointF, QRectF, Qt, Signal
 from PySide6.QtGui import QKeyEvent
-from PySide6.QtWidgets import QWidget
+from PySide6.QtWidgets import QLabel, QWidget
 
 from gui.theme import colours, grey_indices, indices_of, spares_hues, table
 from gui.widgets.building import fill
@@ -85,6 +85,10 @@ class ImageView(QWidget):
         self._table_key: tuple[Any, ...] = ()
         self._table: npt.NDArray[np.uint8] = np.empty(0, np.uint8)
         fill(self, self.graphics)
+        self._caution = QLabel(parent=self.graphics)
+        self._caution.setObjectName("caution")
+        self._caution.setWordWrap(True)
+        self._caution.hide()
         scene = self.graphics.scene()
         scene.sigMouseMoved.connect(self._moved)
         scene.sigMouseClicked.connect(self._mouse_clicked)
@@ -160,6 +164,22 @@ class ImageView(QWidget):
         if self.image is not None:
             across, down = self.extent
             self.box.setRange(xRange=(0, across), yRange=(0, down), padding=0.01)
+
+    @property
+    def caution(self) -> str:
+        """What is written over the image."""
+        return self._caution.text()
+
+    def caution_against(self, words: str) -> None:
+        """Write over the image why it is not what it seems; nothing where ``words`` are empty."""
+        if words != self.caution:
+            self._caution.setText(words)
+            self._caution.setVisible(bool(words))
+        margin = 8
+        width = max(self.graphics.width() - 2 * margin, 1)
+        self._caution.setFixedWidth(min(width, self._caution.fontMetrics().horizontalAdvance(words) + 40))
+        self._caution.adjustSize()
+        self._caution.move(margin, margin)
 
     def clear(self) -> None:
         """Show nothing."""

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QCheckBox, QGridLayout, QTextBrowser, QWidget
 
 from gui.theme import colours
-from gui.widgets.building import button, fill, in_row, label
+from gui.widgets.building import button, choice, fill, in_row, label
 from gui.widgets.image_view import ImageView
 from gui.widgets.plots import LevelsBar, curve_pen, legend, plot_widget
 from recon.solvers.base import IterationRecord
@@ -53,11 +54,12 @@ class FactsView(QTextBrowser):
 
 
 class PictureView(QWidget):
-    """Shows one picture, (height, width) or (height, width, 3)."""
+    """Shows one picture, (height, width) or (height, width, 3), or what was found beside it."""
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.picture: npt.NDArray[np.float32] | None = None
+        self.beside: dict[str, npt.NDArray[np.float32]] = {}
         self.turned_deg = 0
         self.pitch_um: float | None = None
         self.image = _ScaledImage()
@@ -67,23 +69,49 @@ class PictureView(QWidget):
         self.turn = button("Turn 90°", tip, self.turn_by_90)
         tip = "Show the whole picture (the wheel zooms, dragging moves)"
         self.whole = button("Whole", tip, self.image.whole)
+        tip = (
+            "The picture, its pixels' standard deviation (95 % intervals are plus and minus 1.96 of it), or "
+            "what is left of the photograph, in units of its noise"
+        )
+        self.which = choice(("Picture",), tip, lambda _: self._chosen())
+        self.which.setVisible(False)
         self.image.setMinimumSize(70, 50)
         self.hovered = self.image.hovered
-        fill(self, (self.image, 1), in_row(None, self.whole, self.turn), self.levels)
+        fill(self, (self.image, 1), in_row(self.which, None, self.whole, self.turn), self.levels)
 
     @property
     def shown(self) -> npt.NDArray[np.float32] | None:
-        """The picture as it is turned now."""
-        return None if self.picture is None else np.rot90(self.picture, self.turned_deg // 90)
+        """The picture, or what is shown instead, as it is turned now."""
+        values = self._values
+        return None if values is None else np.rot90(values, self.turned_deg // 90)
+
+    @property
+    def _values(self) -> npt.NDArray[np.float32] | None:
+        return self.beside.get(self.which.currentText(), self.picture)
 
     def show_picture(
-        self, picture: npt.NDArray[np.float32], *, pitch_um: float | None = None, keep_levels: bool = False
+        self,
+        picture: npt.NDArray[np.float32],
+        *,
+        pitch_um: float | None = None,
+        keep_levels: bool = False,
+        beside: Mapping[str, npt.NDArray[np.float32] | None] = MappingProxyType({}),
     ) -> None:
-        """Show a picture; ``pitch_um`` is a pixel's size in the object's plane."""
+        """Show a picture and what goes with it; ``pitch_um``: a pixel's size in the object's plane."""
         self.picture = picture
+        self.beside = {name: values for name, values in beside.items() if values is not None}
+        with QSignalBlocker(self.which):
+            self.which.clear()
+            self.which.addItems(["Picture", *self.beside])
+        self.which.setVisible(bool(self.beside))
         self.image.pitch_um = pitch_um
         self.levels.set_image(picture, keep_levels=keep_levels)
         self._show()
+
+    def _chosen(self) -> None:
+        if (values := self._values) is not None:
+            self.levels.set_image(values)
+            self._show()
 
     def turn_by_90(self) -> None:
         """Turn it counter-clockwise; exports are turned alike."""

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Self, cast
 
 from drivers.camera import Camera
+from drivers.common.answers import STOP_ANSWER_S, within
+from drivers.common.checked import checked
 from drivers.device import Device, SharedPart
 from drivers.errors import DeviceLostError, LimitError
 from drivers.frame import Frame, FrameMetadata
@@ -49,7 +51,7 @@ class Bench:
             name: shared.part(shared.options) for name, shared in config.shared.items()
         }
         self.devices: Mapping[Kind, Device] = {
-            kind: device.driver(
+            kind: checked(device.driver)(
                 device.options, self.shared[device.driver.Shared.table] if device.driver.Shared else None
             )
             for kind, device in config.devices.items()
@@ -304,7 +306,7 @@ class Bench:
 
     def _close_device(self, device: Device) -> None:
         self._opened.discard(device)
-        device.close()
+        within(2 * STOP_ANSWER_S, device.name, "closing", device.close)
 
     def _safe_steps(self) -> list[SafeStep]:
         blanks = self.slm is not None and cast(SlmTable, self.config.devices["slm"].settings).blank_when_safe

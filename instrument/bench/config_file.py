@@ -26,6 +26,7 @@ from instrument.bench.config import (
 )
 from instrument.bench.config_mistakes import Mistakes, key_lines, nearest, nearest_name
 from instrument.files.errors import ConfigError, ConfigProblem, FileError
+from instrument.files.reading import parse_toml, read_bytes
 
 DEFAULT_NAME = "bench.toml"
 BUILT_IN = "built-in bench.toml"
@@ -34,7 +35,7 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 
 def template(name: str = "default") -> str:
-    """Return a commented configuration: ``default``, the simulated bench; ``display``; ``led_microscope``."""
+    """Return a commented simulated bench: ``default``, ``display``, ``led_microscope`` or ``screen``."""
     return resources.files("instrument.bench").joinpath(f"{name}_bench.toml").read_text("utf-8")
 
 
@@ -52,15 +53,11 @@ def load_config(path: Path | str | None = None) -> BenchConfig:
         path = DEFAULT_NAME
     path = Path(path)
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        text = read_bytes(path).decode("utf-8-sig")
     except FileNotFoundError:
         raise FileError(path, "there is no such file.", f"Write one with: diffuserbench new {path}") from None
-    except IsADirectoryError:
-        raise FileError(path, "is a folder; a bench.toml file is expected.") from None
     except UnicodeDecodeError as error:
         raise FileError(path, f"is not UTF-8 text (byte {error.start}); a bench.toml is expected.") from None
-    except OSError as error:
-        raise FileError(path, f"cannot be read: {error.strerror}.") from error
     return parse_config(text, path)
 
 
@@ -68,9 +65,11 @@ def parse_config(text: str, path: Path | None) -> BenchConfig:
     """Check a configuration given as text; ``path`` is the file it came from, if any. See ``load_config``."""
     source = path if path is not None else BUILT_IN
     try:
-        tables = tomllib.loads(text)
+        tables = parse_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(source, [_toml_problem(error, text)]) from None
+    except ValueError as error:
+        raise ConfigError(source, [ConfigProblem(None, "the file", f"{error}.")]) from None
     reader = _Reader(tables, Mistakes(key_lines(text)))
     plain = {name: reader.plain_table(name, model) for name, model in PLAIN_TABLES.items()}
     devices = {kind: device for kind in DEVICE_TABLES if (device := reader.device(kind))}

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.camera import Camera
+from drivers.common.answers import CALL_MARGIN_S, within
 from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import LedPattern
 from instrument.files.atomic import check_writable, require_new
@@ -64,7 +65,8 @@ def photograph(
     total = np.zeros((), np.float64)
     metadata: list[FrameMetadata] = []
     for taken in range(1, average + 1):
-        frame = camera.snap()
+        limit_s = camera.longest_silence_s + 3 * camera.exposure_ms / 1e3 + CALL_MARGIN_S
+        frame = within(limit_s, camera.name, "an exposure", camera.snap)
         metadata.append(frame.metadata)
         if average > 1:
             total = np.add(total, frame.image)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Iterable
 from typing import Protocol
 
 from drivers.camera import Camera
+from drivers.common.answers import STOP_ANSWER_S, within
 from drivers.device import Device
 from drivers.errors import DeviceLostError, DeviceNotOpenError
 from drivers.led_array import LedArray
@@ -145,7 +146,7 @@ def safe_steps(
 def _when_open(device: Device, step: Callable[[], None]) -> Callable[[], None]:
     def run() -> None:
         if device.is_open:
-            step()
+            within(STOP_ANSWER_S, device.name, "making it safe", step)
 
     return run
 
@@ -160,7 +161,7 @@ def _made_sure(
         if lost and device not in opened:
             return
         try:
-            step()
+            within(STOP_ANSWER_S, device.name, "making it safe", step)
         except Exception as error:
             if not (lost and isinstance(error, DeviceNotOpenError)):
                 text = str(error) or type(error).__name__

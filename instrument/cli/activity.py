@@ -16,7 +16,7 @@ from instrument.files.volumes import is_zarr_name
 from instrument.reconstruction.activity import ActivitySettings, find_activity, write_activity
 from instrument.reconstruction.options import InputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.video_files import VideoPictures
-from instrument.runs.run import STATE
+from instrument.runs.run_files import STATE
 from recon.base.declare import option
 from recon.reconstruction.options import ReconstructionOptions
 
@@ -87,10 +87,24 @@ def activity(
             typer.echo(
                 "Warning: frames move by half a pixel or more: edges look active. Try --align.", err=True
             )
+        if found.still_moving_px:
+            typer.echo(
+                f"Warning: moved back, frames still move by up to {found.still_moving_px:.1f} pixels: what "
+                "turns, stretches or leaves the field has no place of its own. No region is looked for.",
+                err=True,
+            )
         typer.echo(f"{'Bleaching':<12}{_fading(found.faded)}")
         typer.echo(f"{'Regions':<12}{len(found.regions)}")
+        left_out = found.search.left_out
+        if left_out:
+            told = (f"{count} that {what}" for what, count in left_out.items())
+            typer.echo(f"{'Left out':<12}places whose neighbours go together: {', '.join(told)}")
         if not found.regions:
-            typer.echo("Warning: no region found; lower --correlation, or is nothing active?", err=True)
+            typer.echo(
+                "Warning: no region found: nothing is active here, or too weakly. A lower --correlation or "
+                "more light may show it.",
+                err=True,
+            )
         typer.echo(f"{'Wrote':<12}{', '.join(map(str, write_activity(found, pictures, out, settings)))}")
 
 

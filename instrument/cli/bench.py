@@ -31,33 +31,39 @@ _OF_THE_WINDOW = ("PySide6", "shiboken6", "pyqtgraph")
         "diffuserbench new --force          overwrite an existing bench.toml",
         "diffuserbench new display.toml --display",
         "diffuserbench new microscope.toml --led-microscope",
+        "diffuserbench new screen.toml --screen",
     )
 )
 def new(
-    file: Annotated[Path, typer.Argument(help="The file to write.")] = Path("bench.toml"),
+    out: Annotated[Path, typer.Argument(help="The file to write.", metavar="FILE")] = Path("bench.toml"),
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
     display: Annotated[bool, typer.Option("--display", help="A holographic display instead.")] = False,
     led_microscope: Annotated[
         bool, typer.Option("--led-microscope", help="An LED array microscope instead, for calibrate dpc.")
+    ] = False,
+    screen: Annotated[
+        bool, typer.Option("--screen", help="A camera before a monitor instead, for calibrate screen.")
     ] = False,
 ) -> None:
     """Write a commented bench.toml in which every key is explained: the simulated bench to start from."""
     from instrument.bench.config_file import DEFAULT_NAME, template
     from instrument.files.atomic import require_new, write_text
 
-    if file.is_dir():
-        raise FileError(file, "is a folder.", f"Name a file in it, e.g. {file / DEFAULT_NAME}")
-    require_new(file, overwrite=force)
-    if display and led_microscope:
-        raise BenchError("Give --display or --led-microscope, not both.")
-    text, what = template(), "bench, with every key explained"
+    if out.is_dir():
+        raise FileError(out, "is a folder.", f"Name a file in it, e.g. {out / DEFAULT_NAME}")
+    require_new(out, overwrite=force)
+    if display + led_microscope + screen > 1:
+        raise BenchError("Give one of --display, --led-microscope and --screen.")
+    name, what = "default", "bench, with every key explained"
     if display:
-        text, what = template("display"), "holographic display"
+        name, what = "display", "holographic display"
     if led_microscope:
-        text, what = template("led_microscope"), "LED array microscope"
-    write_text(file, text)
-    typer.echo(f"Wrote {file}: a SIMULATED {what}.")
-    typer.echo(f"Next: diffuserbench check{'' if file == Path(DEFAULT_NAME) else f' --bench {file}'}")
+        name, what = "led_microscope", "LED array microscope"
+    if screen:
+        name, what = "screen", "camera before a monitor"
+    write_text(out, template(name))
+    typer.echo(f"Wrote {out}: a SIMULATED {what}.")
+    typer.echo(f"Next: diffuserbench check{'' if out == Path(DEFAULT_NAME) else f' --bench {out}'}")
 
 
 @check_app.command(

@@ -50,6 +50,7 @@ from instrument.runs.acquire import free_bytes
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import RunState, RunStatus
+from recon.base.declare import options_of
 from recon.types import Geometry
 
 RunFolder = Annotated[
@@ -109,9 +110,56 @@ def _function(routine: Routine) -> Callable[..., None]:
     ) -> None:
         carry_out(routine, options, bench, out, dry_run=dry_run)
 
+    def with_files(
+        options: Any,
+        files: Any,
+        given: Given,
+        dry_run: DryRun = False,
+        out: RunFolder = None,
+        bench: BenchOption = None,
+    ) -> None:
+        _of_files_or_bench(routine, options, files, given, dry_run, out, bench)
+
     function: Callable[..., None] = with_file if routine.file else with_run
+    if routine.files is not None:
+        function = with_files
+        function.__annotations__["files"] = routine.files.options
     function.__annotations__["options"] = routine.options
     return function
+
+
+def _of_files_or_bench(
+    routine: Routine,
+    options: Any,
+    files: Any,
+    given: Given,
+    dry_run: bool,
+    out: Path | None,
+    bench: Path | None,
+) -> None:
+    """Carry a routine out on files where they are named, else on the bench; refuse options of the other."""
+    instead = routine.files
+    assert instead is not None
+    named = next(o for o in options_of(instead.options) if o.name == instead.named).flag
+    if getattr(files, instead.named) is None:
+        if useless := given.flags(*routine.useless(with_files=False)):
+            raise BenchError(
+                f"Only with {named}: {', '.join(useless)}. On the bench pictures are taken: leave out what "
+                f"is only for files, or give {named}."
+            )
+        carry_out(routine, options, bench, out, dry_run=dry_run)
+        return
+    others = given.flags(*routine.useless(with_files=True))
+    if useless := [*others, *(["--bench"] if bench is not None else [])]:
+        raise BenchError(f"With {named} nothing is photographed: leave out {' and '.join(useless)}.")
+    console = Console()
+    print_lines(console, instead.look(options, files))
+    if dry_run:
+        console.print("Dry run: nothing was solved.")
+        return
+    with TerminalListener(console) as listener:
+        done = instead.make(options, files, out or Path(instead.folder), RunControl(), listener)
+    print_outcome(console, done)
 
 
 def carry_out(

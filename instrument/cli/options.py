@@ -13,11 +13,13 @@ import inspect
 import typing
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import typer
 from typer.core import TyperCommand
 
+from instrument.files.atomic import protecting
 from instrument.files.errors import BenchError
 from recon.base.declare import RARE, Option, options_of
 from recon.base.option_text import help_text, metavar, read
@@ -146,7 +148,8 @@ def flat(function: Callable[..., None]) -> Callable[..., None]:
                 {named[key].name: named[key] for key in given},
                 {named[key].name: _as_typed(named[key], value) for key, value in given.items()},
             )
-        function(**values)
+        with protecting(_inputs(values)):
+            function(**values)
 
     run.__name__, run.__doc__, run.__module__ = function.__name__, function.__doc__, function.__module__
     context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
@@ -156,6 +159,24 @@ def flat(function: Callable[..., None]) -> Callable[..., None]:
     run.declared = declared  # type: ignore[attr-defined]
     run.options_classes = [cls for cls, _ in objects.values()]  # type: ignore[attr-defined]
     return run
+
+
+_WRITTEN = ("out", "figure", "checkpoint", "capture", "picture")
+"""Parameters that name what a command writes; every other path is an input."""
+
+
+def _inputs(values: object) -> list[Path]:
+    """Return the paths in a command's parameters, in options objects and lists too, but those it writes."""
+    if isinstance(values, Path):
+        return [values]
+    if isinstance(values, list | tuple):
+        return [path for entry in values for path in _inputs(entry)]
+    if isinstance(values, dict):
+        named = values
+    else:  # an options object, which may have slots
+        declared = () if isinstance(values, Given) else getattr(type(values), "__dataclass_fields__", ())
+        named = {name: getattr(values, name) for name in declared}
+    return [path for name, value in named.items() if name not in _WRITTEN for path in _inputs(value)]
 
 
 def _as_named(o: Option, words: Container[str]) -> Option:

@@ -122,14 +122,14 @@ def show(
 
 @app.command(epilog=examples("diffuserbench plan new", "diffuserbench plan new sweep.toml"))
 def new(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Where to write it.")] = Path("plan.toml"),
+    out: Annotated[Path, typer.Argument(metavar="FILE", help="Where to write it.")] = Path("plan.toml"),
 ) -> None:
     """Write a commented plan to start from."""
-    if file.suffix.lower() != ".toml":
-        raise FileError(file, "the commented plan is TOML; choose a name that ends in .toml.")
-    require_new(file)
-    write_text(file, (files("instrument.plan") / "example.toml").read_text())
-    typer.echo(f"Wrote {file}. Look at it with: diffuserbench plan show {file}")
+    if out.suffix.lower() != ".toml":
+        raise FileError(out, "the commented plan is TOML; choose a name that ends in .toml.")
+    require_new(out)
+    write_text(out, (files("instrument.plan") / "example.toml").read_text())
+    typer.echo(f"Wrote {out}. Look at it with: diffuserbench plan show {out}")
 
 
 @app.command(
@@ -141,7 +141,7 @@ def new(
 )
 def illumination(
     options: IlluminationOptions,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Where to write it.")] = Path(
+    out: Annotated[Path, typer.Argument(metavar="FILE", help="Where to write it.")] = Path(
         "illumination.toml"
     ),
     bench: BenchOption = None,
@@ -154,9 +154,9 @@ def illumination(
     groups, level = options.groups, options.level
     if sum(given is not None for given in (groups, options.lattice, options.pattern)) != 1:
         raise BenchError("Give the patterns either as --groups, --lattice N or --pattern NAME (one of them).")
-    if file.suffix.lower() not in (".toml", ".json"):
-        raise FileError(file, "a plan's name ends in .toml or .json.")
-    require_new(file)
+    if out.suffix.lower() not in (".toml", ".json"):
+        raise FileError(out, "a plan's name ends in .toml or .json.")
+    require_new(out)
     if groups is not None:
         lights = group_lights(groups, level)
     else:
@@ -169,8 +169,8 @@ def illumination(
             rgb = None if level == 255 else (level, level, level)
             lights = [Light.named(one, rgb) for one in shape.series(opened.led_array)]
     plan = illumination_plan(lights, exposure_ms=options.exposure_ms, average=options.average)
-    save_plan(plan, file)
-    typer.echo(f"Wrote {file}: {len(lights)} patterns. Look at it with: diffuserbench plan show {file}")
+    save_plan(plan, out)
+    typer.echo(f"Wrote {out}: {len(lights)} patterns. Look at it with: diffuserbench plan show {out}")
 
 
 @app.command(epilog=examples("diffuserbench plan patterns"))

@@ -95,7 +95,9 @@ def _photograph(asked: _Asked) -> None:
             f"{' and '.join(flags)}: for a PSF image (--psf); a calibration's PSFs were judged when they "
             "were measured. Leave it out."
         )
-    outputs = Outputs.named(output.out or _PICTURE, output.figure, volume=is_volume)
+    outputs = Outputs.named(
+        output.out or _PICTURE, output.figure, volume=is_volume, uncertainty=asked.options.uncertainty
+    )
     reconstruct_photograph(request, outputs, output)
 
 

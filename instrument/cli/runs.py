@@ -21,7 +21,8 @@ from instrument.plan.model import load_plan
 from instrument.runs.export import export as export_run
 from instrument.runs.inspection import run_paths, summary
 from instrument.runs.inspection import verify as verify_run
-from instrument.runs.run import BENCH_TOML, FinishReason, Run, RunCondition
+from instrument.runs.run import Run, RunCondition
+from instrument.runs.run_files import BENCH_TOML
 from instrument.runs.writer import RunWriter
 from recon.base.declare import option
 
@@ -78,15 +79,14 @@ def verify(
         run = Run.open(path)
         with one_task(path.name) as advance:
             found = verify_run(run, advance)
-        for frame in found.damaged:
-            typer.echo(f"{path}: frame {frame.index}: {frame.problem}", err=True)
-        for problem in found.problems:
-            typer.echo(f"{path}: {problem}", err=True)
+        for line in found.lines():
+            typer.echo(f"{path}: {line}", err=True)
+        if remedy := found.remedy():
+            typer.echo(f"{path}: {remedy}", err=not found.is_sound)
         sound = sound and found.is_sound
         verdict = "sound" if found.is_sound else "DAMAGED"
         typer.echo(f"{path}: {verdict}, {run.condition}, {found.frames} of {run.n_frames} frames read back.")
     if not sound:
-        typer.echo("diffuserbench resume takes damaged frames of a plan again.", err=True)
         raise typer.Exit(1)
 
 
@@ -132,7 +132,7 @@ def export(
     run: Annotated[
         Path, typer.Argument(metavar="RUN|RESULT", help="The run's folder; or a reconstruction's file.")
     ],
-    target: Annotated[
+    out: Annotated[
         Path,
         typer.Argument(
             metavar="TARGET",
@@ -149,7 +149,7 @@ def export(
     """
     if _is_result(run):
         given.refuse("a reconstruction", "reconstruction")
-        _export_result(run, target)
+        _export_result(run, out)
         return
     found = Run.open(run)
     wanted = set(range(found.n_frames)[options.frames or slice(None)])
@@ -157,8 +157,8 @@ def export(
         wanted &= {step.index for step in found.steps(options.label)}
     indices = [index for index in sorted(found.records) if index in wanted]
     with one_task("Frames") as advance:
-        export_run(found, target, indices, frames_per_s=options.frames_per_s, on_progress=advance)
-    typer.echo(f"Wrote {len(indices)} frames: {target}")
+        export_run(found, out, indices, frames_per_s=options.frames_per_s, on_progress=advance)
+    typer.echo(f"Wrote {len(indices)} frames: {out}")
     if absent := len(wanted) - len(indices):
         typer.echo(f"Warning: {absent} frames that are not in the run were left out.", err=True)
 
@@ -213,35 +213,42 @@ def resume(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="The run's folder.")],
     bench: BenchOption = None,
 ) -> None:
-    """Go on with the first step whose data are not safely stored; repeat none that are.
+    """Go on with the first step whose data are not safely stored; repeat none that are. Mend what is damaged.
 
-    Every frame that the run has is read first and held against its checksum; what was found is said. The
-    bench is the run's own bench.toml unless --bench names another. A recording cannot go on; one that was
-    cut off is closed, so that it reads as what it is. A sweep of calibrate becomes its calibration when its
-    last frame is there, a run of calibrate angular or dpc its response or surface.
+    Every frame that the run has is read first and held against its checksum; what was found is said. Missing
+    and damaged frames are taken again, in completed runs too; those of a recording are marked as lost. Files
+    that are damaged are made again from their copies; what is replaced goes into the run's folder "kept".
+    The bench is the run's own bench.toml unless --bench names another; it is opened only where frames are to
+    be taken. A sweep of calibrate becomes its calibration when its last frame is there, a run of calibrate
+    angular or dpc its response or surface.
     """
-    from calibration_routines.plan_procedures import ResumeProcedure, finished
+    from calibration_routines.plan_procedures import ResumeProcedure, finished, mended_recording
     from instrument.cli.calibrate import TerminalListener, carry_out_run, print_outcome
     from instrument.runs.run_control import RunControl
 
     found = Run.open(run)
-    if found.plan is None:
-        _close_recording(found)
-    elif found.condition is RunCondition.COMPLETED and not found.missing():
-        typer.echo(f"{run}: complete already, {found.n_frames} frames. diffuserbench verify reads them all.")
+    with TerminalListener() as listener:
+        if found.plan is None:
+            outcome = mended_recording(run, listener)
+            for words in outcome.verdict:
+                typer.echo(f"{run}: {words}")
+            return
+        whole = found.condition is RunCondition.COMPLETED and verify_run(found, listener.share).is_sound
+    if whole:
+        typer.echo(f"{run}: complete already, {found.n_frames} frames read back, all as they were written.")
         with TerminalListener() as listener:
-            outcome = finished(found, None, RunControl(), listener)
-        if outcome is not None:
-            print_outcome(Console(), outcome)
-    else:
-        with open_and_say(bench or run / BENCH_TOML) as opened:
-            carry_out_run(ResumeProcedure(run), opened, run)
-
-
-def _close_recording(run: Run) -> None:
-    if run.condition is not RunCondition.CRASHED:
-        typer.echo(f"{run.path}: a recording, {run.condition}; there is nothing to go on with.")
+            result = finished(found, None, RunControl(), listener)
+        if result is not None:
+            print_outcome(Console(), result)
         return
-    with RunWriter.reopen(run.path) as writer:
-        closed = writer.finish(FinishReason.ABORTED, "its program ended without finishing it")
-    typer.echo(f"{run.path}: the recording was cut off; closed with its {len(closed.records)} frames.")
+    with open_and_say(bench or _bench_of(found)) as opened:
+        carry_out_run(ResumeProcedure(run), opened, run)
+
+
+def _bench_of(run: Run) -> Path:
+    """Return the run's bench file, made again first where it is damaged."""
+    if any(problem.name == BENCH_TOML for problem in run.files.problems()):
+        with RunWriter.reopen(run.path) as writer:
+            for words in writer.mended or ():
+                typer.echo(words)
+    return run.path / BENCH_TOML

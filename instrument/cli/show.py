@@ -228,16 +228,19 @@ def _capture(
 
 def _show_run(run: Path, picture: Path | None) -> None:
     """Say how a run ended, what it holds, with which bench and software; draw a sheet of its frames."""
-    from instrument.runs.inspection import contact_sheet
+    from instrument.runs.inspection import contact_sheet, verify
     from instrument.runs.run import Run
 
     found = Run.open(run)
-    for name, value in _facts(found):
+    looked = verify(found, read=False)
+    for name, value in [*_facts(found), *(("DAMAGED", line) for line in looked.lines())]:
         typer.echo(f"{name + ':':<14}{value}")
-    if not found.records:
-        return
+    if remedy := looked.remedy():
+        typer.echo(f"{'to do:':<14}{remedy}")
+    damaged = {frame.index for frame in looked.damaged}
     target = picture or run / "summary.png"
-    contact_sheet(found, target)
+    if not contact_sheet(found, target, leave_out=damaged):
+        return
     typer.echo(f"{'picture:':<14}{target}")
 
 
@@ -255,6 +258,9 @@ def _facts(run: Run) -> list[tuple[str, str]]:
     else:
         lost = sum(gap.count for gap in run.gaps)
         facts.append(("lost", f"{lost} in {len(run.gaps)} gaps"))
+        if run.lost or run.unlisted:
+            words = f"{len(run.lost)} after they were stored; {len(run.unlisted)} images have no metadata"
+            facts.append(("damaged", words))
         if run.frame_period_s:
             facts.append(("rate", f"{1 / run.frame_period_s:.3f} frames/s"))
     if run.has_frames:

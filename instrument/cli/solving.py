@@ -14,7 +14,7 @@ from instrument.reconstruction.checkpointing import checkpoint_for, settle_check
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.options import OutputOptions
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned, solve_patterned
-from instrument.reconstruction.request import PictureRequest, VolumeRequest, done_share, iteration_limit
+from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
 from instrument.reconstruction.video import (
     PreparedVideo,
@@ -46,15 +46,13 @@ def reconstruct_photograph(
         outputs.check(planes * job.measurement.size, overwrite=output.force)
         _print_job(job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench")
         keeper = checkpoint_for(output.checkpoint, job, request)
-        total = iteration_limit(request.options) or 1000
         what = "volume" if is_volume else "picture"
-        with one_task(what, total) as advance, first_interrupt_cancels() as cancel:
+        with one_task(what, 100) as advance, first_interrupt_cancels() as cancel:
 
-            def show(record: IterationRecord, _picture: object) -> None:
-                share = done_share(request.options, record)
-                advance(round(total * share), note=f"change {record.change:.1e}")
+            def stage(share: float, what: str) -> None:
+                advance(round(100 * share), note=what)
 
-            result = request.solve(job, watch=show, cancel=cancel, keeper=keeper)
+            result = request.solve(job, cancel=cancel, keeper=keeper, on_stage=stage)
         _print(result)
         if is_volume:
             write_volume(outputs, result, job)
@@ -62,7 +60,7 @@ def reconstruct_photograph(
                 typer.echo(f"{'Planes':<12}{steps} Each plane's depth is in {outputs.record.name}.")
         else:
             _write_picture(outputs, result, job, int(output.rotate_deg))
-        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
+        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.written(result)))}")
         for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
             typer.echo(f"{name:<12}{text}")
     _end(result, what)
@@ -88,7 +86,7 @@ def reconstruct_patterns(request: PatternedRequest, outputs: Outputs, output: Ou
             result = solve_patterned(prepared, watch=show, cancel=cancel)
         _print_end(result)
         write_reconstruction(outputs, result, job, rotate_deg=int(output.rotate_deg))
-        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
+        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.written(result)))}")
     _end(result, "picture")
 
 
@@ -98,7 +96,7 @@ def _print_choice(choice: Choice) -> None:
         typer.echo(line)
     typer.echo(
         f"{'Chosen in':<12}{choice.seconds:.1f} s; --choose NAME=VALUE overrules any of it, --tolerance and "
-        "--iterations the end. Times and errors of a step are rough estimates"
+        "--iterations the end"
     )
 
 
@@ -124,11 +122,18 @@ def _print(result: Reconstruction) -> None:
             typer.echo(line)
     else:
         typer.echo(f"{'Model':<12}{result.model}: {result.reason}")
+    if result.refinement is not None:
+        typer.echo(f"{'Refined PSF':<12}{result.refinement}")
     typer.echo(f"{'Method':<12}{result.solver}, prior {result.prior}{weight}")
+    if chosen := result.provenance.get("weight"):
+        typer.echo(f"{'Weight':<12}{chosen}")
     if memory := result.provenance.get("memory"):
         typer.echo(f"{'Memory':<12}{memory}")
     _print_end(result)
     _print_verdict(result.verdict)
+    if (found := result.uncertainty) is not None:
+        for index, sentence in enumerate(found.sentences):
+            typer.echo(f"{'Uncertainty' if not index else 'Points':<12}{sentence}")
     for warning in result.warnings:
         typer.echo(f"Warning: {warning}", err=True)
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
+from instrument.files.reading import parse_json, read_bytes
 from recon.errors import InputError
 from recon.evaluation.scored import (
     KINDS,
@@ -169,7 +170,7 @@ def read_chart(path: Path, remedy: str = "Make it with diffuserbench chart.") ->
     Raises FileError when it is no such file, or of another version.
     """
     try:
-        record = json.loads(path.read_text("utf-8"))
+        record = parse_json(read_bytes(path))
     except (OSError, ValueError) as error:
         raise FileError(path, f"cannot be read as JSON: {error}.", remedy) from error
     if not _is_chart(record):

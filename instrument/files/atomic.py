@@ -8,13 +8,52 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 from instrument.files.errors import FileError
 
 _NEARLY_FULL_BYTES = 1 << 20
+_inputs: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
+
+
+@contextlib.contextmanager
+def protecting(inputs: Iterable[Path]) -> Iterator[None]:
+    """Refuse, in this thread and while the block runs, to write over any of ``inputs``."""
+    before = _inputs.set((*_inputs.get(), *(path for path in inputs if path.exists())))
+    try:
+        yield
+    finally:
+        _inputs.reset(before)
+
+
+def refuse_input(path: Path) -> None:
+    """Refuse to write over an input of the work at hand, whatever name or link leads to it.
+
+    Inputs are what :func:`protecting` holds: files, and folders with the files in them. A run or a
+    calibration, which get results beside what they hold, are held as a whole only.
+
+    Raises FileError.
+    """
+    for held in _inputs.get():
+        if path.exists() and path.samefile(held):
+            found = "is an input itself"
+        elif path.is_dir() and held.resolve().is_relative_to(path.resolve()):
+            found = f"holds the input {held}"
+        elif path.exists() and _is_content(held) and path.resolve().is_relative_to(held.resolve()):
+            found = f"is part of the input {held}"
+        else:
+            continue
+        raise FileError(
+            path, f"{found}; no output replaces an input, by --force neither.", "Choose another name."
+        )
+
+
+def _is_content(folder: Path) -> bool:
+    """Whether everything in a folder is what it is read for."""
+    return folder.is_dir() and not any((folder / own).exists() for own in ("state.json", "calibration.json"))
 
 
 @contextlib.contextmanager
@@ -58,6 +97,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     """
     mark = secrets.token_hex(4)
     draft, old = path.with_name(f".{path.name}.{mark}.partial"), path.with_name(f".{path.name}.{mark}.old")
+    refuse_input(path)
     draft.mkdir()
     try:
         yield draft
@@ -85,6 +125,7 @@ def require_new(path: Path, *, overwrite: bool | None = None) -> None:
 
     Raises FileError.
     """
+    refuse_input(path)
     if path.exists() and not overwrite:
         remedy = "" if overwrite is None else "Choose another name, or overwrite with --force."
         raise FileError(path, "exists already and was left as it is.", remedy)
@@ -109,7 +150,12 @@ def make_folder(path: Path) -> None:
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Write a mapping as a JSON file, atomically."""
-    write_bytes(path, (json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+    write_bytes(path, json_text(data).encode())
+
+
+def json_text(data: Mapping[str, Any]) -> str:
+    """Return a mapping as the text of a JSON file."""
+    return json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def check_writable(path: Path | str, n_bytes: int = 0) -> None:
@@ -121,6 +167,7 @@ def check_writable(path: Path | str, n_bytes: int = 0) -> None:
     """
     path = Path(path)
     folder = path.parent
+    refuse_input(path)
     if path.is_dir():
         raise FileError(path, "is a folder; a file name is expected.")
     if path.exists() and not path.is_file():

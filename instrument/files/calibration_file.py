@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import whole_folder
 from instrument.files.errors import FileError
+from instrument.files.reading import folder_bytes, require_plausible
 from instrument.files.record import RecordFormat
 from instrument.files.volumes import ome_attributes
 from recon.types import Calibration, Geometry
@@ -163,7 +164,11 @@ def _read_array(folder: Path, name: str, checksums: Mapping[str, str]) -> npt.ND
     import zarr
 
     try:
-        array = np.ascontiguousarray(zarr.open_array(folder / name / "0", mode="r")[...])
+        stored = zarr.open_array(folder / name / "0", mode="r")
+        require_plausible(folder / name, stored.nbytes, folder_bytes(folder / name))
+        array = np.ascontiguousarray(stored[...])
+    except FileError:
+        raise
     except Exception as error:  # zarr's stores and codecs raise errors of many kinds for damaged files
         raise CalibrationFileError(
             folder / name, f"cannot be read ({error}): it is missing or damaged.", _RESTORE

@@ -123,6 +123,8 @@ def in_words(error: BaseException) -> str | None:
         return str(error)
     if isinstance(error, ValueError) and _is_input_error(error):
         return str(error)
+    if isinstance(error, MemoryError):
+        return f"There is not enough memory for that. {error}".strip()
     if isinstance(error, OSError):
         if error.filename is not None:
             return f"{os.fsdecode(error.filename)}: {os_reason(error)}"

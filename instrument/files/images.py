@@ -8,7 +8,11 @@ from __future__ import annotations
 
 import io
 import json
+import math
+import re
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 import tifffile
 
+from instrument.files import reading
 from instrument.files.atomic import whole_file, write_text
 from instrument.files.errors import FileError
 
@@ -26,6 +31,8 @@ Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32
 
 READABLE = "TIFF, PNG, JPEG, BMP, .npy, or .npz with one array"
 WRITABLE = (".tif", ".tiff", ".png", ".npy")
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_OPENCV_MAGIC = (_PNG_MAGIC, b"\xff\xd8", b"BM")
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
@@ -149,26 +156,23 @@ def _metadata(path: Path) -> dict[str, Any]:
             with tifffile.TiffFile(path) as tiff:
                 text = tiff.pages.first.description
         else:
-            text = side_car(path).read_text("utf-8")
-        metadata = json.loads(text)
-    except (OSError, ValueError, tifffile.TiffFileError):
+            text = reading.read_bytes(side_car(path)).decode()
+        metadata = reading.parse_json(text)
+    except (OSError, ValueError, FileError, tifffile.TiffFileError):
         return {}  # another program's description, or none: the pixels were read all the same
     return metadata if isinstance(metadata, dict) else {}
 
 
 # Reading -----------------------------------------------------------------------------------------
+MOST_IMAGE_BYTES = 1 << 35
+
+
 def read_bytes(path: Path) -> bytes:
     """Return a file's content; every failure is a FileError that says what is wrong."""
     try:
-        data = path.read_bytes()
+        data = reading.read_bytes(path, MOST_IMAGE_BYTES)
     except FileNotFoundError:
         raise FileError(path, "there is no such file.") from None
-    except IsADirectoryError:
-        raise FileError(path, "is a folder; an image file is expected.") from None
-    except PermissionError:
-        raise FileError(path, "no permission to read it.", "Check who owns it.") from None
-    except OSError as error:
-        raise FileError(path, f"cannot be read: {error.strerror or error}.") from error
     if not data:
         raise FileError(path, "is empty (0 bytes).")
     return data
@@ -183,26 +187,44 @@ def _decode(path: Path) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
         return _decode_npz(path, data)
     if data[:4] in _TIFF_MAGIC:
         return _decode_tiff(path, data)
+    if not data.startswith(_OPENCV_MAGIC):
+        raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
     return _decode_with_opencv(path, data)
 
 
 def _decode_npy(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
     try:
+        file = io.BytesIO(data)
+        version = np.lib.format.read_magic(file)
+        read = (
+            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        )
+        shape, _, dtype = read(file)
+        if math.prod(shape) * dtype.itemsize > len(data) - file.tell():
+            raise ValueError(f"it says {dtype} {shape}, which are more bytes than it has")
         array: npt.NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise FileError(path, f"is damaged or no plain .npy array: {error}.") from None
+    except Exception as error:  # noqa: BLE001 - the header is Python text, whose parser raises nearly anything
+        raise FileError(path, f"is damaged or no plain .npy array: {error!s:.200}.") from None
     return array, ()
 
 
 def _decode_npz(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            names = list(archive.files)
-            if len(names) != 1:
-                listed = ", ".join(names) or "none"
-                raise FileError(path, f"holds {len(names)} arrays ({listed}); one image is expected.")
-            return archive[names[0]], ()
-    except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile) as error:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+            if len(members) != 1:
+                listed = ", ".join(member.filename.removesuffix(".npy") for member in members[:8]) or "none"
+                raise FileError(path, f"holds {len(members)} arrays ({listed}); one image is expected.")
+            said = members[0].file_size
+            reading.require_plausible(path, said, len(data))
+            with archive.open(members[0]) as member:
+                content = member.read(said + 1)
+            if len(content) > said:
+                raise FileError(path, "is damaged: it holds more than it says.")
+            return _decode_npy(path, content)
+    except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise FileError(path, f"is no .npz with one plain array: {error}.") from None
+    except (NotImplementedError, RuntimeError) as error:  # another compression, a password
         raise FileError(path, f"is no .npz with one plain array: {error}.") from None
 
 
@@ -212,6 +234,7 @@ def _decode_tiff(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, 
             if not tiff.series:
                 raise FileError(path, "is a TIFF without an image.")
             series = tiff.series[0]
+            reading.require_plausible(path, series.size * series.dtype.itemsize, len(data))
             array = series.asarray()
             page = series.keyframe
             axes, notes = series.axes, []
@@ -234,12 +257,16 @@ def _decode_tiff(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, 
 
 
 def _decode_with_opencv(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
-    loudness = cv2.utils.logging.setLogLevel(
-        cv2.utils.logging.LOG_LEVEL_SILENT
-    )  # a damaged file is told of once, in our words
+    if data.startswith(_PNG_MAGIC) and not _png_is_whole(data):
+        raise FileError(path, "is a damaged PNG: its parts are longer than the file, or out of order.")
+    shape = _shape_by_header(data)
+    if shape is not None:
+        reading.require_plausible(path, 8 * math.prod(shape), len(data))
+    # A damaged file is told of once, in our words.
+    loudness = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
+    except (cv2.error, MemoryError):
         array = None
     finally:
         cv2.utils.logging.setLogLevel(loudness)
@@ -249,6 +276,34 @@ def _decode_with_opencv(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tupl
         array = array[..., [2, 1, 0, *range(3, array.shape[-1])]]
     lossy = ("JPEG is lossy and usually gamma-coded: prefer raw frames",) if data[:2] == b"\xff\xd8" else ()
     return array, lossy
+
+
+def _png_is_whole(data: bytes) -> bool:
+    """Whether a PNG's parts fit into it: OpenCV takes memory for what each says it has."""
+    place = len(_PNG_MAGIC)
+    first = True
+    while place + 12 <= len(data):
+        length, kind = struct.unpack(">I4s", data[place : place + 8])
+        if first != (kind == b"IHDR") or place + 12 + length > len(data):
+            return False
+        if kind == b"IEND":
+            return True
+        first, place = False, place + 12 + length
+    return False
+
+
+def _shape_by_header(data: bytes) -> tuple[int, int] | None:
+    """Return the sides that a PNG, BMP or JPEG says it has; None where it says none."""
+    if data.startswith(_PNG_MAGIC):
+        width, height = struct.unpack(">II", data[16:24].ljust(8, b"\0"))
+        return width, height
+    if data.startswith(b"BM"):
+        width, height = struct.unpack("<ii", data[18:26].ljust(8, b"\0"))
+        return abs(width), abs(height)
+    found = re.search(rb"\xff[\xc0-\xc3\xc5-\xc7\xc9-\xcb\xcd-\xcf]...(..)(..)", data, re.DOTALL)
+    if found is None:
+        return None
+    return int.from_bytes(found[1], "big"), int.from_bytes(found[2], "big")
 
 
 def _read_folder(folder: Path, leave_out: Path | None) -> ImageFile:

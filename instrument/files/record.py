@@ -29,6 +29,7 @@ import numpy as np
 
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
+from instrument.files.reading import parse_json, read_bytes
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -91,11 +92,9 @@ class RecordFormat:
         not known.
         """
         try:
-            found = json.loads(path.read_text("utf-8"))
+            found = parse_json(read_bytes(path, error=self.error))
         except FileNotFoundError:
             raise self.error(path, "there is no such file.", self.make) from None
-        except OSError as error:
-            raise self.error(path, f"cannot be read: {error.strerror or error}.") from error
         except ValueError as error:
             raise self.error(
                 path, f"is no valid JSON ({error}): it was changed or damaged.", self.restore or self.make

@@ -14,6 +14,7 @@ import numpy as np
 
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
+from instrument.files.reading import read_bytes
 from instrument.files.record import Fields, RecordFormat
 from recon.verdict.cases import OF_VOLUMES
 from recon.verdict.map import Cell, Size, Stress, StressMap, boundary
@@ -73,7 +74,7 @@ class CellLog:
         self._keep(key, cell)
 
     def _read(self) -> None:
-        lines = self.path.read_text(encoding="utf-8").splitlines()
+        lines = read_bytes(self.path).decode().splitlines()
         for number, line in enumerate(lines, 1):
             try:
                 entry = json.loads(line)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import whole_file, whole_folder
 from instrument.files.errors import FileError
+from instrument.files.reading import folder_bytes, require_file, require_plausible
 
 if TYPE_CHECKING:
     from recon.reconstruction.result import Grid
@@ -281,8 +282,8 @@ class VolumeSource:
         try:
             with self._lock:
                 voxels = np.asarray(read(z, y, x), np.float32)
-        except (OSError, ValueError) as error:
-            raise FileError(self.path, f"cannot be read at plane {z}: {error}.") from error
+        except Exception as error:
+            raise FileError(self.path, f"cannot be read at plane {z}: {error!s:.200}.") from error
         # A damaged voxel must not make the whole view blank.
         voxels = np.nan_to_num(voxels, nan=0.0, posinf=0.0, neginf=0.0)
         return voxels[..., 0] if self.n_channels == 1 else voxels
@@ -323,6 +324,10 @@ def volume_in_memory(voxels: npt.NDArray[Any], path: Path) -> VolumeSource:
     return VolumeSource(path, [lambda z, y, x: view[z, y, x]], [shape], view.shape[3])
 
 
+_SPARSE_BYTES = 1 << 33
+"""An OME-Zarr leaves chunks of zeros out and is read plane by plane: a volume by l1 shrinks 500-fold."""
+
+
 def _open_zarr(path: Path) -> VolumeSource:
     import zarr
 
@@ -331,8 +336,14 @@ def _open_zarr(path: Path) -> VolumeSource:
         multiscale = group.attrs["ome"]["multiscales"][0]
         names = [axis["name"] for axis in multiscale["axes"]]
         arrays = [group[dataset["path"]] for dataset in multiscale["datasets"]]
-    except (OSError, KeyError, IndexError, TypeError, ValueError) as error:
-        raise FileError(path, f"is no OME-Zarr 0.5 image: {error!r}.") from error
+        for array in arrays:
+            require_plausible(path, array.nbytes, folder_bytes(path), small=_SPARSE_BYTES)
+            if len(array.shape) != len(names) or 0 in array.shape:
+                raise FileError(path, f"holds an array of shape {array.shape} for {len(names)} axes.")
+    except FileError:
+        raise
+    except Exception as error:
+        raise FileError(path, f"is no OME-Zarr 0.5 image: {error!r:.200}.") from error
     if names not in (["z", "y", "x"], ["c", "z", "y", "x"]):
         raise FileError(path, f"has the axes {', '.join(names)}; a volume has z, y, x, or c before them.")
 
@@ -348,8 +359,9 @@ def _open_zarr(path: Path) -> VolumeSource:
 
 def _open_npy(path: Path) -> VolumeSource:
     try:
+        require_file(path)
         return volume_in_memory(np.load(path, mmap_mode="r", allow_pickle=False), path)
-    except (ValueError, EOFError, OSError) as error:
+    except Exception as error:
         raise FileError(path, f"is no plain .npy array: {error}.") from error
 
 
@@ -357,11 +369,20 @@ def _open_tiff(path: Path) -> VolumeSource:
     """Map the file where it lies in one piece, else read it page by page."""
     import tifffile
 
+    tiff = None
     try:
+        stored = require_file(path)
         tiff = tifffile.TiffFile(path)
-    except (OSError, tifffile.TiffFileError) as error:
-        raise FileError(path, f"is no TIFF: {error}.") from error
-    series: Any = tiff.series[0]
+        series: Any = tiff.series[0]
+        require_plausible(path, series.size * series.dtype.itemsize, stored)
+    except FileError:
+        if tiff is not None:
+            tiff.close()
+        raise
+    except Exception as error:
+        if tiff is not None:
+            tiff.close()
+        raise FileError(path, f"is no TIFF, or a damaged one: {error!r:.200}.") from error
     axes = series.axes.replace("S", "C")
     if len(axes) == 3 and axes.endswith("YX"):
         axes = "ZYX"  # a stack of pages from elsewhere: whatever its axis is called, it is the depth
@@ -373,7 +394,10 @@ def _open_tiff(path: Path) -> VolumeSource:
         )
     if series.dataoffset is not None and series.dtype.byteorder in ("=", "|", "<"):
         tiff.close()
-        mapped = tifffile.memmap(path, mode="r")
+        try:
+            mapped = tifffile.memmap(path, mode="r")
+        except Exception as error:
+            raise FileError(path, f"is damaged: {error!r:.200}.") from error
         return volume_in_memory(np.moveaxis(mapped, 1, -1) if axes == "ZCYX" else mapped, path)
     per_plane = shape.get("C", 1) if axes == "ZCYX" else 1
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -20,6 +19,7 @@ from pydantic import (
 
 from instrument.files.atomic import write_text
 from instrument.files.errors import BenchError, FileError
+from instrument.files.reading import parse_json, parse_toml, read_bytes
 from instrument.plan.led_shapes import LedPlaces
 from instrument.plan.patterns import OFF, Light
 from instrument.plan.positions import PlanData, Positions, SourcePosition, StagePoints
@@ -47,7 +47,7 @@ class Part(PlanData):
     """Whether the scene (screen, sample) glows."""
     average: int = Field(default=1, ge=1, le=65_536)
     """Frames averaged into the one that is stored."""
-    repeats: int = Field(default=1, ge=1)
+    repeats: int = Field(default=1, ge=1, le=1_000_000)
     """How often all of it is done again; ``interval_s`` is the time from start to start of a repeat (0: at
     once)."""
     interval_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
@@ -335,7 +335,7 @@ def load_plan(path: Path | str) -> Plan:
     if not path.is_file():
         raise FileError(path, "is a folder; a plan is a file." if path.is_dir() else "no such plan file.")
     try:
-        data = reader(path.read_text())
+        data = reader(read_bytes(path).decode())
     except UnicodeDecodeError:
         raise FileError(path, "is no text file.", "A plan is a TOML or JSON file.") from None
     except ValueError as error:  # of tomllib and json alike; both name the line
@@ -346,7 +346,7 @@ def load_plan(path: Path | str) -> Plan:
 def save_plan(plan: Plan, path: Path | str) -> None:
     """Write a plan as TOML or JSON, by the file's suffix; :func:`load_plan` reads it back equal."""
     path = Path(path)
-    is_toml = _reader(path) is tomllib.loads
+    is_toml = _reader(path) is parse_toml
     write_text(path, plan_toml(plan) if is_toml else plan.to_json() + "\n")
 
 
@@ -363,7 +363,7 @@ def plan_toml(plan: Plan) -> str:
 
 
 def _reader(path: Path) -> Any:
-    readers: Mapping[str, Any] = {".toml": tomllib.loads, ".json": json.loads}
+    readers: Mapping[str, Any] = {".toml": parse_toml, ".json": parse_json}
     if path.suffix.lower() not in readers:
         raise FileError(path, f"a plan's name ends in {' or '.join(readers)}.")
     return readers[path.suffix.lower()]

@@ -24,16 +24,16 @@ from instrument.reconstruction.video_files import (
 )
 from recon.base.declare import option
 from recon.streams.activity import (
+    LEAST_FRAMES,
     Motion,
-    Region,
     aligned,
     baseline,
     change,
     fading,
-    find_regions,
-    local_correlation,
+    floor_of,
     motion,
 )
+from recon.streams.regions import Region, Search, find_regions, local_correlation, noise_of
 
 Floats = npt.NDArray[np.float32]
 
@@ -91,15 +91,21 @@ class Activity:
     frames: Floats
     dff: Floats
     """float32, (n_frames, height, width): fluorescence, and its relative change."""
-    correlation: Floats
-    """float32, (height, width)."""
-    regions: list[Region]
+    search: Search
+    """Regions, what was left out, and the local correlation, float32, (height, width)."""
     traces: Floats
     """float32, (n_regions, n_frames): dF/F of the regions' mean fluorescence."""
     motion: Motion
     """Before alignment."""
     faded: float
     """Share of the field's light that is lost by the end; negative where it grows."""
+    still_moving_px: float = 0.0
+    """How far frames move that were moved back, where they do not stand still: no region is looked for."""
+
+    @property
+    def regions(self) -> list[Region]:
+        """Places that are active."""
+        return self.search.regions
 
 
 def find_activity(
@@ -114,8 +120,12 @@ def find_activity(
     """
     settings = settings or ActivitySettings()
     indices = [index for index in range(len(video)) if video.is_written(index)]
-    if len(indices) < 3:
-        raise FileError(video.path, f"has {len(indices)} pictures; activity needs three at least.")
+    if len(indices) < LEAST_FRAMES:
+        raise FileError(
+            video.path,
+            f"has {len(indices)} pictures; activity is looked for in {LEAST_FRAMES} at least.",
+            "In fewer nothing tells it from noise: record for longer.",
+        )
     height, width = video.read(indices[0]).shape[:2]
     need = COPIES * len(indices) * height * width * 4
     if free_bytes is not None and need > free_bytes:
@@ -128,29 +138,44 @@ def find_activity(
         picture = video.read(index)
         frames[place] = picture.mean(axis=2) if picture.ndim == 3 else picture
     found = motion(frames)
+    still_moving_px = 0.0
     if settings.align:
         frames = aligned(frames, found)
+        left = motion(frames)
+        still_moving_px = 0.0 if left.is_still else left.largest_px
     period_s = video.period_s
     window = round(settings.window_s / (period_s or 0.1))
     fade = fading(frames)
     base = baseline(frames, max(window, 3), settings.percentile, fade)
-    dff = change(frames, base)
-    regions = find_regions(dff, least_correlation=settings.least_correlation, radius_px=settings.radius_px)
-    traces = np.zeros((len(regions), len(indices)), np.float32)
-    for trace, region in zip(traces, regions, strict=True):
+    floor = floor_of(frames)
+    dff = change(frames, base, floor)
+    noise = noise_of(frames)
+    excess = np.subtract(frames, base, out=base)
+    if still_moving_px:
+        search = Search([], {}, local_correlation(excess))
+    else:
+        search = find_regions(
+            excess,
+            least_correlation=settings.least_correlation,
+            radius_px=settings.radius_px,
+            noise=noise,
+            moved=None if found.is_still else found,
+        )
+    traces = np.zeros((len(search.regions), len(indices)), np.float32)
+    for trace, region in zip(traces, search.regions, strict=True):
         light = region.trace(frames)[:, None, None]
         level = baseline(light, max(window, 3), settings.percentile, fade)
-        trace[...] = ((light - level) / np.maximum(level, np.finfo(np.float32).tiny))[:, 0, 0]
+        trace[...] = change(light, level, floor)[:, 0, 0]
     return Activity(
         indices=tuple(indices),
         times_s=np.array(indices) * (period_s or 1.0),
         frames=frames,
         dff=dff,
-        correlation=local_correlation(dff),
-        regions=regions,
+        search=search,
         traces=traces,
         motion=found,
         faded=1 - float(fade[-1]),
+        still_moving_px=still_moving_px,
     )
 
 
@@ -189,6 +214,7 @@ def write_activity(
         "simulated": simulated,
         "frames": len(activity.indices),
         "regions": len(activity.regions),
+        "left_out": activity.search.left_out,
         "largest_motion_px": activity.motion.largest_px,
         "faded": activity.faded,
         "software": origin.get("software"),
@@ -212,7 +238,7 @@ def write_activity_figure(path: Path, activity: Activity, *, simulated: bool) ->
     for place, (image, title, colours) in enumerate(
         (
             (mean, "mean fluorescence, regions", "gray"),
-            (activity.correlation, "local correlation of dF/F", "magma"),
+            (activity.search.correlation, "local correlation", "magma"),
         )
     ):
         axes = figure.add_subplot(grid[0, place])

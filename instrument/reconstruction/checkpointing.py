@@ -7,7 +7,6 @@ history. Each is written whole or not at all; a kill costs what came after the l
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 import time
 import zipfile
@@ -22,6 +21,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import check_writable, whole_file, write_json
 from instrument.files.errors import BenchError, FileError
+from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
@@ -192,7 +192,7 @@ class CheckpointFolder:
     def _compare(self, problem: Mapping[str, Any]) -> None:
         path = self.folder / PROBLEM
         try:
-            kept = json.loads(path.read_text())
+            kept = parse_json(read_bytes(path))
         except (OSError, ValueError) as error:
             raise FileError(path, f"cannot be read ({error}).", "Name another folder.") from None
         if not isinstance(kept, dict) or kept.get("format") != problem.get("format"):

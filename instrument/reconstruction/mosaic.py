@@ -41,8 +41,17 @@ def mosaic_named(text: str) -> MosaicChoice:
 
 def mosaic_of(image: ImageFile) -> Pattern | None:
     """Return the mosaic that an image's metadata tell of, as the camera's driver wrote it; else None."""
-    name = str(image.metadata.get("pixel_format", ""))
-    return None if image.is_colour or not name.startswith("Bayer") else _GENICAM.get(name[5:7])
+    return None if image.is_colour else _named(str(image.metadata.get("pixel_format", "")))
+
+
+def in_colours(image: npt.NDArray[np.float32], pixel_format: str) -> npt.NDArray[np.float32]:
+    """Return a raw frame of a mosaic sensor as (height, width, 3), interpolated; any other image as it is."""
+    pattern = None if image.ndim == 3 else _named(pixel_format)
+    return image if pattern is None else interpolate_bayer(image, pattern)
+
+
+def _named(pixel_format: str) -> Pattern | None:
+    return _GENICAM.get(pixel_format[5:7]) if pixel_format.startswith("Bayer") else None
 
 
 def require_mosaic(image: ImageFile, pattern: Pattern) -> None:

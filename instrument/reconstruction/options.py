@@ -149,7 +149,7 @@ class InputOptions:
     )
     erasures: ErasuresChoice = option(
         "saturated",
-        help="Pixels to leave out: none, saturated, a mask FILE's zeros, a share.",
+        help="Pixels left out: none, saturated, FILE's zeros, a share.",
         metavar="WHICH",
         parse=_erasures,
         applies=_NOT_PATTERNED,
@@ -227,7 +227,7 @@ class OutputOptions:
     force: bool = option(False, help="Overwrite files that exist.", group=_OUTPUT)
     explain: bool = option(
         False,
-        help="Only say what auto would choose, why, and what a step up or down would cost.",
+        help="Only say what auto would choose, why, and what a step up or down would be.",
         applies=_KEPT,
         group=_OUTPUT,
     )

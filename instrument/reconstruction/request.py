@@ -21,18 +21,18 @@ from instrument.reconstruction.job import (
 )
 from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.reconstruction.preparation import darkest_block
-from instrument.runs.run import STATE
+from instrument.runs.run_files import STATE
 from recon.base.checks import require_noise, select_psf
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.camera.refocus import at_depth
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.problem import Problem
-from recon.reconstruction.reconstruct import reconstruct
+from recon.reconstruction.problem import Problem, Stage
+from recon.reconstruction.psf_refinement import refined
+from recon.reconstruction.reconstruct import reconstruct, require_two_images
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choice_for
-from recon.reconstruction.solve import ITERATIONS
 from recon.reconstruction.solvers import SOLVERS, volume_priors
 from recon.solvers.base import IterationRecord, Keeper
 from recon.types import Calibration
@@ -67,6 +67,7 @@ class _Request:
         watch: Watch | None = None,
         cancel: threading.Event | None = None,
         keeper: Keeper | None = None,
+        on_stage: Stage | None = None,
     ) -> Reconstruction:
         """Reconstruct what ``prepare`` returned.
 
@@ -74,7 +75,13 @@ class _Request:
         """
         measurement = self._measurement(job)
         return reconstruct(
-            measurement, job.calibration, self.options, on_progress=watch, cancel=cancel, keeper=keeper
+            measurement,
+            job.calibration,
+            self.options,
+            on_progress=watch,
+            cancel=cancel,
+            keeper=keeper,
+            on_stage=on_stage,
         )
 
     def explain(self, job: Job) -> Choice:
@@ -83,7 +90,9 @@ class _Request:
         Raises BenchError where it would not be asked for all of it.
         """
         _require_choice("--explain", self.options.model)
-        return choice_for(Problem.of(self._measurement(job), job.calibration, self.options))
+        problem = Problem.of(self._measurement(job), job.calibration, self.options)
+        require_two_images(problem)
+        return choice_for(refined(problem)[0] if self.options.refine_psf else problem)
 
     def _measurement(self, job: Job) -> Measurement:
         """Return a job's photograph with what is known of it."""
@@ -164,19 +173,6 @@ def request_of(
         inputs=inputs,
         options=options,
     )
-
-
-def iteration_limit(options: ReconstructionOptions) -> int | None:
-    """Return the largest count of iterations: as given, or the default, or none where time is the end."""
-    return ITERATIONS if options.iterations is None and options.time_s is None else options.iterations
-
-
-def done_share(options: ReconstructionOptions, record: IterationRecord) -> float:
-    """Return how much of the work is done, 0 to 1: whichever of count and time is nearer to its end."""
-    limit = iteration_limit(options)
-    by_count = 0.0 if limit is None else record.iteration / limit
-    by_time = 0.0 if options.time_s is None else record.seconds / options.time_s
-    return min(max(by_count, by_time), 1.0)
 
 
 def _require_known(inputs: InputOptions, options: ReconstructionOptions) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import check_writable, write_json
+from instrument.files.atomic import check_writable, write_json, write_text
 from instrument.files.errors import FileError
 from instrument.files.figures import save_figure
 from instrument.files.images import write_image
@@ -25,7 +25,9 @@ from instrument.files.volumes import (
     write_volume_zarr,
 )
 from instrument.reconstruction.job import Job
+from recon.reconstruction.point_errors import PointErrors
 from recon.reconstruction.result import Grid, Reconstruction
+from recon.reconstruction.uncertainty import Uncertainty
 
 WHITE_PERCENTILE = 99.9
 """The preview's white; brighter pixels are shown white too."""
@@ -33,26 +35,33 @@ WHITE_PERCENTILE = 99.9
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """The files of one reconstruction: float32 TIFF, 8-bit preview, settings and history, optional figure.
+    """The files of one reconstruction: float32 TIFF, 8-bit preview, settings and history, and optional ones.
 
-    A volume may be an OME-Zarr folder instead of a TIFF.
+    Those are a figure, a float32 TIFF of standard deviations, a table of points, and without a verdict one of
+    what is left of the data. A volume may be an OME-Zarr folder instead of a TIFF.
     """
 
     image: Path
     preview: Path
     record: Path
     figure: Path | None = None
+    deviation: Path | None = None
+    points: Path | None = None
+    residual: Path | None = None
 
     @classmethod
-    def named(cls, out: Path, figure: Path | None = None, *, volume: bool = False) -> Outputs:
+    def named(
+        cls, out: Path, figure: Path | None = None, *, volume: bool = False, uncertainty: bool = False
+    ) -> Outputs:
         """Return the files that go with ``out``, whose suffix must be ``.tif`` (volumes: or ``.ome.zarr``).
 
-        Raises FileError.
+        With ``uncertainty`` a picture's standard deviations and points are among them. Raises FileError.
         """
         if volume and is_zarr_name(out):
             if not (stem := stem_of(out)):
                 raise FileError(out, "has no name before its suffix.", "Call it volume.ome.zarr, say.")
-            return cls(out, out.with_name(f"{stem}.png"), out.with_name(f"{stem}.json"))
+            record, residual = out.with_name(f"{stem}.json"), out.with_name(f"{stem}-residual.tif")
+            return cls(out, out.with_name(f"{stem}.png"), record, residual=residual)
         if out.suffix.lower() not in (".tif", ".tiff"):
             raise FileError(
                 out,
@@ -63,14 +72,29 @@ class Outputs:
             )
         if figure is not None and figure.suffix.lower() not in (".png", ".pdf", ".svg"):
             raise FileError(figure, "a figure is written as .png, .pdf or .svg.")
-        outputs = cls(out, out.with_suffix(".png"), out.with_suffix(".json"), figure)
+        deviation = out.with_name(f"{out.stem}-deviation{out.suffix}") if uncertainty else None
+        points = out.with_name(f"{out.stem}-points.csv") if uncertainty else None
+        residual = out.with_name(f"{out.stem}-residual{out.suffix}")
+        preview, record = out.with_suffix(".png"), out.with_suffix(".json")
+        outputs = cls(out, preview, record, figure, deviation, points, residual)
         if figure in outputs.files()[:3]:
             raise FileError(out.with_suffix(".png"), "is the preview; give the figure another name.")
         return outputs
 
     def files(self) -> tuple[Path, ...]:
         """Return every file that will be written."""
-        return tuple(p for p in (self.image, self.preview, self.record, self.figure) if p is not None)
+        files = self.image, self.preview, self.record, self.figure, self.deviation, self.points, self.residual
+        return tuple(p for p in files if p is not None)
+
+    def written(self, result: Reconstruction) -> tuple[Path, ...]:
+        """Return the files that a result was written to: points and residual are not in every one."""
+        found = result.uncertainty
+        left_out = (
+            None if found is not None else self.deviation,
+            None if found is not None and found.points is not None else self.points,
+            None if result.residual is not None else self.residual,
+        )
+        return tuple(p for p in self.files() if p not in left_out)
 
     def check(self, n_pixels: int, *, overwrite: bool = False) -> None:
         """Refuse places that cannot be written, or are taken, before the work.
@@ -102,11 +126,26 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
     write_image(outputs.image, image, {"simulated": job.simulated, "record": outputs.record.name})
     pixels, white = preview(image)
     write_image(outputs.preview, pixels)
+    if outputs.deviation is not None and result.uncertainty is not None:
+        deviation = np.rot90(result.uncertainty.deviation[0], rotate_deg // 90)
+        write_image(outputs.deviation, deviation, {"simulated": job.simulated, "record": outputs.record.name})
+        if outputs.points is not None and result.uncertainty.points is not None:
+            write_text(outputs.points, _table(result.uncertainty.points, result.grid, rotate_deg))
+    _write_residual(outputs, result, job, rotate_deg)
     record = reconstruction_record(result, job, volume=False) | {
+        "uncertainty": _of_uncertainty(result.uncertainty, outputs),
+        "residual": None if result.residual is None else outputs.written(result)[-1].name,
         "rotated_deg": rotate_deg,
         "preview": {"white": white, "white_percentile": WHITE_PERCENTILE, "black": 0.0},
     }
     write_json(outputs.record, record)
+
+
+def _write_residual(outputs: Outputs, result: Reconstruction, job: Job, rotate_deg: int = 0) -> None:
+    """Write what is left of the data, in units of their noise, where no verdict says what that is worth."""
+    if outputs.residual is not None and result.residual is not None:
+        about = {"simulated": job.simulated, "record": outputs.record.name}
+        write_image(outputs.residual, np.rot90(result.residual, rotate_deg // 90), about)
 
 
 def picture_grid(grid: Grid) -> dict[str, Any]:
@@ -171,6 +210,42 @@ def _of_picture(result: Reconstruction) -> dict[str, Any]:
     }
 
 
+_COLUMNS = "row,column,light,row_deviation,column_deviation,light_deviation,x_um,y_um"
+
+
+def _table(points: PointErrors, grid: Grid, rotate_deg: int) -> str:
+    """Return points as CSV: rows and columns of the picture as it is written; x and y from the axis."""
+    shape = grid.shape[1:]
+    lines = [_COLUMNS]
+    across = rotate_deg % 180 != 0
+    for place, light, deviation in zip(points.places, points.light, points.deviations, strict=True):
+        row, column = place
+        x, y = (
+            (at - n) * float(grid.pitch_um[0]) for at, n in ((column, grid.centre[1]), (row, grid.centre[0]))
+        )
+        height, width = shape
+        for _ in range(rotate_deg // 90 % 4):
+            row, column, height, width = width - 1 - column, row, width, height
+        down, over = (deviation[1], deviation[0]) if across else (deviation[0], deviation[1])
+        values = (row, column, light, down, over, deviation[2], x, y)
+        lines.append(",".join(f"{value:.7g}" if np.isfinite(value) else "" for value in values))
+    return "\n".join([*lines, ""])
+
+
+def _of_uncertainty(found: Uncertainty | None, outputs: Outputs) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    return {
+        "file": None if outputs.deviation is None else outputs.deviation.name,
+        "points": None if found.points is None or outputs.points is None else outputs.points.name,
+        "sentences": found.sentences,
+        "trusted": found.trusted,
+        "repeats": found.repeats,
+        "residual_over_noise": found.misfit,
+        "seconds": found.seconds,
+    }
+
+
 def _of_volume(result: Reconstruction) -> dict[str, Any]:
     grid = result.grid
     return {
@@ -202,4 +277,5 @@ def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
     else:
         write_volume_tiff(outputs.image, result.volume, result.volume.shape, result.grid)
     save_figure(volume_figure(result, simulated=job.simulated), outputs.preview)
+    _write_residual(outputs, result, job)
     write_json(outputs.record, reconstruction_record(result, job, volume=True))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,9 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import whole_file
+from instrument.files.atomic import refuse_input, whole_file
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, write_image
+from instrument.files.reading import parse_json, read_bytes, require_file
 from instrument.files.volumes import (
     VolumeSource,
     is_zarr_name,
@@ -41,6 +41,18 @@ class StoredResult:
     """The volume; None for a picture. Close it in the end."""
     record: Mapping[str, Any]
     """What was written beside it; empty for results from elsewhere."""
+    deviation: npt.NDArray[np.float32] | None = None
+    """Standard deviation of a picture's pixels, as it; None where it was not asked for."""
+    residual: npt.NDArray[np.float32] | None = None
+    """What is left of the data, in units of their noise; None where a verdict says what it is worth."""
+
+    @property
+    def inputs(self) -> list[Path]:
+        """The files that it was made of, as far as they are known, and its own."""
+        named = self.record.get("inputs")
+        values = named.values() if isinstance(named, Mapping) else ()
+        named = [value.get("path") if isinstance(value, Mapping) else value for value in values]
+        return [self.path, *(Path(value) for value in named if isinstance(value, str) and value)]
 
     @property
     def simulated(self) -> bool:
@@ -97,6 +109,10 @@ class StoredResult:
         facts: list[tuple[str, str]] = []
         if self.verdict:
             facts.append(("Verdict", " ".join(self.verdict)))
+        if said := (record.get("uncertainty") or {}).get("sentences"):
+            facts += [(name, str(one)) for name, one in zip(("Uncertainty", "Points"), said, strict=False)]
+        if refined := (origin.get("psf_refinement") or {}).get("words"):
+            facts.append(("Refined PSF", str(refined)))
         chosen = self._chosen()
         facts += chosen
         if record and "Model" not in dict(chosen):
@@ -180,7 +196,17 @@ def open_result(path: Path | str) -> StoredResult:
     if is_zarr_name(path) or path.is_dir() or _is_volume(path, record):
         return StoredResult(path, None, open_volume(path), record)
     pixels = read_image(path).pixels
-    return StoredResult(path, np.asarray(pixels, np.float32), None, record)
+    deviation = _beside(path, (record.get("uncertainty") or {}).get("file"))
+    residual = _beside(path, record.get("residual"))
+    return StoredResult(path, np.asarray(pixels, np.float32), None, record, deviation, residual)
+
+
+def _beside(path: Path, name: str | None) -> npt.NDArray[np.float32] | None:
+    """Read what was written beside a picture; None where it is no more."""
+    beside = path.with_name(Path(str(name)).name)
+    if name is None or not beside.is_file():
+        return None
+    return np.asarray(read_image(beside).pixels, np.float32)
 
 
 def record_file(path: Path) -> Path:
@@ -211,8 +237,8 @@ def _record_of(path: Path) -> dict[str, Any]:
     if not beside.is_file():
         return {}
     try:
-        record = json.loads(beside.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        record = parse_json(read_bytes(beside))
+    except (OSError, ValueError) as error:
         raise FileError(beside, f"cannot be read as JSON: {error}.") from error
     # Another program's JSON, or that of another kind of file of ours, is no record of this one.
     return record if isinstance(record, dict) and "grid" in record else {}
@@ -225,15 +251,17 @@ def _is_volume(path: Path, record: Mapping[str, Any]) -> bool:
         import tifffile
 
         try:
+            require_file(path)
             with tifffile.TiffFile(path) as tiff:
                 series = tiff.series[0]
                 return len(series.shape) == 4 or (len(series.shape) == 3 and "S" not in series.axes)
-        except (OSError, IndexError, tifffile.TiffFileError):
+        except Exception:  # noqa: BLE001 - a damaged TIFF raises nearly anything
             return False  # reading it as an image then says what is wrong
     if path.suffix.lower() == ".npy":
         try:
+            require_file(path)
             shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
-        except (OSError, ValueError, EOFError):
+        except Exception:  # noqa: BLE001 - a damaged header raises nearly anything
             return False
         return len(shape) == 4 or (len(shape) == 3 and shape[-1] not in (1, 3, 4))
     return False
@@ -273,8 +301,8 @@ def _is_record(path: Path) -> bool:
         with path.open("rb") as file:
             if b'"diffuserbench ' not in file.read(200):  # the program's name stands first
                 return False
-        record = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+        record = parse_json(read_bytes(path))
+    except (OSError, ValueError, FileError):
         return False  # another program's file
     if not isinstance(record, dict) or not {"grid", "prior", "inputs"} <= record.keys():
         return False
@@ -322,6 +350,7 @@ def export_result(
         ``advance(planes done, planes)``; may raise to end the work.
     """
     target = Path(target)
+    refuse_input(target)
     volume = result.volume is not None
     known = VOLUME_SUFFIXES if volume else PICTURE_SUFFIXES
     if not target.name.lower().endswith(known):

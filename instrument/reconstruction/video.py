@@ -28,7 +28,6 @@ from instrument.reconstruction.video_files import (
     SAMPLES,
     VideoPictures,
     create_output,
-    has_light,
     levels_of,
     require_video,
 )
@@ -40,6 +39,7 @@ from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, require_joint
+from recon.streams.stillness import has_light
 from recon.streams.video import BLOCK, COLD_ITERATIONS, VideoSolver, stream_problem
 
 
@@ -116,6 +116,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         ),
         picture.calibration,
         replace(options, iterations=None),
+        choosing=request.video.over_time is None,
     )
     if request.video.over_time is not None:
         require_joint(problem)
@@ -144,7 +145,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         _create(request, run, plan, picture)
         job = VideoJob.create(request.out, plan, problem, reduction)
     saturated = sum(record.metadata.saturated_fraction > 0 for record in run.records.values())
-    warnings = list(picture.warnings)
+    warnings = list(dict.fromkeys((*picture.warnings, *problem.warnings)))
     if saturated:
         warnings.append(f"{saturated} of {len(frames)} frames have saturated pixels: expect halos there.")
     if not has_light(picture.measurement, problem.noise):

@@ -15,14 +15,6 @@ from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import FileError
 from instrument.files.volumes import ome_attributes
 from instrument.runs.run import Run
-from recon.base.blocks import block_mean
-from recon.base.noise import estimate_deviation
-
-_BLOCK = 8
-"""Pixels along a side over which light is averaged to tell it from noise."""
-
-LIT = 2.0
-"""Variance of block means from which a frame has light, in units of what its pixels' noise makes of it."""
 
 STILL = {"um": 0.5, "mrad": 0.02}
 """How far readings of a stage that stands may lie apart, by the unit that an axis' name ends in.
@@ -80,33 +72,6 @@ def _stands(positions: Sequence[Mapping[str, float]]) -> bool:
         if not np.ptp(readings) <= STILL.get(axis.rsplit("_", 1)[-1], 0.0):
             return False
     return True
-
-
-def has_light(frame: npt.NDArray[Any], deviation: npt.NDArray[Any]) -> bool:
-    """Tell whether there is more in a frame than noise.
-
-    Noise of single pixels goes away where pixels are averaged, a scene through a diffuser does not: the
-    variance of the means of 8 x 8 pixels is compared with what noise leaves of it. Noise grows with light: a
-    frame dimmer than the one that ``deviation`` was found on has less, which it tells itself.
-
-    Parameters
-    ----------
-    frame : ndarray, (height, width) or (height, width, n_channels)
-        Counts less dark.
-    deviation : ndarray, (n_channels,)
-        Of the noise, counts; that of another frame of the same camera is enough.
-    """
-    channels = frame[None] if frame.ndim == 2 else np.moveaxis(frame, 2, 0)
-    height, width = (n // _BLOCK for n in channels.shape[1:])
-    if min(height, width) < 2:
-        return True  # too few blocks to tell
-    means = block_mean(channels, _BLOCK, dtype=np.float64)
-    spread = means.var(axis=(1, 2)) * _BLOCK**2
-    given = np.asarray(deviation, np.float64).reshape(-1)
-    if (spread > LIT * given**2).any():
-        return True
-    own = np.array([estimate_deviation(channel) for channel in channels])
-    return bool(((own > 0) & (spread > LIT * own**2)).any())  # 0 is no estimate: most pixels are alike
 
 
 if TYPE_CHECKING:

@@ -155,7 +155,7 @@ class VideoJob:
         )
         pitch_um, distance_mm = (None if np.isnan(v) else float(v) for v in a["geometry"])
         calibration = Calibration(a["psfs"], a["positions"], geometry=Geometry(pitch_um, distance_mm))
-        return stream_problem(measurement, calibration, ReconstructionOptions(**asked))
+        return stream_problem(measurement, calibration, ReconstructionOptions(**asked), choosing=False)
 
     @property
     def reduction(self) -> Reduction:

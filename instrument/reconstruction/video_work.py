@@ -21,13 +21,14 @@ from typing import Any
 import numpy as np
 
 from instrument.files.errors import BenchError
-from instrument.reconstruction.video_files import VideoPictures, has_light
+from instrument.reconstruction.video_files import VideoPictures
 from instrument.reconstruction.video_job import VideoJob
 from instrument.runs.frame_array import FrameArray
-from instrument.runs.run import FRAMES
+from instrument.runs.run_files import FRAMES
 from recon.base.threads import get_threads, set_threads
 from recon.reconstruction.measurement import Floats
 from recon.streams.joint import solve_together
+from recon.streams.stillness import has_light
 from recon.streams.video import VideoSolver
 
 _kept = threading.local()

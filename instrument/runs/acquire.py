@@ -5,16 +5,16 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 from instrument.bench.bench import Bench
 from instrument.bench.camera_settings import camera_settings, restore_camera
-from instrument.bench.photograph import Progress
 from instrument.files.errors import FileError
 from instrument.plan import BenchAbilities, Plan, check
-from instrument.runs.run import DamagedFrame, Run, RunCondition, RunError
+from instrument.runs.inspection import Verification, verify
+from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_control import RunControl
+from instrument.runs.run_files import SLM_IMAGES, RunError, log_size
 from instrument.runs.runner import Runner, RunProgress
 from instrument.runs.writer import BenchRecord, RunWriter
 
@@ -128,68 +128,16 @@ def there_now(folder: Path) -> Path:
     raise FileError(folder, "nothing of this path is there, not even its disk. Is the drive connected?")
 
 
-@dataclass(frozen=True, slots=True)
-class RunFindings:
-    """What was found in a run's folder before it is continued."""
-
-    condition: RunCondition
-    """How the run was left."""
-    stored: int
-    """Frames that are on the disk as they were written; none of them is taken again."""
-    todo: tuple[int, ...]
-    """Steps whose data are not safely stored, in order."""
-    damaged: tuple[DamagedFrame, ...] = ()
-    """Frames among them that the log calls written, but that are not as they were."""
-    torn_bytes: int = 0
-    """Length of the half line that a crash left at the end of the log."""
-    unlogged: int = 0
-    """Frames among them whose image had reached the disk, but not their line in the log."""
-
-    def __str__(self) -> str:
-        lines = [f"{self.condition}: {self.stored} frames safely stored, {len(self.todo)} to do"]
-        if self.todo:
-            lines[0] += f", first step {self.todo[0]}"
-        if self.torn_bytes:
-            lines.append(f"the log ended in a half line of {self.torn_bytes} bytes (dropped)")
-        if self.unlogged:
-            lines.append(f"{self.unlogged} images without their line in the log (taken again)")
-        lines += [f"frame {frame.index}: {frame.problem} (taken again)" for frame in self.damaged]
-        return "\n  ".join(lines)
-
-
-def inspect(run: Run, on_progress: Progress | None = None) -> RunFindings:
-    """Read every frame that a run's log calls written, and say what is left to do.
-
-    ``on_progress`` is called with frames read and frames to read.
-
-    Raises RunError when the run is a recording.
-    """
-    if run.plan is None:
-        raise RunError(run.path, "is a recording; only runs of a plan can be continued.")
-    damaged = run.damaged(on_progress)
-    again = {frame.index for frame in damaged}
-    todo = tuple(i for i in range(len(run.plan)) if i not in run.records or i in again)
-    unlogged = 0
-    if run.has_frames:
-        unlogged = sum(i not in run.records and run.array.chunk_path(i).exists() for i in todo)
-    return RunFindings(
-        condition=run.condition,
-        stored=len(run.plan) - len(todo),
-        todo=todo,
-        damaged=damaged,
-        torn_bytes=run.torn_bytes,
-        unlogged=unlogged,
-    )
-
-
 def prepare_resume(
     bench: Bench,
     path: Path | str,
     *,
     on_verify: Callable[[int, int], None] | None = None,
     on_progress: RunProgress | None = None,
-) -> tuple[Runner, RunFindings]:
-    """Verify a run and return the runner of the steps that are left, with what was found.
+) -> tuple[Runner, Verification]:
+    """Mend a run's files, read its frames, and return the runner of the steps that are left.
+
+    With it comes what was found before anything was mended.
 
     The camera gets the settings that it had when the run began. Settings that the plan left as they were are
     brought back as the steps before had them. The bench is as a rule opened from the run's own
@@ -200,19 +148,61 @@ def prepare_resume(
     bench cannot do what is left; DeviceError or BenchError when the camera does not take the settings of the
     run.
     """
-    before = Run.open(path)
-    condition = before.condition  # asked before this program's own lock answers "running"
-    writer = RunWriter.reopen(before.path)
+    size = log_size(path)
+    findings = verify(_at_rest(path), on_verify)  # before this program's own lock answers "running"
+    if findings.is_recording:
+        raise RunError(Path(path), "is a recording; only runs of a plan can be continued.")
+    writer = RunWriter.reopen(path, log_bytes=size)
     try:
         run = Run.open(path)
-        findings = replace(inspect(run, on_verify), condition=condition, torn_bytes=before.torn_bytes)
         plan = run.plan
-        assert plan is not None  # inspect has refused recordings
+        assert plan is not None
+        _require_slm_images(findings, plan)
         restore_camera(bench.camera, run.provenance["camera"])
         check(plan, abilities_of(bench, run.path), todo=findings.todo, start=run.start)
-        writer.note("found", text=str(findings))
+        writer.note("found", text="\n  ".join([str(findings), *(writer.mended or ())]))
     except BaseException:
         writer.close()
         raise
     runner = Runner(bench, plan, writer, start=run.start, todo=findings.todo, on_progress=on_progress)
     return runner, findings
+
+
+def _require_slm_images(findings: Verification, plan: Plan) -> None:
+    """Refuse to show an SLM image that is not the one that the run began with."""
+    wrong = {file.name for file in findings.files}
+    for image in plan.slm_images:
+        if f"{SLM_IMAGES}/{image.name}" in wrong or (findings.todo and not image.is_file()):
+            raise RunError(image, "is not the image that the run began with.", "Put it back from a backup.")
+
+
+def _at_rest(path: Path | str) -> Run:
+    """Return a run that no program writes to; raises RunError where one does."""
+    run = Run.open(path)
+    if run.is_being_written:
+        raise RunError(run.path, "another program is writing to this run.", "Wait until it ends.")
+    return run
+
+
+def settle_recording(path: Path | str, on_verify: Callable[[int, int], None] | None = None) -> list[str]:
+    """Mend a recording's files, and mark frames that are missing or damaged as lost; returns it in words.
+
+    A recording that was cut off is closed. Images without a line in the log are listed there and stay.
+
+    Raises RunError when some program writes to it, or its log is another run's.
+    """
+    size = log_size(path)
+    found = verify(_at_rest(path), on_verify)
+    if found.is_sound and found.condition is not RunCondition.CRASHED:
+        return []
+    with RunWriter.reopen(path, log_bytes=size) as writer:
+        words = [*(writer.mended or ()), *writer.settle({f.index: f.problem for f in found.damaged})]
+        reason, error = FinishReason.ABORTED, "its program ended without finishing it"
+        if found.condition is RunCondition.CRASHED:
+            words.append("the recording was cut off; it is closed now")
+        else:
+            run = Run.open(path)
+            reason, error = FinishReason(found.condition), run.error
+        writer.note("found", text="\n  ".join([str(found), *words]))
+        writer.finish(reason, error)
+    return words

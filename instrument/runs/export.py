@@ -16,7 +16,8 @@ from instrument.bench.photograph import Progress
 from instrument.files.atomic import check_writable, require_new, whole_file
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import as_shown, write_image, write_mp4
-from instrument.runs.run import Run, RunError
+from instrument.runs.run import Run
+from instrument.runs.run_files import RunError
 
 Image = npt.NDArray[Any]
 _BIG_TIFF_BYTES = 3_900_000_000

@@ -7,7 +7,7 @@ speed. Tests read the result back with zarr-python and hold it against the OME-Z
 
 from __future__ import annotations
 
-import json
+import math
 import os
 import shutil
 import zlib
@@ -23,11 +23,16 @@ import numpy.typing as npt
 
 from instrument.files.atomic import make_folder, sync_folder, write_json
 from instrument.files.errors import FileError
+from instrument.files.reading import parse_json, read_bytes
 from instrument.files.volumes import ome_attributes, ome_axis
 
 Image = npt.NDArray[Any]
 _LEVEL = "0"
+DESCRIPTIONS = f"{_LEVEL}/zarr.json", "zarr.json"
+"""Files that describe the array and the image."""
 _DTYPES = ("uint8", "uint16", "float32")
+_FRAME_FILES = ("0/0", "0/0/0")
+"""Of grey and of colour frames, below the frame's number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,15 +93,35 @@ class FrameArray:
     :meth:`write` takes and :meth:`read` returns ``(height, width)`` or ``(height, width, 3)``.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, description: dict[str, Any] | None = None) -> None:
+        """Read the array's own description, unless one is given."""
         self.path = path
-        described = json.loads((path / _LEVEL / "zarr.json").read_text())
-        shape = tuple(described["shape"])
+        described = description or parse_json(read_bytes(path / DESCRIPTIONS[0]))
+        shape = tuple(int(side) for side in described["shape"])
+        if len(shape) not in (3, 4) or min(shape[1:]) < 1 or described["data_type"] not in _DTYPES:
+            raise ValueError(f"no frames have the shape {shape} and the type {described['data_type']!r:.40}")
         self.n_frames: int = shape[0]
         self.is_colour = len(shape) == 4
         self.frame_shape: tuple[int, ...] = (*shape[2:], shape[1]) if self.is_colour else shape[1:]
         self.dtype = np.dtype(described["data_type"])
         self._described = described
+
+    @property
+    def frame_bytes(self) -> int:
+        """Size of one frame's file."""
+        return int(math.prod(self.frame_shape) * self.dtype.itemsize)
+
+    @staticmethod
+    def is_there(path: Path) -> bool:
+        """Whether an array was ever made in ``path``."""
+        return (path / _LEVEL / "c").is_dir()
+
+    @staticmethod
+    def indices(path: Path) -> list[int]:
+        """Return the frames of which there is an image, whole or not, in order."""
+        folder = path / _LEVEL / "c"
+        found = sorted(int(p.name) for p in folder.iterdir() if p.name.isdecimal()) if folder.is_dir() else []
+        return [i for i in found if any((folder / str(i) / end).is_file() for end in _FRAME_FILES)]
 
     @cached_property
     def _sync(self) -> SyncPool:
@@ -127,18 +152,14 @@ class FrameArray:
         data_type = np.dtype(dtype).name
         if data_type not in _DTYPES:
             raise TypeError(f"Frames are stored as {', '.join(_DTYPES)}, not {data_type}.")
-        colour = len(frame_shape) == 3
-        shape = [n_frames, *((frame_shape[2], *frame_shape[:2]) if colour else frame_shape)]
-        axes = ["t", "c", "y", "x"] if colour else ["t", "y", "x"]
+        array = description_of(n_frames, frame_shape, data_type)
         # Under another name until it is whole, so that a crash here leaves no half array behind.
         draft = path.with_name(f".{path.name}.draft")
         shutil.rmtree(draft, ignore_errors=True)
         for folder in (draft, draft / _LEVEL, draft / _LEVEL / "c"):
             make_folder(folder)
-        write_json(draft / _LEVEL / "zarr.json", _array_metadata(shape, data_type, axes))
-        # A plan's steps have no even spacing in time; a recording gets it at its end.
-        ome = ome_attributes(name, axes, {"y": pixel_pitch_um, "x": pixel_pitch_um})
-        write_json(draft / "zarr.json", {"zarr_format": 3, "node_type": "group", "attributes": {"ome": ome}})
+        write_json(draft / DESCRIPTIONS[0], array)
+        write_json(draft / DESCRIPTIONS[1], group_of(array["dimension_names"], pixel_pitch_um, name))
         draft.rename(path)
         sync_folder(path.parent)
         return cls(path)
@@ -205,22 +226,35 @@ class FrameArray:
     def resize(self, n_frames: int, *, frame_period_s: float | None = None) -> None:
         """Change the number of frames that the array says it has, and the time between them if given."""
         self._described["shape"][0] = n_frames
-        write_json(self.path / _LEVEL / "zarr.json", self._described)
+        write_json(self.path / DESCRIPTIONS[0], self._described)
         self.n_frames = n_frames
         if frame_period_s is not None:
-            group = json.loads((self.path / "zarr.json").read_text())
-            multiscale = group["attributes"]["ome"]["multiscales"][0]
-            multiscale["axes"][0] = ome_axis("t", known=True)
-            multiscale["datasets"][0]["coordinateTransformations"][0]["scale"][0] = frame_period_s
-            write_json(self.path / "zarr.json", group)
+            group = parse_json(read_bytes(self.path / DESCRIPTIONS[1]))
+            write_json(self.path / DESCRIPTIONS[1], with_period(group, frame_period_s))
+
+    def description_sums(self) -> dict[str, int]:
+        """Return the CRC-32 of the files that describe the array and the image."""
+        return {name: zlib.crc32(read_bytes(self.path / name)) for name in DESCRIPTIONS}
 
     def checksum(self, index: int) -> StoredChunk | None:
         """Return size and CRC-32 of a frame as it is on the disk, None where it is not."""
-        try:
-            data = self.chunk_path(index).read_bytes()
-        except FileNotFoundError:
+        path = self.chunk_path(index)
+        if not path.is_file():
             return None
+        data = path.read_bytes()
         return StoredChunk(len(data), zlib.crc32(data))
+
+    def n_bytes(self, index: int) -> int | None:
+        """Return the size of a frame's file, None where there is none."""
+        try:
+            return self.chunk_path(index).stat().st_size
+        except OSError:
+            return None
+
+    def remove_half_written(self) -> None:
+        """Take away what a crash left of frames that were being written."""
+        for part in (self.path / _LEVEL / "c").glob(f"*/{'/'.join('0' * (len(self.frame_shape) - 1))}/part"):
+            part.unlink()
 
     def chunk_path(self, index: int) -> Path:
         """Return the file that holds a frame."""
@@ -245,7 +279,10 @@ class FrameArray:
         return _Draft(handle, path, StoredChunk(len(data), zlib.crc32(data)))
 
 
-def _array_metadata(shape: list[int], data_type: str, axes: list[str]) -> dict[str, Any]:
+def description_of(n_frames: int, frame_shape: tuple[int, ...], data_type: str) -> dict[str, Any]:
+    """Return what the array's own ``zarr.json`` holds; parameters as :meth:`FrameArray.create`."""
+    colour = len(frame_shape) == 3
+    shape = [n_frames, *((frame_shape[2], *frame_shape[:2]) if colour else frame_shape)]
     return {
         "zarr_format": 3,
         "node_type": "array",
@@ -257,6 +294,26 @@ def _array_metadata(shape: list[int], data_type: str, axes: list[str]) -> dict[s
         "codecs": [
             {"name": "bytes", **({} if data_type == "uint8" else {"configuration": {"endian": "little"}})}
         ],
-        "dimension_names": axes,
+        "dimension_names": ["t", "c", "y", "x"] if colour else ["t", "y", "x"],
         "attributes": {},
     }
+
+
+def group_of(
+    axes: Sequence[str], pixel_pitch_um: float, name: str, frame_period_s: float | None = None
+) -> dict[str, Any]:
+    """Return what the image's ``zarr.json`` holds.
+
+    A plan's steps have no even spacing in time; a recording gets it at its end.
+    """
+    ome = ome_attributes(name, axes, {"y": pixel_pitch_um, "x": pixel_pitch_um})
+    group = {"zarr_format": 3, "node_type": "group", "attributes": {"ome": ome}}
+    return group if frame_period_s is None else with_period(group, frame_period_s)
+
+
+def with_period(group: dict[str, Any], frame_period_s: float) -> dict[str, Any]:
+    """Give an image's ``zarr.json`` the time between frames; returns it."""
+    multiscale = group["attributes"]["ome"]["multiscales"][0]
+    multiscale["axes"][0] = ome_axis("t", known=True)
+    multiscale["datasets"][0]["coordinateTransformations"][0]["scale"][0] = frame_period_s
+    return group

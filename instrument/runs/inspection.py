@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,48 +11,98 @@ import numpy as np
 from instrument.bench.photograph import Progress
 from instrument.files.errors import ranges
 from instrument.files.figures import save_figure
-from instrument.runs.run import STATE, DamagedFrame, FinishReason, Run, RunCondition, RunError
+from instrument.runs.repair import file_problems
+from instrument.runs.run import DamagedFrame, FinishReason, Run, RunCondition, is_run
+from instrument.runs.run_files import LOG, FileProblem, RunError
 
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What reading a whole run found."""
+    """What looking at a whole run found, and what ``resume`` would do about it."""
 
+    condition: RunCondition
+    """How the run was left."""
+    is_recording: bool
     frames: int
     """Frames that are as they were written."""
+    todo: tuple[int, ...]
+    """A plan's steps whose data are not safely stored, in order."""
     damaged: tuple[DamagedFrame, ...]
     """Frames that the log calls written and that are not as they were."""
+    without_a_line: tuple[int, ...]
+    """Images on the disk that no line of the log is about."""
+    files: tuple[FileProblem, ...]
+    """Small files that are not as they were written."""
     problems: tuple[str, ...]
     """Whatever else contradicts itself."""
 
     @property
     def is_sound(self) -> bool:
         """Whether nothing is wrong. A run that ended early is sound, only not complete."""
-        return not self.damaged and not self.problems
+        return not (self.damaged or self.without_a_line or self.files or self.problems)
+
+    def lines(self) -> list[str]:
+        """Return what is wrong, a line each."""
+        found = [f"frame {frame.index}: {frame.problem}" for frame in self.damaged]
+        if self.without_a_line:
+            found.append(f"images without their line in the log: frames {ranges(self.without_a_line, 8)}")
+        return [*found, *map(str, self.files), *self.problems]
+
+    def remedy(self) -> str:
+        """Return what ``resume`` would do; empty where there is nothing to do."""
+        done = ["makes its files again"] if any(file.text is not None for file in self.files) else []
+        if self.is_recording:
+            if self.damaged:
+                done.append(f"marks frames {ranges([f.index for f in self.damaged], 8)} as lost")
+            if self.without_a_line:
+                done.append("keeps the images without a line")
+        elif self.todo:
+            done.append(f"takes frames {ranges(self.todo, 8)}")
+        if any(file.name == LOG for file in self.files):
+            done.append("cuts out of the log what cannot be read")
+        return f"diffuserbench resume {', '.join(done)}; what it replaces is kept beside." if done else ""
+
+    def __str__(self) -> str:
+        left = "" if self.is_recording else f", {len(self.todo)} to do"
+        left += f", first step {self.todo[0]}" if self.todo else ""
+        return "\n  ".join([f"{self.condition}: {self.frames} frames safely stored{left}", *self.lines()])
 
 
-def verify(run: Run, on_progress: Progress | None = None) -> Verification:
-    """Read every frame of a run and hold it, its metadata and the image array against the log.
+def verify(run: Run, on_progress: Progress | None = None, *, read: bool = True) -> Verification:
+    """Read every frame of a run and hold it, its metadata, files and image array against the log.
 
-    ``on_progress`` is called with frames read and frames to read.
+    ``on_progress`` is called with frames read and frames to read. ``read``: False looks at the images' sizes
+    only, which is quick.
     """
-    damaged = run.damaged(on_progress)
-    return Verification(len(run.records) - len(damaged), damaged, tuple(_contradictions(run)))
+    damaged = run.damaged(on_progress, read=read)
+    again = {frame.index for frame in damaged}
+    plan = run.plan
+    steps = range(len(plan)) if plan is not None else ()
+    running = run.is_being_written
+    return Verification(
+        condition=run.condition,
+        is_recording=plan is None,
+        frames=len(run.records) + len(run.unlisted) - len(damaged),
+        todo=tuple(i for i in steps if i not in run.records or i in again),
+        damaged=damaged,
+        without_a_line=() if running else tuple(run.without_a_line()),
+        files=tuple(file_problems(run)),
+        problems=() if run.log_is_foreign else tuple(_contradictions(run)),
+    )
 
 
 def _contradictions(run: Run) -> list[str]:
     problems: list[str] = []
-    if run.torn_bytes:
-        problems.append(f"the log ends in a half line of {run.torn_bytes} bytes")
     if run.reason is FinishReason.COMPLETED and run.plan is not None and run.missing():
         problems.append(f"marked as completed, but frames {ranges(run.missing(), 8)} are not there")
     beyond = [index for index in run.records if not 0 <= index < run.n_frames]
     if beyond:
         problems.append(f"the log has frames {ranges(beyond, 8)}, beyond the plan's {run.n_frames}")
     gaps = [index for gap in run.gaps for index in range(gap.first, gap.first + gap.count)]
+    accounted = {*gaps, *run.lost, *run.unlisted, *run.without_a_line()}
     if both := sorted(set(gaps) & set(run.records)):
         problems.append(f"frames {ranges(both, 8)} are both stored and lost")
-    if run.plan is None and (nowhere := sorted(set(run.missing()) - set(gaps))):
+    if run.plan is None and (nowhere := sorted(set(run.missing()) - accounted)):
         problems.append(f"frames {ranges(nowhere, 8)} are neither stored nor accounted for as lost")
     if run.has_frames:
         problems += _array_contradictions(run)
@@ -66,8 +117,6 @@ def _contradictions(run: Run) -> list[str]:
 def _array_contradictions(run: Run) -> list[str]:
     problems: list[str] = []
     array = run.array
-    if run.plan is not None and array.n_frames != len(run.plan):
-        problems.append(f"the image array is for {array.n_frames} frames, the plan has {len(run.plan)}")
     if run.plan is None and run.reason is not None and array.n_frames != run.n_frames:
         problems.append(f"the image array is for {array.n_frames} frames, the log knows {run.n_frames}")
     height, width = array.frame_shape[:2]
@@ -83,18 +132,19 @@ def _array_contradictions(run: Run) -> list[str]:
 COLUMNS, ROWS = 4, 3
 
 
-def contact_sheet(run: Run, path: Path) -> list[int]:
+def contact_sheet(run: Run, path: Path, *, leave_out: Collection[int] = ()) -> list[int]:
     """Write a picture of up to twelve of a run's frames, spread evenly, as PNG; returns which.
 
-    Each frame is stretched from its 0.1th to its 99.9th percentile; pixels at full scale are red.
+    Each frame is stretched from its 0.1th to its 99.9th percentile; pixels at full scale are red. Frames to
+    ``leave_out`` are not shown; where none are left, nothing is written.
 
-    Raises RunError when the run has no frames; FileError when ``path`` cannot be written.
+    Raises FileError when ``path`` cannot be written.
     """
     from matplotlib.figure import Figure
 
-    stored = sorted(run.records)
+    stored = sorted(set(run.records) - set(leave_out))
     if not stored:
-        raise RunError(run.path, "has no frames to show.")
+        return []
     chosen = np.unique(np.linspace(0, len(stored) - 1, min(len(stored), COLUMNS * ROWS)).round().astype(int))
     indices = [stored[i] for i in chosen]
     rows = -(-len(indices) // COLUMNS)
@@ -150,7 +200,7 @@ def run_paths(folder: Path) -> list[Path]:
     """Return the folders of the runs in a folder, the oldest first; empty where there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted(p for p in folder.iterdir() if not p.name.startswith(".") and (p / STATE).is_file())
+    return sorted(p for p in folder.iterdir() if not p.name.startswith(".") and is_run(p))
 
 
 def summary(path: Path) -> RunSummary:

@@ -1,16 +1,24 @@
-"""The log of a run: lines of JSON that are on the disk once they were appended, and those about frames."""
+"""The log of a run: lines of JSON that are on the disk once they were appended, and those about frames.
+
+Each line ends in the CRC-32 of what stands before it, so that a changed number is noticed like a broken line.
+Lines without one are of runs made before there were any.
+"""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+import re
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from drivers.frame import FrameMetadata
 from instrument.files.atomic import sync_folder
+from instrument.files.reading import parse_json
 from instrument.files.record import plain, value_of
 
 
@@ -29,6 +37,19 @@ class FrameRecord:
     unknown: Mapping[str, Any] = field(default_factory=dict)
     """Metadata that a newer version of this program has added: kept, and not used."""
 
+    def shape_and_type(self) -> tuple[tuple[int, ...], str]:
+        """Return the image's shape, ``(height, width)`` or ``(height, width, 3)``, and its type.
+
+        Raises ValueError when its size is no such image's.
+        """
+        height, width = (side // self.metadata.binning for side in self.metadata.roi[2:])
+        kinds = {1: "uint8", 2: "uint16", 4: "float32"}
+        for channels in (1, 3):
+            item, rest = divmod(self.n_bytes, max(1, height * width * channels))
+            if rest == 0 and item in kinds:
+                return (height, width) if channels == 1 else (height, width, 3), kinds[item]
+        raise ValueError(f"{self.n_bytes} bytes are no image of {height} x {width} pixels")
+
     def to_json(self) -> dict[str, Any]:
         """Return the log line."""
         return {
@@ -44,12 +65,17 @@ class FrameRecord:
     def from_json(cls, line: Mapping[str, Any]) -> FrameRecord:
         """Return what :meth:`to_json` wrote."""
         unknown: dict[str, Any] = {}
+        metadata = value_of(FrameMetadata, line["metadata"], unknown)
+        if not all(isinstance(number, int) for number in (*metadata.roi, metadata.binning)):
+            raise TypeError(f"region {metadata.roi} and binning {metadata.binning!r} are no whole numbers")
+        if metadata.binning < 1:
+            raise ValueError(f"there is no binning {metadata.binning}")
         return cls(
             index=int(line["index"]),
             n_bytes=int(line["n_bytes"]),
             crc32=int(line["crc32"], 16),
             average=int(line["average"]),
-            metadata=value_of(FrameMetadata, line["metadata"], unknown),
+            metadata=metadata,
             unknown=unknown,
         )
 
@@ -80,26 +106,54 @@ class Gap:
         return value_of(cls, line)
 
 
+@dataclass(frozen=True, slots=True)
+class Unlisted:
+    """An image without the line that says what it is: found by ``resume``, and kept where it is."""
+
+    index: int
+    n_bytes: int
+    crc32: str
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """A recording's frame that was stored, and is missing or damaged now."""
+
+    index: int
+    why: str
+
+
 Json = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class BadLine:
+    """A piece of a log that cannot be read, or is not as it was written."""
+
+    number: int
+    """Of the line in the file, from 1."""
+    data: bytes
+
+    @property
+    def is_torn(self) -> bool:
+        """Whether it is the half line that a crash left at the end."""
+        return not self.data.endswith(b"\n")
 
 
 class AppendOnlyLog:
     """A file of JSON lines that only ever grows.
 
-    A line counts once :meth:`append` has returned. A crash can leave one torn line at the end; opening the
-    log for writing removes it (``torn_bytes`` says how much that was).
+    A line counts once :meth:`append` has returned. A crash can leave one torn line at the end; what is
+    appended then begins on a line of its own.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
         try:
-            _, whole = read_lines(path)
-            self._size = whole
-            self.torn_bytes = os.fstat(self._handle).st_size - whole
-            if self.torn_bytes:
-                os.ftruncate(self._handle, whole)
-                os.fsync(self._handle)
+            self._size = os.fstat(self._handle).st_size
+            if self._size and os.pread(self._handle, 1, self._size - 1) != b"\n":
+                self._size += os.write(self._handle, b"\n")
             sync_folder(path.parent)
         except BaseException:
             os.close(self._handle)
@@ -107,8 +161,7 @@ class AppendOnlyLog:
 
     def append(self, records: Iterable[Json]) -> None:
         """Append records and wait until they are on the disk; all of them, or (raising) none."""
-        text = "".join(json.dumps(record, ensure_ascii=False) + "\n" for record in records)
-        data = text.encode()
+        data = b"".join(log_line(record) for record in records)
         try:
             written = 0
             while written < len(data):
@@ -126,23 +179,58 @@ class AppendOnlyLog:
             os.close(handle)
 
 
-def read_lines(path: Path) -> tuple[list[dict[str, Any]], int]:
-    """Return a log's records and how many of the file's bytes they fill.
+_SUM = "line_crc32"
+_SUM_BEGINS = f', "{_SUM}": "'.encode()
+_BEGINS = re.compile(rb'\{"kind": "')
+_LONGEST_LINE = 1 << 26
+"""Bytes; what is longer is no line of ours, and is read in pieces."""
 
-    Reading ends at the first line that is not whole: after a crash, that is the torn one at the end.
+
+def log_line(record: Json) -> bytes:
+    """Return a record as its line in the log."""
+    text = json.dumps(record, ensure_ascii=False).encode()
+    return text[:-1] + b'%s%08x"}\n' % (_SUM_BEGINS, zlib.crc32(text))
+
+
+def read_lines(path: Path) -> tuple[list[dict[str, Any]], list[BadLine]]:
+    """Return a log's records, and the pieces of it that are none.
+
+    What a bad byte spoils is one record: where it joined two lines, both are told apart again.
     """
     records: list[dict[str, Any]] = []
-    whole = 0
+    bad: list[BadLine] = []
     with path.open("rb") as file:
-        for line in file:
-            if not line.endswith(b"\n"):
-                break
-            try:
-                record = json.loads(line)
-            except ValueError:
-                break
-            if not isinstance(record, dict):
-                break
-            records.append(record)
-            whole += len(line)
-    return records, whole
+        for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), start=1):
+            record = _record(line) if line.endswith(b"\n") else None
+            if record is not None:
+                records.append(record)
+                continue
+            for piece in _pieces(line):
+                record = _record(piece) if len(piece) < len(line) else None
+                if record is not None:
+                    records.append(record)
+                else:
+                    bad.append(BadLine(number, piece))
+    return records, bad
+
+
+def _pieces(line: bytes) -> Iterator[bytes]:
+    """Cut a line where a record may begin within it."""
+    starts = [0, *(found.start() for found in _BEGINS.finditer(line) if found.start() > 0), len(line)]
+    return (line[a:b] for a, b in pairwise(starts))
+
+
+def _record(line: bytes) -> dict[str, Any] | None:
+    """Return a line's record; None where it is none, or not what was written."""
+    end = line.rfind(b"}") + 1
+    before, found, digits = line[: end - 1].rpartition(_SUM_BEGINS)
+    text = before + b"}" if found else line[:end]
+    if len(line) - end > 1 or (found and digits != b'%08x"' % zlib.crc32(text)):
+        return None
+    try:
+        record = parse_json(text)
+        if not found and isinstance(record, dict) and record.get("kind") == "frame":
+            FrameRecord.from_json(record)
+    except (LookupError, TypeError, ValueError, AttributeError):
+        return None
+    return record if isinstance(record, dict) else None

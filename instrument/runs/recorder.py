@@ -21,7 +21,8 @@ from instrument.plan.abilities import SPARE_BYTES
 from instrument.runs.acquire import free_bytes, record_of
 from instrument.runs.finish import end_run
 from instrument.runs.log import Gap
-from instrument.runs.run import FinishReason, Run, RunError
+from instrument.runs.run import FinishReason, Run
+from instrument.runs.run_files import RunError
 from instrument.runs.writer import FrameToStore, RunWriter
 from recon.base.declare import option, with_overrides
 
@@ -204,6 +205,8 @@ class Recorder:
         while not self._is_done():
             frame = reader.next_frame(0.1)
             if frame is None:
+                if self._stream is not None:
+                    self._stream.require_answer()
                 if not reader.is_running:  # STOP, from another thread
                     raise StoppedError(self._bench.camera.name, "its stream was stopped.")
                 continue

@@ -6,7 +6,6 @@ The folder's format is in docs/reference/run-folder.md.
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,20 +19,28 @@ import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
 from instrument.files.errors import FileError
-from instrument.files.record import RecordFormat
+from instrument.files.reading import parse_json, read_bytes
+from instrument.files.record import value_of
 from instrument.plan import Plan, Step
-from instrument.runs.frame_array import FrameArray, StoredChunk
-from instrument.runs.log import FrameRecord, Gap, read_lines
+from instrument.runs.frame_array import FrameArray, description_of
+from instrument.runs.log import FrameRecord, Gap, Lost, Unlisted, read_lines
+from instrument.runs.run_files import (
+    BENCH,
+    FRAMES,
+    LOCK,
+    LOG,
+    PLAN,
+    PROVENANCE,
+    RUN_STATE,
+    STATE,
+    RunError,
+    RunFiles,
+)
 
 if TYPE_CHECKING:
     import zarr
 
     from instrument.bench.photograph import Progress
-
-
-PLAN, BENCH, PROVENANCE, STATE = "plan.json", "bench.json", "provenance.json", "state.json"
-BENCH_TOML, LOG, FRAMES, LOCK = "bench.toml", "log.jsonl", "frames.ome.zarr", "lock"
-SLM_IMAGES = "slm"
 
 
 class FinishReason(StrEnum):
@@ -62,14 +69,6 @@ class RunCondition(StrEnum):
     FAILED = "failed"
 
 
-class RunError(FileError):
-    """A run folder that cannot be used as asked."""
-
-
-RUN_STATE = RecordFormat("diffuserbench run", "run's state", error=RunError, numbered_before=True)
-"""``state.json``; its version is that of the whole folder."""
-
-
 @dataclass(frozen=True, slots=True)
 class DamagedFrame:
     """A frame that the log calls written and that is not as it was written."""
@@ -96,32 +95,111 @@ class Run:
         The log's other lines: started, paused, resumed, finished ...
     state : mapping
         The fields of ``state.json``.
-    torn_bytes : int
-        Length of the half line that a crash left at the end of the log.
+    unlisted : dict of int to Unlisted
+        Images without a line about them, which ``resume`` found and kept: nothing is known of their making.
+    lost : dict of int to Lost
+        Frames of a recording that were stored, and that ``resume`` found missing or damaged.
+    bad_lines : list of BadLine
+        What cannot be read of the log.
+    files : RunFiles
+        The small files.
+    state_problem : str
+        What is wrong with ``state.json``, whose ``state`` is then the log's; otherwise empty.
+    log_is_foreign : bool
+        Whether ``log.jsonl`` is another run's; nothing is taken from it then.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.state: Mapping[str, Any] = RUN_STATE.read(path / STATE)
-        size = (path / LOG).stat().st_size
-        lines, whole = read_lines(path / LOG)
-        self.torn_bytes = max(0, size - whole)
+        try:
+            lines, self.bad_lines = read_lines(path / LOG)
+        except FileNotFoundError:
+            lines, self.bad_lines = [], []
+        self.files = RunFiles.of_log(path, lines)
+        stored, state_problem = self._stored_state()
+        self.log_is_foreign = self.files.log_is_foreign((stored or {}).get("id"))
+        if self.log_is_foreign:
+            lines, self.files = [], RunFiles(path)
         self.records: dict[int, FrameRecord] = {}
+        self.unlisted: dict[int, Unlisted] = {}
+        self.lost: dict[int, Lost] = {}
         gaps: list[Gap] = []
         events: list[Mapping[str, Any]] = []
         for line in lines:
-            if line.get("kind") == "frame":
-                record = FrameRecord.from_json(line)
-                self.records[record.index] = record
-            elif line.get("kind") == "gap":
-                gaps.append(Gap.from_json(line))
-            else:
-                events.append(line)
+            self._take(line, gaps, events)
         RUN_STATE.warn_unknown(
             path / LOG, sorted({name for r in self.records.values() for name in r.unknown})
         )
         self.gaps = tuple(gaps)
         self.events = tuple(events)
+        self.state_problem = state_problem
+        self.state: Mapping[str, Any] = stored if stored is not None else self.state_by_log()
+
+    def _take(self, line: Mapping[str, Any], gaps: list[Gap], events: list[Mapping[str, Any]]) -> None:
+        """Take what a line of the log says; of several about one frame the last counts."""
+        match line.get("kind"):
+            case "frame":
+                record = FrameRecord.from_json(line)
+                self.records[record.index] = record
+                self.lost.pop(record.index, None)
+                self.unlisted.pop(record.index, None)
+            case "gap":
+                gaps.append(Gap.from_json(line))
+            case "lost":
+                lost = value_of(Lost, _fields(line))
+                self.lost[lost.index] = lost
+                self.records.pop(lost.index, None)
+                self.unlisted.pop(lost.index, None)
+            case "unlisted":
+                unlisted = value_of(Unlisted, _fields(line))
+                self.unlisted[unlisted.index] = unlisted
+            case _:
+                events.append(line)
+
+    def _stored_state(self) -> tuple[dict[str, Any] | None, str]:
+        """Return what ``state.json`` says; None and why, where it says nothing that makes sense.
+
+        Raises RunError when it is of a version that is not known.
+        """
+        try:
+            found = parse_json(read_bytes(self.path / STATE, error=RunError))
+        except FileNotFoundError:
+            return None, "is gone"
+        except ValueError as error:
+            return None, f"is no valid JSON ({error})"
+        kind = found.get("format") if isinstance(found, dict) else None
+        if kind != RUN_STATE.name and not isinstance(kind, int):
+            return None, "is no state of a run"
+        state = RUN_STATE.checked(found, self.path / STATE)
+        missing = [name for name in ("label", "simulated", "state", "started_utc") if name not in state]
+        if missing:
+            return None, f"lacks {', '.join(missing)}"
+        if state["state"] == "finished" and state.get("reason") not in set(FinishReason):
+            return None, f"names no reason for the end: {state.get('reason')!r:.40}"
+        return state, ""
+
+    def state_by_log(self) -> dict[str, Any]:
+        """Return the state that the log and the other files tell of; raises RunError where they do not."""
+        provenance = self.files.table(PROVENANCE)
+        label = provenance.get("label", self.plan.label if self.plan is not None else self.path.name)
+        state = {
+            "label": label,
+            "simulated": bool(provenance["simulated"]),
+            "state": "running",
+            "started_utc": provenance["utc"],
+        }
+        if "id" in provenance:
+            state["id"] = provenance["id"]
+        ends = [event for event in self.events if event.get("kind") in ("started", "finished")]
+        last: Mapping[str, Any] = ends[-1] if ends else {}
+        if last.get("kind") == "finished":
+            state |= {
+                "state": "finished",
+                "reason": last["reason"],
+                "error": last["error"],
+                "finished_utc": last["utc"],
+            }
+        return state
 
     @classmethod
     def open(cls, path: Path | str) -> Run:
@@ -132,13 +210,13 @@ class Run:
         path = Path(path)
         if not path.is_dir():
             raise RunError(path, "no such folder." if not path.exists() else "is no folder.")
-        if not (path / STATE).is_file():
+        if not is_run(path):
             raise RunError(path, f"is no run folder: it has no {STATE}.", "diffuserbench list shows runs.")
         try:
             return cls(path)
         except PermissionError as error:
             raise RunError(error.filename or path, "may not be read (permission denied).") from None
-        except (FileNotFoundError, KeyError, TypeError, ValueError) as error:
+        except (OSError, LookupError, TypeError, ValueError, AttributeError) as error:
             raise RunError(path, f"is damaged: {error!r}.") from error
 
     # What it is ----------------------------------------------------------------------------------
@@ -153,6 +231,11 @@ class Run:
         if self.state["state"] == "finished":
             return RunCondition(self.state["reason"])
         return RunCondition.RUNNING if self.is_locked() else RunCondition.CRASHED
+
+    @property
+    def is_being_written(self) -> bool:
+        """Whether some program is at work on the run, so that a line of its log may be half there."""
+        return self.condition is RunCondition.RUNNING
 
     @property
     def reason(self) -> FinishReason | None:
@@ -173,22 +256,24 @@ class Run:
     def plan(self) -> Plan | None:
         """The plan; None for a recording."""
         path = self.path / PLAN
-        if not path.exists():
+        if self.files.text(PLAN) is None:
+            if any("steps" in event for event in self.events if event.get("kind") == "started"):
+                raise RunError(path, "is gone, and the log has no copy of it.", "Put it back from a backup.")
             return None
         with RUN_STATE.damaged(path):
-            plan, unknown = Plan.with_unknown(self._json(PLAN), path)
+            plan, unknown = Plan.with_unknown(self.files.table(PLAN), path)
         RUN_STATE.warn_unknown(path, unknown)
         return plan.with_slm_images(lambda image: self.path / image)
 
     @cached_property
     def provenance(self) -> dict[str, Any]:
         """Software versions, host, git commit, devices."""
-        return self._json(PROVENANCE)
+        return self.files.table(PROVENANCE)
 
     @cached_property
     def bench(self) -> dict[str, Any]:
         """The bench's configuration as used, defaults included."""
-        return self._json(BENCH)
+        return self.files.table(BENCH)
 
     @property
     def start(self) -> Step:
@@ -206,7 +291,7 @@ class Run:
         if self.plan is not None:
             return len(self.plan)
         ends = [gap.first + gap.count for gap in self.gaps]
-        return max([*ends, *(index + 1 for index in self.records)], default=0)
+        return max([*ends, *(index + 1 for index in (*self.records, *self.unlisted, *self.lost))], default=0)
 
     @property
     def frame_period_s(self) -> float | None:
@@ -223,14 +308,25 @@ class Run:
     @property
     def has_frames(self) -> bool:
         """Whether any frame was ever stored."""
-        return (self.path / FRAMES / "zarr.json").exists()
+        return FrameArray.is_there(self.path / FRAMES)
 
     @cached_property
     def array(self) -> FrameArray:
-        """The stored frames."""
+        """The stored frames.
+
+        Raises RunError when there are none yet, or nothing says any more what they are.
+        """
         if not self.has_frames:
             raise RunError(self.path, "has no frames yet.")
-        return FrameArray(self.path / FRAMES)
+        first = next(iter(self.records.values()), None)
+        try:
+            array = FrameArray(self.path / FRAMES)
+            if first is None or array.frame_bytes == first.n_bytes:
+                return array
+        except (OSError, LookupError, TypeError, ValueError, FileError) as error:
+            if first is None:
+                raise RunError(self.path / FRAMES, f"is damaged: {error}.") from error
+        return FrameArray(self.path / FRAMES, description_of(self.n_frames, *first.shape_and_type()))
 
     @property
     def frames(self) -> zarr.Array[Any]:
@@ -248,8 +344,9 @@ class Run:
         Raises RunError when it was not stored.
         """
         index = index.index if isinstance(index, Step) else index
-        if index not in self.records:
-            raise RunError(self.path, f"frame {index} was not stored ({self.condition}).")
+        if index not in self.records and index not in self.unlisted:
+            why = f"is lost: {self.lost[index].why}" if index in self.lost else "was not stored"
+            raise RunError(self.path, f"frame {index} {why} ({self.condition}).")
         return self.array.read(index)
 
     def metadata(self, index: int | Step) -> FrameMetadata:
@@ -278,31 +375,45 @@ class Run:
 
     def verify(self, index: int) -> DamagedFrame | None:
         """Read a recorded frame's file and hold it against the log; None when it is as it was written."""
-        record = self.records[index]
         if not self.has_frames:
             return DamagedFrame(index, "the image array is gone")
+        n_bytes, crc32 = self._written(index)
+        there = self.array.n_bytes(index)
+        if there is not None and there != n_bytes:
+            return DamagedFrame(index, f"its file has {there} bytes; written were {n_bytes}")
         found = self.array.checksum(index)
         if found is None:
             return DamagedFrame(index, "its file is gone")
-        if found != StoredChunk(record.n_bytes, record.crc32):
-            return DamagedFrame(
-                index,
-                f"its file has {found.n_bytes} bytes and CRC-32 {found.crc32:08x}; "
-                f"written were {record.n_bytes} bytes and {record.crc32:08x}",
-            )
+        if found.crc32 != crc32:
+            return DamagedFrame(index, f"its file has the CRC-32 {found.crc32:08x}; written was {crc32:08x}")
         return None
 
-    def damaged(self, on_progress: Progress | None = None) -> tuple[DamagedFrame, ...]:
-        """Read every recorded frame; return those that are not as they were written.
+    def _written(self, index: int) -> tuple[int, int]:
+        """Return the size and the CRC-32 of a frame as it was written."""
+        if (record := self.records.get(index)) is not None:
+            return record.n_bytes, record.crc32
+        return self.unlisted[index].n_bytes, int(self.unlisted[index].crc32, 16)
 
-        ``on_progress`` is called with frames read and frames to read.
+    def damaged(self, on_progress: Progress | None = None, *, read: bool = True) -> tuple[DamagedFrame, ...]:
+        """Return the frames that are not as they were written.
+
+        ``on_progress`` is called with frames read and frames to read. ``read``: False only looks at the
+        files' sizes.
         """
         found = []
-        for count, index in enumerate(sorted(self.records), start=1):
+        listed = sorted({*self.records, *self.unlisted})
+        for count, index in enumerate(listed, start=1):
+            if not read and self.has_frames and self.array.n_bytes(index) == self._written(index)[0]:
+                continue
             found.append(self.verify(index))
             if on_progress is not None:
-                on_progress(count, len(self.records))
+                on_progress(count, len(listed))
         return tuple(frame for frame in found if frame is not None)
+
+    def without_a_line(self) -> list[int]:
+        """Return the images on the disk that no line of the log is about, in order."""
+        known = {*self.records, *self.unlisted, *self.lost}
+        return [index for index in FrameArray.indices(self.path / FRAMES) if index not in known]
 
     def is_locked(self) -> bool:
         """Whether some program has the run open for writing."""
@@ -318,11 +429,14 @@ class Run:
             os.close(handle)
         return False
 
-    def _json(self, name: str) -> dict[str, Any]:
-        found = json.loads((self.path / name).read_text())
-        if not isinstance(found, dict):
-            raise ValueError(f"{name} holds no table")
-        return found
-
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r}, {self.condition}, {len(self.records)} of {self.n_frames} frames)"
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder is a run's, even where one of its files is gone."""
+    return (path / STATE).is_file() or ((path / LOG).is_file() and (path / PROVENANCE).is_file())
+
+
+def _fields(line: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in line.items() if name != "kind"}

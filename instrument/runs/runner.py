@@ -211,6 +211,11 @@ class Runner:
         return self._writer.path
 
     @property
+    def mended(self) -> tuple[str, ...]:
+        """What was done to the files of a run that goes on, in words."""
+        return self._writer.mended or ()
+
+    @property
     def is_pausing(self) -> bool:
         """Whether the run is paused, or will be before its next step."""
         with self._condition:
@@ -251,6 +256,10 @@ class Runner:
         stop_until(stop, self._finished, once=executes_here)
 
     # In one thread -------------------------------------------------------------------------------
+    def keep_text(self, name: str, text: str) -> None:
+        """Write one more small file of the run: what a routine knows of it; RunError when the disk fails."""
+        self._writer.keep_text(name, text)
+
     def discard(self) -> None:
         """Close the run's files without carrying anything out; it can be resumed."""
         self._writer.close()

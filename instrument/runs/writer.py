@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import hashlib
 import os
 import platform
 import re
+import secrets
 import shutil
 import socket
 import subprocess
@@ -24,12 +24,14 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
-from instrument.files.atomic import make_folder, sync_folder, write_bytes, write_json
+from instrument.files.atomic import json_text, make_folder, sync_folder, write_bytes, write_json
 from instrument.files.record import plain
 from instrument.plan import Plan
 from instrument.runs.frame_array import FrameArray
-from instrument.runs.log import AppendOnlyLog, FrameRecord, Gap
-from instrument.runs.run import (
+from instrument.runs.log import AppendOnlyLog, FrameRecord, Gap, log_line
+from instrument.runs.repair import keep_beside, mend_files, settle_recording
+from instrument.runs.run import FinishReason, Run
+from instrument.runs.run_files import (
     BENCH,
     BENCH_TOML,
     FRAMES,
@@ -40,9 +42,9 @@ from instrument.runs.run import (
     RUN_STATE,
     SLM_IMAGES,
     STATE,
-    FinishReason,
-    Run,
     RunError,
+    log_size,
+    slm_image_name,
 )
 
 _PACKAGES = ("diffuserbench", "numpy", "scipy", "opencv-contrib-python-headless", "pydantic")
@@ -102,6 +104,8 @@ def _disk(path: Path, what: str) -> Iterator[None]:
 
 _FULL, _FORBIDDEN = (errno.ENOSPC, errno.EDQUOT), (errno.EACCES, errno.EPERM, errno.EROFS)
 _FIRST_CAPACITY = 256
+_TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]+)?")
+"""Names that a file has while it is written whole."""
 """Frames that a recording's array is made for at first; it doubles as needed."""
 
 
@@ -137,10 +141,16 @@ class RunWriter:
 
     :meth:`create` or :meth:`reopen` one, :meth:`write` frames, :meth:`finish`. A frame for which ``write``
     has returned is on the disk with its metadata, and survives ``kill -9`` and a power cut.
+
+    Attributes
+    ----------
+    mended : tuple of str
+        What :meth:`reopen` did to the run's files, in words; None in a new run.
     """
 
     def __init__(self, path: Path, lock: int) -> None:
         self.path = path
+        self.mended: tuple[str, ...] | None = None
         self._lock = lock
         try:
             run = Run.open(path)
@@ -178,21 +188,28 @@ class RunWriter:
             draft = parent / f".{path.name}.draft"
             draft.mkdir()
             try:
+                facts, identity = plain(bench), {"id": secrets.token_hex(8), "label": label}
+                texts = {
+                    BENCH: json_text(facts.pop("config")),
+                    BENCH_TOML: facts.pop("toml"),
+                    PROVENANCE: json_text(
+                        {**identity, **provenance(), **facts, "calibrations": list(calibrations)}
+                    ),
+                }
                 if plan is not None:
-                    write_bytes(draft / PLAN, plan_with_copies(plan, draft).to_json().encode())
-                facts = plain(bench)
-                write_json(draft / BENCH, facts.pop("config"))
-                write_bytes(draft / BENCH_TOML, facts.pop("toml").encode())
-                write_json(draft / PROVENANCE, {**provenance(), **facts, "calibrations": list(calibrations)})
+                    texts[PLAN] = plan_with_copies(plan, draft).to_json()
+                for name, text in texts.items():
+                    write_bytes(draft / name, text.encode())
                 state = {
-                    "label": label,
+                    **identity,
                     "simulated": bench.simulated,
                     "state": "running",
                     "started_utc": datetime.now(UTC).isoformat(),
                     "pid": os.getpid(),
                 }
                 write_json(draft / STATE, RUN_STATE.stamped(state))
-                write_bytes(draft / LOG, b"")
+                copies = (log_line({"kind": "file", "name": n, "text": text}) for n, text in texts.items())
+                write_bytes(draft / LOG, b"".join(copies))
                 write_bytes(draft / LOCK, b"")
                 lock = lock_run(draft)
                 draft.rename(path)
@@ -203,17 +220,29 @@ class RunWriter:
         return cls(path, lock)
 
     @classmethod
-    def reopen(cls, path: Path | str) -> RunWriter:
-        """Open a run folder to continue it.
+    def reopen(cls, path: Path | str, *, log_bytes: int | None = None) -> RunWriter:
+        """Open a run folder to continue it; its damaged files are made again (``mended`` says which).
 
-        Raises RunError when it is no run, or some program writes to it now.
+        ``log_bytes`` is the log's size when the run was looked at: what was found then still holds.
+
+        Raises RunError when it is no run, some program writes to it now or has since it was looked at, or its
+        log is another run's.
         """
         path = Run.open(path).path
         with _disk(path, "cannot be continued"):
-            writer = cls(path, lock_run(path))
-            for leftover in path.glob(".*"):  # of a write that a crash cut off
-                if leftover.is_file():
-                    leftover.unlink()
+            lock = lock_run(path)
+            try:
+                if log_bytes not in (None, log_size(path)):
+                    raise RunError(path, "was written to while it was looked at.", "Try once more.")
+                for leftover in path.glob(".*"):  # of a write that a crash cut off
+                    if leftover.is_file() and _TEMPORARY.fullmatch(leftover.name):
+                        leftover.unlink()
+                mended = mend_files(path)
+            except BaseException:
+                os.close(lock)
+                raise
+            writer = cls(path, lock)
+            writer.mended = tuple(mended)
         return writer
 
     def start(self, **fields: Any) -> None:
@@ -235,6 +264,8 @@ class RunWriter:
                 array = self._array or self._make_array(frames)
                 if self._is_recording and (last := max(f.index for f in frames)) >= array.n_frames:
                     array.resize(max(last + 1, 2 * array.n_frames))
+                if self.mended is not None:
+                    self._keep_images(array, frames)
                 images = [(f.index, f.image.astype(np.float32) if self._float else f.image) for f in frames]
                 stored = array.write(images)
                 self._log.append(
@@ -243,6 +274,24 @@ class RunWriter:
                 )
         except ValueError as error:
             raise RunError(self.path, f"does not take a frame: {error}") from error
+
+    def _keep_images(self, array: FrameArray, frames: Sequence[FrameToStore]) -> None:
+        """Keep beside what these frames are about to take the place of."""
+        for frame in frames:
+            image = array.chunk_path(frame.index)
+            if image.is_file():
+                keep_beside(self.path, str(image.relative_to(self.path)))
+
+    def keep_text(self, name: str, text: str) -> None:
+        """Write one more small file of the run, with its copy in the log."""
+        with _disk(self.path, f"{name} could not be written"):
+            write_bytes(self.path / name, text.encode())
+        self._append({"kind": "file", "name": name, "text": text})
+
+    def settle(self, damaged: Mapping[int, str]) -> list[str]:
+        """Say in a recording's log what became of damaged frames (why, by frame) and of unlisted images."""
+        with _disk(self.path, "its log could not be written"):
+            return settle_recording(Run.open(self.path), self._log, damaged)
 
     def note(self, kind: str, **fields: Any) -> None:
         """Append an event to the log; ``utc`` is added."""
@@ -265,7 +314,8 @@ class RunWriter:
         try:
             with _disk(self.path, "its array could not be trimmed"):
                 self._trim()
-            self.note("finished", **ended)
+            sums = self._array.description_sums() if self._array is not None else {}
+            self.note("finished", **ended, descriptions=sums)
             self._set_state(state="finished", **ended, finished_utc=datetime.now(UTC).isoformat())
         finally:
             self.close()
@@ -317,7 +367,7 @@ def plan_with_copies(plan: Plan, folder: Path) -> Plan:
     copies: dict[Path, Path] = {}
     for path in plan.slm_images:
         data = path.read_bytes()
-        copies[path] = Path(SLM_IMAGES) / f"{hashlib.sha256(data).hexdigest()[:16]}{path.suffix}"
+        copies[path] = Path(SLM_IMAGES) / slm_image_name(data, path.suffix)
         write_bytes(folder / copies[path], data)
     return plan.with_slm_images(copies.__getitem__)
 

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from recon.analysis.correlation import autocorrelate, correlate, cut_to_light, lit_extent, similarity
 from recon.camera.refocus import central_psfs, refocus
 from recon.camera.registration import register
+from recon.camera.transformed import geometric_centre, resampled
 from recon.errors import InputError
 from recon.types import Calibration
 
@@ -175,16 +176,10 @@ def _block_displacements(
 
 def _undone(image: Array, factor: complex, shift: complex) -> npt.NDArray[np.float32]:
     """Return ``image(factor p + shift)``: cubic splines, zero beyond the border."""
-    from scipy import ndimage
-
     # (r + i c)(a + i b) = (a r - b c) + i (b r + a c)
     matrix = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
-    centre = (np.array(image.shape) - 1) / 2
-    offset = centre + np.array([shift.real, shift.imag]) - matrix @ centre
-    result: npt.NDArray[np.float32] = ndimage.affine_transform(
-        np.asarray(image, np.float32), matrix, offset, order=3
-    )
-    return np.maximum(result, 0)
+    centre = geometric_centre(image)
+    return resampled(image, matrix, centre + np.array([shift.real, shift.imag]) - matrix @ centre)
 
 
 def _at(old: Calibration, z_um: float) -> Array:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.noise import NoiseModel
+from recon.base.blocks import block_mean
+from recon.base.noise import NoiseModel, estimate_deviation
 from recon.errors import InputError
 from recon.types import Calibration
 
@@ -18,6 +19,21 @@ SATURATED_SHARE = 1e-5
 
 SATURATED_LIGHT = 0.01
 """Share of a PSF's light in saturated pixels from which the picture suffers."""
+
+SAME = 1 - 1e-6
+"""Correlation of two images that are one: of two of the same scene the noise differs."""
+SAME_PX = 250_000
+"""On so many pixels, about, of each depth."""
+SHARPER = 3.0
+"""How many times as strong a photograph's details may be: measured ones have 0.16 times the PSF's at most."""
+DETAIL_PX = 200
+"""Longest side that details are looked for on, pixels, about."""
+DARKEST = 1.0
+"""Percentile of the pixels that is black."""
+LEAST_PX = 32
+"""Sides of images so small tell nothing of frequencies."""
+DETAILS = ((0.1, 0.25), (0.02, 0.06))
+"""Spatial frequencies of details and of coarser structure, cycles a pixel."""
 
 
 def as_channels(image: npt.ArrayLike, name: str) -> npt.NDArray[np.float32]:
@@ -91,6 +107,69 @@ def check_psf(psfs: npt.NDArray[np.float32]) -> tuple[str, ...]:
                 f"{where} is negative in {negative:.0%} of its absolute sum: check the background subtracted."
             )
     return tuple(warnings)
+
+
+def require_photograph(
+    data: npt.NDArray[np.float32], psfs: npt.NDArray[np.float32], valid: npt.NDArray[np.bool_]
+) -> None:
+    """Refuse what no scene gives: the PSF itself for a photograph, and the two swapped.
+
+    A photograph is the PSF's pattern many times over, ``|B(f)| / B(0) <= |H(f)| / H(0)`` for light that is
+    nowhere negative: its details are fainter beside its light than the PSF's, at best, of a single point, as
+    strong.
+
+    Parameters
+    ----------
+    data : ndarray, (n_channels, height, width)
+        Background removed.
+    psfs : ndarray, (n_z, 1 or n_channels, height, width)
+        Of each depth, background removed.
+    valid : ndarray of bool, as ``data``
+        Pixels that are not erased.
+
+    Raises InputError when they are the same image or swapped.
+    """
+    if min(data.shape[1:]) < LEAST_PX:
+        return
+    step = max(1, round((data[0].size / SAME_PX) ** 0.5))
+    few, known = data[:, ::step, ::step], valid[:, ::step, ::step]
+    for plane in psfs:
+        psf = np.broadcast_to(plane[:, ::step, ::step], few.shape)
+        lit = known & (psf > np.median(psf))  # background may have been cut off at zero
+        one, other = few[lit], psf[lit]
+        if lit.any() and np.ptp(one) > 0 and np.ptp(other) > 0 and np.corrcoef(one, other)[0, 1] > SAME:
+            raise InputError(
+                "PSF and photograph are the same image: give the photograph of the scene, and the one of a "
+                "point source as the PSF."
+            )
+    seen = np.where(valid, data, [[[np.median(d[v])]] for d, v in zip(data, valid, strict=True)])
+    middle = psfs[len(psfs) // 2]
+    (of_data, fine_data), (of_psf, fine_psf) = (_details(image.mean(axis=0)) for image in (seen, middle))
+    if of_data > SHARPER * of_psf and fine_data > 0.5 * fine_psf:
+        raise InputError(
+            "PSF and photograph seem to be swapped: beside its light the photograph's details are "
+            f"{of_data / of_psf:.3g} times as strong as the PSF's, and no scene makes them stronger. "
+            "Exchange the two."
+        )
+
+
+def _details(image: npt.NDArray[np.float32]) -> tuple[float, float]:
+    """Return how strong details of four to ten pixels are beside the light, and beside coarser ones.
+
+    Light is what exceeds the darkest pixels: a black level that was not subtracted is none.
+    """
+    small = block_mean(image, max(1, max(image.shape) // DETAIL_PX))
+    noise = estimate_deviation(image, np.ones(image.shape, bool)) ** 2 * small.size**2 / image.size
+    window = np.outer(*(np.hanning(n + 2)[1:-1] for n in small.shape))
+    level = float(np.sum(small * window) / np.sum(window))
+    power = np.abs(np.fft.rfft2((small - level) * window)) ** 2 / np.mean(window**2)
+    frequency = np.hypot(np.fft.fftfreq(small.shape[0])[:, None], np.fft.rfftfreq(small.shape[1]))
+    fine, coarse = (
+        max(float(np.mean(power[(low < frequency) & (frequency < high)])) - noise, 0.0)
+        for low, high in DETAILS
+    )
+    light = level - float(np.percentile(small, DARKEST))
+    return fine**0.5 / max(light * small.size, 1e-30), fine / max(coarse, 1e-30)
 
 
 def saturated_share(image: npt.NDArray[Any]) -> float:

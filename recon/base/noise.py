@@ -44,7 +44,8 @@ _PLANE: Stencil = tuple((i, j, _LINE[i] * _LINE[j]) for i in range(3) for j in r
 _ROW: Stencil = tuple((0, j, _LINE[j]) for j in range(3))
 _PAIR: Stencil = ((0, 0, 1.0), (0, 1, -1.0))
 ENOUGH = 256
-"""Stencils from which a median is trusted."""
+"""Stencils from which a median is trusted as it is: with fewer, the one that says least, errors included, as
+structure only ever adds."""
 
 TILE = 16
 """Side of the tiles within which noise is taken for even, pixels."""
@@ -76,15 +77,16 @@ def estimate_deviation(measurement: npt.NDArray[Any], valid: npt.NDArray[np.bool
     """
     m = np.asarray(measurement, np.float64)
     v = np.ones(m.shape, bool) if valid is None else valid
-    best, count = np.full((1, 1), np.nan), 0
+    best, least, enough = None, np.inf, min(ENOUGH, m.size // 4)
     for stencil, stride in ((s, n) for s in (_PLANE, _ROW, _PAIR) for n in (1, 2)):
         samples = np.abs(_apply(stencil, stride, m, v))
         found = int(np.count_nonzero(~np.isnan(samples)))
-        if found > count:
-            best, count = samples, found
-        if count >= min(ENOUGH, m.size // 4):
+        bound = float(np.nanmedian(samples)) * (1 + 2 / np.sqrt(found)) if found else np.inf
+        if bound < least:
+            best, least = samples, bound
+        if found >= enough:
             break
-    if count == 0:
+    if best is None:
         return 0.0
     # A Gaussian's median magnitude is 0.6745 deviations.
     overall = float(np.nanmedian(best)) / 0.6745

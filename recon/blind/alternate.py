@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.blind.points import Points
-from recon.blind.polish import first_psf, offset_of, points_on_grid, polish
+from recon.blind.polish import first_psf, offset_of, polish
 from recon.blind.psf_step import BeadMixer, refuse_what_is_no_beads, solve_psfs
 from recon.camera.convolution import field_of
+from recon.camera.points import Points, points_on_grid
 from recon.camera.registration import shifted
 from recon.camera.varying_psfs import FieldOfPsfs, interpolation_weights, local_convolution
 from recon.errors import InputError

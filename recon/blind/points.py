@@ -7,272 +7,80 @@ than a pixel this model error exceeds the noise. A point with a continuous place
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
+from recon.camera.base import LinearOperator
 from recon.camera.convolution import field_of
+from recon.camera.points import FieldFunctions, Points
 
 Array = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 Numbers = npt.NDArray[Any]
 
 
-class FieldFunctions:
-    """What PSFs vary with: polynomials of the field's coordinates, orthonormal over the places of the beads.
-
-    PSFs that are combinations of ``k`` images weighted with ``k`` functions have rank ``k`` at most (Kuo
-    2020, Eq. 5.13), and vary over the field no faster than the functions do: 1, 3, 6 for degrees 0, 1, 2.
-    Beyond the rectangle of the beads, where nothing was measured, they stay what they are at its border.
-
-    Parameters
-    ----------
-    degree : int
-    places : ndarray, (n, 2)
-        ``(row, column)`` of the beads; at least as many as functions, not all on a line.
-    """
-
-    def __init__(self, degree: int, places: Floats) -> None:
-        self.degree = degree
-        self._low, self._high = places.min(axis=0), places.max(axis=0)
-        _, upper = np.linalg.qr(self._monomials(places) / np.sqrt(len(places)))
-        # QR leaves the signs open; like this the first function is 1, and its image the mean PSF.
-        self._to_orthonormal = upper * np.sign(np.diag(upper))[:, None]
-        self.count = len(upper)
-
-    def at(self, places: Floats) -> Floats:
-        """Return the functions' values at places (n, 2): (n, count)."""
-        return np.asarray(np.linalg.solve(self._to_orthonormal.T, self._monomials(places).T).T)
-
-    def _monomials(self, places: Floats) -> Floats:
-        middle, half = (self._low + self._high) / 2, np.maximum((self._high - self._low) / 2, 1e-9)
-        row, column = np.clip((places - middle) / half, -1, 1).T
-        powers = [(n - m, m) for n in range(self.degree + 1) for m in range(n + 1)]
-        return np.stack([row**i * column**j for i, j in powers], axis=1)
-
-
-_MARGIN = 4  # pixels around a PSF for the tails of a shift between pixels
-_LARGEST_MOVE_PX = 0.5
-_HALVINGS = 3
-_SAME_PX = 0.7  # points nearer to one another are one
-_WEAKEST = 0.15  # of the median light: what is dimmer is no bead of the slide
-_SURE = 5.0  # times its own noise, for a bead to be believed
 _BLUR_PX = 0.8  # of the image in which the support is found
 _ABOVE_NOISE = 3.0  # standard deviations: fainter pixels would sum to a haze of noise
 _LEAST_PX = 4  # pixels in one piece
 
 
-@dataclass(frozen=True, slots=True)
-class Points:
-    """The beads of one image.
+class Mixer(LinearOperator):
+    """The map from PSFs to images in which each image is a sum of the PSFs' convolutions, cropped.
 
-    Attributes
-    ----------
-    places : ndarray, float64, (n, 2)
-        ``(row, column)`` from the axis, object pixels.
-    light : ndarray, float64, (n,)
+    Subclasses fill ``_spectra``, of what image ``i`` has of PSF ``k``: (n_images, n_psfs, *spectrum); and
+    ``lipschitz``, a bound of the squared norm.
     """
 
-    places: Floats
-    light: Floats
+    lipschitz: float
 
-    def __len__(self) -> int:
-        return len(self.light)
-
-
-class PointImages:
-    """What points look like through PSFs that vary over the field.
-
-    Parameters
-    ----------
-    psfs : ndarray, float32, (n_functions, height, width)
-        One image a field function.
-    functions : FieldFunctions
-    sensor_shape : (int, int)
-    """
-
-    def __init__(self, psfs: Array, functions: FieldFunctions, sensor_shape: tuple[int, int]) -> None:
-        self._functions, self._sensor = functions, sensor_shape
-        self.psfs = psfs
-        self._shape = psfs.shape[1] + 2 * _MARGIN, psfs.shape[2] + 2 * _MARGIN
-        self._f_y = np.fft.fftfreq(self._shape[0])[:, None]
-        self._f_x = np.fft.rfftfreq(self._shape[1])[None, :]
-
-    def patch(self, place: Floats, *, slopes: bool = False) -> tuple[Array, tuple[slice, slice]]:
-        """Return the image of a point of unit light and where on the sensor it lies.
-
-        Parameters
-        ----------
-        place : ndarray, (2,)
-        slopes : bool
-            Also its derivatives along rows and columns.
-
-        Returns
-        -------
-        ndarray, float32, (1 or 3, rows, columns)
-            Cut to the sensor.
-        (slice, slice)
-        """
-        weights = self._functions.at(place[None])[0].astype(np.float32)
-        padded = np.zeros(self._shape, np.float32)
-        padded[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN] = np.tensordot(weights, self.psfs, 1)
-        whole = np.round(place).astype(int)
-        part = place - whole
-        spectrum = np.fft.rfft2(padded) * np.exp(-2j * np.pi * (self._f_y * part[0] + self._f_x * part[1]))
-        spectra = [spectrum]
-        if slopes:
-            spectra += [-2j * np.pi * self._f_y * spectrum, -2j * np.pi * self._f_x * spectrum]
-        images = np.fft.irfft2(np.stack(spectra), s=self._shape, axes=(1, 2)).astype(np.float32)
-        inside, on_sensor = [], []
-        for axis in (0, 1):
-            p, s = self.psfs.shape[1 + axis], self._sensor[axis]
-            first = s // 2 - p // 2 + int(whole[axis]) - _MARGIN
-            low, high = min(max(first, 0), s), min(max(first + self._shape[axis], 0), s)
-            inside.append(slice(low - first, high - first))
-            on_sensor.append(slice(low, high))
-        return images[:, inside[0], inside[1]], (on_sensor[0], on_sensor[1])
-
-    def image(self, points: Points) -> Array:
-        """Return the image (height, width) of all points."""
-        seen = np.zeros(self._sensor, np.float32)
-        for place, light in zip(points.places, points.light, strict=True):
-            patch, where = self.patch(place)
-            seen[where] += np.float32(light) * patch[0]
-        return seen
-
-
-def refine(camera: PointImages, image: Array, points: Points, sweeps: int = 2) -> tuple[Points, Array]:
-    """Fit place and light of each point in turn, the others fixed: Gauss-Newton steps that only descend.
-
-    Returns
-    -------
-    Points
-    ndarray, float32, (height, width)
-        What is left of the image.
-    """
-    places, light = points.places.copy(), points.light.copy()
-    left = image - camera.image(points)
-    for _ in range(sweeps):
-        for k in range(len(light)):
-            places[k], light[k] = _refined(camera, left, places[k], float(light[k]))
-    return Points(places, light), left
-
-
-def _refined(camera: PointImages, left: Array, place: Floats, light: float) -> tuple[Floats, float]:
-    """Improve one point; ``left`` is kept up to date."""
-    patch, where = camera.patch(place, slopes=True)
-    if not patch.any():
-        return place, light
-    left[where] += np.float32(light) * patch[0]  # the data for this point alone
-    columns = patch.reshape(3, -1).astype(np.float64)
-    columns[1:] *= light
-    normal = columns @ columns.T + 1e-9 * np.eye(3) * float(columns[0] @ columns[0])
-    step = np.linalg.lstsq(normal, columns @ left[where].ravel() - normal[:, 0] * light, rcond=None)[0]
-    move = step[1:] * min(1.0, _LARGEST_MOVE_PX / max(float(np.abs(step[1:]).max()), 1e-12))
-    best_place, best_light, best_gain = place, *_fitted(patch[0], left[where])
-    best = patch[0], where
-    for _ in range(_HALVINGS):
-        new_patch, new_where = camera.patch(place + move)
-        new_light, gain = _fitted(new_patch[0], left[new_where])
-        if gain > best_gain:
-            best_place, best_light, best = place + move, new_light, (new_patch[0], new_where)
-            break
-        move = move / 2
-    left[best[1]] -= np.float32(best_light) * best[0]
-    return best_place, best_light
-
-
-def _fitted(patch: Array, data: Array) -> tuple[float, float]:
-    """Return the best light, not negative, and by how much it lessens the squared misfit."""
-    energy = float(np.vdot(patch, patch))
-    inner = max(float(np.vdot(patch, data)), 0.0)
-    return (inner / energy, inner**2 / energy) if energy > 0 else (0.0, 0.0)
-
-
-def cleaned(camera: PointImages, points: Points, noise: float) -> Points:
-    """Merge points that are one, and drop those too dim to be beads."""
-    order = np.argsort(-points.light)
-    places: list[Floats] = []
-    light: list[float] = []
-    for k in order:
-        near = [i for i, place in enumerate(places) if np.hypot(*(place - points.places[k])) < _SAME_PX]
-        if near:
-            light[near[0]] += float(points.light[k])
-        else:
-            places.append(points.places[k])
-            light.append(float(points.light[k]))
-    if not light:
-        return points
-    sure = _SURE * noise / float(np.linalg.norm(camera.patch(np.zeros(2))[0]) + 1e-30)
-    least = max(_WEAKEST * float(np.median(light)), sure)
-    kept = np.array(light) >= least
-    return Points(np.array(places)[kept].reshape(-1, 2), np.array(light)[kept])
-
-
-def overlooked(camera: PointImages, left: Array, points: Points, noise: float) -> Points:
-    """Return the points with those added that still stand out of what is left of the image."""
-    from scipy import ndimage
-
-    patch, where = camera.patch(np.zeros(2))
-    energy = float(np.vdot(patch[0], patch[0]))
-    if energy == 0 or not len(points):
-        return points
-    kernel = np.zeros_like(left)
-    kernel[where] = patch[0]
-    grid = fft.fast_shape([2 * n for n in left.shape])
-    spectra = [np.fft.rfft2(a, s=grid) for a in (left, kernel)]
-    correlation = np.fft.irfft2(spectra[0] * np.conj(spectra[1]), s=grid) / energy
-    reach = [min(n, m // 2) for n, m in zip(left.shape, grid, strict=True)]
-    rolled = np.roll(correlation, reach, axis=(0, 1))[: 2 * reach[0], : 2 * reach[1]]
-    least = max(_SURE * noise / np.sqrt(energy), 2 * _WEAKEST * float(np.median(points.light)))
-    peaks = (rolled == ndimage.maximum_filter(rolled, 5)) & (rolled > least)
-    found = np.argwhere(peaks).astype(np.float64) - reach
-    distant = [f for f in found if np.hypot(*(points.places - f).T).min() > 2 * _SAME_PX]
-    if not distant:
-        return points
-    added = np.array(distant)
-    lights = np.array([rolled[int(r) + reach[0], int(c) + reach[1]] for r, c in added])
-    return Points(np.concatenate([points.places, added]), np.concatenate([points.light, lights]))
-
-
-class Mixer:
-    """A linear map from PSFs to images in which each image is a sum of the PSFs' convolutions, cropped.
-
-    Subclasses fill ``_spectra``: of what image ``i`` has of PSF ``k``, (n_images, n_psfs, *spectrum).
-    """
-
-    _spectra: npt.NDArray[np.complex64]
-
-    def __init__(self, psf_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> None:
-        self._psf, self._sensor = psf_shape, sensor_shape
+    def __init__(
+        self, counts: tuple[int, int], psf_shape: tuple[int, int], sensor_shape: tuple[int, int]
+    ) -> None:
+        n_images, n_psfs = counts
+        super().__init__((n_psfs, *psf_shape), (n_images, *sensor_shape), np.float32)
         self._grid = fft.fast_shape(field_of(sensor_shape, psf_shape)[0])
+        self._spectra = np.empty((*counts, *fft.spectrum_shape(self._grid)), np.complex64)
+        self._seen = np.empty((n_images, *self._spectra.shape[2:]), np.complex64)
+        self._rows = np.empty((n_images, sensor_shape[0], self._grid[1]), np.float32)
 
-    def forward(self, psfs: Numbers) -> Array:
+    def forward(self, x: Numbers, out: Array | None = None) -> Array:
         """Return images (n_images, height, width) of PSFs (n_psfs, psf height, psf width)."""
-        padded = np.zeros((len(psfs), *self._grid), np.float32)
-        padded[:, : self._psf[0], : self._psf[1]] = psfs
+        _, height, width = self.domain_shape
+        padded = np.zeros((len(x), *self._grid), np.float32)
+        padded[:, :height, :width] = x
         spectra = fft.rfft(padded)
-        seen = np.stack([np.einsum("kyx,kyx->yx", row, spectra) for row in self._spectra])
-        return np.ascontiguousarray(fft.irfft(seen, self._grid[1])[self._window])
+        for row, seen in zip(self._spectra, self._seen, strict=True):
+            np.einsum("kyx,kyx->yx", row, spectra, out=seen)
+        rows = fft.irfft_strip(self._seen, height - 1, self._rows)
+        return _into(out, rows[:, :, width - 1 : width - 1 + self.range_shape[2]])
 
-    def adjoint(self, images: Numbers) -> Array:
+    def adjoint(self, y: Numbers, out: Array | None = None) -> Array:
         """Return the exact transpose."""
-        padded = np.zeros((len(images), *self._grid), np.float32)
-        padded[self._window] = images
-        spectra = np.conj(fft.rfft(padded))
+        _, height, width = self.domain_shape
+        self._rows[...] = 0
+        self._rows[:, :, width - 1 : width - 1 + self.range_shape[2]] = y
+        fft.rfft_strip(self._rows, height - 1, self._seen)
+        np.conj(self._seen, out=self._seen)
         total = np.zeros(self._spectra.shape[1:], np.complex64)
-        for row, image in zip(self._spectra, spectra, strict=True):
+        for row, image in zip(self._spectra, self._seen, strict=True):
             total += row * image
         back = fft.irfft(np.conj(total), self._grid[1])
-        return np.ascontiguousarray(back[:, : self._psf[0], : self._psf[1]])
+        return _into(out, back[:, :height, :width])
 
     @property
-    def _window(self) -> tuple[slice, slice, slice]:
-        (top, left), (height, width) = ((n - 1 for n in self._psf), self._sensor)
-        return slice(None), slice(top, top + height), slice(left, left + width)
+    def norm_bound(self) -> float:
+        """Root of ``lipschitz``."""
+        return float(np.sqrt(self.lipschitz))
+
+
+def _into(out: Array | None, values: Array) -> Array:
+    if out is None:
+        return values.copy()
+    out[...] = values
+    return out
 
 
 class PointMixer(Mixer):
@@ -300,10 +108,9 @@ class PointMixer(Mixer):
         psf_shape: tuple[int, int],
         sensor_shape: tuple[int, int],
     ) -> None:
-        super().__init__(psf_shape, sensor_shape)
+        super().__init__((len(beads), functions.count), psf_shape, sensor_shape)
         _, centre = field_of(sensor_shape, psf_shape)
         f_y, f_x = np.fft.fftfreq(self._grid[0]), np.fft.rfftfreq(self._grid[1])
-        self._spectra = np.empty((len(beads), functions.count, len(f_y), len(f_x)), np.complex64)
         for points, out in zip(beads, self._spectra, strict=True):
             weights = functions.at(points.places) * points.light[:, None]
             rows = np.exp(-2j * np.pi * np.outer(points.places[:, 0] + centre[0], f_y)).astype(np.complex64)

@@ -9,17 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.blind.points import (
-    FieldFunctions,
-    PointImages,
-    PointMixer,
-    Points,
-    cleaned,
-    overlooked,
-    refine,
-    solve_smooth,
-    support_of,
-)
+from recon.blind.points import PointMixer, solve_smooth, support_of
+from recon.camera.points import FieldFunctions, PointImages, Points, cleaned, overlooked, refine
 from recon.camera.registration import displacement, shifted
 
 Array = npt.NDArray[Any]
@@ -94,11 +85,8 @@ def _brightest_window(image: Array, shape: tuple[int, int]) -> tuple[slice, slic
     return slice(int(row), int(row) + h), slice(int(column), int(column) + w)
 
 
-BLOB_PX = 2
-"""How far around its brightest pixel a bead's light may lie on the grid."""
 _BEADS_A_FUNCTION = 4  # at least so many beads for each field function
 _ROUNDS = 3  # with each degree
-_MOST_BEADS = 150  # an image; more are no separate beads, and would take for ever
 _LEAST_GAIN = 0.003  # relative decrease of the misfit that another round must bring
 
 
@@ -184,27 +172,6 @@ def polish(
     assert psfs is not None
     assert functions is not None
     return Polished(psfs, functions, tuple(beads), tuple(misfits))
-
-
-def points_on_grid(beads: Floats, centre: tuple[int, int]) -> Points:
-    """Return the blobs of a bead image (height, width) on the field's grid as points: centroid and light."""
-    from scipy import ndimage
-
-    peaks = (beads == ndimage.maximum_filter(beads, 2 * BLOB_PX + 1)) & (beads > 0.1 * beads.max())
-    peaks[:BLOB_PX] = peaks[-BLOB_PX:] = False
-    peaks[:, :BLOB_PX] = peaks[:, -BLOB_PX:] = False
-    offsets = np.arange(-BLOB_PX, BLOB_PX + 1)
-    places, light = [], []
-    for row, column in np.argwhere(peaks):
-        blob = beads[row - BLOB_PX : row + BLOB_PX + 1, column - BLOB_PX : column + BLOB_PX + 1]
-        total = float(blob.sum(dtype=np.float64))
-        middle = [float(blob.sum(axis=1 - axis) @ offsets) / total for axis in (0, 1)]
-        places.append((row - centre[0] + middle[0], column - centre[1] + middle[1]))
-        light.append(total)
-    brightest = np.argsort(light)[::-1][:_MOST_BEADS]
-    return Points(
-        np.array(places, np.float64).reshape(-1, 2)[brightest], np.array(light, np.float64)[brightest]
-    )
 
 
 def _better_points(

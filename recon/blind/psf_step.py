@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
-from recon.blind.points import Mixer, Points
+from recon.blind.points import Mixer
 from recon.camera.base import Array
 from recon.camera.convolution import field_of
+from recon.camera.points import Points
 from recon.camera.registration import LOCAL_MEAN_PX
 from recon.errors import InputError
 
@@ -108,9 +109,8 @@ class BeadMixer(Mixer):
         psf_shape: tuple[int, int],
         sensor_shape: tuple[int, int],
     ) -> None:
-        super().__init__(psf_shape, sensor_shape)
+        super().__init__((len(beads), len(weights)), psf_shape, sensor_shape)
         field_shape, _ = field_of(sensor_shape, psf_shape)
-        self._spectra = np.empty((len(beads), len(weights), *fft.spectrum_shape(self._grid)), np.complex64)
         padded = np.zeros((len(weights), *self._grid), np.float32)
         sums = np.empty((len(beads), len(weights)))
         for i, image in enumerate(beads):

@@ -139,7 +139,7 @@ _SAMPLES = 6
 
 
 class BackgroundRemoval(Projection):
-    """Projection of data onto what low DCT frequencies cannot explain; its own adjoint.
+    """Takes out of data what a smooth background of low DCT frequencies explains; its own adjoint.
 
     Kuo 2020, Eqs. 6.1 and 6.2, solves ``min_{y, g} 1/2 ||b - (A y + g)||^2 + prior(y)`` for a background
     ``g`` with low DCT frequencies only. Given ``y``, the best ``g`` is the projection of ``b - A y`` onto
@@ -149,8 +149,11 @@ class BackgroundRemoval(Projection):
     :meth:`non_negative` is the projection onto backgrounds that obey it (see
     :mod:`recon.reconstruction.solve`).
 
-    A prior that does not mind a smooth object (total variation) leaves object and background to be exchanged
-    for one another; l1, as in Eq. 6.2, does not.
+    A prior that does not mind a smooth object (total variation, bounds alone) leaves object and background to
+    be exchanged for one another: much light more in the one and as much less in the other, without bound. A
+    ``restraint`` ``r`` adds ``r/2 ||g||^2``: the best ``g`` is ``1 / (1 + r)`` of the projection, and the
+    smooth part of what is left counts ``sqrt(r / (1 + r))`` instead of nothing. Without one this is an
+    orthogonal projection.
 
     Parameters
     ----------
@@ -162,6 +165,13 @@ class BackgroundRemoval(Projection):
         Pixels that were measured; the others are zero in the result.
     dtype : dtype
         float32 or float64.
+    restraint : float
+        Weight of the background's squared norm on the valid pixels, relative to that of the misfit.
+
+    Attributes
+    ----------
+    taken : float
+        Share of the data's smooth part that :meth:`forward` takes out; changes with :meth:`restrain`.
     """
 
     def __init__(
@@ -170,8 +180,10 @@ class BackgroundRemoval(Projection):
         n_frequencies: tuple[int, int] = (5, 5),
         valid: npt.NDArray[np.bool_] | None = None,
         dtype: npt.DTypeLike = np.float32,
+        restraint: float = 0.0,
     ) -> None:
         super().__init__(shape, shape, dtype)
+        self.restrain(restraint)
         _, height, width = shape
         ny, nx = min(n_frequencies[0], height), min(n_frequencies[1], width)
         self._rows, self._columns = _cosines(ny, height), _cosines(nx, width)
@@ -191,12 +203,20 @@ class BackgroundRemoval(Projection):
         """Return what :meth:`background` computes with: cosines along y and x, inverse Gram matrix."""
         return self._rows, self._columns, self._inverse[channel]
 
+    def restrain(self, restraint: float) -> None:
+        """Set how much the background's squared norm counts."""
+        self.restraint, self.taken = restraint, 1 - float(np.sqrt(restraint / (1 + restraint)))
+
     def background(self, y: Array) -> Array:
-        """Return the smooth part of ``y`` on all pixels: the least-squares fit to the valid ones."""
+        """Return the background for data ``y``, on all pixels."""
+        return self._fitted(y, 1 / (1 + self.restraint))
+
+    def _fitted(self, y: Array, share: float) -> Array:
+        """Return a share of the least-squares fit to the valid pixels, on all."""
         fitted = np.empty(self.range_shape, self.dtype)
         for channel, image in enumerate(y):
             coefficients = self._coefficients(image, channel)
-            best = (self._inverse[channel] @ coefficients.ravel()).reshape(coefficients.shape)
+            best = share * (self._inverse[channel] @ coefficients.ravel()).reshape(coefficients.shape)
             fitted[channel] = self._rows.T @ best @ self._columns
         return fitted
 
@@ -235,7 +255,7 @@ class BackgroundRemoval(Projection):
 
     def forward(self, x: Array, out: Array | None = None) -> Array:
         """Remove the smooth part."""
-        fitted = self.background(x)
+        fitted = self._fitted(x, self.taken)
         out = np.subtract(x, fitted, out=np.empty_like(fitted) if out is None else out)
         if self._valid is not None:
             out *= self._valid

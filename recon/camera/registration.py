@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from recon.base import fft
 from recon.base.blocks import block_mean
+from recon.camera.transformed import geometric_centre, resampled
 from recon.errors import InputError
 
 Array = npt.NDArray[Any]
@@ -139,20 +140,10 @@ def rescaled(image: Array, s: float, *, centre: tuple[float, float] | None = Non
     centre : (float, float), optional
         ``(row, column)`` that stays; default the geometric centre.
     """
-    from scipy import ndimage
-
     if not 0 < s < np.inf:
         raise InputError(f"A scale is a positive number, not {s}.")
-    height, width = image.shape[-2:]
-    middle = ((height - 1) / 2, (width - 1) / 2) if centre is None else centre
-    blur = 0.5 * np.sqrt(max(s * s - 1, 0.0))
-    planes = np.asarray(image, np.float32).reshape(-1, height, width)
-    result = np.empty_like(planes)
-    for plane, out in zip(planes, result, strict=True):
-        source = ndimage.gaussian_filter(plane, blur) if blur > 0.1 else plane
-        ndimage.affine_transform(source, [s, s], [c - s * c for c in middle], output=out, order=3)
-        np.clip(out, min(float(plane.min()), 0.0), None, out=out)
-    return result.reshape(image.shape)
+    middle = geometric_centre(image) if centre is None else np.asarray(centre, float)
+    return resampled(image, [s, s], middle - s * middle)
 
 
 def displacement(psf: Array, reference: Array) -> tuple[int, int]:
@@ -163,6 +154,11 @@ def displacement(psf: Array, reference: Array) -> tuple[int, int]:
     psf, reference : ndarray, (height, width)
     """
     return _Correlation(_fine(psf), _fine(reference)).whole_peak()
+
+
+def likeness(psf: Array, reference: Array) -> float:
+    """Return how alike the fine structure of two images (height, width) is where they match best, up to 1."""
+    return _Correlation(_fine(psf), _fine(reference)).height
 
 
 def shifted(image: Array, rows: int, columns: int) -> Array:

@@ -52,6 +52,96 @@ def sparse_picture(rng: np.random.Generator, side: int, density: float) -> Float
     return image
 
 
+def text(rng: np.random.Generator, side: int, density: float) -> Floats:
+    """Lines of letters of several sizes on black, (side, side), 0 to 1. ``density`` scales their number."""
+    import cv2
+
+    image = np.zeros((side, side), np.uint8)
+    top = 0.08 * side
+    while top < 0.92 * side:
+        high = rng.uniform(0.06, 0.14) * side / np.sqrt(density)
+        letters = "".join(rng.choice(list("ABCDEFGHKLMNPRSTUVXYZ23456789"), 40))
+        # Hershey letters are 21 units high.
+        bold = max(round(high / 8), 1)
+        place = (round(rng.uniform(0.05, 0.25) * side), round(top + high))
+        shown = letters[: max(int((0.9 * side - place[0]) / (0.9 * high)), 1)]
+        shade = float(rng.uniform(120, 255))
+        cv2.putText(image, shown, place, cv2.FONT_HERSHEY_SIMPLEX, high / 21, shade, bold, cv2.LINE_AA)
+        top += 1.5 * high
+    return np.asarray(image / 255.0)
+
+
+def filaments(rng: np.random.Generator, side: int, density: float) -> Floats:
+    """Bent threads on black, (side, side), 0 to 1. ``density`` scales their number."""
+    import cv2
+
+    image = np.zeros((side, side))
+    for _ in range(max(round(14 * density), 1)):
+        steps = 40
+        turn = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, 0.12, steps))
+        line = rng.uniform(0.1, 0.9, 2) + np.cumsum(
+            np.column_stack([np.cos(turn), np.sin(turn)]), axis=0
+        ) / steps * (rng.uniform(0.3, 0.9))
+        one = np.zeros((side, side), np.uint8)
+        wide = max(round(rng.uniform(0.006, 0.014) * side), 1)
+        cv2.polylines(one, [np.round(line * side).astype(np.int32)], False, 255, wide, cv2.LINE_AA)
+        image = np.maximum(image, one / 255.0 * rng.uniform(0.3, 1))
+    return image
+
+
+def gradient(rng: np.random.Generator, side: int, density: float) -> Floats:
+    """Smooth shades with nowhere an edge, (side, side), 0 to 1. ``density`` scales how often they change."""
+    y, x = np.mgrid[:side, :side] / side - 0.5
+    image = rng.uniform(-1, 1) * y + rng.uniform(-1, 1) * x
+    for _ in range(3):
+        turn, phase = rng.uniform(0, 2 * np.pi, 2)
+        waves = 2 * np.pi * rng.uniform(0.3, 1.2) * density
+        image += rng.uniform(0.2, 0.6) * np.sin(waves * (np.cos(turn) * y + np.sin(turn) * x) + phase)
+    return _from_0_to_1(image)
+
+
+def texture(rng: np.random.Generator, side: int, density: float) -> Floats:
+    """Noise whose amplitudes fall as one over the frequency, as in natural pictures, (side, side), 0 to 1.
+
+    ``density`` makes them fall more slowly.
+    """
+    frequency = np.hypot(np.fft.fftfreq(2 * side)[:, None], np.fft.rfftfreq(2 * side)) * 2 * side
+    spectrum = np.fft.rfft2(rng.standard_normal((2 * side, 2 * side)))
+    spectrum *= np.maximum(frequency, 1) ** (-1.3 / density**0.25)
+    return _from_0_to_1(np.fft.irfft2(spectrum)[:side, :side])
+
+
+def lights(rng: np.random.Generator, side: int, density: float) -> Floats:
+    """Small beads in one plane, on black, (side, side), 0 to 1. ``density`` scales their number."""
+    image = np.zeros((side, side))
+    radius = 0.008 * side
+    reach = int(radius) + 1
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    for _ in range(max(round(30 * density), 1)):
+        row, column = rng.integers(reach, side - reach, 2)
+        disc = np.clip(radius + 0.5 - np.hypot(y, x), 0, 1) * rng.uniform(0.3, 1)
+        around = np.s_[row - reach : row + reach + 1, column - reach : column + reach + 1]
+        image[around] = np.maximum(image[around], disc)
+    return image
+
+
+def _from_0_to_1(image: Floats) -> Floats:
+    low, high = image.min(), image.max()
+    return np.asarray((image - low) / (high - low))
+
+
+PICTURES = {
+    "dense-picture": dense_picture,
+    "sparse-picture": sparse_picture,
+    "text": text,
+    "filaments": filaments,
+    "gradient": gradient,
+    "texture": texture,
+    "lights": lights,
+}
+"""What draws a picture of each family: ``draw(rng, side, density)``."""
+
+
 def beads(rng: np.random.Generator, size: float, count: int) -> Floats:
     """Beads anywhere in the volume, (count, 4), each as bright as 0.5 to 1.5."""
     places = rng.uniform(-0.42, 0.42, (count, 2)) * size

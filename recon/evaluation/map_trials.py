@@ -247,7 +247,7 @@ def _alone(key: tuple[int, int, float, float, float, int], iterations: int) -> f
 def _error(video: Video, name: OverTimeName, weight: float, iterations: int) -> float:
     from scipy.ndimage import gaussian_filter
 
-    problem = stream_problem(video.frames[0], video.psf)
+    problem = stream_problem(video.frames[0], video.psf, choosing=False)
     pictures = solve_together(problem, video.frames, name, weight=weight, iterations=iterations)
     assert pictures is not None  # nothing ends it before
     return relative_error(gaussian_filter(pictures, (0, 1, 1)), video.truth)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -12,11 +12,24 @@ from recon.base.noise import NoiseModel
 from recon.errors import InputError
 from recon.evaluation import content
 from recon.evaluation.lenslets import SPOT_PX, Floats, LensletCamera, Optics, build_camera
+from recon.evaluation.measured_camera import MeasuredCamera, measured_camera, smooth_light
+from recon.evaluation.measured_sets import MEASURED, MeasuredSet
 from recon.types import Calibration, Geometry
 
-Family = Literal["dense-picture", "sparse-picture", "beads", "dense-volume", "microscope"]
+Family = Literal[
+    "dense-picture",
+    "sparse-picture",
+    "beads",
+    "dense-volume",
+    "microscope",
+    "text",
+    "filaments",
+    "gradient",
+    "texture",
+    "lights",
+]
 FAMILIES: tuple[Family, ...] = get_args(Family)
-PICTURES = ("dense-picture", "sparse-picture")
+Camera = LensletCamera | MeasuredCamera
 
 
 @dataclass(frozen=True)
@@ -41,14 +54,16 @@ class SceneSpec:
     their harmonic mean."""
     layers: tuple[float, float] = (0.0, 1.0)
     """Range of the depth that holds anything, from 0 (``z_far``) to 1 (``z_near``)."""
-    optics: Optics = "random"
-    """``"random"`` or ``"regular"`` lenslets, or a ``"smooth"`` diffuser."""
+    optics: Optics | MeasuredSet = "random"
+    """``"random"`` or ``"regular"`` lenslets, a ``"smooth"`` diffuser, or the measured PSFs of ``"hand"`` or
+    ``"usaf"``: a picture stands at one of their depths, which the seed draws."""
     fall_off_deg: float = np.inf
     aberration: float = 0.0
     dispersion: float = 0.0
     spot_px: float = SPOT_PX
     """``fall_off_deg``, ``aberration``, ``dispersion`` and ``spot_px``: as
-    :class:`~recon.evaluation.lenslets.LensletCamera`."""
+    :class:`~recon.evaluation.lenslets.LensletCamera`; with measured PSFs, as
+    :class:`~recon.evaluation.measured_camera.MeasuredCamera`, which has no spots."""
     channels: int = 1
     """1 or 3."""
     colourful: bool = False
@@ -57,7 +72,8 @@ class SceneSpec:
     """Photo-electrons at the brightest pixel."""
     read_noise_e: float = 2.0
     background: float = 0.0
-    """Smooth stray light, relative to the mean of the scene's."""
+    """Smooth stray light, relative to the mean of the scene's; with measured PSFs as it lies on that set's
+    photograph."""
     saturation: float | None = None
     """Counts at which pixels saturate, relative to the brightest one without noise."""
     erased: float = 0.0
@@ -99,7 +115,7 @@ class SceneSpec:
     @property
     def is_picture(self) -> bool:
         """Whether the scene lies in one plane."""
-        return self.family in PICTURES
+        return self.family in content.PICTURES
 
 
 _DEFAULTS: dict[Family, dict[str, Any]] = {
@@ -139,7 +155,7 @@ class TestScene:
     """The sensor's."""
     background: npt.NDArray[np.float32]
     """as ``measurement``: the true stray light, counts."""
-    camera: LensletCamera
+    camera: Camera
     """As it was when the measurement was taken."""
     points: Floats
     """(n, 4): ``x, y, z`` in micrometres and power."""
@@ -163,16 +179,7 @@ def make_scene(spec: SceneSpec | Family, **changes: Any) -> TestScene:
     spec = replace(spec, **changes) if isinstance(spec, SceneSpec) else spec_of(spec, **changes)
     seeds = np.random.SeedSequence(spec.seed).spawn(4)
     scene_rng, noise_rng, calibration_rng = (np.random.default_rng(s) for s in seeds[:3])
-    calibrated_camera = build_camera(
-        spec.shape,
-        optics=spec.optics,
-        seed=int(seeds[3].generate_state(1)[0]),
-        focus=2 / (1 / spec.z_near + 1 / spec.z_far),
-        aberration=spec.aberration,
-        fall_off_deg=spec.fall_off_deg,
-        dispersion=spec.dispersion,
-        spot_px=spec.spot_px,
-    )
+    calibrated_camera = _camera(spec, int(seeds[3].generate_state(1)[0]))
     camera = calibrated_camera.moved((spec.drift_px, spec.drift_px), 1 + spec.drift_scale, spec.drift_deg)
     places = _places(spec, scene_rng)
     tints = _tints(spec, places, scene_rng)
@@ -210,13 +217,34 @@ def make_scene(spec: SceneSpec | Family, **changes: Any) -> TestScene:
 
 
 # Pieces ------------------------------------------------------------------------------------------------
+def _camera(spec: SceneSpec, seed: int) -> Camera:
+    """Return the camera as it is calibrated."""
+    imperfections = {
+        "aberration": spec.aberration,
+        "fall_off_deg": spec.fall_off_deg,
+        "dispersion": spec.dispersion,
+    }
+    if spec.optics in MEASURED:
+        plane = np.random.default_rng(seed).random() if spec.is_picture or spec.depths == 1 else None
+        depths = (spec.z_near, spec.z_far)
+        return measured_camera(spec.shape, spec.optics, depths, plane=plane, **imperfections)
+    focus = 2 / (1 / spec.z_near + 1 / spec.z_far)
+    return build_camera(
+        spec.shape,
+        optics=cast(Optics, spec.optics),
+        seed=seed,
+        focus=focus,
+        spot_px=spec.spot_px,
+        **imperfections,
+    )
+
+
 def _places(spec: SceneSpec, rng: np.random.Generator) -> Floats:
     """Rows, columns (picture pixels from the axis), places in depth and brightness, (n, 4)."""
     side = max(spec.shape)
     if spec.is_picture:
         count = round(spec.field * side) * content.SUBSAMPLES
-        draw = content.dense_picture if spec.family == "dense-picture" else content.sparse_picture
-        image = draw(rng, count, spec.density)
+        image = content.PICTURES[spec.family](rng, count, spec.density)
         along = (np.arange(count) - (count - 1) / 2) / content.SUBSAMPLES
         rows, columns = np.meshgrid(along, along, indexing="ij")
         places = np.column_stack(
@@ -250,7 +278,7 @@ def _channels(spec: SceneSpec, tints: Floats) -> list[tuple[int, Floats]]:
     return [(1, tints[:, 0])] if spec.channels == 1 else [(c, tints[:, c]) for c in range(3)]
 
 
-def _points(spec: SceneSpec, places: Floats, camera: LensletCamera) -> Floats:
+def _points(spec: SceneSpec, places: Floats, camera: Camera) -> Floats:
     """``x, y, z`` and power of every point, (n, 4)."""
     z = _depth_um(spec, places[:, 2], camera.distance_um)
     to_scene = -camera.pitch_um * z / camera.distance_um
@@ -269,7 +297,10 @@ def _plane_places(spec: SceneSpec) -> Floats:
 
 
 def _stray_light(spec: SceneSpec, rng: np.random.Generator) -> Floats:
-    """Smooth light of mean ``spec.background``: a slope and a broad hill."""
+    """Smooth light of mean ``spec.background``: a slope and a broad hill, or as a photograph has it."""
+    if spec.optics in MEASURED:
+        light = smooth_light(spec.optics, spec.shape)
+        return np.asarray(spec.background * light / light.mean())
     y, x = (np.linspace(-1, 1, n) for n in spec.shape)
     slope, place = rng.uniform(-0.3, 0.3, 2), rng.uniform(-0.5, 0.5, 2)
     hill = np.exp(-((y[:, None] - place[0]) ** 2 + (x - place[1]) ** 2) / 1.5)
@@ -277,7 +308,7 @@ def _stray_light(spec: SceneSpec, rng: np.random.Generator) -> Floats:
     return np.asarray(spec.background * light / light.mean())
 
 
-def _calibrate(spec: SceneSpec, camera: LensletCamera, rng: np.random.Generator) -> tuple[Calibration, float]:
+def _calibrate(spec: SceneSpec, camera: Camera, rng: np.random.Generator) -> tuple[Calibration, float]:
     """Photograph a point source at every depth and place; also return the counts of a unit power.
 
     One exposure serves all, set by a point on the axis at the nearest depth, whether the grid holds it or

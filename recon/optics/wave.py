@@ -17,8 +17,10 @@ enough that the stretch hardly varies within one. docs/decisions/0008-propagatio
 from __future__ import annotations
 
 import itertools
+import threading
+from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -43,6 +45,8 @@ def check_source(source_um: Source) -> None:
 # (some tens of micrometres) is wrong by at most this fraction: well below a pixel.
 TILE_TOLERANCE = 0.04
 MOST_TILES = 256
+KEPT_BYTES = 128 << 20
+"""Of the newest point spread functions: another picture in the place of one needs the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +105,8 @@ class WavePropagator:
         self._typical_slope = float(np.sqrt((slope**2).mean()))
         self._steepest = float(np.quantile(slope, 0.9995))
         self.workers = workers
+        self._kept: OrderedDict[Any, npt.NDArray[np.float32]] = OrderedDict()
+        self._lock = threading.Lock()
 
     def psf(
         self,
@@ -133,7 +139,17 @@ class WavePropagator:
             source): multiplied by the source's intensity along the axis, the light on the pixel. The angular
             response of the pixels is not included (:mod:`recon.optics.fall_off`).
         """
-        return self.caustic(source_um, grid, spectrum, diameter_um=diameter_um, emission=emission).on(grid)
+        key = (source_um, grid, spectrum, diameter_um, emission)
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key].copy()
+        light = self.caustic(source_um, grid, spectrum, diameter_um=diameter_um, emission=emission).on(grid)
+        with self._lock:
+            self._kept[key] = light.copy()
+            while sum(kept.nbytes for kept in self._kept.values()) > KEPT_BYTES:
+                self._kept.popitem(last=False)
+        return light
 
     def displacement_um(self, z_um: float) -> float:
         """Return how far the relief typically displaces light on the sensor (root mean square, on axis)."""

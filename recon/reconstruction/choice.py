@@ -1,4 +1,4 @@
-"""What was chosen, in words and numbers, and what an error of the model costs."""
+"""What was chosen, in words and numbers."""
 
 from __future__ import annotations
 
@@ -18,30 +18,6 @@ Name = Literal[
 
 
 @dataclass(frozen=True, slots=True)
-class Option:
-    """What one step up or down would be.
-
-    Attributes
-    ----------
-    value : str
-    time : float
-        Time of the whole reconstruction relative to that with what was chosen.
-    error_db : float
-        Estimated change of the picture's signal-to-error ratio by this step, decibels: above 0 is better. NaN
-        where nothing is known.
-    """
-
-    value: str
-    time: float
-    error_db: float
-
-    def __str__(self) -> str:
-        """Say it in words."""
-        change = "error not known" if self.error_db != self.error_db else f"{self.error_db:+.1f} dB"
-        return f"{self.value}: {self.time:.2g} x the time, {change}"
-
-
-@dataclass(frozen=True, slots=True)
 class Decision:
     """One choice.
 
@@ -51,24 +27,25 @@ class Decision:
     value : str
     why : str
         With the numbers that decided.
-    error_db : float
-        Estimated loss by this choice against the largest model on offer, decibels, 0 or below.
-    up, down : Option or None
-        The next larger and the next smaller choice; None at the end of the scale.
+    up, down : str or None
+        The next larger and the next smaller choice; None at the end of the scale. What a step would cost is
+        not foretold: estimates of time and error did not come true (``docs/benchmarks/explain.md``).
     overruled : bool
         Whether the caller chose.
     numbers : mapping of str to float
         What ``why`` says, to compute with.
+    open : bool
+        Whether there was anything to decide; what was not is told only where everything is.
     """
 
     name: Name
     value: str
     why: str
-    error_db: float = 0.0
-    up: Option | None = None
-    down: Option | None = None
+    up: str | None = None
+    down: str | None = None
     overruled: bool = False
     numbers: Mapping[str, float] = field(default_factory=dict)
+    open: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,10 +104,16 @@ class Choice:
         return hashlib.sha256(repr(chosen).encode()).hexdigest()[:8]
 
     def lines(self, *, steps: bool = True) -> list[str]:
-        """Return what was chosen and why, a line a choice, and what one step up and down would be."""
+        """Return what was chosen and why, a line a choice, and one step up and down.
+
+        Without ``steps`` only what there was to decide.
+        """
         text = []
         for d in self.decisions:
-            text.append(f"{d.name.capitalize():<12}{d.value}: {d.why}{' (as asked)' if d.overruled else ''}")
+            if not (steps or d.open or d.overruled):
+                continue
+            asked = (" (as asked)" if d.why else "as asked") if d.overruled else ""
+            text.append(f"{d.name.capitalize():<12}{d.value}: {d.why}{asked}")
             if steps:
                 ways = (("up", d.up), ("down", d.down))
                 text += [f"{'':<12}  one step {way}: {o}" for way, o in ways if o is not None]
@@ -161,19 +144,3 @@ def _recorded(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     return value
-
-
-ERROR_SCALE = 0.5
-"""Relative PSF error that costs 3 dB."""
-LEFT_OUT_SCALE = 0.1
-"""Share of the light left out that costs 3 dB."""
-
-
-def loss_db(error: float) -> float:
-    """Return what a relative error of the PSFs costs, 0 or below."""
-    return -10 * float(np.log10(1 + (error / ERROR_SCALE) ** 2))
-
-
-def left_out_db(share: float) -> float:
-    """Return what leaving out a share of the light costs, 0 or below."""
-    return -10 * float(np.log10(1 + share / LEFT_OUT_SCALE)) if share > 0 else 0.0

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from recon.base.noise import estimate_deviation
 from recon.errors import InputError
-from recon.reconstruction.choice import ERROR_SCALE, Decision, Option
+from recon.reconstruction.choice import Decision
 from recon.reconstruction.options import Overrides
 from recon.types import Calibration
 
@@ -118,7 +118,7 @@ def channels_of(
     """Decide whether colour channels are reconstructed as one; also return how they are proportional."""
     n = len(data)
     if n == 1:
-        return Decision("channels", "one", "the photograph has one channel"), None
+        return Decision("channels", "one", "the photograph has one channel", open=False), None
     common = int(np.count_nonzero(valid.all(axis=0)))
     if common < max(LEAST_COMMON, LEAST_COMMON_SHARE * valid[0].size):
         why = f"only {common} of {valid[0].size} pixels tell all colours, as with a colour mosaic"
@@ -135,9 +135,6 @@ def channels_of(
         f"channels proportional to one another miss the data by {tint.misfit:.2f} of its noise and the PSFs "
         f"by {tint.psf_misfit:.1%} (up to {CHANNEL_NOISE:g} and {CHANNEL_PSF:.0%} pass for alike)"
     )
-    loss = -10 * float(np.log10(1 + max(tint.misfit**2 - 1, 0) + (tint.psf_misfit / ERROR_SCALE) ** 2))
     if merge:
-        up = Option(f"all {n}", float(n), -loss)
-        return Decision("channels", "merged", why, loss, up=up, overruled=asked, numbers=numbers), tint
-    down = Option("merged", 1 / n, loss)
-    return Decision("channels", f"all {n}", why, 0.0, down=down, overruled=asked, numbers=numbers), tint
+        return Decision("channels", "merged", why, up=f"all {n}", overruled=asked, numbers=numbers), tint
+    return Decision("channels", f"all {n}", why, down="merged", overruled=asked, numbers=numbers), tint

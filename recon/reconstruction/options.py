@@ -242,6 +242,13 @@ class ReconstructionOptions:
         group=_RARE,
         applies=("picture", "volume"),
     )
+    refine_psf: bool = option(
+        False,
+        help="First fit the PSFs' size and rotation to the photograph.",
+        label="Refine the PSF",
+        group=_CHOICE,
+        applies=("picture", "volume"),
+    )
     axis_weights: npt.ArrayLike | None = option(
         None,
         help="Weights of the z, y and x differences of TV, (3,) or (n_z, 3).",
@@ -295,6 +302,13 @@ class ReconstructionOptions:
         group=_COMPUTE,
         recorded=False,
         applies=("picture", "volume", "live picture"),
+    )
+    uncertainty: bool = option(
+        False,
+        help="Also the standard deviation of every pixel; takes about seven times as long.",
+        group=_MAIN,
+        applies=("picture",),
+        identifies=False,
     )
     judged: bool = option(
         True,

@@ -48,6 +48,11 @@ class Reshaped(LinearOperator):
         return self.own.norm_bound
 
 
+def expects_background(problem: Problem) -> bool:
+    """Whether a background of this problem has a prior mean: see :meth:`Part.set_data`."""
+    return problem.n_planes == 1 and kind_of(problem.prior_name) == "tv"
+
+
 class Part:
     """Operator, data and prior of the channels that are solved together.
 
@@ -62,7 +67,8 @@ class Part:
     camera : LinearOperator
         Domain (n_channels, n_z, grid height, grid width), range (n_channels, height, width).
     data : ndarray, (n_channels, height, width)
-        In units of the noise, and in the precision of the arithmetic.
+        In units of the noise, and in the precision of the arithmetic; less what a background is expected to
+        be, where one is estimated.
     valid : ndarray of bool, as ``data``
     removal : BackgroundRemoval or None
         What takes a smooth background out of the data, where one is estimated.
@@ -81,8 +87,9 @@ class Part:
         self.tau: float | None = None
         self.weight = 0.0
         self._removed: BackgroundRemoval | None = None
+        self._usual: Array = np.zeros((1, 1, 1), self.dtype)
         self.removal = (
-            BackgroundRemoval(self.valid.shape, BACKGROUND_FREQUENCIES, self.valid, dtype=self.dtype)
+            BackgroundRemoval(self.valid.shape, BACKGROUND_FREQUENCIES, self.valid, self.dtype)
             if problem.smooth
             else None
         )
@@ -96,9 +103,25 @@ class Part:
             self.camera = PatternedCamera(self.camera, problem.measurement.light(), window)
 
     def set_data(self, problem: Problem) -> None:
-        """Take another photograph's data."""
+        """Take another photograph's data.
+
+        A background's prior deviation is their root mean square: object and background do not trade places
+        beyond that. Its prior mean is half of theirs in pictures by priors that do not mind an even object
+        and would keep its even part: none of the light may be stray or all. It is 0 with l1, which minds
+        light, and in volumes, where it stands for what PSFs do not tell as well and may be negative.
+        """
         self.problem = problem
         self.data = self._measured = problem.data[self._rows].astype(self.dtype, copy=False)
+        if self.removal is not None:
+            power = float(np.sum(self.data.astype(np.float64) ** 2))
+            pixels = int(np.count_nonzero(self.valid))
+            self.removal.restrain(pixels / max(power, pixels))
+            if expects_background(problem):
+                means = [
+                    0.5 * d[v].mean(dtype=np.float64) for d, v in zip(self.data, self.valid, strict=True)
+                ]
+                self._usual = np.asarray(means, self.dtype)[:, None, None]
+                self.data = np.where(self.valid, self.data - self._usual, 0)
 
     @property
     def _rows(self) -> slice:
@@ -275,12 +298,14 @@ class Part:
                     )
         return reduce(add, terms)
 
-    def weigh(self, tau: float | None) -> None:
-        """Set the prior's weight: relative to ``max |A^H b|``, or from the noise."""
+    def weigh(self, tau: float | None, times_noise: float | None = None) -> None:
+        """Set the prior's weight: relative to ``max |A^H b|``, else to the noise, else by the table."""
         name = self.problem.prior_name
         if isinstance(self.problem.prior, Prior) or not is_weighted(name):
             return
         peak = self.peak()
+        if tau is None and times_noise is not None and peak > 0:
+            tau = times_noise / peak
         self.tau = default_tau(name, self.problem.camera_class, peak) if tau is None else float(tau)
         self.weight = self.tau * peak
 
@@ -300,7 +325,7 @@ class Part:
         """Return the smooth background that goes with a solution, in units of the noise, as ``data``."""
         if self.removal is None:
             raise ValueError("No background was asked for.")
-        return self.removal.background(self.data - self.camera.forward(solution))
+        return self._usual + self.removal.background(self.data - self.camera.forward(solution))
 
     def residual(self, solution: Array, background: Array | None) -> Array:
         """Return what a solution and its background leave of the data, as ``data``; 0 where erased."""

@@ -13,7 +13,7 @@ from recon.analysis.correlation import similarity
 from recon.camera.camera_model import Depths, members_of_depths
 from recon.camera.refocus import refocus
 from recon.errors import InputError
-from recon.reconstruction.choice import Choice, Decision, Option, left_out_db, loss_db
+from recon.reconstruction.choice import Choice, Decision
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.part import Part
 from recon.reconstruction.probe import CoarsePass
@@ -33,14 +33,16 @@ TV_LEAVES = 2.0
 rightly, from 2.6 times where wrongly, on two scenes of beads, each with one PSF and with nine a depth."""
 
 
-def planes_of(passed: CoarsePass, depths: Depths, overrides: Overrides) -> tuple[tuple[int, ...], Decision]:
+def planes_of(
+    passed: CoarsePass | None, depths: Depths, overrides: Overrides
+) -> tuple[tuple[int, ...], Decision]:
     """Decide which depths take part, by where a coarse pass finds light."""
     n = len(depths.z_um)
     everything = tuple(range(n))
-    if n == 1:
+    if n == 1 or passed is None:
         if isinstance(overrides.planes, tuple):
             _within(overrides.planes, n)
-        return everything, Decision("planes", "1", "one depth was calibrated")
+        return everything, Decision("planes", "1", "one depth was calibrated", open=False)
     lit = np.any([_most_of(light) for light in passed.light], axis=0)
     # The coarse pass may take a plane for its neighbour: those of lit planes stay.
     order = np.argsort(depths.z_um) if np.isfinite(depths.z_um).all() else np.arange(n)
@@ -64,19 +66,12 @@ def planes_of(passed: CoarsePass, depths: Depths, overrides: Overrides) -> tuple
         else f"a coarse pass finds more than {LEFT_OUT:.0%} of the light{channel} in whatever could be left "
         "out, or in its neighbours"
     )
-    loss = left_out_db(lost)
     numbers = {"planes": float(len(planes)), "of": float(n), "light_left_out": lost}
-    up = None if len(planes) == n else Option(f"all {n}", n / len(planes), -loss)
+    up = None if len(planes) == n else f"all {n}"
     fewest = tuple(int(z) for z in np.flatnonzero(lit))
-    down = None
-    if len(fewest) < len(planes):
-        down = Option(
-            f"{len(fewest)} without their neighbours",
-            len(fewest) / len(planes),
-            left_out_db(_share(passed.light, ~lit)) - loss,
-        )
+    down = f"{len(fewest)} without their neighbours" if len(fewest) < len(planes) else None
     value = f"all {n}" if len(planes) == n else f"{len(planes)} of {n} ({_ranges(planes)})"
-    return planes, Decision("planes", value, why, loss, up, down, asked, numbers)
+    return planes, Decision("planes", value, why, up, down, asked, numbers)
 
 
 def put_back(choice: Choice, signs: Sequence[float], *, everything: bool) -> Choice | None:
@@ -103,7 +98,7 @@ def put_back(choice: Choice, signs: Sequence[float], *, everything: bool) -> Cho
         f"{_ranges(tuple(shown))} {max(signs):.1f} times as much as noise and prior explain"
     )
     decisions = tuple(
-        replace(d, value=value, why=why, error_db=0.0, up=None, down=None) if d.name == "planes" else d
+        replace(d, value=value, why=why, up=None, down=None) if d.name == "planes" else d
         for d in choice.decisions
     )
     return replace(choice, planes=planes, decisions=decisions)
@@ -171,7 +166,7 @@ def between_of(
         why = prevented or "no two neighbouring depths take part"
         if overrides.between:
             raise InputError(f"Planes cannot be added between depths (between=on): {why}.")
-        return (), Decision("between", "no planes", why, overruled=asked)
+        return (), Decision("between", "no planes", why, overruled=asked, open=False)
     alike = {k: similarity(depths.central[k], depths.central[k + 1]) for k in gaps}
     worst = min(gaps, key=alike.__getitem__)
     unlike = tuple(k for k in gaps if alike[k] < UNLIKE)
@@ -189,15 +184,10 @@ def between_of(
             f"those made for depths between are {said} with measured ones ({MADE_ALIKE:g} is asked of them)"
         )
     added = (tuple(gaps) if overrides.between else ()) if asked else (unlike if told else ())
-    # An object half way is as far from each neighbour as these are from half way: half of their difference.
-    loss = loss_db(0.5 * float(np.sqrt(2 * max(1 - alike[worst], 0.0))))
-    n = len(planes)
     if added:
-        down = Option("no planes", n / (n + len(added)), loss)
         value = f"{len(added)} plane{'s' if len(added) > 1 else ''}"
-        return added, Decision("between", value, why, 0.0, None, down, asked, numbers)
-    up = Option(f"{len(gaps)} planes", (n + len(gaps)) / n, -loss if told else float("nan"))
-    return (), Decision("between", "no planes", why, loss if told else 0.0, up, None, asked, numbers)
+        return added, Decision("between", value, why, None, "no planes", asked, numbers)
+    return (), Decision("between", "no planes", why, f"{len(gaps)} planes", None, asked, numbers)
 
 
 def middle(depths_um: Array, k: int) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,9 +12,8 @@ from recon.analysis.correlation import autocorrelate
 from recon.camera.camera_model import Depths, ModelName
 from recon.camera.spatially_varying import SpatiallyVarying
 from recon.reconstruction.part import Part
+from recon.reconstruction.pilot import pilot
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.solvers import SOLVERS
-from recon.solvers import StoppingRules
 
 Array = npt.NDArray[Any]
 
@@ -23,8 +21,6 @@ COARSE_PX = 96
 """Longest side that the coarse pass works on, pixels, about. Depths are told apart by a pixel's shift at the
 pattern's edge: on fewer pixels all depths look alike."""
 COARSE_ITERATIONS = 40
-VARYING_ITERATIONS = 20
-"""The same with PSFs that vary over the field, whose solver goes further in one."""
 ACCEPTED = 0.005
 """Brightness, relative to the axis, below which the sensor counts as accepting nothing."""
 LIGHT_LOST = 2e-4
@@ -33,106 +29,53 @@ LIGHT_LOST = 2e-4
 
 @dataclass(frozen=True)
 class CoarsePass:
-    """A quick reconstruction.
+    """A quick reconstruction with l1, one convolution a depth and a background: it sees where light is.
 
     Attributes
     ----------
-    misfit : float
-        Root mean square of the residual in units of the noise.
     light : ndarray, (n_channels, n_z)
         Share of every plane in the channel's light.
-    seconds : float
-        Processor time of an iteration.
     smooth_share : float
-        Mean of the smooth background relative to that of the data; 0 where none was estimated.
-    objective : float
-        Half the squared misfit and the prior, summed over the channels.
+        Mean of the smooth background relative to that of the data.
     """
 
-    misfit: float
     light: npt.NDArray[np.float64]
-    seconds: float
     smooth_share: float
-    objective: float
 
 
-def coarse_passes(
-    channels: list[Problem],
-    prior: str,
-    *,
-    background: bool,
-    model: ModelName = "convolution",
-    iterations: int = COARSE_ITERATIONS,
-) -> CoarsePass:
-    """Reconstruct every channel in few iterations; misfits are their root mean square, shares their mean."""
-    passes = [coarse_pass(_as(c, model, prior, background), iterations=iterations) for c in channels]
-    return CoarsePass(
-        float(np.sqrt(np.mean([p.misfit**2 for p in passes]))),
-        np.concatenate([p.light for p in passes]),
-        sum(p.seconds for p in passes),
-        float(np.mean([p.smooth_share for p in passes])),
-        sum(p.objective for p in passes),
-    )
+def coarse_passes(channels: list[Problem]) -> CoarsePass:
+    """Reconstruct every channel in few iterations; the share is their mean."""
+    passes = [_coarse_pass(coarse_copy(c, "convolution", "l1", background=True)) for c in channels]
+    return CoarsePass(np.stack([p[0] for p in passes]), float(np.mean([p[1] for p in passes])))
 
 
-def _as(problem: Problem, model: ModelName, prior: str, background: bool) -> Problem:
+def coarse_copy(problem: Problem, model: ModelName, prior: str, *, background: bool) -> Problem:
     """Return a coarse copy with another model and prior; TV of planes as far apart as their pixels."""
     weights = None if problem.n_planes == 1 else (1.0, 1.0, 1.0)
     options = replace(problem.options, prior=prior, axis_weights=weights, drop_empty=False)
     return replace(problem, options=options, model=model, smooth=background)
 
 
-def coarse_pass(problem: Problem, *, iterations: int) -> CoarsePass:
-    """Reconstruct a problem of one channel in few iterations."""
-    part = Part(problem, slice(0, 1))
-    try:
-        part.weigh(None)
-        solver = SOLVERS["admm"].make(part, None)
-        began = time.process_time()
-        outcome = solver.run(StoppingRules(iterations=iterations, tolerance=0.0))
-        seconds = (time.process_time() - began) / iterations
-        solution = part.lifted(outcome.solution)
-        smooth = part.background(solution)[0] if problem.smooth else None
-        residual = part.residual(solution, smooth)[0]
-        volume = np.abs(np.asarray(solution[0], np.float64))
-    finally:
-        part.close()
+def _coarse_pass(problem: Problem) -> tuple[npt.NDArray[np.float64], float]:
+    """Return the planes' shares of the light of a problem of one channel, and the background's."""
+    found = pilot(problem, COARSE_ITERATIONS)
+    assert found.background is not None
     psfs = problem.levelled[0].central
-    per_plane = volume.sum(axis=(1, 2)) * psfs[:, 0].sum(axis=(1, 2), dtype=np.float64)
+    per_plane = found.solution[0].sum(axis=(1, 2), dtype=np.float64) * psfs[:, 0].sum(
+        axis=(1, 2), dtype=np.float64
+    )
     valid = problem.valid[0]
-    misfit = float(np.sqrt(np.mean(residual[valid].astype(np.float64) ** 2)))
+    mean = float(problem.data[0][valid].mean(dtype=np.float64))
     share = per_plane / max(float(per_plane.sum()), 1e-30)
-    light = float(problem.data[0][valid].mean(dtype=np.float64))
-    smooth_share = 0.0 if smooth is None or light <= 0 else float(smooth[valid].mean()) / light
-    return CoarsePass(misfit, share[None], seconds, smooth_share, outcome.history[-1].objective)
+    return share, 0.0 if mean <= 0 else float(found.background[0][valid].mean()) / mean
 
 
-@dataclass(frozen=True)
-class CameraCost:
-    """What one forward and adjoint of the coarse copy's camera cost.
-
-    Attributes
-    ----------
-    seconds : float
-        Processor time.
-    fft_pixels : int
-        Pixels transformed: the same at any time, to choose by. 0 for one convolution.
-    """
-
-    seconds: float
-    fft_pixels: int
-
-
-def camera_cost(problem: Problem, model: ModelName) -> CameraCost:
-    """Measure a forward and an adjoint of the coarse copy's camera."""
-    part = Part(_as(problem, model, "nonnegative", background=False), slice(0, 1))
+def camera_cost(problem: Problem, model: ModelName) -> int:
+    """Return the pixels that the coarse copy's camera transforms; 0 for one convolution."""
+    part = Part(coarse_copy(problem, model, "nonnegative", background=False), slice(0, 1))
     try:
         camera = part.camera
-        camera.adjoint(camera.forward(np.zeros(camera.domain_shape, np.float32)))
-        began = time.process_time()
-        camera.adjoint(camera.forward(np.zeros(camera.domain_shape, np.float32)))
-        seconds = max(time.process_time() - began, 1e-6)
-        return CameraCost(seconds, camera.fft_pixels if isinstance(camera, SpatiallyVarying) else 0)
+        return camera.fft_pixels if isinstance(camera, SpatiallyVarying) else 0
     finally:
         part.close()
 

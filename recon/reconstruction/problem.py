@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from recon.reconstruction.reduction import Reduction
 
 Array = npt.NDArray[Any]
+Stage = Callable[[float, str], object]
+"""``on_stage(share, what)``: how much is done, 0 to 1, of what comes before or after the iterations."""
 
 
 @dataclass(frozen=True)

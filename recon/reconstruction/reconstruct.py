@@ -8,22 +8,31 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
+from recon.base.checks import require_photograph
 from recon.base.declare import with_overrides
 from recon.camera.camera_model import CAMERAS
+from recon.errors import InputError
 from recon.priors import PRIORS
+from recon.reconstruction.background import HELD_OUT
+from recon.reconstruction.course import Course
+from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.problem import Problem
+from recon.reconstruction.part import Part, parts_of
+from recon.reconstruction.problem import Problem, Stage
+from recon.reconstruction.psf_refinement import refined
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
-from recon.reconstruction.solve import Progress, solve
+from recon.reconstruction.solve import Progress, rules_of, solve
 from recon.reconstruction.solvers import SOLVERS
+from recon.reconstruction.uncertainty import refused, uncertain
 from recon.solvers.base import Keeper
 from recon.types import Calibration
 from recon.verdict.evidence import evidence_of, not_judged, observations, unsettled_by
-from recon.verdict.judge import Verdict, method_name, verdict_on
+from recon.verdict.judge import Verdict, method_name, unlike_any, verdict_on
 
 FACTS = tuple(f.name for f in fields(Measurement) if f.name != "image")
 """What is known of a measurement, by the names that :func:`reconstruct` takes them by."""
@@ -38,6 +47,7 @@ def reconstruct(
     on_progress: Progress | None = None,
     cancel: threading.Event | None = None,
     keeper: Keeper | None = None,
+    on_stage: Stage | None = None,
     **overrides: Any,
 ) -> Reconstruction:
     """Reconstruct a picture or a volume from a lensless camera's measurement.
@@ -61,6 +71,9 @@ def reconstruct(
         Set it to stop after the iteration in progress.
     keeper : Keeper, optional
         Keeps the solvers' state, and has them go on from what was kept of the same reconstruction.
+    on_stage : callable, optional
+        ``on_stage(share, what)``: how much of all is done, 0 to 1, which never falls: fitting the PSF
+        (``refine_psf``), choosing, the iterations, the repetitions of ``uncertainty``, judging.
     **overrides
         Single options by their names: ``reconstruct(image, psf, prior="l1", iterations=50)``.
 
@@ -71,11 +84,29 @@ def reconstruct(
     if not isinstance(measurement, Measurement):
         measurement = Measurement(measurement)
     problem = Problem.of(replace(measurement, **known), calibration, options)
-    problem = choose(problem)
-    result = solve(problem, warm=warm, on_progress=on_progress, cancel=cancel, keeper=keeper)
-    return (
-        judged(result, problem, started=warm is not None) if options.judged else replace(result, basis=None)
-    )
+    require_two_images(problem)
+    if options.uncertainty and (reason := refused(problem)) is not None:
+        raise InputError(f"{reason[0].upper()}{reason[1:]}.")
+    course, refinement = Course(options, on_stage), None
+    if options.refine_psf:
+        problem, refinement = refined(problem, on_stage=course.stage("refine"), cancel=cancel)
+    problem = choose(problem, on_stage=course.stage("choose"))
+    watch = course.iterations(on_progress, len(parts_of(problem)))
+    result = solve(problem, warm=warm, on_progress=watch, cancel=cancel, keeper=keeper)
+    if options.uncertainty:
+        result = uncertain(result, problem, on_stage=course.stage("uncertainty"), cancel=cancel)
+    if refinement is not None:
+        provenance = {**result.provenance, "psf_refinement": refinement.to_json()}
+        result = replace(result, refinement=refinement, provenance=provenance)
+    if not options.judged:
+        return replace(result, basis=None)
+    return judged(result, problem, started=warm is not None, on_stage=course.stage("judge"))
+
+
+def require_two_images(problem: Problem) -> None:
+    """Raise InputError where a photograph is its own PSF, or the two are swapped."""
+    if not problem.patterned:
+        require_photograph(problem.data, problem.depths.central, problem.valid)
 
 
 def given(
@@ -92,8 +123,54 @@ def _defaults() -> ReconstructionOptions:
     return ReconstructionOptions()
 
 
-def judged(result: Reconstruction, problem: Problem, *, started: bool = False) -> Reconstruction:
-    """Return the result with a verdict on whether to trust it, at the cost of about two iterations.
+SHARE, LEAST = 3, 20
+"""Of a result's iterations a third are run without held-out pixels, and so many at least."""
+
+
+def held_out_error(result: Reconstruction, problem: Problem) -> float:
+    """Return the root mean square error of a tenth of the pixels by a shorter run without them.
+
+    Parameters
+    ----------
+    result : Reconstruction
+    problem : Problem
+        That was solved; of several channels that are solved one by one the one with most signal counts.
+
+    Returns
+    -------
+    float
+        In units of the noise, which it holds itself: 1 is as good as can be.
+    """
+    unseen = problem.valid & (np.random.default_rng(0).random(problem.valid.shape) < HELD_OUT)
+    spread = [float(d[v].std()) for d, v in zip(problem.data, problem.valid, strict=True)]
+    channels = next(c for c in parts_of(problem) if c.start <= int(np.argmax(spread)) < c.stop)
+    seen = replace(problem, data=np.where(unseen, 0, problem.data), valid=problem.valid & ~unseen)
+    offered = SOLVERS.named(result.solver)
+    if offered.accepts(seen) is not None:
+        offered = SOLVERS.named("admm")
+    rules = rules_of(seen, offered)
+    if not offered.one_step:
+        rules = replace(rules, iterations=max(len(result.history) // SHARE, LEAST))
+    part = Part(seen, channels)
+    try:
+        part.weigh(result.tau)
+        solution = part.lifted(offered.make(part, None).run(rules).solution)
+        told = part.camera.forward(solution)
+        if part.removal is not None:
+            told = told + part.background(solution)
+    finally:
+        part.close()
+    missed = (problem.data[channels] - told)[unseen[channels]].astype(np.float64)
+    return float(np.sqrt(np.mean(missed**2)))
+
+
+def judged(
+    result: Reconstruction, problem: Problem, *, started: bool = False, on_stage: Stage | None = None
+) -> Reconstruction:
+    """Return the result with a verdict on whether to trust it and whether the calibration is its own.
+
+    At the cost of about two iterations, and of a hundred on few pixels; where no known case tells, of a third
+    of the iterations more, for pixels that are held out.
 
     Parameters
     ----------
@@ -102,10 +179,39 @@ def judged(result: Reconstruction, problem: Problem, *, started: bool = False) -
         That was solved.
     started : bool
         Whether it was started from another result.
+    on_stage : callable, optional
+        ``on_stage(share, what)`` as it goes on.
     """
     problem, small = result.basis or (problem, result)
+    tell = on_stage or (lambda *_: None)
+    tell(0.0, "judging the result")
     verdict, said = _verdict(small, problem, started=started)
-    return replace(result, verdict=verdict, warnings=(*result.warnings, *said), basis=None)
+    if verdict is not None:
+        try:
+            check = check_calibration(problem, on_stage=tell)
+            verdict = verdict if check is None else verdict.with_calibration(check)
+            if unlike_any(verdict):
+                verdict = replace(verdict, held_out=held_out_error(small, problem))
+        except Exception as error:  # noqa: BLE001 - the verdict says what it says without it
+            said = (
+                *said,
+                f"The calibration was not checked: {error}",
+            )
+    tell(1.0, "judged")
+    uncertainty = result.uncertainty
+    if uncertainty is not None and verdict is not None and verdict.calibration is not None:
+        uncertainty = replace(uncertainty, wrong_calibration=verdict.calibration.wrong)
+        said = (*said, *(doubt for doubt in uncertainty.doubt if doubt not in result.warnings))
+    residual = result.residual if verdict is None or unlike_any(verdict) else None
+    warnings = (*result.warnings, *said)
+    return replace(
+        result,
+        verdict=verdict,
+        residual=residual,
+        uncertainty=uncertainty,
+        warnings=warnings,
+        basis=None,
+    )
 
 
 def _verdict(

@@ -91,6 +91,7 @@ class Reduction:
             volume=self.volume(small.volume),
             grid=self.given.grid,
             background=None if background is None else self.background(background),
+            residual=None if small.residual is None else self._larger(small.residual),
             choice=choice,
             empty_planes=tuple(
                 replace(e, planes=_empty(choice, [places[z] for z in e.planes])) for e in small.empty_planes

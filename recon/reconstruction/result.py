@@ -18,6 +18,8 @@ from recon.verdict.judge import Verdict
 if TYPE_CHECKING:
     from recon.reconstruction.choice import Choice
     from recon.reconstruction.problem import Problem
+    from recon.reconstruction.psf_refinement import Refinement
+    from recon.reconstruction.uncertainty import Uncertainty
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +121,15 @@ class Reconstruction:
         What may be wrong with the result, in sentences.
     verdict : Verdict or None
         Whether to trust it, from the data alone; None where nobody asked for one.
+    uncertainty : Uncertainty or None
+        How far it may be off, pixel by pixel; None where nobody asked for it.
+    residual : ndarray, float32, shaped as the measurement, or None
+        What is left of the data, in units of their noise, 0 where there are none; None where a verdict says
+        what the result is worth, or none was asked for.
     choice : Choice or None
         What was chosen and why, where the program chose (``model="auto"``).
+    refinement : Refinement or None
+        How the PSFs were brought to fit the photograph, where that was asked for (``refine_psf``).
     state : ndarray or None
         The whole object on the operator's grid in measurement units, (n_channels, n_z, grid height, grid
         width), for a start that forgets nothing; None where that would take too much memory, or does not fit
@@ -148,7 +157,10 @@ class Reconstruction:
     empty_planes: tuple[EmptyPlanes, ...] = ()
     warnings: tuple[str, ...] = ()
     verdict: Verdict | None = None
+    uncertainty: Uncertainty | None = None
+    residual: npt.NDArray[np.float32] | None = None
     choice: Choice | None = None
+    refinement: Refinement | None = None
     state: npt.NDArray[Any] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     basis: tuple[Problem, Reconstruction] | None = field(default=None, repr=False, compare=False)

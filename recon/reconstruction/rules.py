@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR, TOLERATED, Depths, ModelName, choose_model
 from recon.camera.varying_psfs import principal_psfs
-from recon.reconstruction.choice import ERROR_SCALE, Decision, Option, left_out_db, loss_db
+from recon.reconstruction.choice import Decision
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.probe import (
     ACCEPTED,
-    CameraCost,
-    CoarsePass,
     acceptance_px,
     psf_window,
     resolution_px,
@@ -23,8 +19,6 @@ from recon.reconstruction.probe import (
 from recon.verdict.cases import shipped_maps
 from recon.verdict.map import PRECISION
 
-VARYING_COST = 3.0
-"""Operator applications an iteration of conjugate gradients, relative to a convolution."""
 HIDDEN, HIDDEN_VARIATION = 4.0, 0.4
 """Volumes by total variation: the PSFs' relative differences times the data's contrast in units of its
 noise, and the differences themselves, up to which one convolution serves. Below, in 16 dim volumes, the true
@@ -38,7 +32,7 @@ def candidates(depths: Depths) -> tuple[ModelName, ...]:
 
 
 def model_of(
-    depths: Depths, overrides: Overrides, contrast: float | None, costs: Mapping[ModelName, CameraCost]
+    depths: Depths, overrides: Overrides, contrast: float | None, costs: Mapping[ModelName, int]
 ) -> tuple[ModelName, Decision]:
     """Decide on the camera model, with its neighbours on the scale convolution, low-rank, local.
 
@@ -64,7 +58,7 @@ def model_of(
         why = "as asked"
     elif model != "convolution":
         differ = f"PSFs differ by {variation:.1%} over the field"
-        share = costs["lowrank"].fft_pixels / max(costs["local"].fft_pixels, 1)
+        share = costs["lowrank"] / max(costs["local"], 1)
         components = f"{differ}; {rank} component{'s' if rank > 1 else ''} tell all but {LOW_RANK_ERROR:.0%}"
         if contrast is not None and contrast * variation <= HIDDEN and variation <= HIDDEN_VARIATION:
             model = "convolution"
@@ -84,21 +78,14 @@ def model_of(
             f"(--model {unjudged[0]} takes it)"
         )
     if not varying:
-        return model, Decision("model", model, why, numbers=numbers, overruled=asked)
+        return model, Decision("model", model, why, numbers=numbers, overruled=asked, open=False)
     numbers |= {"rank": float(rank), "rank_error": low.error}
-    loss = {"convolution": loss_db(variation), "lowrank": loss_db(low.error), "local": 0.0}
 
-    def cost(m: ModelName) -> float:
-        kind, applications = ("convolution", 1.0) if m == "convolution" else ("varying", VARYING_COST)
-        return costs[m].seconds * applications * USUAL_ITERATIONS[kind]
-
-    def step(by: int) -> Option | None:
+    def step(by: int) -> str | None:
         place = scale.index(model) + by
-        if not 0 <= place < len(scale):
-            return None
-        return Option(scale[place], cost(scale[place]) / cost(model), loss[scale[place]] - loss[model])
+        return scale[place] if 0 <= place < len(scale) else None
 
-    return model, Decision("model", model, why, loss[model], step(1), step(-1), asked, numbers)
+    return model, Decision("model", model, why, step(1), step(-1), asked, numbers)
 
 
 LEAST_SIDE = 20
@@ -128,16 +115,11 @@ def binning_of(depths: Depths, overrides: Overrides, *, whole: bool) -> Decision
         )
     if not whole and not asked and fitting > 1:
         why = f"erased pixels are not averaged with others; else {why}"
-    up = None if binning == 1 else Option(str(binning - 1), (binning / (binning - 1)) ** 2, 0.0)
-    down = None
-    if side // (binning + 1) >= 16:
-        down = Option(
-            str(binning + 1),
-            (binning / (binning + 1)) ** 2,
-            loss_db(max(SAMPLES * (binning + 1) / sharpest - 1, 0.0) * ERROR_SCALE),
-        )
+    up = None if binning == 1 else str(binning - 1)
+    down = str(binning + 1) if side // (binning + 1) >= 16 else None
     numbers = {"binning": float(binning), "autocorrelation_px": sharpest}
-    return Decision("binning", f"{binning} x {binning}", why, 0.0, up, down, asked, numbers)
+    value = f"{binning} x {binning}"
+    return Decision("binning", value, why, up, down, asked, numbers, open=binning > 1)
 
 
 def field_of(
@@ -170,7 +152,7 @@ def field_of(
     if plain:
         why = "one convolution of a picture is quick on everything that can reach the sensor"
         numbers = {"share_of_largest": 1.0}
-        whole = Decision("field", f"{largest} pixels", why, overruled=overruled, numbers=numbers)
+        whole = Decision("field", f"{largest} pixels", why, overruled=overruled, numbers=numbers, open=False)
         return (height, width), None, whole
     asked = overrides.field == "all"
     window = (height, width) if asked else psf_window(depths)
@@ -189,37 +171,16 @@ def field_of(
         reach = None
     modelled = extent[0] * extent[1] if reach is None else min(np.pi * reach**2, extent[0] * extent[1])
     share = modelled / ((2 * height - 1) * (2 * width - 1))
-    up = None if share > 0.99 else Option(largest, 1 / share, 0.0)
-    down = None
-    if height * width < modelled:
-        # An even object beyond the sensor's own throws as much light onto the sensor as the part of the PSFs
-        # that this one throws beside it: light in the wrong place.
-        lost = float((window[0] / (2 * height) + window[1] / (2 * width)) / 2)
-        down = Option(f"{height} x {width}", height * width / modelled, left_out_db(lost))
+    up = None if share > 0.99 else largest
+    down = f"{height} x {width}" if height * width < modelled else None
     numbers = {"share_of_largest": share}
     value = f"{extent[0]} x {extent[1]} pixels" + ("" if reach is None else f", {reach:.0f} about the axis")
-    return window, reach, Decision("field", value, why, 0.0, up, down, asked, numbers)
+    return window, reach, Decision("field", value, why, up, down, asked, numbers)
 
 
 STRAY_SHARE = 0.2
 """Share of the data's light, in a coarse l1 pass's smooth background, from which on there may be stray light
 in a picture: sparse ones without any had up to 0.15 there, dense ones, which l1 does not explain, 0.75."""
-POINTS_SHARE = 0.11
-"""The same from which on points have a background estimated. Where there was stray light of 0.3 to 1.2 times
-the scene's one gained 1.6 to 12 dB, with few points and with many; without any it changed -3 to 0.9 dB."""
-OBJECTIVE_FALL = 0.15
-"""By how much of itself misfit and prior together must fall in a picture with total variation.
-
-What neither object nor noise explains is made up for by structure that costs more than a background's few
-numbers save: stray light, light from beyond the calibrated field. On the scenes it was tuned on a background
-gained 1.3 to 5.7 dB where the objective of twenty iterations fell by 0.17 or more (once by 0.09), and lost
-0.3 to 5 dB where it fell by less. Of volumes with total variation, which cannot tell a smooth object from a
-background and loses the hold that darkness gives it, it says nothing: there one lost up to 8, gained 1.6 dB.
-"""
-IDLE_BACKGROUND_DB = {"tv": 2.5, "l1": 0.3}
-"""What a background costs that the data do not ask for: the median of the scenes tuned on."""
-GAINED_DB = {"tv": 12.0, "l1": 15.0}
-"""What one gains for each unit of what decides on it: a rule of thumb of the same scenes."""
 SETTLED = {"convolution": 1e-3, "merged": 1e-3, "varying picture": 2e-3, "varying volume": 3e-3}
 """Change an iteration at which pictures were seen to be within 0.2 dB of the end: the solver of varying PSFs,
 with its exact data term, goes further in one iteration. Merged colours have the light of all: less noise, and
@@ -227,84 +188,13 @@ more to be gained at the end, in a third of the time."""
 USUAL_ITERATIONS = {"convolution": 100, "varying": 60}
 
 
-@dataclass(frozen=True, slots=True)
-class SmoothLight:
-    """What quick passes say of smooth light.
-
-    Attributes
-    ----------
-    share : float
-        Of the data's light, in the background of a coarse l1 pass.
-    dark, lit : CoarsePass or None
-        Of a picture with total variation in which there may be stray light: passes by the model that is used,
-        without and with a background.
-    """
-
-    share: float
-    dark: CoarsePass | None = None
-    lit: CoarsePass | None = None
-
-    @property
-    def fall(self) -> float | None:
-        """By how much of itself the objective falls with a background; None where nobody looked."""
-        if self.dark is None or self.lit is None:
-            return None
-        return 1 - self.lit.objective / self.dark.objective if self.dark.objective > 0 else 0.0
-
-
 def is_stray(share: float) -> bool:
     """Tell whether the smooth part of a coarse l1 pass may be stray light."""
     return share >= STRAY_SHARE
 
 
-def background_of(
-    light: SmoothLight, kind: Literal["tv", "l1"], overrides: Overrides, *, given: bool
-) -> Decision:
-    """Decide whether a smooth background is estimated as well."""
-    fall = light.fall
-    numbers = {"smooth_share": light.share}
-    if light.dark is not None and light.lit is not None and fall is not None:
-        numbers |= {
-            "objective_falls": fall,
-            "misfit_without": light.dark.misfit,
-            "misfit_with": light.lit.misfit,
-        }
-    found = f"a coarse pass puts {light.share:.0%} of the light into a smooth background"
-    if given:
-        why, on = "a background was given", False
-    elif kind == "l1":
-        on = light.share >= POINTS_SHARE
-        why = f"{found} ({POINTS_SHARE:.0%} are asked of it)"
-    elif fall is not None:
-        on = fall >= OBJECTIVE_FALL
-        why = (
-            f"{found}; with one misfit and prior together {'fall' if fall >= 0 else 'rise'} by "
-            f"{abs(fall):.0%} (a fall of {OBJECTIVE_FALL:.0%} is asked of it)"
-        )
-    else:
-        on, why = False, f"{found}; total variation cannot tell a smooth background from a smooth object"
-    asked = overrides.background is not None
-    on = on if overrides.background is None else overrides.background
-    change = _change_db(light, kind)
-    # A few more numbers in the solver's equations: the time is the same.
-    if on:
-        down = Option("none", 1.0, -change)
-        return Decision("background", "estimated", why, 0.0, None, down, asked, numbers)
-    up = Option("estimated", 1.0, change)
-    return Decision("background", "none", why, 0.0, up, None, asked, numbers)
-
-
-def _change_db(light: SmoothLight, kind: Literal["tv", "l1"]) -> float:
-    """Return what a background changes: rules of thumb of the scenes tuned on."""
-    told, least = (light.share, POINTS_SHARE) if kind == "l1" else (light.fall, OBJECTIVE_FALL)
-    return -IDLE_BACKGROUND_DB[kind] if told is None or told < least else GAINED_DB[kind] * told
-
-
 def iterations_of(tolerance: float, overrides: Overrides, *, plain: bool) -> Decision:
-    """Say why to stop at a change an iteration, with what stopping later and earlier would be.
-
-    The steps are rules of thumb of the scenes tuned on; ``plain`` as in :func:`field_of`.
-    """
+    """Say why to stop at a change an iteration; ``plain`` as in :func:`field_of`."""
     asked = overrides.tolerance is not None
     seen = "pictures were seen to be within 0.2 dB of the end there"
     usual = "where this solver stops by default" if plain else seen
@@ -312,18 +202,17 @@ def iterations_of(tolerance: float, overrides: Overrides, *, plain: bool) -> Dec
         "iterations",
         f"until they change by less than {tolerance:g}",
         "as asked" if asked else usual,
-        up=Option(f"until {tolerance / 10:g}", 3.0, 0.2),
-        down=Option(f"until {tolerance * 3:g}", 0.5, -0.5),
+        up=f"until {tolerance / 10:g}",
+        down=f"until {tolerance * 3:g}",
         overruled=asked,
         numbers={"tolerance": tolerance},
+        open=False,
     )
 
 
 METHOD = "admm tv"
 """Of the map; it is ADMM that reconstructs what is chosen here. The map is of pictures; those of volumes are
 ADMM as well, with sums as long for each of their planes."""
-DOUBLE_COST = 2.0
-"""Time of float64 relative to float32: transforms move twice the bytes."""
 
 
 def drift(iterations: int, pixels: int) -> float:
@@ -359,11 +248,8 @@ def precision_of(overrides: Overrides, iterations: int, pixels: int) -> Decision
         f"by the stability map float32 differs from float64 by at most {expected:.0e} of the picture after "
         f"{iterations} iterations on {pixels} pixels ({PRECISION:.0%} is a failure)"
     )
-    loss = 0.0 - 10 * float(np.log10(1 + expected**2))
     numbers = {"expected_difference": expected}
     value = overrides.precision or ("float64" if expected > PRECISION else "float32")
-    if value == "float64":
-        down = Option("float32", 1 / DOUBLE_COST, loss)
-        return Decision("precision", value, why, 0.0, None, down, asked, numbers)
-    up = Option("float64", DOUBLE_COST, abs(loss))
-    return Decision("precision", value, why, loss, up, None, asked, numbers)
+    double = value == "float64"
+    up, down = (None, "float32") if double else ("float64", None)
+    return Decision("precision", value, why, up, down, asked, numbers, open=double)

@@ -4,32 +4,25 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.camera_model import ModelName
+from recon.camera.camera_model import CAMERAS, ModelName
 from recon.errors import InputError
+from recon.reconstruction.background import FLOOR, Trial, background_of, floor, trial_of
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import channels_of, merged
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.planes import between_of, planes_of
-from recon.reconstruction.probe import (
-    COARSE_PX,
-    VARYING_ITERATIONS,
-    CoarsePass,
-    camera_cost,
-    coarse_passes,
-)
-from recon.reconstruction.problem import Problem
+from recon.reconstruction.probe import COARSE_PX, camera_cost, coarse_copy, coarse_passes
+from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import on_blocks, reduced, reduced_calibration
 from recon.reconstruction.rules import (
     SETTLED,
     USUAL_ITERATIONS,
-    SmoothLight,
-    background_of,
     binning_of,
     candidates,
     field_of,
@@ -38,14 +31,19 @@ from recon.reconstruction.rules import (
     model_of,
     precision_of,
 )
-from recon.reconstruction.solvers import SOLVERS, require_solver
+from recon.reconstruction.solvers import SOLVERS, require_solver, volume_priors
 from recon.reconstruction.weights import kind_of
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
 
 
-def choose(problem: Problem, options: ReconstructionOptions | None = None) -> Problem:
+def choose(
+    problem: Problem,
+    options: ReconstructionOptions | None = None,
+    *,
+    on_stage: Stage | None = None,
+) -> Problem:
     """Return the smallest problem that explains the data as well: model ``"auto"``.
 
     What is chosen: the camera model, the depths that take part and planes between them, the field, binning,
@@ -58,12 +56,14 @@ def choose(problem: Problem, options: ReconstructionOptions | None = None) -> Pr
     problem : Problem
     options : ReconstructionOptions, optional
         Default the problem's own.
+    on_stage : callable, optional
+        ``on_stage(share, what)`` as it goes on.
 
     Returns
     -------
     Problem
         With ``choice`` (the reasons, and what one step up and down would cost) and ``reduction`` (the way
-        back). The same problem where the options ask for a model.
+        back). Where the options ask for a model the same problem, in pictures with a background if it helps.
 
     Raises InputError when the input is unusable, or a choice was asked for that cannot be had.
     """
@@ -75,13 +75,36 @@ def choose(problem: Problem, options: ReconstructionOptions | None = None) -> Pr
                 f"Choices are about what model='auto' chooses; they do not go with model={problem.model!r}. "
                 "Leave one of the two out."
             )
+        return with_background(problem, problem.calibration) if problem.n_planes == 1 else problem
+    return reduced(choice_for(problem, on_stage), problem)
+
+
+def with_background(problem: Problem, calibration: Calibration) -> Problem:
+    """Return a problem of a given model with a smooth background where ``auto`` would have one; nobody said.
+
+    All of the calibration's PSFs tell whether there is one.
+    """
+    options, model = problem.options, problem.model
+    said = options.estimate_background is not None or problem.measurement.background is not None
+    if said or problem.patterned or model in CAMERAS:
         return problem
-    return reduced(choice_for(problem), problem)
+    asked = replace(options, model="auto", choose=Overrides(model=model, binning=1, channels="all"))
+    choice = choice_for(Problem.of(problem.measurement, calibration, asked))
+    if choice.background != problem.smooth:
+        options = replace(options, estimate_background=choice.background)
+        problem = Problem.of(problem.measurement, problem.calibration, options)
+    if not choice.background:
+        return problem
+    (why,) = (d.why for d in choice.decisions if d.name == "background")
+    said_so = f"A smooth background is estimated as well: {why}."
+    return replace(problem, warnings=(*problem.warnings, said_so))
 
 
-def choice_for(problem: Problem) -> Choice:
+def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     """Choose what to reconstruct a problem with; errors as :func:`choose`."""
     began = time.perf_counter()
+    tell = on_stage or (lambda *_: None)
+    tell(0.0, "choosing: camera models")
     overrides, held = _held(problem, _settled(problem))
     measurement, calibration = problem.measurement, problem.calibration
     counts = measurement.counts()
@@ -97,23 +120,29 @@ def choice_for(problem: Problem) -> Choice:
         depths = Problem.of(
             Measurement(data[0]), calibration, ReconstructionOptions(z_um=problem.options.z_um)
         ).depths
-    coarse = _coarse(data, valid, calibration, problem.options.z_um)
     kind = kind_of(problem.prior_name)
     picture = problem.n_planes == 1
-    costs = {m: camera_cost(coarse[0], m) for m in candidates(depths)}
+    scale = candidates(depths)
+    looked = not picture or len(scale) > 1  # else one PSF is all there is
+    given = measurement.background is not None
+    unsaid = not given and overrides.background is None
+    lit = unsaid and (looked or all(floor(d[v]) >= FLOOR for d, v in zip(data, valid, strict=True)))
+    coarse = _coarse(data, valid, calibration, problem.options.z_um) if looked or lit else []
+    costs = {m: camera_cost(coarse[0], m) for m in scale} if len(scale) > 1 else {}
+    tell(0.2, "choosing: where light is")
     contrast = None if kind == "l1" or picture else _contrast(data, valid, deviation)
     model, by_model = model_of(depths, overrides, contrast, costs)
-    # One convolution a depth: quick, and good enough to see where light is and whether there is stray light.
-    sparse = coarse_passes(coarse, "l1", background=True)
-    light = _smooth_light(coarse, sparse, kind, model)
+    sparse = coarse_passes(coarse) if looked else None
+    tell(0.4, "choosing: a background")
     given = measurement.background is not None
-    smooth = background_of(light, kind, overrides, given=given)
+    smooth = background_of(_trial(problem, coarse, model) if lit else None, overrides, given=given)
     estimated = smooth.value == "estimated"
     planes, dropped = planes_of(sparse, depths, overrides)
     between, added = between_of(calibration, depths, planes, overrides)
     binning = binning_of(depths, overrides, whole=whole)
     # A background of a few numbers takes what light from beyond the field has of them, not all of it.
-    haze = is_stray(light.share) and not given and not (estimated and kind == "l1")
+    stray = sparse is not None and is_stray(sparse.smooth_share)
+    haze = stray and not given and not (estimated and kind == "l1")
     plain = picture and model == "convolution" and not estimated
     window, reach, field = field_of(depths, overrides, model, haze=haze, plain=plain)
     usual = USUAL_ITERATIONS["convolution" if model == "convolution" else "varying"]
@@ -208,7 +237,7 @@ def _held(problem: Problem, overrides: Overrides) -> tuple[Overrides, dict[str, 
 def _coarse(data: Array, valid: Array, calibration: Calibration, z_um: float | None) -> list[Problem]:
     """Return small copies of every channel."""
     # Erased pixels cannot be averaged with others: the coarse pass then has all pixels.
-    factor = max(1, max(data.shape[1:]) // COARSE_PX) if valid.all() else 1
+    factor = -(-max(data.shape[1:]) // COARSE_PX) if valid.all() else 1
     options = ReconstructionOptions(z_um=z_um, estimate_background=False)
     several = calibration.psfs.shape[1] > 1
     coarse = []
@@ -226,16 +255,8 @@ def _contrast(data: Array, valid: Array, deviation: Array) -> float:
     return max(s / max(float(n), 1e-30) for s, n in zip(spread, deviation, strict=True))
 
 
-def _smooth_light(
-    coarse: list[Problem], sparse: CoarsePass, kind: Literal["tv", "l1"], model: ModelName
-) -> SmoothLight:
-    """Look for light that a smooth background would explain."""
-    share = sparse.smooth_share
-    # A picture that l1 explains has no smooth light; that of a volume total variation does not tell.
-    if not (kind == "tv" and coarse[0].n_planes == 1 and is_stray(share) and model != "convolution"):
-        return SmoothLight(share)
-    dark, lit = (
-        coarse_passes(coarse, "tv", background=b, model=model, iterations=VARYING_ITERATIONS)
-        for b in (False, True)
-    )
-    return SmoothLight(share, dark, lit)
+def _trial(problem: Problem, coarse: list[Problem], model: ModelName) -> Trial:
+    """Try the coarse copies with the problem's prior; one that ADMM has no way for by what it counts."""
+    name = problem.prior_name
+    prior = name if name in volume_priors() else kind_of(name)
+    return trial_of([coarse_copy(c, model, prior, background=True) for c in coarse])

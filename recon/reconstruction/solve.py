@@ -12,11 +12,13 @@ import numpy.typing as npt
 
 from recon.base.declare import settled
 from recon.errors import InputError
+from recon.reconstruction.first_look import FirstLook, look_at
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.planes import limit_of, signs_in_words, signs_of_light
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reduction import Reduction
+from recon.reconstruction.residual import background_in_words, residual_in_words
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solvers import OfferedSolver
@@ -133,6 +135,8 @@ class _Solved:
     memory: str | None
     noise_norm: float
     residual: float
+    rest: Array | None
+    doubts: list[str]
 
 
 def _solve(
@@ -148,16 +152,20 @@ def _solve(
         raise InputError(f"The prior {problem.prior_name} has no weight: leave tau out.")
     channels = parts_of(problem)
     rules = rules_of(problem, offered, len(channels))
+    look = look_at(problem, cancel)
+    if look is not None and rules.time_s is not None:
+        rules = replace(rules, time_s=max(rules.time_s - look.seconds / len(channels), 1e-9))
     found = []
     for one in channels:
         part = Part(problem, one)
         try:
             channel = f"channel-{one.start}" if len(channels) > 1 or not problem.together else ""
             kept = keeper, "-".join(filter(None, (prefix, channel)))
+            part.weigh(problem.options.tau, None if look is None else look.weight(problem.prior_name))
             found.append(_run(part, offered, rules, warm, on_progress, cancel, kept))
         finally:
             part.close()
-    return _together(problem, offered, found)
+    return _together(problem, offered, found, look)
 
 
 def rules_of(problem: Problem, offered: OfferedSolver, runs: int = 1) -> StoppingRules:
@@ -219,7 +227,6 @@ def _run(
 ) -> _Solved:
     """Solve for some channels."""
     problem, options = part.problem, part.problem.options
-    part.weigh(options.tau)
     shape = part.camera.domain_shape
     start = None if warm is None else problem.start(warm, part.channels, (shape[2], shape[3]))
     solver = offered.make(part, start)
@@ -254,6 +261,10 @@ def _run(
         rest = part.residual(solution, smooth)[0]
         channel, window = part.channels.start, problem.extent.psf_window
         signs = signs_of_light(rest, problem.extent.left_out, channel, window) / limit_of(part)
+    rest = _rest(part, solution, smooth, outcome)
+    residual = float("nan") if rest is None else float(np.linalg.norm(rest))
+    if outcome.history:
+        residual = outcome.history[-1].data_residual
     return _Solved(
         volume=problem.measured(solution, part.channels),
         state=_state(part, solution),
@@ -264,20 +275,23 @@ def _run(
         signs=signs,
         memory=part.memory_used(),
         noise_norm=part.noise_norm,
-        residual=_residual(part, solution, smooth, outcome),
+        residual=residual,
+        rest=rest,
+        doubts=[
+            *residual_in_words(problem, outcome, residual, part.noise_norm),
+            *background_in_words(problem, smooth),
+        ],
     )
 
 
-def _residual(part: Part, solution: Array, background: Array | None, outcome: Outcome) -> float:
-    """Return the norm of what a run leaves of the data, in units of the noise.
+def _rest(part: Part, solution: Array, background: Array | None, outcome: Outcome) -> Array | None:
+    """Return what a run leaves of the data, in units of the noise; None where nobody judges by it.
 
     A solution in one step fits whatever there is, with negative light where the model is wrong: without it.
     """
-    if outcome.history:
-        return outcome.history[-1].data_residual
     if not part.problem.options.judged:
-        return float("nan")
-    return float(np.linalg.norm(part.residual(np.maximum(solution, 0), background)))
+        return None
+    return part.residual(solution if outcome.history else np.maximum(solution, 0), background)
 
 
 def _state(part: Part, solution: Array) -> Array | None:
@@ -289,7 +303,9 @@ def _state(part: Part, solution: Array) -> Array | None:
     return state
 
 
-def _together(problem: Problem, offered: OfferedSolver, found: list[_Solved]) -> Reconstruction:
+def _together(
+    problem: Problem, offered: OfferedSolver, found: list[_Solved], look: FirstLook | None
+) -> Reconstruction:
     """Return what all parts gave as one result."""
     signs = [f.signs for f in found if f.signs is not None]
     left_out = np.max(signs, axis=0).tolist() if signs else []
@@ -309,14 +325,25 @@ def _together(problem: Problem, offered: OfferedSolver, found: list[_Solved]) ->
         residuals=tuple(f.residual for f in found),
         histories=tuple(f.outcome.history for f in found),
         stop_reasons=tuple(f.outcome.stop_reason for f in found),
-        seconds=sum(f.outcome.seconds for f in found),
+        seconds=sum(f.outcome.seconds for f in found) + (0.0 if look is None else look.seconds),
         background=_stacked([f.background for f in found if f.background is not None], problem.flat),
+        residual=_stacked([f.rest for f in found if f.rest is not None], problem.flat),
         empty_planes=empty,
-        warnings=(*problem.warnings, *_uncertified(empty), *signs_in_words(left_out)),
+        warnings=tuple(
+            dict.fromkeys(
+                (
+                    *problem.warnings,
+                    *_uncertified(empty),
+                    *signs_in_words(left_out),
+                    *(w for f in found for w in f.doubts),
+                )
+            )
+        ),
         state=np.concatenate(states) if states else None,
         provenance={
             **problem.provenance(),
             **({} if memory is None else {"memory": memory}),
+            **({} if look is None else {"weight": look.in_words(problem.prior_name)}),
             **({"light_in_planes_left_out": left_out} if signs else {}),
         },
     )

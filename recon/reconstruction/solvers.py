@@ -44,6 +44,8 @@ class OfferedSolver:
         Whether it has no iterations: limits do not apply to it.
     cost : float
         Rough time that a picture takes, relative to the first solver's.
+    suits : callable
+        ``suits(problem)`` tells whether it is to be preferred to those before it where it takes a problem.
     """
 
     name: str
@@ -54,6 +56,7 @@ class OfferedSolver:
     prior: str = "tv"
     one_step: bool = False
     cost: float = 1.5
+    suits: Callable[[Problem], bool] = lambda _: False
 
     def accepts(self, problem: Problem) -> str | None:
         """Say why it cannot solve a problem; None where it can."""
@@ -74,6 +77,10 @@ def volume_priors() -> tuple[str, ...]:
     return tuple(name for name in splitting_priors() if not PRIORS[name].pictures_only)
 
 
+MANY_PIXELS = 20_000
+"""Pixels of a sensor from which ``admm-sensor`` is as good as ``admm`` in less time
+(docs/benchmarks/weights.md): with fewer, what an iteration costs beside its pixels outweighs that it takes a
+third of the iterations."""
 _ONE_LIGHT = "it is for photographs in one light (fista takes patterns)"
 
 
@@ -228,6 +235,7 @@ def _offered() -> tuple[OfferedSolver, ...]:
             make=_sensor_admm,
             refuses=lambda problem: _plain_only(problem) or _by_name(problem, splitting_priors()),
             cost=2.0,
+            suits=lambda problem: problem.data[0].size >= MANY_PIXELS,
         ),
         OfferedSolver(
             name="fista",
@@ -267,7 +275,7 @@ def require_solver(name: str) -> None:
 
 
 def solver_for(problem: Problem) -> OfferedSolver:
-    """Return the solver that was asked for, or the first that takes a problem.
+    """Return the solver that was asked for, or the first that suits a problem, or else that takes it.
 
     Raises InputError when it has no way for the problem, with the reason.
     """
@@ -275,7 +283,7 @@ def solver_for(problem: Problem) -> OfferedSolver:
     require_solver(asked)
     if asked == "auto":
         reasons = []
-        for name, offered in SOLVERS.items():
+        for name, offered in sorted(SOLVERS.items(), key=lambda item: not item[1].suits(problem)):
             if (reason := offered.accepts(problem)) is None:
                 return offered
             reasons.append(f"{name}: {reason}")

@@ -136,7 +136,7 @@ class OperatorAdmm(ExactAdmm):
         return self.system.masked(self.camera.forward(self.x)[0])
 
     def _update(self) -> None:
-        back = self._invert(self.camera.adjoint(self.e[None]))
+        back = self._invert(self.camera.adjoint(self.system.weighed(self.e)[None]))
         back /= back.dtype.type(self._used_penalty)
         self.x += back
 

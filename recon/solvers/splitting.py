@@ -41,8 +41,8 @@ class SensorSystem:
     window : tuple of slice
         Where the sensor lies on the grid.
     measured : SensorData
-        Its valid pixels, and a smooth background to be estimated as well: a projection that is a further
-        factor of ``C``.
+        Its valid pixels, and a smooth background to be estimated as well: a further factor ``W`` of ``C``,
+        a projection or, restrained, nearly one.
     dtype : dtype
     xp : module
         Whose arrays: ``numpy`` or ``cupy``.
@@ -75,6 +75,7 @@ class SensorSystem:
         self._operator_bend = bend
         self.dtype = np.dtype(dtype)
         self._basis = None if background is None else [xp.asarray(part) for part in background.basis(0)]
+        self._taken = 1.0 if background is None else background.taken
         self._mask = None if valid is None or valid.all() else xp.asarray(valid.astype(self.dtype))
         self._plane = xp.zeros(grid_shape, self.dtype)
         self._spectrum = xp.empty(fft.spectrum_shape(grid_shape), fft.complex_dtype(self.dtype))
@@ -104,18 +105,31 @@ class SensorSystem:
         if self._mask is not None:
             image *= self._mask
         if self._basis is not None:
-            rows, columns, inverse = self._basis
-            coefficients = rows @ image.astype(np.float64) @ columns.T
-            best = (inverse @ coefficients.ravel()).reshape(coefficients.shape)
-            image -= (rows.T @ best @ columns).astype(self.dtype)
+            image -= self._smooth(image)
             if self._mask is not None:
                 image *= self._mask
         return image
 
+    def _smooth(self, image: Array) -> Array:
+        """Return what a background takes of an image."""
+        assert self._basis is not None
+        rows, columns, inverse = self._basis
+        coefficients = rows @ image.astype(np.float64) @ columns.T
+        best = self._taken * (inverse @ coefficients.ravel()).reshape(coefficients.shape)
+        smooth: Array = (rows.T @ best @ columns).astype(self.dtype)
+        return smooth
+
+    def weighed(self, e: Array) -> Array:
+        """``W e``, with ``W`` the factor that a restrained background is; ``e`` itself where it is none.
+
+        A projection changes nothing of what lies in its range.
+        """
+        return self.masked(e.copy()) if self._taken < 1 else e
+
     def spectrum_of(self, e: Array) -> Array:
         """``F C^T e``, in an array that the next call overwrites."""
         self._plane[...] = 0
-        self._plane[self.window] = e
+        self._plane[self.window] = self.weighed(e)
         return fft.rfft(self._plane, out=self._spectrum)
 
     def from_spectrum(self, X: Array) -> Array:
@@ -130,7 +144,9 @@ class SensorSystem:
     def _bend(self, e: Array) -> Array:
         """``C q C^T e``."""
         return (
-            self._filtered(e, self._q) if self._operator_bend is None else self.masked(self._operator_bend(e))
+            self._filtered(e, self._q)
+            if self._operator_bend is None
+            else self.masked(self._operator_bend(self.weighed(e)))
         )
 
     def solve(self, right: Array, e: Array) -> None:
@@ -146,6 +162,8 @@ class SensorSystem:
         self.steps = 0
         while float(xp.linalg.norm(residual)) > target and self.steps < self.max_steps:
             z = self._filtered(residual, self._preconditioner)
+            if self._taken < 1:  # smooth light hardly bends: it is its own
+                z += self._smooth(residual)
             rho, rho_before = float(xp.vdot(residual, z)), rho
             if not rho > 0:  # what is left is less than the arithmetic can tell
                 break

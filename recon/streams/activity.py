@@ -1,11 +1,4 @@
-"""Fluorescence over time (Kuo 2020, Sec. 6.4): motion, the baseline, the change, and what is active together.
-
-Regions are found by how a pixel's time course resembles that of its neighbours. Camera noise is independent
-from pixel to pixel, so that the correlation of neighbours shows where something happens, whatever its
-brightness (local correlation image). Pixels around each of its peaks that follow the peak's time course make
-up a region. A reconstruction's noise is not independent: a prior on differences makes it flat in patches,
-whose pixels go together. But it flickers from frame to frame where activity lasts, and that tells them apart.
-"""
+"""Fluorescence over time (Kuo 2020, Sec. 6.4): motion, fading, the baseline and the change relative to it."""
 
 from __future__ import annotations
 
@@ -23,9 +16,12 @@ Floats = npt.NDArray[np.float32]
 PERCENTILE = 20.0
 """Of a pixel's values that its baseline is (Kuo 2020, Fig. 6.5)."""
 FLOOR_SHARE = 0.1
-"""Least baseline that a change is divided by, relative to the bright part of the picture: where there is
-next to nothing, a relative change means nothing."""
-BRIGHT_PERCENTILE = 99.9
+"""Least baseline that a change is divided by, relative to how bright light is: where there is next to
+nothing, a relative change means nothing."""
+SURE = 3.0
+"""Standard errors from which a fading is one."""
+LEAST_FRAMES = 30
+"""Fewer cannot tell what lasts from what merely varies."""
 MOST_COMPARED = 500
 """Frames whose light is compared, each with each, to find how it fades; of longer videos every so many."""
 
@@ -99,7 +95,8 @@ def fading(frames: Floats) -> npt.NDArray[np.float64]:
 
     Its rate is the median slope of the logarithm of a frame's light between any two frames (Sen 1968):
     activity, which comes and goes, does not tell on it; a step that stays does in part. What bleaches
-    otherwise than the whole is left to the sliding baseline.
+    otherwise than the whole is left to the sliding baseline. A slope within three standard errors, by the
+    scatter about it, is none.
 
     Parameters
     ----------
@@ -113,7 +110,8 @@ def fading(frames: Floats) -> npt.NDArray[np.float64]:
     first, later = np.triu_indices(len(at), 1)
     level = np.log(light[at])
     slope = float(np.median((level[later] - level[first]) / (at[later] - at[first])))
-    relative: npt.NDArray[np.float64] = np.exp(slope * np.arange(len(frames)))
+    error = float(np.std(level - slope * at) / (np.sqrt(len(at)) * at.std()))
+    relative: npt.NDArray[np.float64] = np.exp(slope * (abs(slope) > SURE * error) * np.arange(len(frames)))
     return relative
 
 
@@ -171,139 +169,31 @@ def baseline(
     return result
 
 
-def change(frames: Floats, base: Floats) -> Floats:
+def brightness(image: Floats) -> float:
+    """Return the value above which half of an image's light lies; empty space around it changes nothing."""
+    values = np.sort(np.maximum(image, 0), axis=None)[::-1]
+    light = np.cumsum(values, dtype=np.float64)
+    return float(values[np.searchsorted(light, light[-1] / 2)])
+
+
+def floor_of(frames: Floats) -> float:
+    """Return the least baseline that a change is divided by: a tenth of how bright the pictures' light is.
+
+    Raises InputError when the pictures, (n_frames, height, width), hold no light.
+    """
+    floor = FLOOR_SHARE * brightness(frames.mean(axis=0))
+    if not floor > 0:
+        raise InputError("The video is dark: it holds no light anywhere.")
+    return floor
+
+
+def change(frames: Floats, base: Floats, floor: float) -> Floats:
     """Return dF/F, ``(F - F0) / max(F0, floor)``; the floor keeps what hardly shines from looking active.
 
     Parameters
     ----------
     frames, base : ndarray, (n_frames, height, width)
+    floor : float
+        Of :func:`floor_of`.
     """
-    floor = FLOOR_SHARE * float(np.percentile(base, BRIGHT_PERCENTILE))
-    if not floor > 0:
-        raise InputError("The video is dark: its baseline is zero nearly everywhere.")
     return ((frames - base) / np.maximum(base, np.float32(floor))).astype(np.float32)
-
-
-LASTING = 0.6
-"""Mean squared step from frame to frame relative to the variance (von Neumann's ratio) below which a course
-is activity that lasts. White noise has 2; patches of reconstructed noise 1.6 in the median and 0.7 at the
-first percentile; transients of half a second at ten frames a second 0.3 to 0.5 (benchmarks/activity.py).
-What lasts for one frame cannot be told from noise."""
-
-
-@dataclass(frozen=True, slots=True)
-class Region:
-    """Pixels that are active together."""
-
-    rows: npt.NDArray[np.intp]
-    columns: npt.NDArray[np.intp]
-    """``rows`` and ``columns``: its pixels."""
-    centre: tuple[float, float]
-    """Row and column, weighted with the activity."""
-    correlation: float
-    """Local correlation at its peak."""
-
-    def trace(self, frames: Floats) -> Floats:
-        """Return the mean over the region of each frame, (n_frames,)."""
-        trace: Floats = frames[:, self.rows, self.columns].mean(axis=1, dtype=np.float64).astype(np.float32)
-        return trace
-
-
-def local_correlation(frames: Floats) -> Floats:
-    """Return each pixel's mean correlation over time with its eight neighbours, (height, width).
-
-    Parameters
-    ----------
-    frames : ndarray, (n_frames, height, width)
-        Of dF/F, or of fluorescence less its baseline.
-    """
-    if len(frames) < 3:
-        raise InputError(f"Correlation over time needs three frames at least, not {len(frames)}.")
-    courses, norm = _courses(frames)
-    courses = (courses / np.where(norm > 0, norm, 1)).astype(np.float32)
-    height, width = norm.shape
-    total, count = np.zeros(norm.shape), np.zeros(norm.shape)
-    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        here = np.s_[: height - dy, max(0, -dx) : width - max(0, dx)]
-        there = np.s_[dy:, max(0, dx) : width - max(0, -dx)]
-        product = np.einsum("tyx,tyx->yx", courses[:, *here], courses[:, *there])
-        for part in (here, there):
-            total[part] += product
-            count[part] += 1
-    return (total / np.maximum(count, 1)).astype(np.float32)
-
-
-def _courses(frames: Floats) -> tuple[Floats, Array]:
-    """Return each pixel's course over time less its mean, and the courses' norms."""
-    courses = frames - frames.mean(axis=0)
-    return courses, np.sqrt(np.sum(courses.astype(np.float64) ** 2, axis=0))
-
-
-def lasts(course: Array) -> bool:
-    """Whether a course over time is activity that lasts longer than a frame, (n_frames,)."""
-    variance = float(np.var(course))
-    return variance > 0 and float(np.mean(np.diff(course) ** 2)) < LASTING * variance
-
-
-def find_regions(
-    frames: Floats,
-    *,
-    least_correlation: float = 0.5,
-    radius_px: float = 8.0,
-    least_pixels: int = 4,
-    alike: float = 0.7,
-    at_most: int = 200,
-) -> list[Region]:
-    """Find regions, the most correlated first.
-
-    Parameters
-    ----------
-    frames : ndarray, (n_frames, height, width)
-        As :func:`local_correlation`.
-    least_correlation : float
-        Of a peak.
-    radius_px : float
-        As far from its peak as a region reaches.
-    least_pixels : int
-        Fewer are taken for noise.
-    alike : float
-        Correlation of a pixel's course with that of the region's core from which it belongs to it.
-    """
-    from scipy import ndimage
-
-    correlation = local_correlation(frames)
-    height, width = correlation.shape
-    courses, norm = _courses(frames)
-    free = norm > 0
-    peaks = (ndimage.maximum_filter(correlation, 3) == correlation) & (correlation >= least_correlation)
-    places = np.argwhere(peaks)
-    order = np.argsort(-correlation[peaks], kind="stable")
-    regions: list[Region] = []
-    for row, column in places[order]:
-        if not free[row, column] or len(regions) == at_most:
-            continue
-        reach = int(radius_px)
-        box = np.s_[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
-        y, x = np.ogrid[box[0].start : min(box[0].stop, height), box[1].start : min(box[1].stop, width)]
-        core = courses[:, max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].mean(axis=(1, 2))
-        size = float(np.linalg.norm(core))
-        if size == 0:
-            continue
-        likeness = np.einsum("t,tyx->yx", core / size, courses[:, *box]) / np.where(
-            norm[box] > 0, norm[box], 1
-        )
-        near = (likeness >= alike) & (np.hypot(y - row, x - column) <= radius_px)
-        labels, _ = ndimage.label(near & free[box])
-        own = labels[row - box[0].start, column - box[1].start]
-        mask = labels == own
-        if own == 0 or int(mask.sum()) < least_pixels:
-            continue
-        rows, columns = (places + side.start for places, side in zip(np.nonzero(mask), box, strict=True))
-        free[rows, columns] = False
-        if not lasts(frames[:, rows, columns].mean(axis=1, dtype=np.float64)):
-            continue
-        weight = norm[rows, columns]
-        centre = (float(np.average(rows, weights=weight)), float(np.average(columns, weights=weight)))
-        free[box] &= ~near  # its halo is not another region
-        regions.append(Region(rows, columns, centre, float(correlation[row, column])))
-    return regions

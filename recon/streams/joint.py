@@ -19,6 +19,7 @@ from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.errors import InputError
 from recon.priors.base import Prior
+from recon.reconstruction.first_look import look_at
 from recon.reconstruction.measurement import Floats
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
@@ -227,7 +228,8 @@ def solve_together(
         raise InputError(f"A prior over time needs two frames at least, grey; got {frames.shape}.")
     shape = problem.sensor_shape
     part = Part(problem, slice(0, 1))
-    part.weigh(problem.options.tau)
+    look = look_at(problem)
+    part.weigh(problem.options.tau, None if look is None else look.weight(problem.prior_name))
     psfs = problem.depths.central[0] / problem.energy[:, None, None]
     operator: LinearOperator = Convolution(psfs, shape, n_channels=len(frames), dtype=part.dtype)
     data = np.stack([problem.with_data(frame).data[0] for frame in frames])

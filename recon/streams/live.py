@@ -22,7 +22,8 @@ from recon.reconstruction.reconstruct import given, reconstruct
 from recon.reconstruction.reduction import on_blocks, reduced_calibration
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import Progress
-from recon.streams.live_picture import ComingLevel, Level, LiveOptions, LivePicture
+from recon.streams.fit import CalibrationWatch
+from recon.streams.live_picture import NOISE_ONLY, ComingLevel, Level, LiveOptions, LivePicture
 from recon.streams.pace import Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch
 from recon.streams.video import require_steps, stream_problem
@@ -118,6 +119,8 @@ class LiveReconstructor:
         self._greeted = False
         """Whether the newest scene was shown by a Wiener filter already."""
         self._settled = False
+        self._dark = False
+        self._fit = CalibrationWatch(self._given if isinstance(self._given, Calibration) else None)
 
     def _checked(self) -> Problem:
         """Return the problem of a frame that holds nothing: what has no way is refused before the stream."""
@@ -130,7 +133,7 @@ class LiveReconstructor:
         options = self.options
         if options.estimate_background is None and "background" in known:
             options = replace(options, estimate_background=False)
-        problem = stream_problem(Measurement(blank, **known), self._given, options)
+        problem = stream_problem(Measurement(blank, **known), self._given, options, choosing=False)
         require_steps(problem)
         return problem
 
@@ -154,6 +157,7 @@ class LiveReconstructor:
         level = self._level_for(frame)
         small = block_mean(frame, level.binning, about_axis=True)
         self._scene = self._watch.see(small)
+        self._dark = not self._sees_light(level, frame)
         affordable = self._pace.affordable(level.binning, self.budget_ms)
         cut = self._scene is SceneState.NEW and not self._greeted
         too_slow = affordable < 1 and self._scene is not SceneState.STILL
@@ -244,8 +248,24 @@ class LiveReconstructor:
         self._shape = ()
         self._watch.forget()
         self._follows = self._greeted = self._settled = False
+        self._fit = CalibrationWatch(self._given if isinstance(self._given, Calibration) else None)
 
     # Pieces ----------------------------------------------------------------------------------------
+    def _sees_light(self, level: Level, frame: Floats) -> bool:
+        """Tell whether there is a scene to see; what was settled on noise is then made anew."""
+        mean = self._as_given(self._watch.mean)
+        if not level.sees_light(mean, self._watch.count):
+            return False
+        if not level.lit and self._coming is None:
+            self._level = replace(level, lit=True)  # once, also where there is no memory for another
+            self._make(level.binning, frame)
+        self._fit.see(
+            lambda: level.problem.with_data(mean.copy()), level.binning, self._scene, self._watch.count
+        )
+        if self._fit.advice and self._fit.advice not in self.warnings:
+            self.warnings = (*self.warnings, self._fit.advice)
+        return True
+
     def _iterate(
         self, level: Level, began: Spent, at_most: int | None, newer: Callable[[], bool]
     ) -> tuple[int, Spent]:
@@ -289,7 +309,8 @@ class LiveReconstructor:
         measurement = on_blocks(frame, valid, self._known.get("noise"), binning, flat=len(self._shape) == 2)
         calibration = reduced_calibration(self.calibration, binning, None)
         plane = self._n_planes // 2 if self.live.plane is None else self.live.plane
-        return Level.of(stream_problem(measurement, calibration, self._options), binning, plane)
+        problem = stream_problem(measurement, calibration, self._options, choosing=False)
+        return Level.of(problem, binning, plane)
 
     def _first_binning(self) -> int:
         """Return the finest binning at which a first picture takes no time to speak of."""
@@ -408,6 +429,7 @@ class LiveReconstructor:
             else f"brightest {of}"
             if plane is None
             else f"depth {plane} {of}",
+            doubt=NOISE_ONLY if self._dark else self._fit.doubt,
         )
 
 

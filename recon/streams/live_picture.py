@@ -18,7 +18,7 @@ from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
 from recon.solvers.wiener import WienerFilter, cross_validated
-from recon.streams.stillness import SceneState
+from recon.streams.stillness import SceneState, has_light
 from recon.streams.video import VideoSolver
 
 Array = npt.NDArray[Any]
@@ -27,6 +27,9 @@ Array = npt.NDArray[Any]
 SETTLED = 1e-3
 """Change an iteration below which a frame's picture is done, or the solver's own where that is smaller: 55 dB
 from where the exact-data ADMM would end."""
+
+NOISE_ONLY = "Noise only, no light of a scene"
+"""Doubt of a picture whose frames hold nothing else."""
 
 _LIVE = "Live pictures"
 
@@ -98,15 +101,22 @@ class LivePicture:
     picture."""
     shown: str = ""
     """Which of several depths ``image`` shows, in words."""
+    doubt: str = ""
+    """Why this is no picture of the scene, in words; empty where nothing speaks against it."""
 
     @property
     def quality(self) -> str:
-        """What the picture is worth, in words: ``"binned 2 x 2, 3 iterations (41 in all), moving"``."""
+        """What the picture is worth, in words: ``"binned 2 x 2, 3 iterations (41 in all), moving"``.
+
+        A doubt comes first.
+        """
         pixels = "all pixels" if self.binning == 1 else f"binned {self.binning} x {self.binning}"
         steps = f"{self.iterations} iterations ({self.total_iterations} in all)"
         how = "Wiener filter" if self.method == "wiener" else steps
         scene = f"still, {self.frames} frames averaged" if self.frames > 1 else str(self.scene)
-        return ", ".join(filter(None, (pixels, self.shown, how, scene, "settled" if self.settled else "")))
+        settled = "settled" if self.settled else ""
+        worth = ", ".join(filter(None, (pixels, self.shown, how, scene, settled)))
+        return f"{self.doubt}: {worth}" if self.doubt else worth
 
 
 @dataclass(frozen=True)
@@ -123,6 +133,8 @@ class Level:
     preview: Part
     """Of the same frame through one PSF, without a background: what the filter is for."""
     filter: WienerFilter
+    lit: bool
+    """Whether that frame held light: what was settled on noise serves no scene."""
     solver: VideoSolver | None = None
     """None until it was made: a filter is made in a moment, for the first picture."""
 
@@ -132,7 +144,13 @@ class Level:
         plain = problem if problem.together else _preview(problem, plane)
         part = Part(plain, slice(0, plain.n_channels))
         operator = part.picture_operator
-        return cls(problem, binning, part, WienerFilter(operator, cross_validated(operator, part.data)))
+        wiener = WienerFilter(operator, cross_validated(operator, part.data))
+        return cls(problem, binning, part, wiener, has_light(_filled(problem), problem.noise))
+
+    def sees_light(self, frame: Floats, count: int) -> bool:
+        """Tell whether the mean of ``count`` frames, shaped as those that came, holds more than noise."""
+        seen = self.problem.with_data(frame)
+        return has_light(_filled(seen), self.problem.noise / np.float32(count) ** 0.5)
 
     @cached_property
     def method(self) -> str:
@@ -168,6 +186,15 @@ class Level:
         """Return what the solver has at present, (n_z, height, width[, n_channels])."""
         assert self.solver is not None
         return self.solver.volume() / np.float32(self.binning**2)
+
+
+def _filled(problem: Problem) -> Floats:
+    """Return a problem's frame in counts, (height, width, n_channels), the mean where pixels are erased."""
+    data, valid = problem.data * problem.noise[:, None, None], problem.valid
+    if not valid.all():
+        mean = np.sum(data, axis=(1, 2), keepdims=True) / np.sum(valid, axis=(1, 2), keepdims=True)
+        data = np.where(valid, data, mean.astype(np.float32))
+    return np.moveaxis(data, 0, -1)
 
 
 def _preview(problem: Problem, plane: int) -> Problem:

@@ -1,4 +1,4 @@
-"""Whether the scene of a video stands still, told from the frames alone, whatever their noise is.
+"""Whether a video's frames hold light, and whether its scene stands still, told from the frames alone.
 
 Camera noise is white, whether it comes from photons or from reading: the mean of ``s x s`` pixels of it has
 ``1 / s^2`` of the variance. What a moved scene changes is not: caustics are several pixels wide. The variance
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.blocks import block_mean
+from recon.base.noise import estimate_deviation
 
 Array = npt.NDArray[Any]
 
@@ -28,6 +29,47 @@ NEW_SCENE = 0.5
 picture panning by 3 x 6 pixels a frame (a share of about 0.3) a warm start is still as good as a cold one."""
 
 
+LIT_BLOCKS = (8, 16, 32)
+"""Pixels along a side over which light is averaged to tell it from noise: dim scenes show in large ones."""
+LIT = 2.0
+"""Variance of block means from which a frame has light, in units of what its pixels' noise makes of it."""
+
+
+def has_light(frame: Array, deviation: Array) -> bool:
+    """Tell whether there is more in a frame than noise.
+
+    Noise of single pixels goes away where pixels are averaged, a scene through a diffuser does not: the
+    variance of the means of 8 x 8 to 32 x 32 pixels is compared with what noise leaves of it. Noise grows
+    with light: a frame dimmer than the one that ``deviation`` was found on has less, which it tells itself.
+
+    Parameters
+    ----------
+    frame : ndarray, (height, width) or (height, width, n_channels)
+        Counts less dark.
+    deviation : ndarray, (n_channels,)
+        Of the noise, counts; that of another frame of the same camera is enough.
+    """
+    channels = frame[None] if frame.ndim == 2 else np.moveaxis(frame, 2, 0)
+    if min(channels.shape[1:]) < 2 * LIT_BLOCKS[0]:
+        return True  # too few blocks to tell
+    spreads = [_spread(channels, side) for side in LIT_BLOCKS if min(channels.shape[1:]) >= 2 * side]
+    if _beyond_noise(spreads, np.asarray(deviation, np.float64).reshape(-1)):
+        return True
+    own = np.array([estimate_deviation(channel) for channel in channels])
+    # 0 is no estimate: most pixels are alike.
+    return _beyond_noise(spreads, np.where(own > 0, own, np.inf))
+
+
+def _spread(channels: Array, side: int) -> tuple[int, Array]:
+    """Return how many blocks there are, and the variance of their means if their pixels were independent."""
+    means = block_mean(channels, side, dtype=np.float64)
+    return means[0].size, means.var(axis=(1, 2)) * side**2
+
+
+def _beyond_noise(spreads: list[tuple[int, Array]], deviation: Array) -> bool:
+    return any((spread > _beyond_chance(LIT, n) * deviation**2).any() for n, spread in spreads)
+
+
 class SceneState(enum.StrEnum):
     """How a frame's scene relates to those before."""
 
@@ -37,6 +79,11 @@ class SceneState(enum.StrEnum):
     """The scene of before, changed."""
     STILL = "still"
     """As before, within the noise."""
+
+
+def _beyond_chance(ratio: float, blocks: int) -> float:
+    """Return the ratio of variances that counts: few blocks make it uncertain by itself."""
+    return max(ratio, 1 + 5 * float(np.sqrt(2 / blocks)))
 
 
 LARGEST_GAIN = 2.0
@@ -114,6 +161,6 @@ class SceneWatch:
                 break
             blocks = block_mean(blocks, 2)
             ratio = side**2 * float(np.vdot(blocks, blocks)) / blocks.size / variance
-            if ratio > max(LEAST_RATIO, 1 + 5 * float(np.sqrt(2 / blocks.size))):
+            if ratio > _beyond_chance(LEAST_RATIO, blocks.size):
                 return False
         return True

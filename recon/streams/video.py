@@ -15,12 +15,15 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from recon.camera.camera_model import choose_model
 from recon.errors import InputError
-from recon.reconstruction.measurement import Floats, Measurement
+from recon.reconstruction.first_look import look_at
+from recon.reconstruction.measurement import Floats, Measurement, depths_of
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.reconstruct import given
+from recon.reconstruction.reconstruct import given, require_two_images
+from recon.reconstruction.selection import with_background
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver
 from recon.solvers.base import Solver, StoppingRules
 from recon.solvers.sensor_admm import SensorAdmm
@@ -39,6 +42,8 @@ def stream_problem(
     frame: Measurement | npt.ArrayLike,
     calibration: Calibration | npt.ArrayLike,
     options: ReconstructionOptions | None = None,
+    *,
+    choosing: bool = True,
     **overrides: Any,
 ) -> Problem:
     """Settle noise, scales and camera from one frame, for all frames of a video.
@@ -50,20 +55,44 @@ def stream_problem(
     frame : Measurement or array, (height, width[, n_channels])
         Background subtracted. A bright one, where the video has brighter and darker ones.
     options : ReconstructionOptions, optional
-        Any camera model, prior, background and depths; ``"auto"`` is one PSF a depth here, as the quickest,
-        and the exact-data ADMM where that has a way.
+        Any camera model, prior, background and depths; ``"auto"`` is one PSF a depth here, as the quickest
+        (the problem's warnings say where PSFs differ over the field), and the exact-data ADMM where that has
+        a way.
+    choosing : bool
+        Whether a smooth background is estimated where a photograph would have one, unless the options say.
     **overrides
         Single options, and facts about the frame, by their names, as of :func:`recon.reconstruct`.
     """
     known, options = given(overrides, options)
     measurement = frame if isinstance(frame, Measurement) else Measurement(frame)
+    doubt = ""
     if options.model == "auto":
+        doubt = _by_one_psf(calibration, options)
         options = replace(options, model="convolution")
     problem = Problem.of(replace(measurement, **known), calibration, options)
+    if choosing:
+        require_two_images(problem)
+    if choosing and isinstance(calibration, Calibration):
+        problem = with_background(problem, calibration)
+    if doubt:
+        problem = replace(problem, warnings=(*problem.warnings, doubt))
     if options.solver == "auto" and SOLVERS["admm-sensor"].accepts(problem) is None:
         problem = replace(problem, options=replace(options, solver="admm-sensor"))
     problem.solver  # noqa: B018 - refuses at once what it has no way for
     return problem
+
+
+def _by_one_psf(calibration: Calibration | npt.ArrayLike, options: ReconstructionOptions) -> str:
+    """Say what one PSF for the whole field does not tell of a calibration; empty where it is enough."""
+    if not isinstance(calibration, Calibration) or len(calibration.psfs) == 1:
+        return ""
+    model, why = choose_model(depths_of(calibration, options)[1], "auto")
+    if model == "convolution":
+        return ""
+    return (
+        f"One PSF serves the whole field, as is quickest: {why}. "
+        f"--model {model} takes all of them, in several times the time."
+    )
 
 
 class VideoSolver:
@@ -107,8 +136,9 @@ class VideoSolver:
         self._offered = require_steps(problem)
         self._first = self.problem = problem
         self.parts = parts or [Part(problem, channels) for channels in parts_of(problem)]
+        look = look_at(problem)
         for part in self.parts:
-            part.weigh(problem.options.tau)
+            part.weigh(problem.options.tau, None if look is None else look.weight(problem.prior_name))
         self.solvers: list[Any] = [None for _ in self.parts]
         self.iterations = self._calm = 0
         self._cold = True

@@ -21,11 +21,13 @@ from recon.solvers.base import IterationRecord, StoppingRules, StopReason
 Array = npt.NDArray[Any]
 
 NEAR_PX = 2
-"""Shifts up to here belong to the PSF's own sharpness."""
+"""Shifts up to here, or up to the full width of the PSF's autocorrelation, belong to its own sharpness."""
 NO_LESS = 1e-4
 """Least variance of the signal in units of the noise', so that ratios to it stay finite."""
-RING = (0.1, 0.25)
-"""Spatial frequencies of details, cycles a pixel: periods from ten to four pixels."""
+RING = (0.2, 0.5)
+"""Spatial frequencies of details, cycles a resolved distance: periods of five to two of them."""
+SPOT, LEAST_SPOT_PX = 0.7, 2.0
+"""Autocorrelation of a PSF at the distance that it resolves, and the least that pixels resolve."""
 LIT = 0.05
 """Share of the brightest voxels' value (their 99.5th percentile) from which a voxel counts as lit, and a
 difference between neighbours as an edge."""
@@ -49,8 +51,9 @@ class Evidence:
     """Standard deviation of the measurement over its pixels, less the noise', in units of the noise: what
     there is to reconstruct from."""
     detail: float
-    """Signal over noise of the picture's details of four to ten pixels, as the camera transmits them: root of
-    the power of the picture times the PSF's on that ring of frequencies, over the noise'."""
+    """Signal over noise of the picture's details of two to five resolved distances (four to ten pixels with
+    sharp optics), as the camera transmits them: root of the power of the picture times the PSF's on that ring
+    of frequencies, over the noise'."""
     unexplained: float
     """Residual beyond the expected noise, relative to the measurement's standard deviation without noise:
     what the model does not describe (a moved diffuser, another depth or colour, stray light, saturation)."""
@@ -69,7 +72,7 @@ class Evidence:
     dimming: float
     """Least norm of a depth's PSF relative to the greatest: how much dimmer the farthest points are."""
     ambiguity: float
-    """Greatest correlation of a PSF with itself, three pixels or more apart: near 1 for a regular array."""
+    """Greatest correlation of a PSF with itself, moved by more than its width: near 1 for a regular array."""
     unsettled: float
     """Change of the last iteration over ten times the tolerance, where a limit ended the run; else 0."""
     height: float | None = None
@@ -116,10 +119,11 @@ def measure(
     signal2 = max(float(np.var(used)) - 1.0, NO_LESS)
     beyond2 = max(residual_norm**2 / len(used) - 1.0, 0.0)
     lit, edges = lit_and_edges(volume)
+    correlation = _autocorrelation(psfs[len(psfs) // 2])
     found = asdict(points_of(volume, _norms(psfs) / noise, len(used))) if points else {}
     return Evidence(
         signal=float(np.sqrt(signal2)),
-        detail=_detail(volume, psfs, noise, len(used)),
+        detail=_detail(volume, psfs, noise, len(used), _spot_px(correlation)),
         unexplained=float(np.sqrt(beyond2 / signal2)),
         erased=1.0 - len(used) / data.size,
         saturated=seen.saturated,
@@ -129,17 +133,17 @@ def measure(
         planes=len(volume),
         similarity=_similarity(psfs),
         dimming=_dimming(psfs),
-        ambiguity=_ambiguity(psfs[len(psfs) // 2]),
+        ambiguity=_ambiguity(correlation),
         unsettled=unsettled,
         **found,
     )
 
 
-def _detail(volume: Array, psfs: Array, noise: float, count: int) -> float:
+def _detail(volume: Array, psfs: Array, noise: float, count: int, spot_px: float) -> float:
     """Signal over noise of what a picture's finer half throws onto ``count`` pixels."""
     shape = fft.fast_shape([a + b for a, b in zip(volume.shape[1:], psfs.shape[1:], strict=True)])
     y, x = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])
-    frequency = np.hypot(y, x)
+    frequency = np.hypot(y, x) * max(spot_px, LEAST_SPOT_PX)
     ring = (frequency > RING[0]) & (frequency < RING[1])
     if not ring.any():  # a picture of a few pixels has no such frequency
         return 0.0
@@ -177,20 +181,43 @@ def _inner(one: Array, other: Array) -> float:
     return float(np.vdot(one.astype(np.float64), other.astype(np.float64)))
 
 
-def _ambiguity(psf: Array) -> float:
-    """Return the highest side peak of a PSF's autocorrelation, over the mean that any PSF has."""
-    shape = fft.fast_shape([2 * n for n in psf.shape])
+def _autocorrelation(psf: Array) -> Array:
+    """Return the correlation of a PSF with itself moved down and to either side, 1 where it is not moved.
+
+    Shifts to the left are counted from the last column back.
+    """
+    height, width = psf.shape
+    shape = fft.fast_shape([2 * height, 2 * width])
     padded = np.zeros((1, *shape), np.float32)
-    padded[0, : psf.shape[0], : psf.shape[1]] = psf
+    padded[0, :height, :width] = psf
     spectrum = fft.rfft(padded)
-    correlation = fft.irfft((spectrum * spectrum.conj()).astype(np.complex64), shape[1])[0]
-    peak = float(correlation[0, 0])
-    if peak <= 0:
+    correlation: Array = fft.irfft((spectrum * spectrum.conj()).astype(np.complex64), shape[1])[0, :height]
+    return correlation / max(float(correlation[0, 0]), 1e-30)
+
+
+def _ambiguity(correlation: Array) -> float:
+    """Return the highest side peak of a PSF's autocorrelation."""
+    cuts = correlation[:, 0], correlation[0, : correlation.shape[1] // 2]
+    bars = [(float(cut[0]) + float(np.median(cut[: len(cut) // 2]))) / 2 for cut in cuts]
+    near = max(NEAR_PX, *(2 * int(np.ceil(_crossing(*of))) for of in zip(cuts, bars, strict=True)))
+    away = correlation.copy()
+    away[: near + 1, : near + 1] = away[: near + 1, -near:] = 0
+    return float(away.max())
+
+
+def _spot_px(correlation: Array) -> float:
+    """Return the size of a PSF's finest details, as the optics' resolution is defined, pixels."""
+    down, across = correlation[:, 0], correlation[0, : correlation.shape[1] // 2]
+    return float(np.sqrt(_crossing(down, SPOT) * _crossing(across, SPOT)))
+
+
+def _crossing(cut: Array, bar: float) -> float:
+    """Return how far from its beginning a cut falls to a bar, pixels, linear between them; 0 if never."""
+    first = int(np.argmax(cut < bar))
+    if not first:
         return 0.0
-    near = NEAR_PX
-    correlation[: near + 1, : near + 1] = correlation[: near + 1, -near:] = 0
-    correlation[-near:, : near + 1] = correlation[-near:, -near:] = 0
-    return float(correlation.max()) / peak
+    above, below = float(cut[first - 1]), float(cut[first])
+    return first - 1 + (above - bar) / (above - below)
 
 
 def averaged(channels: list[Evidence]) -> Evidence:

@@ -1,8 +1,9 @@
 """Verdicts on reconstructions: the rules by which evidence is judged, and what is said.
 
-A verdict looks up the most similar cases (:mod:`recon.verdict.cases`), where the truth was known, and asks
-how many of them failed. Which stress limits is asked the same way: were this one number as good as a good
-case's, how many would fail?
+A verdict asks for the chance that such a reconstruction has failed, as learned where the truth was known
+(:mod:`recon.verdict.chance`). Which stress limits is asked the same way: were this one number as good as a
+good case's, what would the chance be? Limits that no case overrules: what the model leaves unexplained, and
+iterations that had not settled.
 """
 
 from __future__ import annotations
@@ -13,12 +14,11 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from recon.verdict.cases import OF_VOLUMES, Cases, cases_of, group_of, place_of
+from recon.verdict.calibration_check import CalibrationCheck, Fit
+from recon.verdict.cases import OF_VOLUMES, group_of
+from recon.verdict.chance import Chances, place_of, shipped_chances, value_of
 from recon.verdict.evidence import DIVERGED, Evidence
-
-Floats = npt.NDArray[np.float64]
 
 
 class Region(enum.StrEnum):
@@ -34,13 +34,15 @@ WORDS: Mapping[Region, str] = {
     Region.INSIDE: "reliable: inside the region where {method} works",
     Region.NEAR: "doubtful: near the boundary where {method} fails",
     Region.OUTSIDE: "not reliable: outside the region where {method} works",
-    Region.UNKNOWN: "not judged: the stability maps hold no case of {method} that is much like this one",
+    Region.UNKNOWN: "not judged: this measurement is unlike every known case of {method}",
 }
 
 UNFINISHED = 10.0
 """``unsettled`` from which no similar case is asked any more: the picture had hardly begun to settle."""
 FIRST_ITERATIONS = "not reliable: the iterations were ended when the picture had hardly begun to settle"
 STILL_CHANGING = "doubtful: the iterations were ended while the picture still changed; similar ones are good"
+UNEXPLAINED = "doubtful: the model leaves {residual} unexplained, whatever similar cases say"
+NO_CASES = "not judged: there are no known cases of {method}"
 NOISELESS = 1e3
 """``signal`` from which the data are no photograph's: a full well of 100,000 electrons gives some 300."""
 COMPUTED = (
@@ -48,20 +50,22 @@ COMPUTED = (
     "photographs"
 )
 LOST = 0.5
-"""Share of failures among similar cases from which a reconstruction is outside."""
+"""Chance of failing from which a reconstruction is outside."""
 MOST = 2
 """Stresses that are named."""
-NEIGHBOURS = 16
-"""Cases that are asked. With twelve, 1 of 150 that were called reliable had failed, with sixteen none of 134,
-and with a tenth of failures allowed 2 of 165 (the mixed scenes, each judged by the cases of the others)."""
-NEIGHBOURS_OF_VOLUMES = 12
-"""There are fewer cases of volumes: sixteen reach too far."""
-FAR = 2.0
-FAR_OF_VOLUMES = 3.0
-"""Distance beyond which the third nearest case is no witness: a factor of about seven in one number. Volumes
-are compared by more numbers. One case in twenty of those known is as far from the others."""
-UNSETTLED = 0.2
-"""``unsettled`` from which a reconstruction is not inside: its last change was twice the tolerance."""
+MOST_RESIDUAL = 5.0
+MOST_UNEXPLAINED = 0.15
+"""Residual in units of the noise, and ``unexplained``, from which nothing is called reliable."""
+NAMED = 0.1
+"""Share of the chance of failing that has to go with a stress for it to be named: more light that changes
+next to nothing is not asked for."""
+MOST_LIGHT = 10.0
+"""By how much more light is supposed to lift what it relieves, at most: a hundred times the light."""
+ABOVE_NOISE = 2.0
+"""Residual in units of the noise from which noise is not what limits."""
+UNSETTLED = 0.7
+"""``unsettled`` from which a reconstruction is not inside: its last change was seven times the tolerance, of
+which ten times are a failure."""
 CLIPPED = 0.02
 """Share of the used pixels at full scale from which that is named first."""
 OF_LIGHT = ("detail", "signal", "height")
@@ -70,9 +74,6 @@ WITHOUT_LIGHT: Mapping[str, str] = {
     "peaks": "A stronger prior (--tau) would help; a scene of so many points is too dense",
 }
 """What else helps where more light would relieve as well, by stress."""
-FEWEST = 40
-"""Cases that a group needs to be judged by."""
-
 STRESSES: Mapping[str, tuple[int, str, str]] = {
     "detail": (
         1,
@@ -145,13 +146,7 @@ STRESSES: Mapping[str, tuple[int, str, str]] = {
 """By evidence: whether more of it is better, what is said, what would help."""
 
 
-def reliable_share(method: str) -> float:
-    """Return the share of failures among similar cases up to which a reconstruction is inside.
-
-    Failures of volumes lie among the good ones, most of them little worse than trivial: with 5 % few volumes
-    would ever be inside, and with total variation no more of those that 10 % lets in fail. With l1 they do.
-    """
-    return 0.1 if group_of(method) == "volume tv" else 0.05
+BETTER: Mapping[str, int] = {name: better for name, (better, *_) in STRESSES.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,8 +158,8 @@ class Finding:
     value: float
     """What was measured."""
     gain: float
-    """By how much the share of failing cases would fall, were this one as in a good case; where no case is
-    much like it, by how much nearer the nearest would be."""
+    """By how much the chance of failing would fall, were this one as in a good case; where no case is like
+    it, by how much nearer it would be to them."""
     words: str
     help: str
     """``words`` and ``help``: what it is, and what would help."""
@@ -178,41 +173,46 @@ class Verdict:
     method: str
     """The maps' name of the method."""
     failing: float | None
-    """Share of the most similar cases of the maps that failed; None where there are none."""
+    """The chance that it has failed, by cases with a truth; None where there are none."""
     findings: tuple[Finding, ...]
     """What limits, the most limiting first."""
     evidence: Mapping[str, float] = field(default_factory=dict)
     """What was measured, see :class:`~recon.verdict.evidence.Evidence`."""
     basis: str = ""
     """By which cases it was judged."""
+    decided: str = ""
+    """What decided instead of those cases, in words."""
+    held_out: float | None = None
+    """Where nothing else is known: by how much pixels that a shorter run did not see are missed, in units of
+    their noise."""
+    calibration: CalibrationCheck | None = None
+    """Whether the calibration is the photograph's own; None where that was not looked at."""
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """The verdict in plain words: what, which stress limits it, what would help."""
-        said = [WORDS[self.region].format(method=self.method)]
-        unfinished = self.evidence.get("unsettled", 0.0) >= UNFINISHED
-        if unfinished and self.failing is not None and self.failing < LOST:
-            said = [FIRST_ITERATIONS]  # that is why; the share of similar cases would contradict it
-        elif self._still_changing:
-            said = [STILL_CHANGING]
-        elif self.region is Region.UNKNOWN and self.evidence.get("signal", 0.0) >= NOISELESS:
-            said = [COMPUTED]
-        elif self.region is Region.UNKNOWN and not self.basis:
-            said = [f"not judged: there are no known cases of {self.method}"]
-        elif self.failing is not None and self.region is not Region.UNKNOWN:
-            said[0] += f" (of the most similar simulated cases {self.failing:.0%} failed)"
+        if self.calibration is not None and self.calibration.wrong:  # whatever else: that is why
+            first, *rest = self.calibration.sentences
+            return tuple(f"{s}." for s in (f"not reliable: {first}", *rest))
+        said = [self.decided or WORDS[self.region].format(method=self.method)]
+        if self.failing is not None and self.region is not Region.UNKNOWN and not self.decided:
+            said[0] += f" (chance of failing {self.failing:.0%}, by simulated cases)"
         if self.region in (Region.NEAR, Region.OUTSIDE):
             said += [f"{f.words}. {f.help}" for f in self.findings[:MOST]]
-        elif self.region is Region.UNKNOWN and said[0] != COMPUTED:
+        elif self.region is Region.UNKNOWN and self.basis and not self.decided:
             said += [f"What sets it apart: {f.words}. {f.help}" for f in self.findings[:1]]
+        if unlike_any(self):
+            said += [left_unexplained(self.evidence, self.held_out)]
         return tuple(f"{s}." for s in said)
 
-    @property
-    def _still_changing(self) -> bool:
-        """Whether nothing but the end of the run keeps it from being inside."""
-        if self.region is not Region.NEAR or self.failing is None:
-            return False
-        return self.failing <= reliable_share(self.method)
+    def with_calibration(self, check: CalibrationCheck) -> Verdict:
+        """Return the verdict with what is known of the calibration: with a wrong one it is never inside."""
+        if check.wrong:
+            return replace(self, region=Region.OUTSIDE, calibration=check)
+        if check.fit is Fit.UNTOLD and self.region is Region.INSIDE:
+            decided = f"doubtful: {'. '.join(check.sentences)}"
+            return replace(self, region=Region.NEAR, calibration=check, decided=decided)
+        return replace(self, calibration=check)
 
     def as_json(self) -> dict[str, Any]:
         """Return the verdict for a file."""
@@ -224,6 +224,8 @@ class Verdict:
             "findings": [asdict(f) for f in self.findings],
             "evidence": dict(self.evidence),
             "basis": self.basis,
+            "held_out": self.held_out,
+            "calibration": None if self.calibration is None else self.calibration.as_json(),
         }
 
 
@@ -234,86 +236,110 @@ def method_name(solver: str, prior: str, *, volume: bool = False) -> str:
     return f"{solver} {'tv' if prior.startswith('tv') else prior}{OF_VOLUMES if volume else ''}"
 
 
-def verdict_on(evidence: Evidence, method: str, cases: Cases | None = None) -> Verdict:
-    """Judge a reconstruction by its evidence and cases; default are those of its method that are shipped."""
+def verdict_on(evidence: Evidence, method: str, chances: Chances | None = None) -> Verdict:
+    """Judge a reconstruction by its evidence and what is known of its method; default is what is shipped."""
     numbers = evidence.as_json()
-    group = group_of(method)
-    if cases is None and group is not None:
-        cases = cases_of(group)
-    if cases is None or len(cases.severities) < FEWEST:
-        return Verdict(Region.UNKNOWN, method, None, (), numbers)
-    place = _no_better_than_any(cases, place_of(numbers, cases.weights))
-    of_volumes = str(group).startswith("volume")
-    count, far = (NEIGHBOURS_OF_VOLUMES, FAR_OF_VOLUMES) if of_volumes else (NEIGHBOURS, FAR)
-    share, nearest = failing_share(cases, place, count)
-    reliable = share <= reliable_share(method)
-    if numbers["unsettled"] >= UNFINISHED or not np.isfinite(place).all():
-        region = Region.OUTSIDE
-    elif numbers["signal"] >= NOISELESS:  # before similar cases are asked: numbers in its noise mean nothing
-        region = Region.UNKNOWN
-    elif share >= LOST:
-        region = Region.OUTSIDE
-    elif nearest > far:
-        region = Region.UNKNOWN
-    else:
-        settled = numbers["unsettled"] < UNSETTLED
-        region = Region.INSIDE if reliable and settled else Region.NEAR
-    sources = [f"maps {', '.join(cases.maps)}"] if cases.maps else []
-    sources += [f"{cases.n_scenes} mixed scenes"] if cases.n_scenes else []
-    basis = f"{count} nearest of {len(cases.severities)} simulated cases ({'; '.join(sources)})"
+    chances = chances or shipped_chances().get(group_of(method) or "")
+    if chances is None:
+        return Verdict(Region.UNKNOWN, method, None, (), numbers, decided=NO_CASES.format(method=method))
+    chance, distance = _known(chances, numbers)
+    region, decided = _region(numbers, chance, chances, far=not distance <= chances.far)
 
-    def gain(relieved: Floats) -> float:
-        other, third = failing_share(cases, relieved, count)
-        # Those stresses first without which cases would be nearest, or the share of failures lowest.
-        return nearest - third if region is Region.UNKNOWN else share - other
+    def gain(relieved: Mapping[str, float]) -> float:
+        other, nearer = _known(chances, relieved)
+        # Those stresses first without which it would be nearest to the cases, or the chance lowest.
+        return distance - nearer if region is Region.UNKNOWN else chance - other
 
-    findings = _clipped_first(_relieved(cases, place, numbers, gain), numbers)
-    findings = _unfinished_first(findings, numbers, reliable)
-    return Verdict(region, method, share, findings, numbers, basis)
+    least = 0.0 if region is Region.UNKNOWN else NAMED * chance
+    findings = tuple(f for f in _relieved(chances, numbers, gain) if f.gain > least)
+    findings = _clipped_first(findings, numbers)
+    if decided in (STILL_CHANGING, FIRST_ITERATIONS) or numbers["unsettled"] >= UNFINISHED:
+        findings = _unfinished_first(findings, numbers)
+    elif decided and region is Region.NEAR:
+        first = _named("unexplained", findings, numbers)
+        findings = (first, *(f for f in findings if f.stress != "unexplained"))
+    basis = f"a regression on {chances.n_cases} simulated cases of {chances.n_scenes} scenes"
+    return Verdict(region, method, chance, findings, numbers, basis, decided)
 
 
-def _no_better_than_any(cases: Cases, place: Floats) -> Floats:
-    """Return a place moved to the best case's where it is better: more light than the most is as good."""
-    moved = place.copy()
-    for index, name in enumerate(cases.weights):
-        if name in STRESSES:
-            column = cases.places[:, index]
-            better = STRESSES[name][0]
-            moved[index] = min(moved[index], column.max()) if better > 0 else max(moved[index], column.min())
-    return moved
+def _known(chances: Chances, numbers: Mapping[str, float]) -> tuple[float, float]:
+    """Return the chance of failing, and how far the numbers are from the cases."""
+    place = chances.no_better_than_any(place_of(numbers, chances.features), BETTER)
+    return float(chances.chance(place)), chances.distance(place)
 
 
-def failing_share(cases: Cases, place: Floats, count: int) -> tuple[float, float]:
-    """Return the share of failures among the ``count`` nearest cases, and the distance of the third nearest.
+def _region(
+    numbers: Mapping[str, float], chance: float, chances: Chances, *, far: bool
+) -> tuple[Region, str]:
+    """Return where a reconstruction lies, and what decided that where similar cases did not."""
+    if numbers["unsettled"] >= UNFINISHED:
+        # That is why; a low chance would contradict it.
+        return Region.OUTSIDE, FIRST_ITERATIONS if chance < LOST else ""
+    if not np.isfinite([*numbers.values()]).all():
+        return Region.OUTSIDE, ""
+    if numbers["signal"] >= NOISELESS:  # before cases are asked: numbers in its noise mean nothing
+        return Region.UNKNOWN, COMPUTED
+    if far:
+        return Region.UNKNOWN, ""
+    if chance > chances.reliable:
+        return Region.OUTSIDE if chance >= LOST else Region.NEAR, ""
+    if numbers["unsettled"] >= UNSETTLED:
+        return Region.NEAR, STILL_CHANGING
+    if numbers["unexplained"] >= MOST_UNEXPLAINED or residual_of(numbers) >= MOST_RESIDUAL:
+        return Region.NEAR, UNEXPLAINED.format(residual=_residual(numbers))
+    return Region.INSIDE, ""
 
-    Nearer cases count more.
-    """
-    distance = np.linalg.norm(cases.places - place, axis=1)
-    order = np.argsort(distance)[:count]
-    weight = 1 / (0.2 + distance[order])
-    failed = cases.severities[order] >= 1
-    return float(np.sum(weight * failed) / np.sum(weight)), float(distance[order[2]])
+
+def unlike_any(verdict: Verdict) -> bool:
+    """Tell whether a photograph's verdict is that no known case is like it."""
+    return verdict.region is Region.UNKNOWN and verdict.decided != COMPUTED
+
+
+def left_unexplained(numbers: Mapping[str, float], held_out: float | None) -> str:
+    """Say how far the data are explained, where no known case tells what that is worth."""
+    said = f"The model leaves {_residual(numbers)} unexplained"
+    if held_out is None:
+        return said
+    return f"{said}; pixels that a shorter run did not see are missed by {held_out:.1f} times the noise"
+
+
+def residual_of(numbers: Mapping[str, float]) -> float:
+    """Return what is left of the data, in units of their noise."""
+    return float((1 + (numbers["signal"] * numbers["unexplained"]) ** 2) ** 0.5)
+
+
+def _residual(numbers: Mapping[str, float]) -> str:
+    share = numbers["unexplained"]
+    return f"{residual_of(numbers):.1f} times the noise, {share:.1%} of the measurement's contrast,"
 
 
 def _relieved(
-    cases: Cases, place: Floats, numbers: Mapping[str, float], gain_of: Callable[[Floats], float]
+    chances: Chances, numbers: Mapping[str, float], gain_of: Callable[[Mapping[str, float]], float]
 ) -> tuple[Finding, ...]:
-    """Return the stresses that are worse than in good cases, by what is gained where one is as in those."""
-    if cases.typical is None:
-        return ()
+    """Return the stresses that are worse than in good cases, by what is gained where one is as in those.
+
+    More light relieves all that it relieves at once, and the one that lacks most is named for it; what is not
+    explained stays the same share, and so stands out of the noise: where it does already, none is asked for.
+    """
+    place = place_of(numbers, chances.features)
+    lacking = {
+        name: float(typical - here) * BETTER[name]
+        for name, typical, here in zip(chances.features, chances.typical, place, strict=True)
+        if name in BETTER
+    }
+    lit = {name: numbers[name] for name in OF_LIGHT if name in lacking}
+    dimmest = None if residual_of(numbers) >= ABOVE_NOISE else max(lit, key=lambda name: lacking[name])
+    brighter = 1.0 if dimmest is None else min(float(np.exp(max(lacking[dimmest], 0.0))), MOST_LIGHT)
     findings = []
-    for index, name in enumerate(cases.weights):
-        if name not in STRESSES:
-            continue
-        better, words, help_ = STRESSES[name]
-        typical = float(cases.typical[index])
-        if (place[index] - typical) * better >= 0:
+    for name, lack in lacking.items():
+        if lack <= 0 or (name in lit and name != dimmest):
             continue  # as good as in a good case already
-        relieved = place.copy()
-        relieved[index] = typical
-        gain = gain_of(relieved)
-        if gain > 0:
-            findings.append(Finding(name, numbers[name], gain, words.format(value=numbers[name]), help_))
+        as_good = (
+            {k: v * brighter for k, v in lit.items()}
+            if name == dimmest
+            else {name: value_of(name, float(chances.typical[chances.features.index(name)]))}
+        )
+        findings.append(replace(_named(name, (), numbers), gain=gain_of({**numbers, **as_good})))
     return tuple(sorted(findings, key=lambda f: -f.gain))
 
 
@@ -336,18 +362,11 @@ def _clipped_first(findings: tuple[Finding, ...], numbers: Mapping[str, float]) 
     return (first, *(replace(f, help=WITHOUT_LIGHT.get(f.stress, f.help)) for f in others))
 
 
-def _unfinished_first(
-    findings: tuple[Finding, ...], numbers: Mapping[str, float], reliable: bool
-) -> tuple[Finding, ...]:
+def _unfinished_first(findings: tuple[Finding, ...], numbers: Mapping[str, float]) -> tuple[Finding, ...]:
     """Return the findings, first that a limit ended the run too early where that alone decides.
 
-    A picture that had hardly begun to settle is outside, whatever similar cases say; and what else was
-    measured of it, first of all what the model leaves unexplained, may well come of it. One that was still
-    changing is not inside, even where similar cases did not fail.
+    What else was measured of it, first of all what the model leaves unexplained, may well come of it.
     """
-    still_changing = numbers["unsettled"] >= UNSETTLED and reliable
-    if numbers["unsettled"] < UNFINISHED and not still_changing:
-        return findings
     first = _named("unsettled", findings, numbers)
     if numbers["unsettled"] >= DIVERGED:
         first = replace(first, help=f"{first.help}, or another method if they make it worse")

@@ -162,11 +162,20 @@ def test_a_resume_that_fails_before_its_first_frame_gives_the_run_up_again(
     run = _aborted(bench, tmp_path)
     record = run.path / "sweep.json"
     whole = record.read_text()
-    record.write_text(whole[: len(whole) // 2])
+    record.write_text("{}")
     with pytest.raises(CalibrationError, match="cannot be read"):
         ResumeProcedure(run.path).carry_out(bench)
     record.write_text(whole)
     assert ResumeProcedure(run.path).carry_out(bench).good
+
+
+def test_a_damaged_record_comes_from_its_copy(bench: Bench, tmp_path: Path) -> None:
+    run = _aborted(bench, tmp_path)
+    record = run.path / "sweep.json"
+    whole = record.read_text()
+    record.write_text(whole[: len(whole) // 2])
+    assert ResumeProcedure(run.path).carry_out(bench).good
+    assert record.read_text() == whole
 
 
 def test_pause_waits_dark_until_it_goes_on(bench: Bench, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.camera_settings import CameraOptions
 from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
 from drivers.simulated.options import WorldOptions
+from drivers.simulated.screen import ScreenOptions, SimulatedScreen
 from drivers.simulated.slm import SimulatedSlm, SlmOptions
 from drivers.simulated.stage import AxisOptions, SimulatedStage, StageOptions
 from drivers.simulated.world import SimulatedWorld
@@ -62,6 +63,11 @@ class TestSimulatedSlm(SlmContract):
         return SimulatedSlm(SlmOptions(shape=(60, 80)), tiny_world())
 
 
+class TestSimulatedScreen(SlmContract):
+    def make(self) -> Device:
+        return SimulatedScreen(ScreenOptions(shape=(60, 80)), tiny_world())
+
+
 @pytest.mark.parametrize(
     ("driver", "options"),
     [
@@ -69,6 +75,7 @@ class TestSimulatedSlm(SlmContract):
         (SimulatedStage, StageOptions()),
         (SimulatedLedArray, LedArrayOptions()),
         (SimulatedSlm, SlmOptions()),
+        (SimulatedScreen, ScreenOptions()),
     ],
 )
 def test_needs_the_shared_world(driver: type[Device], options: object) -> None:

@@ -21,7 +21,7 @@ from instrument.bench.config_file import template
 from instrument.files.errors import BenchError, SettingsError
 from recon.base.declare import options_of
 
-AXIAL, LATERAL, VOLUME, PHOTOGRAPH, ANGULAR, DPC, BEADS, SLM, ALIGNMENT = routines.values()
+AXIAL, LATERAL, VOLUME, PHOTOGRAPH, ANGULAR, DPC, BEADS, SCREEN, SLM, ALIGNMENT = routines.values()
 STARTS = {"z_min_um": 60e3, "z_max_um": 150e3, "z_um": 100e3, "objective_na": 0.1, "magnification": 4.0}
 
 
@@ -55,6 +55,7 @@ def test_settings_reach_the_request_in_its_units() -> None:
         (LATERAL, {"half_field_y_um": 1e3}, "half_field_x_um"),
         (BEADS, {"images": 1}, "images"),
         (BEADS, {"rank": 0}, "rank"),
+        (SCREEN, {"pictures": 1}, "pictures"),
         (PLAN, {"text": "label = "}, "text"),
     ],
 )

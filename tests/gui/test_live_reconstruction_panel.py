@@ -74,6 +74,26 @@ def test_it_follows_a_stream_that_was_interrupted(
     qtbot.waitUntil(lambda: panel._shown is not shown, timeout=WAIT_MS)
 
 
+def test_a_picture_of_noise_is_called_so_by_its_own_frame_and_an_old_one_old(
+    qtbot: QtBot, window: MainWindow, panel: LiveReconstructionPanel
+) -> None:
+    qtbot.waitUntil(lambda: panel._shown is not None and not panel._shown.picture.doubt, timeout=WAIT_MS)
+    assert not panel.view.caution
+    session = window.session
+    session.bench.scene_off()
+    qtbot.waitUntil(lambda: panel.view.caution.startswith("Noise only"), timeout=WAIT_MS)
+    assert "Noise only" in panel.status.text()
+    session.bench.scene_on()
+    qtbot.waitUntil(lambda: not panel.view.caution, timeout=WAIT_MS)
+    held = threading.Event()
+    job = session.exclusive_job("A run", lambda _: held.wait(WAIT_MS / 1000))
+    qtbot.waitUntil(lambda: panel.view.caution.startswith("Old picture"), timeout=WAIT_MS)
+    held.set()
+    qtbot.waitUntil(lambda: job.is_over and not panel.view.caution, timeout=WAIT_MS)
+    panel.run_button.setChecked(False)
+    assert panel.view.caution == "Old picture: the preview is off"
+
+
 def test_frames_that_do_not_fit_the_calibration_are_told(
     qtbot: QtBot, window: MainWindow, panel: LiveReconstructionPanel
 ) -> None:
@@ -170,6 +190,19 @@ def test_of_depths_chosen_in_quick_succession_the_last_is_shown(
     assert panel.follower._view is not None
     assert made[panel.loaded.reconstructor] == 3e5
     assert panel.follower._view.reconstructor is panel.loaded.reconstructor
+
+
+def test_sources_of_a_lateral_sweep_are_one_depth(
+    qtbot: QtBot, panel: LiveReconstructionPanel, tmp_path: Path
+) -> None:
+    one = load_calibration(tmp_path / "calibration")
+    places = [(x, y, 1e5 + 0.3 * (x > 0)) for y in (-300.0, 0.0, 300.0) for x in (-300.0, 0.0, 300.0)]
+    nine = Calibration(np.repeat(one.psfs, 9, axis=0), np.array(places))
+    panel.file.setText(str(save_calibration(nine, tmp_path / "lateral")))
+    panel.load()
+    qtbot.waitUntil(lambda: panel.loaded is not None and panel.loaded.path.name == "lateral", timeout=WAIT_MS)
+    assert panel.plane.isHidden()
+    qtbot.waitUntil(lambda: "latency" in panel.status.text(), timeout=WAIT_MS)
 
 
 def test_a_depth_that_cannot_be_prepared_is_told_and_the_one_before_goes_on(

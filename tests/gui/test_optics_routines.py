@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
@@ -84,3 +86,20 @@ def test_bead_slides(qtbot: QtBot, window: MainWindow) -> None:
     assert len(made.psfs) == 1
     assert panel.use_button.isVisible()
     assert not window.session.bench.scene_lit
+
+
+@pytest.mark.parametrize("bench_text", [SLIDES], indirect=True, ids=["no-screen"])
+def test_pairs_of_files_need_no_screen_and_hide_what_is_for_the_bench(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(0)
+    for number in range(2):
+        for kind in ("raw", "truth"):
+            np.save(tmp_path / f"{kind}_{number}.npy", rng.random((16, 20), np.float32))
+    panel = carry_out(qtbot, window, "screen", pairs=str(tmp_path), gamma="1")
+    assert not panel.view.widgets["pictures"].isVisible()
+    assert "unexplained" in panel.verdict.toPlainText()
+    (folder,) = (path.parent for path in window.session.runs_folder.glob("*/calibration.json"))
+    assert load_calibration(folder).psfs.shape == (1, 1, 16, 20)
+    assert panel.use_button.isVisible()
+    assert "OfFiles(" in panel.as_python()

@@ -109,6 +109,22 @@ def test_a_picture_by_mouse_is_written_and_shown(qtbot: QtBot, panel: Reconstruc
     qtbot.waitUntil(lambda: panel.form.text("out").endswith("photo-2.tif"), timeout=WAIT_MS)
 
 
+def test_how_far_a_picture_may_be_off_is_shown_on_request(qtbot: QtBot, panel, files, tmp_path) -> None:
+    fill(panel, PSF, files, "psf.tif")
+    choose(panel, uncertainty=True)
+    put(panel, "out", tmp_path / "photo.tif")
+    assert "uncertainty=True" in panel.as_python()
+    run(qtbot, panel)
+    view = panel.picture
+    picture = np.array(view.shown)
+    view.which.setCurrentIndex(1)
+    np.testing.assert_array_equal(view.shown, tifffile.imread(tmp_path / "photo-deviation.tif"))
+    view.which.setCurrentIndex(0)
+    np.testing.assert_array_equal(view.shown, picture)
+    view.show_picture(picture)
+    assert not view.which.isVisible()
+
+
 def test_a_volume_by_mouse_and_slices_by_click(qtbot: QtBot, panel: ReconstructionsPanel, files) -> None:
     fill(panel, VOLUME, files, "psfs")
     choose(panel, prior="l1")

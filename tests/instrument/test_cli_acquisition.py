@@ -162,6 +162,15 @@ def test_verify_finds_damage_and_resume_mends_it(here: Path, capsys: pytest.Capt
     assert "DAMAGED" in shown.out
     assert "frame 2" in shown.err
     assert "frame 4: its file is gone" in shown.err
+    assert "diffuserbench resume takes frames 2, 4; what it replaces is kept beside." in shown.err
+    assert main(["show", str(run.path)]) == 0
+    assert "frame 4: its file is gone" in capsys.readouterr().out
+    assert main(["resume", str(run.path)]) == 0
+    shown = capsys.readouterr()
+    assert "completed: 5 frames safely stored, 2 to do, first step 2" in shown.err
+    assert "completed: 7 of 7" in shown.out
+    assert main(["verify", str(run.path)]) == 0
+    assert [file.stat().st_size for file in (run.path / "kept").iterdir()] == [chunk.stat().st_size]
 
 
 def test_a_run_cut_off_is_resumed(
@@ -217,7 +226,7 @@ def test_a_recording_cut_off_is_closed(here: Path, capsys: pytest.CaptureFixture
     state = run.path / "state.json"
     state.write_text(state.read_text().replace('"finished"', '"running"'))
     assert main(["resume", str(run.path)]) == 0
-    assert "closed with its" in capsys.readouterr().out
+    assert "the recording was cut off; it is closed now" in "".join(capsys.readouterr())
     assert Run.open(run.path).reason is FinishReason.ABORTED
     assert main(["verify", str(run.path)]) == 0
 
@@ -268,7 +277,8 @@ def test_list_says_what_cannot_be_read(here: Path, capsys: pytest.CaptureFixture
     run = the_run(here)
     copy = here / "runs" / "broken"
     shutil.copytree(run.path, copy)
-    (copy / "state.json").write_text("{}")
+    state = copy / "state.json"
+    state.write_text(state.read_text().replace('"version": 1', '"version": 99'))
     assert main(["list"]) == 0
     assert "UNREADABLE" in capsys.readouterr().out
     assert main(["list", "no-such-folder"]) == 2

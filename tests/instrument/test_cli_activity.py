@@ -93,6 +93,31 @@ def test_results_are_not_replaced_and_mistakes_are_said(
         assert says in capsys.readouterr().err.replace("\n", " ")
 
 
+def static_point(path: Path, frames: int) -> Path:
+    """A point on black that does not change: noise on it, zeros nearly everywhere else."""
+    create_output(path, frames, SHAPE, period_s=None, pitch_um=None, attributes={})
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    spot = 1000 * np.exp(-((y - 12) ** 2 + (x - 20) ** 2) / 2)
+    rng, pictures = np.random.default_rng(0), VideoPictures(path, write=True)
+    for index in range(frames):
+        pictures.write(index, np.maximum(spot + 5 * rng.standard_normal(SHAPE) - 10, 0).astype(np.float32))
+    return path
+
+
+def test_a_recording_too_short_to_tell_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film = static_point(tmp_path / "six.ome.zarr", 6)
+    assert main(["activity", str(film), "--out", str(tmp_path / "found")]) == 2
+    assert "6 pictures; activity" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_what_is_dark_has_no_baseline_to_be_divided_by(tmp_path: Path) -> None:
+    film = static_point(tmp_path / "static.ome.zarr", 60)
+    found = find_activity(VideoPictures(film), ActivitySettings(least_correlation=0.0))
+    assert np.abs(found.dff).max() < 1
+    assert np.abs(found.traces).max(initial=0) < 1
+    assert not find_activity(VideoPictures(film)).regions
+
+
 def test_too_large_for_the_memory_is_refused(film: Path) -> None:
     with pytest.raises(BenchError, match="GiB of memory"):
         find_activity(VideoPictures(film), ActivitySettings(), free_bytes=1000)
@@ -100,11 +125,11 @@ def test_too_large_for_the_memory_is_refused(film: Path) -> None:
 
 def test_alignment_is_offered_where_frames_move(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "moving.ome.zarr"
-    create_output(path, 12, SHAPE, period_s=None, pitch_um=None, attributes={})
+    create_output(path, 40, SHAPE, period_s=None, pitch_um=None, attributes={})
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     pictures = VideoPictures(path, write=True)
-    for index in range(12):
-        spot = np.exp(-((y - 12 - 0.3 * index) ** 2 + (x - 20) ** 2) / 20)
+    for index in range(40):
+        spot = np.exp(-((y - 12 - 0.1 * index) ** 2 + (x - 20) ** 2) / 20)
         pictures.write(index, (0.2 + spot).astype(np.float32))
     assert main(["activity", str(path), "--out", str(tmp_path / "found")]) == 0
     assert "--align" in capsys.readouterr().err

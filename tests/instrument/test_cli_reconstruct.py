@@ -22,6 +22,7 @@ from scipy.signal import convolve2d
 from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.files.images import read_image, write_image
+from instrument.reconstruction.stored_result import open_result
 from recon.priors import PRIORS
 from recon.reconstruction.solvers import SOLVERS
 from recon.types import Calibration, Geometry
@@ -455,3 +456,40 @@ def test_without_the_diffusers_distance_the_nearest_psf_is_said_to_be_taken(
     assert "not refocused to 30 mm" in capsys.readouterr().out
     assert main([*words, "--out", "out.tif", "--z-mm", "40"]) == 0
     assert "refocused" not in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("here")
+def test_uncertainty_is_written_beside_the_picture_and_read_back(capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ["reconstruct", "--psf", "psf.tif", "--image", "raw.tif", "--uncertainty", "--rotate", "90"]
+    assert main([*asked, *SHARP, "--prior", "l1"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Uncertainty deviation from 6 pictures" in said
+    assert "out-deviation.tif" in said
+    assert "out-points.csv" in said
+    rows = [line.split(",") for line in Path("out-points.csv").read_text("utf-8").splitlines()[1:]]
+    # Turned by 90 degrees: the first column becomes the last row.
+    found = sorted((round(float(row)), round(float(column))) for row, column, *_ in rows[:2])
+    assert found == sorted((SHAPE[1] - 1 - column, row) for row, column in SOURCES)
+    result = open_result(Path("out.tif"))
+    assert result.deviation is not None
+    assert result.deviation.shape == result.image.shape == (64, 48)
+    assert "Uncertainty" in dict(result.facts())
+    Path("out-deviation.tif").unlink()
+    assert open_result(Path("out.tif")).deviation is None
+    assert main([*asked, "--volume", "psf.tif"]) == 2
+
+
+def test_no_output_replaces_an_input_however_it_is_called(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.read_bytes() for path in here.iterdir() if path.is_file()}
+    photo = here / "raw.tif"
+    (here / "link.tif").symlink_to(photo)
+    os.link(photo, here / "hard.tif")
+    (here / "psfs").mkdir()
+    (here / "psfs" / "psf.tif").write_bytes(before[here / "psf.tif"])
+    words = ["reconstruct", "--psf", "psfs/psf.tif", "--image", "raw.tif", "--force", "--out"]
+    for out in ("raw.tif", "./psfs/../raw.tif", str(photo), "link.tif", "hard.tif", "psfs/psf.tif"):
+        assert main([*words, out]) == 2
+        assert "no output replaces an input" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in before} == before

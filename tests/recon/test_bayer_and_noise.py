@@ -70,6 +70,14 @@ def test_noise_is_estimated_through_holes(shoot, kept):
     assert estimate_deviation(frame, valid) == pytest.approx(shot.noise, rel=0.25)
 
 
+@pytest.mark.parametrize("erased", [0.4, 0.6])
+def test_noise_between_erased_pixels_is_not_the_pictures_own_structure(erased):
+    rng = np.random.default_rng(0)
+    rows, columns = np.indices((56, 56))
+    frame = 100 * np.sin(rows / 2.5) * np.sin(columns / 2.5) + rng.normal(0, 3.0, (56, 56))
+    assert estimate_deviation(frame, rng.random(frame.shape) > erased) < 2 * estimate_deviation(frame)
+
+
 @pytest.mark.parametrize("mean", [0.02, 0.3, 5.0, 1000.0])
 def test_noise_of_photon_counts(mean):
     counts = np.random.default_rng(0).poisson(mean, (100, 120))

@@ -13,6 +13,7 @@ import pytest
 
 from recon import Calibration, Geometry, InputError, NoiseModel, reconstruct
 from recon.base.metrics import psnr
+from recon.priors import PRIORS
 from recon.solvers import StopReason
 
 ROOT = Path(__file__).parents[2]
@@ -60,7 +61,7 @@ def test_default_holds_over_noise(shoot, snr):
         for e in np.arange(-5, -1, 0.5)
     )
     print(f"snr {snr}: default {default:.2f} dB, tuned {tuned:.2f} dB")
-    assert default > tuned - 1.0
+    assert default > tuned - 1.3  # at SNR 1000 1.13 dB by the law of 0071, which loses 0.2 dB in the mean
 
 
 @pytest.mark.parametrize("method", ["admm", "fista", "wiener"])
@@ -71,7 +72,7 @@ def test_compilation_is_not_counted_as_solving(method, tmp_path):
         "import numpy as np, time; from recon import reconstruct\n"
         "psf = np.random.default_rng(0).random((60, 80)) ** 8\n"
         "began = time.perf_counter()\n"
-        f"result = reconstruct(psf + 1, psf, solver={method!r}, **{limits})\n"
+        f"result = reconstruct(psf[::-1] + 1, psf, solver={method!r}, **{limits})\n"
         "print(result.seconds, time.perf_counter() - began)"
     )
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
@@ -85,12 +86,13 @@ def test_compilation_is_not_counted_as_solving(method, tmp_path):
 def test_colour_channels_are_solved_each_with_its_psf(shot, shoot):
     other = shoot(seed=7)
     measurement = np.stack([shot.measurement, 3 * other.measurement], axis=-1)
-    both = reconstruct(measurement, np.stack([shot.psf, other.psf], axis=-1), iterations=60, tolerance=0)
+    asked = {"prior": PRIORS["tv"](1.0), "iterations": 60, "tolerance": 0}  # a default weight is that of both
+    both = reconstruct(measurement, np.stack([shot.psf, other.psf], axis=-1), **asked)
     assert both.image.shape == (*shot.truth.shape, 2)
-    alone = reconstruct(shot.measurement, shot.psf, iterations=60, tolerance=0, tau=None)
+    alone = reconstruct(shot.measurement, shot.psf, **asked)
     assert np.linalg.norm(both.image[..., 0] - alone.image) < 1e-3 * np.linalg.norm(alone.image)
     assert psnr(both.image[..., 1] / 3, other.truth) > 24
-    shared = reconstruct(measurement[..., :1], shot.psf, iterations=60, tolerance=0)
+    shared = reconstruct(measurement[..., :1], shot.psf, **asked)
     assert shared.image.shape == (*shot.truth.shape, 1)
     assert shared.image[..., 0] == pytest.approx(alone.image)
 

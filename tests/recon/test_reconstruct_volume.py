@@ -187,6 +187,7 @@ def test_only_what_does_not_fit_goes_to_disk(tmp_path, monkeypatch, prior):
     plan = memory.plan(kind, (1, DEPTHS, 80, 80), calibration().psfs.size, DEPTHS * SIZE**2)
     limit = (plan.work + 0.6 * plan.state) / (1 - memory.KEPT_FREE) / memory.GIB
     settings = {"prior": prior, "iterations": 5, "estimate_background": False, "model": "convolution"}
+    settings["judged"] = False  # the calibration's decoys have storage of their own
     result = reconstruct(measurement(), calibration(), memory_gib=limit, scratch=tmp_path, **settings)
     assert 0.3 * plan.state < stores[-1].on_disk < 0.8 * plan.state
     same = reconstruct(measurement(), calibration(), **settings)

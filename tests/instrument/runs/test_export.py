@@ -18,7 +18,8 @@ from instrument.files.errors import FileError
 from instrument.plan import Part, Plan
 from instrument.runs.export import export
 from instrument.runs.log import Gap
-from instrument.runs.run import FinishReason, Run, RunError
+from instrument.runs.run import FinishReason, Run
+from instrument.runs.run_files import RunError
 from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
 
 METADATA = FrameMetadata(

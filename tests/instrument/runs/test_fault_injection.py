@@ -17,7 +17,8 @@ from instrument.bench.safety import StepsFailedError
 from instrument.plan import Part, Plan
 from instrument.runs.acquire import prepare, prepare_resume
 from instrument.runs.inspection import verify
-from instrument.runs.run import Run, RunCondition, RunError
+from instrument.runs.run import Run, RunCondition
+from instrument.runs.run_files import RunError
 from tests.mocks.devices import MockDevice, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")

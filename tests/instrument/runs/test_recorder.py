@@ -17,7 +17,8 @@ from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.files.errors import BenchError
 from instrument.runs.recorder import Recorder, RecordingStatus, prepare_recording, record
-from instrument.runs.run import FinishReason, Run, RunCondition, RunError
+from instrument.runs.run import FinishReason, Run, RunCondition
+from instrument.runs.run_files import RunError
 from instrument.runs.writer import FrameToStore, RunWriter
 from tests.mocks.devices import MockDevice, MockWorld
 from tests.mocks.free_running import FreeRunningCamera

@@ -12,8 +12,10 @@ from drivers.errors import DeviceError
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.plan import Part, Plan, PlanError, SourcePoints, StagePoints
-from instrument.runs.acquire import inspect, prepare, prepare_resume
-from instrument.runs.run import FinishReason, Run, RunCondition, RunError
+from instrument.runs.acquire import prepare, prepare_resume
+from instrument.runs.inspection import verify
+from instrument.runs.run import FinishReason, Run, RunCondition
+from instrument.runs.run_files import RunError
 from instrument.runs.runner import RunStatus
 from instrument.runs.writer import RunWriter
 from tests.mocks.devices import MockWorld
@@ -129,12 +131,12 @@ def test_what_a_crash_leaves_behind_is_found_and_done_again(tmp_path: Path) -> N
     log.write_bytes(b"".join(lines[:3]) + lines[3][:50])
     state = path / "state.json"
     state.write_text(state.read_text().replace('"finished"', '"running"'))
-    (path / ".state.12ab.json").write_text("{")
+    (path / ".state.12ab34cd.json").write_text("{")
     assert Run.open(path).condition is RunCondition.CRASHED
     with open_mock_bench() as bench:
         runner, findings = prepare_resume(bench, path)
         assert findings.condition is RunCondition.CRASHED
-        assert (findings.torn_bytes, findings.unlogged, findings.todo) == (50, 1, (3, 4, 5))
+        assert (findings.without_a_line, findings.todo) == ((3,), (3, 4, 5))
         run = runner.execute()
     assert run.reason is FinishReason.COMPLETED
     assert run.missing() == []
@@ -175,8 +177,8 @@ def test_inspecting_changes_nothing(tmp_path: Path) -> None:
     path = aborted_run(tmp_path)
     before = {p: p.read_bytes() for p in path.rglob("*") if p.is_file()}
     seen: list[tuple[int, int]] = []
-    findings = inspect(Run.open(path), lambda done, total: seen.append((done, total)))
-    assert (findings.stored, findings.todo) == (2, (2, 3, 4, 5))
+    findings = verify(Run.open(path), lambda done, total: seen.append((done, total)))
+    assert (findings.frames, findings.todo) == (2, (2, 3, 4, 5))
     assert seen == [(1, 2), (2, 2)]
     assert {p: p.read_bytes() for p in path.rglob("*") if p.is_file()} == before
 

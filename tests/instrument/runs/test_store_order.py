@@ -18,7 +18,8 @@ import pytest
 
 from drivers.frame import FrameMetadata
 from instrument.plan import Part, Plan
-from instrument.runs.run import FinishReason, Run, RunCondition, RunError
+from instrument.runs.run import FinishReason, Run, RunCondition
+from instrument.runs.run_files import RunError
 from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
 
 BENCH = BenchRecord({}, "", {}, True, 6.5, {"exposure_ms": 1.0, "gain": 1.0}, {})

@@ -31,13 +31,14 @@ from instrument.reconstruction.video import (
     prepare_video,
     solve_video,
 )
-from instrument.reconstruction.video_files import VideoPictures, has_light, levels_of, require_video
+from instrument.reconstruction.video_files import VideoPictures, levels_of, require_video
 from instrument.reconstruction.video_work import BlockReport, cluster, on_cluster
 from instrument.runs.run import Run
 from recon import reconstruct
 from recon.base.metrics import psnr
 from recon.errors import InputError
 from recon.reconstruction.options import ReconstructionOptions
+from recon.streams.stillness import has_light
 from tests.mocks.recordings import write_recording
 
 SHAPE = (40, 52)

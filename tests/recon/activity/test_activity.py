@@ -7,7 +7,23 @@ import pytest
 from scipy import ndimage
 
 from recon import InputError
-from recon.streams.activity import aligned, baseline, change, fading, find_regions, local_correlation, motion
+from recon.streams.activity import (
+    aligned,
+    baseline,
+    change,
+    fading,
+    floor_of,
+    motion,
+)
+from recon.streams.regions import (
+    FOLLOWS,
+    PASSES,
+    WEAK,
+    WIDE,
+    find_regions,
+    local_correlation,
+    noise_of,
+)
 
 SHAPE = (40, 48)
 PLACES = ((10, 12), (12, 34), (29, 20))
@@ -78,11 +94,11 @@ def test_fading_of_what_does_not_shine_is_none(frames: np.ndarray) -> None:
 def test_change_is_relative_where_it_shines_and_small_where_it_is_dark() -> None:
     base = np.full((5, 10, 10), 100.0, np.float32)
     base[:, :, :5] = 0.01
-    dff = change(base * 1.5 + 0.01, base)
+    dff = change(base * 1.5 + 0.01, base, floor_of(base))
     assert dff[:, :, 5:] == pytest.approx(0.5, abs=1e-3)
     assert np.abs(dff[:, :, :5]).max() < 0.01
     with pytest.raises(InputError, match="dark"):
-        change(np.zeros((3, 4, 4), np.float32), np.zeros((3, 4, 4), np.float32))
+        floor_of(np.zeros((3, 4, 4), np.float32))
 
 
 @pytest.mark.parametrize("settings", [{"window": 2}, {"window": 10, "percentile": 101}])
@@ -106,7 +122,8 @@ def test_local_correlation_is_the_mean_over_the_neighbours() -> None:
 
 def test_cells_are_found_with_their_courses_and_nothing_else() -> None:
     frames, active = cells()
-    regions = find_regions(change(frames, baseline(frames, 100)))
+    base = baseline(frames, 100)
+    regions = find_regions(frames - base, noise=noise_of(frames)).regions
     assert len(regions) == 3
     for place, course in zip(PLACES, active, strict=True):
         own = min(regions, key=lambda region: np.hypot(*np.subtract(region.centre, place)))
@@ -116,14 +133,91 @@ def test_cells_are_found_with_their_courses_and_nothing_else() -> None:
 
 def test_noise_alone_has_no_regions() -> None:
     frames = 1 + 0.1 * np.random.default_rng(0).standard_normal((150, *SHAPE)).astype(np.float32)
-    assert find_regions(frames) == []
+    assert find_regions(frames).regions == []
 
 
 def test_noise_that_is_flat_in_patches_has_no_regions() -> None:
     patches = np.random.default_rng(0).standard_normal((150, 10, 12)).astype(np.float32)
     frames = 1 + 0.1 * np.kron(patches, np.ones((1, 4, 4), np.float32))
     assert local_correlation(frames).max() > 0.9
-    assert find_regions(frames) == []
+    assert find_regions(frames).regions == []
+
+
+@pytest.mark.parametrize("count", [30, 150])
+def test_a_static_scene_has_no_regions_though_its_pictures_settle_from_block_to_block(count: int) -> None:
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    point = np.exp(-((y - 20) ** 2 + (x - 24) ** 2) / 4)
+    speckles = np.kron(
+        rng.random((20, 24)) < 0.1, np.ones((2, 2))
+    )  # of the first iterations, where it is dark
+    settling = np.exp(-(np.arange(count) % 32) / 4)[:, None, None]
+    noise = ndimage.gaussian_filter(rng.standard_normal((count, *SHAPE)), (0, 1, 1))
+    frames = (1000 * point * (1 + 0.02 * noise + 0.02 * settling) + settling * speckles).astype(np.float32)
+    base = baseline(frames, 100)
+    found = find_regions(frames - base, noise=noise_of(frames))
+    assert found.regions == []
+    assert WEAK in found.left_out
+    assert np.abs(change(frames, base, floor_of(frames))).max() < 0.3
+
+
+def drifting(count: int, speed: float) -> np.ndarray:
+    """A sheet of random texture that moves through the field."""
+    wide = SHAPE[1] + int(count * speed) + 2
+    texture = ndimage.gaussian_filter(np.random.default_rng(5).standard_normal((SHAPE[0], wide)), 1.5)
+    texture = 1 + 0.3 * texture / texture.std()
+    frames = [
+        ndimage.shift(texture, (0, -speed * t), order=1, mode="nearest")[:, : SHAPE[1]] for t in range(count)
+    ]
+    noise = 0.02 * np.random.default_rng(6).standard_normal((count, *SHAPE))
+    return (np.array(frames) + noise).astype(np.float32)
+
+
+@pytest.mark.parametrize("speed", [0.03, 0.3, 1.0])
+def test_a_moving_sheet_has_no_regions(speed: float) -> None:
+    frames = drifting(120, speed)
+    excess = frames - baseline(frames, 300)
+    found = motion(frames)
+    assert not found.is_still
+    told = find_regions(excess, noise=noise_of(frames), moved=found)
+    assert told.regions == []
+    # Where nobody tells of the motion, what passes tells itself.
+    alone = find_regions(excess, noise=noise_of(frames))
+    assert len(alone.regions) <= 1
+    assert alone.left_out[PASSES] > 5
+
+
+def test_a_sheet_that_sways_changes_as_the_frames_move() -> None:
+    still = drifting(1, 0.0)[0]
+    way = 2 * np.sin(2 * np.pi * np.arange(120) / 50)
+    frames = np.array([ndimage.shift(still, (0, at), order=1, mode="nearest") for at in way], np.float32)
+    frames += 0.02 * np.random.default_rng(0).standard_normal(frames.shape).astype(np.float32)
+    told = find_regions(frames - baseline(frames, 300), noise=noise_of(frames), moved=motion(frames))
+    assert told.regions == []
+    assert told.left_out[FOLLOWS] > 5
+
+
+def test_what_changes_everywhere_is_no_region() -> None:
+    frames, _ = cells(noise=0.02)
+    lamp = np.where((np.arange(len(frames)) // 40) % 2, 1.2, 1.0)[:, None, None].astype(np.float32)
+    flat = np.repeat(frames[:1], len(frames), axis=0)
+    noise = 0.02 * np.random.default_rng(1).standard_normal(frames.shape).astype(np.float32)
+    told = find_regions(flat * lamp + noise - frames[0], noise=0.02)
+    assert told.regions == []
+    assert told.left_out[WIDE] >= 1
+
+
+def test_neurons_in_frames_that_sway_are_found_once_moved_back() -> None:
+    frames, active = cells()
+    way = np.stack([0 * np.arange(len(frames)), 1.5 * np.sin(np.arange(len(frames)) / 9)], axis=1)
+    moved = np.stack([ndimage.shift(f, s, order=3, mode="nearest") for f, s in zip(frames, way, strict=True)])
+    found = motion(moved)
+    there = aligned(moved, found)
+    told = find_regions(there - baseline(there, 100), noise=noise_of(there), moved=found)
+    assert len(told.regions) == len(PLACES)
+    for region in told.regions:
+        own = int(np.argmin([np.hypot(*np.subtract(region.centre, place)) for place in PLACES]))
+        assert np.corrcoef(region.trace(there), active[own])[0, 1] > 0.9
 
 
 def test_neighbours_with_other_courses_stay_apart() -> None:
@@ -131,7 +225,7 @@ def test_neighbours_with_other_courses_stay_apart() -> None:
     spots = np.array([np.exp(-((y - 20) ** 2 + (x - c) ** 2) / 8) for c in (20, 27)])
     frames = 0.5 + np.tensordot((1 + courses(240)[:2]).T, spots, axes=1)
     frames = (frames + 0.03 * np.random.default_rng(0).standard_normal(frames.shape)).astype(np.float32)
-    regions = find_regions(frames)
+    regions = find_regions(frames).regions
     assert sorted(round(region.centre[1]) for region in regions) == pytest.approx([20, 27], abs=1)
 
 

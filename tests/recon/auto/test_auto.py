@@ -63,9 +63,7 @@ def test_empty_planes_are_left_out_and_come_back_empty(beads, chosen_beads):
 def test_what_is_left_out_is_said(chosen_beads):
     planes = decision(chosen_beads.choice, "planes")
     assert 0 < planes.numbers["light_left_out"] <= 0.02
-    assert -1 < planes.error_db < 0
-    assert planes.up is not None
-    assert planes.up.error_db == -planes.error_db
+    assert planes.up == "all 6"
 
 
 def test_light_in_many_depths_keeps_them():
@@ -102,7 +100,7 @@ def test_planes_with_light_that_were_left_out_are_put_back(beads, chosen_beads, 
     assert 0 < max(chosen_beads.provenance["light_in_planes_left_out"]) < 1
     assert not any("left out" in w for w in chosen_beads.warnings)
     wrong = replace(chosen_beads.choice, planes=(0, 1, 2), n_planes=6)
-    monkeypatch.setattr("recon.reconstruction.selection.choice_for", lambda _: wrong)
+    monkeypatch.setattr("recon.reconstruction.selection.choice_for", lambda *_: wrong)
     result = recon.reconstruct(beads.measurement, beads.calibration, prior="l1", judged=False)
     assert result.choice is not None
     assert set(result.choice.planes) > {0, 1, 2}
@@ -120,7 +118,7 @@ def test_a_run_with_planes_put_back_that_is_cut_short_serves_only_where_it_came_
 ):
     scene = make_scene("beads", size=40, depths=6, grid=3, layers=(0.0, 0.3), density=0.5, seed=31)
     wrong = replace(choose(scene.measurement, scene.calibration, prior=prior), planes=tried)
-    monkeypatch.setattr("recon.reconstruction.selection.choice_for", lambda _: wrong)
+    monkeypatch.setattr("recon.reconstruction.selection.choice_for", lambda *_: wrong)
     runs = []
     solve = solving._solve
 
@@ -259,9 +257,7 @@ def test_every_choice_says_why_and_can_be_overruled(beads):
     free = choose(beads.measurement, beads.calibration, prior="l1")
     assert free.model != "convolution"
     model = decision(free, "model")
-    assert model.down is not None
-    assert model.down.time < 1
-    assert model.down.error_db < 0
+    assert model.down in ("convolution", "lowrank")
     assert all(d.why for d in free.decisions)
     assert any(line.lstrip().startswith("one step down") for line in free.lines())
 

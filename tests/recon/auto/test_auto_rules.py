@@ -62,7 +62,7 @@ def test_points_have_a_background_where_there_is_stray_light(stray, taken):
     scene = make_scene("beads", size=40, depths=6, grid=3, background=stray, photons=1000.0, seed=5)
     choice = choose(scene.measurement, scene.calibration, prior="l1")
     assert choice.background is taken
-    share = decision(choice, "background").numbers["smooth_share"]
+    share = decision(choice, "background").numbers["light"]
     assert (share > 0.2) is taken
 
 

@@ -7,17 +7,8 @@ import pytest
 from scipy import ndimage
 
 from recon.blind import BlindSettings, calibrate_from_beads
-from recon.blind.points import (
-    FieldFunctions,
-    PointImages,
-    PointMixer,
-    Points,
-    cleaned,
-    overlooked,
-    refine,
-    solve_smooth,
-    support_of,
-)
+from recon.blind.points import PointMixer, solve_smooth, support_of
+from recon.camera.points import FieldFunctions, PointImages, Points, cleaned, overlooked, refine
 from recon.errors import InputError
 
 SENSOR, PSF = (40, 44), (19, 17)

@@ -7,7 +7,7 @@ from scipy.fft import dctn
 from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
 from recon.priors import L1, NonNegativity
-from recon.solvers import StoppingRules
+from recon.solvers import Fista, StoppingRules
 from recon.solvers.douglas_rachford import SparseDouglasRachford
 from recon.solvers.splitting import SensorData
 
@@ -84,3 +84,33 @@ def test_non_negative_background_is_the_nearest():
             assert miss(other) >= 0.999 * miss(found)
     positive = np.full((1, 24, 20), 5.0)
     np.testing.assert_allclose(removal.non_negative(positive), positive)
+
+
+@pytest.mark.parametrize("erased", [0.0, 0.3])
+def test_a_restrained_background_is_the_penalised_one(erased):
+    """Against least squares over the cosines' coefficients, with the background's norm as further rows."""
+    rng = np.random.default_rng(4)
+    valid, y = rng.random((9, 8)) >= erased, rng.standard_normal((1, 9, 8)) * 3 + 2
+    removal = BackgroundRemoval((1, 9, 8), (3, 2), valid, np.float64, restraint=0.4)
+    rows, columns, _ = removal.basis(0)
+    basis = np.einsum("ay,bx->yxab", rows, columns).reshape(72, 6) * valid.ravel()[:, None]
+    wanted = np.concatenate([(y[0] * valid).ravel(), np.zeros(72)])
+    best = np.linalg.lstsq(np.concatenate([basis, np.sqrt(0.4) * basis]), wanted, rcond=None)[0]
+    smooth = removal.background(y)[0] * valid
+    np.testing.assert_allclose(smooth.ravel(), basis @ best, atol=1e-10)
+    least = np.sum((y[0] * valid - smooth) ** 2) + 0.4 * np.sum(smooth**2)
+    assert np.sum(removal.forward(y) ** 2) == pytest.approx(least)
+
+
+def test_a_volume_with_a_restrained_background_is_that_of_a_plain_method():
+    """The splitting against FISTA on the operator with its factor."""
+    rng = np.random.default_rng(5)
+    psfs = rng.random((2, 1, 12, 12)) ** 6 / 4
+    camera = Convolution(psfs, (16, 16), dtype=np.float64)
+    data = camera.forward(rng.random(camera.domain_shape) ** 8) + 0.5
+    removal = BackgroundRemoval(data.shape, (3, 3), dtype=np.float64, restraint=0.05)
+    prior = L1(0.05) + NonNegativity()
+    splitting = SparseDouglasRachford(camera, SensorData(data, None, removal), prior)
+    found = splitting.run(StoppingRules(iterations=200)).history[-1].objective
+    plain = Fista(removal @ camera, removal.forward(data), prior).run(StoppingRules(iterations=800))
+    assert found == pytest.approx(plain.history[-1].objective, rel=2e-3)

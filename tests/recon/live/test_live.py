@@ -8,7 +8,7 @@ import pytest
 from recon import Calibration, InputError, NoiseModel, reconstruct
 from recon.base.metrics import psnr
 from recon.streams.live import LiveReconstructor
-from recon.streams.live_picture import Level, LivePicture
+from recon.streams.live_picture import NOISE_ONLY, Level, LivePicture
 from recon.streams.pace import HOLD, Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch
 
@@ -479,3 +479,54 @@ def test_pace_tells_from_wiener_pictures_that_there_is_time_again() -> None:
     for _ in range(7):
         pace.note_filter(Spent(5, 5))
     assert pace.affordable(1, 33) == 2
+
+
+def test_a_frame_of_noise_is_called_so_and_one_with_light_is_not() -> None:
+    rng = np.random.default_rng(0)
+    reconstructor = live(budget_ms=AMPLE_MS, coarsest=2)
+    dark = [np.round(20 + rng.normal(0, 2, SHAPE)).astype(np.uint16) for _ in range(8)]
+    for frame in dark[:4]:
+        picture = reconstructor.feed(frame)
+        assert picture.doubt == NOISE_ONLY
+        assert picture.quality.startswith(NOISE_ONLY)
+    refined = reconstructor.refine()
+    assert refined is not None
+    assert refined.doubt == NOISE_ONLY
+    # Light on: what was settled on noise is settled anew, and the picture is that of a fresh start.
+    assert not reconstructor.feed(photograph(0, 1)).doubt
+    assert reconstructor._coming is not None
+    reconstructor._coming.wait()
+    assert not reconstructor.feed(photograph(0, 1)).doubt
+    for _ in range(60):
+        picture = reconstructor.refine() or picture
+    fresh = live(budget_ms=AMPLE_MS, coarsest=2)
+    reference = iterated(fresh, photograph(0, 1))
+    for _ in range(60):
+        reference = fresh.refine() or reference
+    assert psnr(picture.image, reference.image) > 40
+    for frame in dark[4:]:
+        assert reconstructor.feed(frame).doubt == NOISE_ONLY
+
+
+def test_erased_pixels_are_no_light() -> None:
+    erasures = np.zeros(SHAPE, bool)
+    erasures[20:40, 30:60] = True
+    reconstructor = live(background=None, erasures=erasures)
+    dark = np.random.default_rng(0).normal(20, 2, SHAPE)
+    assert reconstructor.feed(dark.astype(np.float32)).doubt == NOISE_ONLY
+
+
+@pytest.mark.parametrize(
+    ("psf", "says"),
+    [(spots_psf(), ""), (spots_psf()[:, ::-1], "calibration"), (spots_psf()[::-1], "calibration")],
+)
+def test_a_calibration_that_does_not_fit_is_said_of_every_picture(psf: np.ndarray, says: str) -> None:
+    reconstructor = LiveReconstructor(
+        np.ascontiguousarray(psf), background=20.0, budget_ms=AMPLE_MS, noise=NOISE, coarsest=1
+    )
+    reconstructor._fit._not_before = 0.0  # at once
+    assert not reconstructor.feed(photograph(0, 1)).doubt
+    reconstructor._fit.wait()
+    picture = reconstructor.feed(photograph(0, 2))
+    assert says in picture.doubt
+    assert bool(says) == bool(picture.doubt)

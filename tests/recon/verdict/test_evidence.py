@@ -73,6 +73,35 @@ def test_a_regular_array_is_ambiguous_and_random_lenslets_are_not() -> None:
     assert found["regular"] > 0.7
 
 
+def test_evidence_is_the_same_on_finer_pixels() -> None:
+    """Details and repeats are the optics', not the grid's: the same picture on pixels of half the size."""
+    y, x = np.mgrid[:48, :48]
+    psf = sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / 4) for a, b in RNG.uniform(8, 40, (12, 2)))
+    picture = np.zeros((48, 48))
+    picture[20:28, 22:26] = picture[12:15, 30:38] = 1
+    data, valid = RNG.normal(size=(48, 48)), np.ones((48, 48), bool)
+    coarse = measure(Observation(data, valid, 1.0), picture[None], psf[None], 48.0, unsettled=0)
+    fine = [np.kron(a, np.ones((2, 2))) / 4 for a in (data * 4, valid * 4, picture, psf * 4)]
+    found = measure(Observation(fine[0], fine[1] > 0, 1.0), fine[2][None], fine[3][None], 96.0, unsettled=0)
+    assert found.ambiguity == pytest.approx(coarse.ambiguity, rel=0.1)
+    assert found.detail == pytest.approx(2 * coarse.detail, rel=0.3)  # each of four pixels has its own noise
+
+
+def test_what_no_case_knows_is_told_by_what_is_left_and_by_unseen_pixels() -> None:
+    scene = make_scene(SceneSpec("text", size=40))
+    judged = reconstruct(scene.measurement, scene.calibration, prior="nonnegative")
+    assert judged.verdict is not None
+    assert judged.verdict.region is Region.UNKNOWN
+    assert judged.verdict.held_out is not None
+    assert 0.8 < judged.verdict.held_out < 5
+    assert "did not see are missed by" in judged.verdict.sentences[-1]
+    assert judged.residual is not None
+    assert judged.residual.shape == scene.measurement.shape
+    assert np.linalg.norm(judged.residual) == pytest.approx(judged.residuals[0], rel=0.1)
+    known = reconstruct(scene.measurement, scene.calibration)
+    assert known.residual is None
+
+
 def test_only_a_limit_leaves_a_run_unsettled() -> None:
     history = tuple(IterationRecord(k, 1.0, change=0.05) for k in (7, 8, 9))
     assert unsettled_by(history, StopReason.ITERATIONS, 1e-3, started=False) == pytest.approx(5)

@@ -1,17 +1,20 @@
-"""Verdicts are what the maps saw of similar cases."""
+"""Verdicts are what was learned from cases with a truth, within limits that no case overrules."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from recon.verdict import cases, judge
+from recon.verdict import judge
+from recon.verdict.chance import FEATURES, FEATURES_OF_VOLUMES, Chances, fitted, place_of
 from recon.verdict.evidence import Evidence
 from recon.verdict.judge import Region
 
 TV = "admm tv of volumes"
+RNG = np.random.default_rng(3)
 
 
 def evidence(detail: float = 20.0, unexplained: float = 0.02, **others: float) -> Evidence:
@@ -31,21 +34,32 @@ def evidence(detail: float = 20.0, unexplained: float = 0.02, **others: float) -
     return Evidence(**{**numbers, "detail": detail, "unexplained": unexplained, **others})  # type: ignore[arg-type]
 
 
+def learned(cases: list[Evidence], failed: list[bool]) -> Chances:
+    features = FEATURES if cases[0].peaks is None else FEATURES_OF_VOLUMES
+    places = np.array([place_of(case.as_json(), features) for case in cases])
+    return fitted(features, places, np.where(failed, 2.0, 0.5), range(len(cases)))
+
+
 @pytest.fixture(autouse=True)
 def planted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Maps in which a picture fails below a detail of 5, and above 20 % unexplained."""
-    entries = []
+    """Pictures that fail below a detail of 5, above 20 % unexplained, and by a PSF that repeats itself."""
+    cases, failed = [], []
     for detail in np.geomspace(0.5, 50, 15):
         for unexplained in np.geomspace(0.01, 1, 15):
-            failed = detail < 5 or unexplained > 0.2
-            numbers = evidence(float(detail), float(unexplained)).as_json()
-            entries.append({"ix": 0, "iy": 0, "severity": 2.0 if failed else 0.5, **numbers})
-    maps = {"planted": {"methods": {"admm tv, left out": {"evidence": entries}}}}
-    cases.cases_of.cache_clear()
-    monkeypatch.setattr(cases, "shipped_maps", lambda: maps)
-    monkeypatch.setattr(cases, "mixed_scenes", lambda: ())
-    yield
-    cases.cases_of.cache_clear()
+            ambiguity, load, shown = RNG.uniform(0.1, 0.9), RNG.uniform(0.03, 0.08), RNG.uniform(0.8, 1.25)
+            cases.append(
+                evidence(
+                    float(detail),
+                    float(unexplained),
+                    signal=float(detail * shown),
+                    ambiguity=ambiguity,
+                    load=load,
+                    saturated=float(RNG.choice([0, 0.1])),
+                )
+            )
+            failed.append(bool(detail < 5 or unexplained > 0.2 or ambiguity > 0.6))
+    chances = learned(cases, failed)
+    monkeypatch.setattr(judge, "shipped_chances", lambda: {"picture tv": chances})
 
 
 def test_regions_are_where_they_were_planted() -> None:
@@ -75,32 +89,46 @@ def test_who_overexposed_is_not_told_to_give_more_light() -> None:
     assert "More light" in " ".join(judge.verdict_on(evidence(1, 0.03, saturated=1e-3), "admm tv").sentences)
 
 
-def test_who_overexposed_a_volume_is_not_told_to_give_more_light(monkeypatch: pytest.MonkeyPatch) -> None:
-    entries = []
-    for k in range(60):
-        numbers = evidence(20 + 0.1 * k, peaks=40.0 if k % 2 else 3.0, height=20.0, ends=0.4)
-        severity = 2.0 if k % 2 else 0.5
-        entries.append({"scene": k, "method": TV, "severity": severity, "evidence": numbers.as_json()})
-    monkeypatch.setattr(cases, "mixed_scenes", lambda: tuple(entries))
-    cases.cases_of.cache_clear()
-    grainy = {"peaks": 40.0, "height": 20.0, "ends": 0.4}
-    clipped = judge.verdict_on(evidence(22, saturated=0.05, **grainy), TV)
-    assert [f.stress for f in clipped.findings] == ["saturated", "peaks"]
-    assert "A stronger prior (--tau) would help" in clipped.sentences[2]
-    assert "light" not in " ".join(clipped.sentences).lower()
-    dim = judge.verdict_on(evidence(22, **grainy), TV)
-    assert "More light or a stronger prior (--tau) would help" in dim.sentences[1]
+def of_volumes(*, bad: bool) -> Evidence:
+    """Grainy and hazy where bad, and alike in all else."""
+    grain = RNG.uniform(0.9, 1.1, 3)
+    points = (2.0, 40.0, 1.6) if bad else (20.0, 3.0, 0.4)
+    height, peaks, ends = (float(g * p) for g, p in zip(grain, points, strict=True))
+    numbers = {"height": height, "peaks": peaks, "ends": ends, "planes": 4, "similarity": 0.7}
+    return evidence(float(RNG.uniform(18, 26)), 0.03, saturated=float(RNG.choice([0, 0.1])), **numbers)
 
 
-def test_what_no_map_saw_is_not_called_reliable() -> None:
-    assert judge.verdict_on(evidence(30, 0.03), "admm nonnegative").region is Region.UNKNOWN
+def volumes() -> Chances:
+    bad = [bool(k % 2) for k in range(60)]
+    return learned([of_volumes(bad=b) for b in bad], bad)
+
+
+def test_who_overexposed_a_volume_is_not_told_to_give_more_light() -> None:
+    chances, grainy = volumes(), of_volumes(bad=True)
+    clipped = judge.verdict_on(replace(grainy, saturated=0.05), TV, chances)
+    assert clipped.findings[0].stress == "saturated"
+    assert {f.stress for f in clipped.findings} <= {"saturated", "peaks", "ends"}
+    assert "light would help" not in " ".join(clipped.sentences)
+    dim = judge.verdict_on(replace(grainy, saturated=0.0), TV, chances)
+    assert "More light" in " ".join(f.help for f in dim.findings)
+
+
+def test_what_is_like_no_case_is_not_judged() -> None:
+    unknown = judge.verdict_on(evidence(30, 0.03), "admm nonnegative")
+    assert unknown.region is Region.UNKNOWN
+    assert unknown.sentences == (
+        "not judged: there are no known cases of admm nonnegative.",
+        "The model leaves 1.3 times the noise, 3.0% of the measurement's contrast, unexplained.",
+    )
     strange = judge.verdict_on(evidence(30, 0.03, load=40.0), "admm tv")
     assert strange.region is Region.UNKNOWN
     # What sets it apart is named, with what would help.
     assert strange.findings[0].stress == "load"
     assert strange.sentences[1].startswith("What sets it apart: 40 unknowns")
+    # What is known without cases is said instead: 0.03 of a contrast of 30 times the noise, and the noise.
+    assert strange.sentences[2].startswith("The model leaves 1.3 times the noise, 3.0%")
     # More light than any case had is as good as the most.
-    assert judge.verdict_on(evidence(500, 0.03), "admm tv").region is Region.INSIDE
+    assert judge.verdict_on(evidence(120, 0.03), "admm tv").region is Region.INSIDE
     assert judge.verdict_on(evidence(30, unsettled=20), "admm tv").region is Region.OUTSIDE
 
 
@@ -113,53 +141,58 @@ def test_data_without_noise_are_no_photograph() -> None:
     assert "%" not in exact.sentences[0]
     # Nor are they called unreliable for what is left unexplained beyond such a noise.
     misfit = judge.verdict_on(evidence(9e4, 0.8), "admm tv")
-    assert misfit.failing is not None
-    assert misfit.failing > 0.5
     assert misfit.region is Region.UNKNOWN
     assert misfit.sentences == exact.sentences
     # Too few iterations are seen without the noise.
     assert judge.verdict_on(evidence(9e4, 0.8, unsettled=20), "admm tv").region is Region.OUTSIDE
-    # What is unlike all cases is not given those cases' share of failures.
+    # What is unlike all cases is not given a chance of failing.
     assert "%" not in judge.verdict_on(evidence(30, 0.03, load=40.0), "admm tv").sentences[0]
 
 
 def test_a_picture_that_had_hardly_begun_to_settle_is_said_to_be_just_that() -> None:
-    # No similar case failed: their share would contradict the verdict, and nothing else explains it.
+    # A low chance of failing would contradict the verdict, and nothing else explains it.
     good = judge.verdict_on(evidence(30, 0.03, unsettled=20), "admm tv")
     assert good.failing is not None
-    assert good.failing < 0.05
+    assert good.failing < 0.1
     assert len(good.sentences) == 2
     assert "hardly begun to settle" in good.sentences[0]
     assert "%" not in good.sentences[0]
     assert "More iterations" in good.sentences[1]
-    # Similar cases failed as well: what remains unexplained may come of too few iterations, named first.
+    # It would have failed as well: what remains unexplained may come of too few iterations, named first.
     bad = judge.verdict_on(evidence(30, 0.8, unsettled=20), "admm tv")
     assert bad.region is Region.OUTSIDE
     assert [f.stress for f in bad.findings[:2]] == ["unsettled", "unexplained"]
-    assert "% failed" in bad.sentences[0]
+    assert "chance of failing" in bad.sentences[0]
     assert "More iterations" in bad.sentences[1]
     assert len([f for f in bad.findings if f.stress == "unsettled"]) == 1
     diverged = judge.verdict_on(evidence(30, 0.8, unsettled=1e3), "fista tv")
     assert "another method" in diverged.sentences[1]
 
 
-def test_a_psf_that_repeats_itself_is_judged_by_those_that_did(monkeypatch: pytest.MonkeyPatch) -> None:
-    numbers = evidence(30, 0.03, ambiguity=0.82).as_json()
-    lost = [
-        {"scene": k, "method": "admm tv", "severity": 3.0, "evidence": {**numbers, "signal": 25.0 + k}}
-        for k in range(12)
-    ]
-    monkeypatch.setattr(cases, "mixed_scenes", lambda: tuple(lost))
-    cases.cases_of.cache_clear()
+def test_a_psf_that_repeats_itself_is_named() -> None:
     regular = judge.verdict_on(evidence(30, 0.03, ambiguity=0.82), "admm tv")
     assert regular.region is Region.OUTSIDE
     assert regular.findings[0].stress == "ambiguity"
     assert "repeats itself" in " ".join(regular.sentences)
-    assert judge.verdict_on(evidence(30, 0.03), "admm tv").region is Region.INSIDE
+    # More light would change nothing.
+    assert "light" not in " ".join(regular.sentences)
+
+
+@pytest.mark.parametrize(("detail", "unexplained"), [(30, 0.19), (600, 0.012)])
+def test_no_case_overrules_what_the_model_leaves_unexplained(detail: float, unexplained: float) -> None:
+    """Much of the contrast, or far above the noise, though similar cases were good."""
+    cases = [evidence(float(d), float(u)) for d in (20, 100, 600) for u in np.geomspace(0.01, 0.3, 30)]
+    chances = learned(cases, [c.unexplained > 0.25 for c in cases])
+    judged = judge.verdict_on(evidence(detail, unexplained), "admm tv", chances)
+    assert judged.failing is not None
+    assert judged.failing < chances.reliable
+    assert judged.region is Region.NEAR
+    assert judged.findings[0].stress == "unexplained"
+    assert f"{unexplained:.1%} of the measurement's contrast" in judged.sentences[0]
 
 
 def test_a_run_that_was_still_changing_is_not_called_reliable() -> None:
-    changing = judge.verdict_on(evidence(30, 0.03, unsettled=0.4), "admm tv")
+    changing = judge.verdict_on(evidence(30, 0.03, unsettled=0.8), "admm tv")
     assert changing.region is Region.NEAR
     assert changing.findings[0].stress == "unsettled"
     assert "still changed" in changing.sentences[0]
@@ -168,48 +201,33 @@ def test_a_run_that_was_still_changing_is_not_called_reliable() -> None:
     assert judge.verdict_on(evidence(30, 0.03, unsettled=0.1), "admm tv").region is Region.INSIDE
 
 
-def test_volumes_are_judged_by_their_points_and_cases_without_them_take_no_part(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_volumes_are_judged_by_their_points() -> None:
     """Of two volumes alike in all else, the one that is grainy and hazy is like those that failed."""
-
-    def entries(with_points: bool) -> list[dict]:
-        made = []
-        for k in range(60):
-            bad = k % 2
-            points = {
-                "height": 2.0 if bad else 20.0,
-                "peaks": 40.0 if bad else 3.0,
-                "ends": 1.6 if bad else 0.4,
-            }
-            numbers = evidence(20 + 0.1 * k, 0.03, planes=4, **(points if with_points else {})).as_json()
-            severity = 2.0 if bad else 0.5
-            made.append({"scene": k, "method": TV, "severity": severity, "evidence": numbers})
-        return made
-
-    monkeypatch.setattr(cases, "mixed_scenes", lambda: tuple(entries(True)))
-    cases.cases_of.cache_clear()
-    good = judge.verdict_on(evidence(22, height=20.0, peaks=3.0, ends=0.4), TV)
+    chances = volumes()
+    good = judge.verdict_on(of_volumes(bad=False), TV, chances)
     assert good.region is Region.INSIDE
-    bad = judge.verdict_on(evidence(22, height=2.0, peaks=40.0, ends=1.6), TV)
+    bad = judge.verdict_on(of_volumes(bad=True), TV, chances)
     assert bad.region is Region.OUTSIDE
-    assert {f.stress for f in bad.findings} <= {"height", "peaks", "ends"}
-    monkeypatch.setattr(cases, "mixed_scenes", lambda: tuple(entries(False)))
-    cases.cases_of.cache_clear()
-    old = judge.verdict_on(evidence(22, height=20.0, peaks=3.0, ends=0.4), TV)
-    assert old.region is Region.UNKNOWN
-    assert old.failing is None
+    assert {"height", "peaks", "ends"} & {f.stress for f in bad.findings}
 
 
-def test_a_scene_can_be_judged_without_its_own_cases(monkeypatch: pytest.MonkeyPatch) -> None:
-    own = evidence(30, 0.03).as_json()
-    entry = {"scene": 7, "method": "admm tv", "severity": 3.0, "evidence": own}
-    monkeypatch.setattr(cases, "mixed_scenes", lambda: (entry,) * 12)
-    cases.cases_of.cache_clear()
-    known = cases.cases_of("picture tv")
-    assert judge.verdict_on(evidence(30, 0.03), "admm tv").region is Region.OUTSIDE
-    assert judge.verdict_on(evidence(30, 0.03), "admm tv", known.without(7)).region is Region.INSIDE
-    assert len(known.without(8).severities) == len(known.severities) == 12 + 225
+def test_what_was_learned_is_the_same_from_a_file() -> None:
+    chances = volumes()
+    read = Chances.from_json(json.loads(json.dumps(chances.as_json(), allow_nan=False)))
+    places = np.array([place_of(of_volumes(bad=b).as_json(), read.features) for b in (True, False)])
+    np.testing.assert_allclose(read.chance(places), chances.chance(places), rtol=1e-3)
+    assert read.distance(places[0]) == pytest.approx(chances.distance(places[0]), rel=1e-3)
+
+
+def test_chances_are_those_that_were_planted() -> None:
+    """The regression returns the chance where cases fail by one, and not only whether."""
+    places = RNG.normal(size=(4000, 2))
+    chance = 1 / (1 + np.exp(-(places[:, 0] - places[:, 1] ** 2)))
+    found = fitted(("a", "b"), places, np.where(RNG.random(4000) < chance, 2.0, 0.5), range(4000))
+    inner = np.abs(places).max(axis=1) < 2
+    assert np.abs(found.chance(places) - chance)[inner].mean() < 0.03
+    called = found.chance(places) <= found.reliable
+    assert chance[called].mean() < 0.08
 
 
 def test_a_verdict_is_a_record() -> None:

@@ -13,6 +13,8 @@ from recon import InputError, Measurement, solve
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.selection import choose
 from recon.solvers import memory
 from recon.streams.joint import solve_together
 from recon.streams.video import VideoSolver, stream_problem
@@ -100,3 +102,22 @@ def test_a_stream_s_scratch_files_do_not_grow_with_frames_and_go_with_it(
     assert min(on_disk) > 0
     assert max(on_disk) <= part.plan.state
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_video_has_the_background_that_a_photograph_would_have() -> None:
+    told = []
+    for stray in (0.0, 2.0):
+        scene = make_scene(
+            "sparse-picture", size=48, grid=3, aberration=4.0, background=stray, photons=3000.0
+        )
+        asked = {"prior": "l1"}
+        chosen = choose(Problem.of(scene.measurement, scene.calibration, ReconstructionOptions(**asked)))
+        assert chosen.choice is not None
+        problem = stream_problem(scene.measurement, scene.calibration, **asked)
+        assert problem.smooth == chosen.choice.background
+        assert any("background is estimated" in text for text in problem.warnings) == problem.smooth
+        assert not stream_problem(
+            scene.measurement, scene.calibration, estimate_background=False, **asked
+        ).smooth
+        told.append(problem.smooth)
+    assert told == [False, True]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
-from drivers.aravis.features import FRAME_TRIGGERS, Features
 from drivers.camera import Roi, TriggerMode
 from drivers.common.pixels import PixelFormat, compile_kernels, genicam_format
 from drivers.errors import DeviceError, LimitError
+from drivers.genicam.features import FRAME_TRIGGERS, Features
 
 
 class Images:
@@ -17,10 +16,6 @@ class Images:
     Parameters
     ----------
     features : Features
-    camera
-        The library's camera.
-    name : str
-        The camera as error messages name it.
     sensor : callable
         Asks for the sensor's ``(height, width)``.
 
@@ -34,10 +29,8 @@ class Images:
     sensor : (int, int)
     """
 
-    def __init__(
-        self, features: Features, camera: Any, name: str, sensor: Callable[[], tuple[int, int]]
-    ) -> None:
-        self._features, self._camera, self._name = features, camera, name
+    def __init__(self, features: Features, sensor: Callable[[], tuple[int, int]]) -> None:
+        self._features = features
         if features.find("BinningHorizontal"):
             features.set_number("BinningHorizontal", 1)
             features.set_number("BinningVertical", 1)
@@ -47,7 +40,7 @@ class Images:
         known = {name: pixels for name in offered if (pixels := genicam_format(name)) is not None}
         if not known:
             raise DeviceError(
-                name,
+                features.name,
                 f"offers only pixel formats that cannot be read here: {', '.join(offered)}.",
                 "Readable: Mono and Bayer of 8 to 16 bits, RGB8, BGR8.",
             )
@@ -107,14 +100,16 @@ class Images:
     def _apply_whole(self) -> None:
         if not self.apply_roi(Roi(0, 0, *self.sensor)):
             raise LimitError(
-                self._name, f"has no region at binning {self.binning} on its sensor.", self.refused()
+                self._features.name, f"has no region at binning {self.binning} on its sensor.", self.refused()
             )
 
     def _read_roi(self) -> Roi:
-        with self._features.words("say its region"):
-            region = self._camera.get_region()
+        top, left, height, width = (
+            int(self._features.number(name)) if self._features.find(name) else 0
+            for name in ("OffsetY", "OffsetX", "Height", "Width")
+        )
         factor = self.binning
-        return Roi(region.y * factor, region.x * factor, region.height * factor, region.width * factor)
+        return Roi(top * factor, left * factor, height * factor, width * factor)
 
     def apply_binning(self, binning: int) -> None:
         """Set the binning along both axes; the region becomes the whole sensor."""
@@ -124,17 +119,17 @@ class Images:
             ]
             if made[0] != made[1]:
                 raise LimitError(
-                    self._name, f"bins {made[0]:g} x {made[1]:g} pixels.", f"Asked for {binning}."
+                    self._features.name, f"bins {made[0]:g} x {made[1]:g} pixels.", f"Asked for {binning}."
                 )
             self.binning = int(made[0])
         self._apply_whole()
 
 
-def set_trigger(features: Features, name: str, mode: TriggerMode, line: str, activation: str) -> None:
+def set_trigger(features: Features, mode: TriggerMode, line: str, activation: str) -> None:
     """Choose what starts an exposure; ``line`` and ``activation`` are of the hardware trigger."""
     if not features.find("TriggerMode"):
         if mode != "free_run":
-            raise LimitError(name, f"has no trigger mode {mode!r}.", "It has no triggers.")
+            raise LimitError(features.name, f"has no trigger mode {mode!r}.", "It has no triggers.")
         return
     selectors = features.entries("TriggerSelector") if features.find("TriggerSelector") else ()
     for selector in selectors or (None,):
@@ -143,7 +138,7 @@ def set_trigger(features: Features, name: str, mode: TriggerMode, line: str, act
         if features.find("TriggerMode"):  # not every selector has it
             features.choose("TriggerMode", "Off")
     if mode != "free_run":
-        frame = next((name for name in FRAME_TRIGGERS if name in selectors), None)
+        frame = next((trigger for trigger in FRAME_TRIGGERS if trigger in selectors), None)
         if frame is not None:
             features.choose("TriggerSelector", frame)
         source = "Software" if mode == "software" else line

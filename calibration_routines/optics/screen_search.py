@@ -1,0 +1,133 @@
+"""Find where the camera sees a screen: bars tell which part of it, bright squares each place."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration_routines.display.display_io import require_slm
+from calibration_routines.optics.screen_pictures import LEAST_MARKS, Levels, ScreenMap, bars, field_along
+from calibration_routines.procedure import CalibrationError, Listener
+from calibration_routines.psf.exposure import ExposureOutcome, TooDarkError, auto_expose, hot_pixels
+from instrument.bench.bench import Bench
+from instrument.reconstruction.mosaic import in_colours
+from instrument.runs.run_control import RunControl
+from recon.base.blocks import block_mean
+from recon.camera.registration import register
+
+Floats = npt.NDArray[np.float32]
+
+_BARS = (9, 16)  # rows, columns
+_MARKS = 5  # along each side of the part that is seen
+_MARKS_WITHIN = 0.8  # of it
+_MARK = 1 / 20  # of its height is a mark's side
+SEARCH = sum(_BARS) + _MARKS**2
+"""Photographs that it takes, besides those that find an exposure."""
+_DIMMEST = 0.05  # of full scale
+_FOUND_PX = 300  # rows of the images that marks are found on
+
+
+class ScreenView:
+    """Shows levels and photographs them, black taken off, colours averaged; nothing is kept."""
+
+    def __init__(self, bench: Bench, control: RunControl) -> None:
+        self.slm = require_slm(bench)
+        self._bench, self._control = bench, control
+        self._black: Floats | None = None
+
+    def expose(self, levels: Levels, target: float) -> float:
+        """Find the exposure at which levels are bright and nothing saturates, and photograph black with it.
+
+        Raises TooDarkError, CalibrationError when there is none.
+        """
+        camera, black = self._bench.camera, np.zeros(self.slm.shape, np.uint8)
+        for _ in range(2):  # hot pixels show at about the exposure that will be used
+            before_ms = camera.exposure_ms
+            self.slm.display(black)
+            dark = camera.snap()
+            self.slm.display(levels)
+            found = auto_expose(camera, target=target, hot=hot_pixels(dark.image, dark.full_scale))
+            self._control.check()
+            if found.outcome is ExposureOutcome.REACHED or found.exposure_ms <= 2 * before_ms:
+                break
+        if found.outcome is ExposureOutcome.TOO_DARK and found.trace[-1].level < _DIMMEST:
+            raise TooDarkError(
+                f"{found.message} The screen hardly lights the camera: make it brighter, bring it nearer, or "
+                "turn it to the camera."
+            )
+        if found.outcome in (ExposureOutcome.TOO_BRIGHT, ExposureOutcome.UNSTEADY):
+            raise CalibrationError(found.message)
+        self._black = None
+        self._black = self.light(black)
+        return found.exposure_ms
+
+    def light(self, levels: Levels) -> Floats:
+        """Show levels and return what comes of them, (height, width), counts."""
+        self._control.check()
+        self.slm.display(levels)
+        taken = self._bench.snap()
+        image = in_colours(np.asarray(taken.image, np.float32), taken.metadata.pixel_format)
+        grey = image.mean(axis=-1, dtype=np.float32) if image.ndim == 3 else image
+        return grey if self._black is None else grey - self._black
+
+
+def find_screen(bench: Bench, control: RunControl, listener: Listener) -> ScreenMap:
+    """Find where the camera sees which place of the screen, by bars and bright squares.
+
+    Raises CalibrationError when the screen is too dark, or too few squares are recognised.
+    """
+    screen = ScreenView(bench, control)
+    height, width = shape = screen.slm.shape
+    listener.step("finding the screen")
+    screen.expose(np.full(shape, 255, np.uint8), 0.5)
+    total, done = SEARCH, 0
+    seen = []
+    for axis, count in enumerate(_BARS):
+        light = []
+        for levels in bars(shape, count, axis):
+            light.append(float(screen.light(levels).mean()))
+            listener.share(done := done + 1, total)
+        seen.append(field_along(np.array(light), shape[axis]))
+    (top, bottom), (left, right) = seen
+    side = max(2, round(_MARK * (bottom - top)))
+    spread = np.linspace(-_MARKS_WITHIN / 2, _MARKS_WITHIN / 2, _MARKS)
+    rows = (top + bottom) / 2 + spread * (bottom - top)
+    columns = (left + right) / 2 + spread * (right - left)
+    corners = [(round(r - side / 2), round(c - side / 2)) for r in rows for c in columns]
+    corners = [(min(max(r, 0), height - side), min(max(c, 0), width - side)) for r, c in corners]
+
+    def mark(corner: tuple[int, int]) -> Levels:
+        levels = np.zeros(shape, np.uint8)
+        levels[corner[0] : corner[0] + side, corner[1] : corner[1] + side] = 255
+        return levels
+
+    middle = len(corners) // 2
+    screen.expose(mark(corners[middle]), 0.7)
+    factor = max(1, bench.camera.frame_shape[0] // _FOUND_PX)
+    photographs = []
+    for corner in corners:
+        photographs.append(block_mean(screen.light(mark(corner)), factor))
+        listener.share(done := done + 1, total)
+    places, shifts = [], []
+    for corner, photograph in zip(corners, photographs, strict=True):
+        found = register(photograph, photographs[middle])
+        if found.reliable:
+            places.append((corner[0] + (side - 1) / 2, corner[1] + (side - 1) / 2))
+            shifts.append((factor * found.rows, factor * found.columns))
+    axis_at = factor * _centroid(photographs[middle]) + (factor - 1) / 2
+    found_map = ScreenMap.of_marks(np.array(places), np.array(shifts).reshape(-1, 2) + axis_at)
+    if found_map is None:
+        raise CalibrationError(
+            f"Of {len(corners)} bright squares on the screen {len(places)} were recognised by their pattern, "
+            f"and fewer than {LEAST_MARKS} agree on where the screen is: darken the room, face the screen to "
+            "the camera, and check that nothing moves."
+        )
+    return found_map
+
+
+def _centroid(photograph: Floats) -> npt.NDArray[np.float64]:
+    """Return the (row, column) about which a pattern lies: what is brighter than a tenth of its brightest."""
+    bright = np.maximum(photograph - 0.1 * np.quantile(photograph, 0.999), 0)
+    rows, columns = (np.arange(n) for n in bright.shape)
+    total = max(float(bright.sum()), 1e-12)
+    return np.array([(bright.sum(axis=1) * rows).sum(), (bright.sum(axis=0) * columns).sum()]) / total

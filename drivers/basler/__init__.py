@@ -1,0 +1,1 @@
+"""Basler cameras through pylon, Basler's own library."""

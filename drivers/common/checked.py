@@ -1,0 +1,228 @@
+"""Devices that are not believed: what one reports is compared with what it was asked for, by any driver.
+
+:func:`checked` makes of a driver a class whose settings, moves, patterns and frames are compared, and whose
+failures of any type come as a DeviceError; the bench uses no other. What a difference may be:
+
+====================  ==============================================================================
+exposure              10 % or 0.2 ms, whichever is more: cameras count in lines and tenths of milliseconds
+gain                  25 % or 0.5, whichever is more: some have steps of 2 dB
+binning, format, ...  none; a region lies within the one asked for
+place of an axis      what its driver lets it settle within (3 times its resolution by default), read
+                      once more after the move
+pattern, SLM image    none
+====================  ==============================================================================
+
+A value that is no finite number is never a report.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import logging
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.camera import Camera, Roi, TriggerMode
+from drivers.common.pixels import Pixels
+from drivers.device import Device
+from drivers.errors import DeviceError
+from drivers.frame import Frame, FrameMetadata
+from drivers.led_array import LedArray, LedPattern
+from drivers.slm import Slm
+from drivers.stage import Stage
+
+_log = logging.getLogger(__name__)
+_D = TypeVar("_D", bound=type[Device])
+_T = TypeVar("_T")
+_REMEDY = "Its readings cannot be trusted: check the device, its firmware and its driver."
+
+
+@functools.cache
+def checked(driver: _D) -> _D:
+    """Return a driver's class whose reports are compared, and whose errors are all DeviceErrors."""
+    mixin, interface = next(
+        (mixin, interface) for mixin, interface in _MIXINS.items() if issubclass(driver, interface)
+    )
+    plain = type(driver.__name__, (mixin, driver), {})
+    made = type(driver.__name__, (plain,), {"__module__": driver.__module__, "__doc__": driver.__doc__})
+    for name in dir(interface):
+        member = inspect.getattr_static(plain, name)
+        if name.startswith("_"):
+            continue
+        if inspect.isfunction(member):
+            setattr(made, name, functools.wraps(member)(_guarded_call(made, name)))
+        elif isinstance(member, property):
+            setattr(made, name, property(_guarded_read(made, name), member.fset, doc=member.__doc__))
+    return cast("_D", made)
+
+
+def _guarded_call(made: type, name: str) -> Callable[..., Any]:
+    def call(self: Device, *args: Any, **named: Any) -> Any:
+        try:
+            return getattr(super(made, self), name)(*args, **named)
+        except DeviceError:
+            raise
+        except Exception as error:
+            raise _driver_failed(self, name, error) from error
+
+    return call
+
+
+def _guarded_read(made: type, name: str) -> Callable[[Any], Any]:
+    def read(self: Device) -> Any:
+        try:
+            return getattr(super(made, self), name)
+        except DeviceError:
+            raise
+        except Exception as error:
+            raise _driver_failed(self, name, error) from error
+
+    return read
+
+
+def _driver_failed(device: Device, name: str, error: Exception) -> DeviceError:
+    """Return a mistake of a driver's as a sentence; its traceback goes to the log."""
+    _log.error("%s: its driver failed in %s", device.name, name, exc_info=error)
+    problem = f"its driver failed in {name}: {type(error).__name__}: {error}."
+    return DeviceError(device.name, problem, "The log has the traceback, for whoever wrote the driver.")
+
+
+def _refuse(device: Device, asked: str, said: object) -> DeviceError:
+    return DeviceError(device.name, f"was asked for {asked} and says {said}.", _REMEDY)
+
+
+def _near(device: Device, what: str, asked: float, said: float, *, share: float, least: float) -> None:
+    """Refuse a number that is none, not above 0, or too far from what was asked for."""
+    if not (math.isfinite(said) and said > 0 and abs(said - asked) <= max(share * abs(asked), least)):
+        raise _refuse(device, f"{what} of {asked:g}", f"{said:g}")
+
+
+def _same(device: Device, what: str, asked: _T, said: _T) -> _T:
+    """Refuse anything but what was asked for."""
+    if said != asked:
+        raise _refuse(device, f"{what} of {asked}", said)
+    return said
+
+
+def _sound(camera: Camera, metadata: FrameMetadata, shape: tuple[int, ...]) -> None:
+    """Refuse a frame whose figures are none, or that has another shape than its region and binning."""
+    for what, value in (("an exposure (ms)", metadata.exposure_ms), ("a gain", metadata.gain)):
+        if not (math.isfinite(value) and value > 0):
+            raise _refuse(camera, f"a frame with {what}", f"{value:g}")
+    _, _, height, width = metadata.roi
+    expected = (height // metadata.binning, width // metadata.binning)
+    if shape[:2] != expected:
+        raise _refuse(camera, f"a frame of {expected} pixels", shape)
+
+
+def _arrived(stage: Stage, target: Mapping[str, float], said: Mapping[str, float]) -> None:
+    """Refuse places away from the target."""
+    strays = {
+        axis.name: said.get(axis.name, math.nan)
+        for axis in stage.axes
+        if axis.name in target
+        and not abs(said.get(axis.name, math.nan) - target[axis.name]) <= stage.settles_within(axis)
+    }
+    if strays:
+        wanted = ", ".join(f"{name} = {target[name]:g}" for name in strays)
+        raise _refuse(stage, wanted, ", ".join(f"{name} = {place:g}" for name, place in strays.items()))
+
+
+class _CheckedCamera(Camera):
+    def set_exposure_ms(self, exposure_ms: float) -> float:
+        said = super().set_exposure_ms(exposure_ms)  # type: ignore[safe-super]
+        for value in (said, self.exposure_ms):
+            _near(self, "an exposure (ms)", exposure_ms, value, share=0.1, least=0.2)
+        return said
+
+    def set_gain(self, gain: float) -> float:
+        said = super().set_gain(gain)  # type: ignore[safe-super]
+        for value in (said, self.gain):
+            _near(self, "a gain", gain, value, share=0.25, least=0.5)
+        return said
+
+    def set_binning(self, binning: int) -> int:
+        return _same(self, "a binning", binning, super().set_binning(binning))  # type: ignore[safe-super]
+
+    def set_pixel_format(self, pixel_format: str) -> str:
+        said = super().set_pixel_format(pixel_format)  # type: ignore[safe-super]
+        return _same(self, "a pixel format", pixel_format, said)
+
+    def set_trigger_mode(self, mode: TriggerMode) -> TriggerMode:
+        return _same(self, "a trigger mode", mode, super().set_trigger_mode(mode))  # type: ignore[safe-super]
+
+    def set_roi(self, roi: Roi | None) -> Roi:
+        said = super().set_roi(roi)  # type: ignore[safe-super]
+        if roi is not None and not roi.contains(said):
+            raise _refuse(self, f"the region {roi.as_tuple()}", said.as_tuple())
+        return said
+
+    def snap(self) -> Frame:
+        frame = super().snap()  # type: ignore[safe-super]
+        _sound(self, frame.metadata, frame.image.shape)
+        return frame
+
+    def next_frame(self, timeout_s: float) -> Frame:
+        frame = super().next_frame(timeout_s)  # type: ignore[safe-super]
+        _sound(self, frame.metadata, frame.image.shape)
+        return frame
+
+    def next_frame_into(self, buffer: Pixels, timeout_s: float) -> FrameMetadata:
+        metadata = super().next_frame_into(buffer, timeout_s)
+        _sound(self, metadata, buffer.shape)
+        return metadata
+
+
+class _CheckedStage(Stage):
+    def home(self) -> None:
+        super().home()  # type: ignore[safe-super]
+        if not self.is_homed:
+            raise _refuse(self, "homing", "that it is not homed")
+
+    def position(self) -> dict[str, float]:
+        said = super().position()  # type: ignore[safe-super]
+        missing = [axis.name for axis in self.axes if not math.isfinite(said.get(axis.name, math.nan))]
+        if missing:
+            raise _refuse(self, "its place", f"nothing, or no number, for {', '.join(missing)}: {said}")
+        return said
+
+    def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
+        said = super().move_to(target, wait=wait)  # type: ignore[safe-super]
+        if wait:
+            _arrived(self, target, said)
+            _arrived(self, target, self.position())
+        return said
+
+
+class _CheckedLedArray(LedArray):
+    def set_pattern(self, pattern: LedPattern) -> LedPattern:
+        said = super().set_pattern(pattern)  # type: ignore[safe-super]
+        for shown in (said, self.pattern):
+            if shown.levels != pattern.levels:
+                raise _refuse(self, f"the pattern {pattern.description!r}", repr(shown.description))
+        return said
+
+    def off(self) -> None:
+        super().off()  # type: ignore[safe-super]
+        if not self.pattern.is_dark:
+            raise _refuse(self, "darkness", f"that it shows {self.pattern.description!r}")
+
+
+class _CheckedSlm(Slm):
+    def display(self, levels: npt.NDArray[np.uint8]) -> None:
+        super().display(levels)  # type: ignore[safe-super]
+        if not np.array_equal(self.displayed, levels):
+            raise _refuse(self, "an image", "that it shows another one")
+
+
+_MIXINS: Mapping[Any, Any] = {
+    _CheckedCamera: Camera,
+    _CheckedStage: Stage,
+    _CheckedLedArray: LedArray,
+    _CheckedSlm: Slm,
+}

@@ -1,0 +1,1 @@
+"""What GenICam cameras have in common, whichever library reaches them."""

@@ -1,0 +1,1 @@
+"""Devices that Micro-Manager's adapters serve: cameras, stages, lights, SLMs."""

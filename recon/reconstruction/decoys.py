@@ -1,0 +1,206 @@
+"""How well a calibration and transformed copies of it explain a photograph, in little time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import count
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.checks import saturated_share
+from recon.camera.camera_model import CAMERAS, ModelName
+from recon.camera.registration import likeness
+from recon.camera.transformed import Transformation, transformed
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.pilot import fine_structure, pilot, tile_means
+from recon.reconstruction.problem import Problem, Stage
+from recon.reconstruction.reduction import on_blocks, reduced_calibration
+from recon.types import Calibration
+from recon.verdict.calibration_check import (
+    BETWEEN,
+    FAR,
+    GIVEN,
+    CalibrationCheck,
+    Fit,
+    Score,
+    check_of,
+    is_told,
+    near_decoys,
+)
+
+Floats = npt.NDArray[np.float32]
+
+QUICK, THOROUGH = (100, 10), (160, 20)
+"""Longest side, about, pixels, and iterations (half as many of volumes). Most right ones are far ahead of
+all decoys in the quick way already: only the others are looked at again."""
+MOST_ERASED, MOST_CLIPPED = 0.75, 0.5
+"""Shares of the blocks of pixels: with more of them erased blocks are smaller; with more of them clipped
+these are not erased, as a few pixels of a dim photograph share its largest count as well."""
+MOST_PLANES = 6
+"""Depths that take part, evenly spaced."""
+WEIGHT = 1.0
+"""Of total variation: as large as the noise that the adjoint of a PSF of unit energy passes on."""
+DECOYS, MOST_DECOYS = 8, 12
+"""Usually; and with farther ones on the side of a near one that is better, each twice as far: to some eight
+degrees or per cent."""
+ALIKE = 0.7
+"""Likeness from which a far decoy tells nothing, as of regular lenslets, which are their own mirror image."""
+VARIED = 0.35
+"""Difference of a field's PSFs from the central one, relative to it, beyond which that one explains little
+more than any other pattern: then all of them are tried, or, where one was chosen, nobody is accused."""
+
+
+def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> CalibrationCheck | None:
+    """Let a problem's calibration compete with its decoys on the channel that has most signal.
+
+    One convolution a depth by the central PSFs, on as few pixels as still tell one per cent of size; of PSFs
+    that vary over the field only whether they are the photograph's at all, and by all of them where they vary
+    much. None where the light is patterned, the camera model comes from outside, or one PSF was chosen of a
+    field that varies much: nothing is known of such.
+    """
+    if problem.patterned or problem.model in CAMERAS:
+        return None
+    done = count(1)
+
+    def scored(small: _Small, iterations: int, *, lit: bool, how: Transformation) -> Score:
+        if on_stage is not None:  # how many there will be depends on what they say
+            on_stage(1 - DECOYS / (DECOYS + next(done)), "judging: the calibration among its decoys")
+        return small.score(how, iterations=iterations, background=lit)
+
+    def compete(small: _Small, iterations: int, *, lit: bool) -> CalibrationCheck:
+        return _competition(small, lambda how: scored(small, iterations, lit=lit, how=how))
+
+    (few_px, quick), (more_px, thorough) = QUICK, THOROUGH
+    few, lit = _small(problem, few_px), problem.smooth or problem.n_planes > 1
+    check = compete(few, quick, lit=lit)
+    if check.sure:
+        return check
+    dark = None
+    if not lit:
+        more = _small(problem, more_px)
+        dark = check = compete(more, thorough, lit=False)
+        # Stray light, or light from beyond the field, which any PSF but the right one may explain better?
+        winner = check.better or GIVEN
+        lit = check.fit is not Fit.FITS and is_told(
+            scored(more, thorough, lit=True, how=winner), check.scores[winner], more.pixels
+        )
+        check = compete(few, quick, lit=True) if lit else check
+    if lit and not check.sure:
+        check = compete(few, thorough, lit=True)
+    if dark is not None and dark.fit is Fit.OFF and check.fit is Fit.UNTOLD:
+        # A background explains much; where odds still are for a decoy, what was certain without one stands.
+        best = min(check.scores, key=lambda how: check.scores[how].objective)
+        if best not in (GIVEN, BETWEEN) and is_told(check.scores[best], check.scores[GIVEN], check.pixels):
+            check = replace(check, fit=Fit.OFF, better=best)
+    given = _given(problem).depths
+    one = given.varies and not problem.depths.varies and given.field_error > VARIED
+    return None if one and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
+
+
+@dataclass(frozen=True, slots=True)
+class _Small:
+    """A channel of a photograph on few pixels, and its calibration there: one PSF a depth, or a field's."""
+
+    photograph: Measurement
+    calibration: Calibration
+    varies: bool
+    """Whether there are other PSFs over the field; near decoys of one convolution then tell nothing."""
+    model: ModelName
+
+    @property
+    def pixels(self) -> int:
+        """That are not erased."""
+        erasures = self.photograph.erasures
+        return int(np.size(self.photograph.image) - (0 if erasures is None else np.count_nonzero(erasures)))
+
+    def decoys(self) -> tuple[Transformation, ...]:
+        """Return those that differ from the PSFs: near ones where one PSF serves the field, then far ones."""
+        psfs = self.calibration.psfs
+        middle = psfs[len(psfs) // 2, 0]
+        far = [how for how in FAR if likeness(transformed(middle, how), middle) < ALIKE]
+        near = () if self.varies else near_decoys(psfs.shape[2:], volume=len(psfs) > 1)
+        return (*near, *far)
+
+    def score(self, how: Transformation, *, iterations: int, background: bool) -> Score:
+        """Reconstruct through transformed PSFs in few iterations."""
+        positions = self.calibration.source_positions_um.copy()
+        positions[:, 1::-1] = positions[:, 1::-1] @ how.matrix.T  # (x, y) is (column, row)
+        copies = replace(
+            self.calibration, psfs=transformed(self.calibration.psfs, how), source_positions_um=positions
+        )
+        options = ReconstructionOptions(
+            prior="tv", model=self.model, estimate_background=background, drop_empty=False
+        )
+        problem = Problem.of(self.photograph, copies, options)
+        return _score(problem, iterations if problem.n_planes == 1 else -(-iterations // 2))
+
+
+def _competition(small: _Small, scored: Callable[[Transformation], Score]) -> CalibrationCheck:
+    """Score a calibration, its decoys, and farther ones on the side of a near one that is better."""
+    decoys = small.decoys()
+    scores = {how: scored(how) for how in (GIVEN, *decoys)}
+    check = check_of(scores, small.pixels)
+    if check.sure:
+        return check
+    scores[BETWEEN] = scored(BETWEEN)
+    near = [how for how in decoys if how not in FAR]
+    before, best = GIVEN, min((GIVEN, *near), key=lambda how: scores[how].objective)
+    while scores[best].objective < scores[before].objective and len(scores) < MOST_DECOYS:
+        before, best = best, Transformation(scale=best.scale**2, rotation_deg=2 * best.rotation_deg)
+        scores[best] = scored(best)
+    return check_of(scores, small.pixels)
+
+
+def _small(problem: Problem, longest_px: int) -> _Small:
+    """Return the channel that has most signal on blocks of pixels, as large ones as erasures allow."""
+    channel = int(np.argmax([d[v].std() for d, v in zip(problem.data, problem.valid, strict=True)]))
+    own = slice(channel, channel + 1)
+    factor = max(1, round(max(problem.sensor_shape) / longest_px))
+    counts, valid = problem.measurement.channels()[own], problem.valid[own]
+    if 0 < saturated_share(counts[valid]) * factor**2 < MOST_CLIPPED:
+        valid = valid & (counts < counts[valid].max())  # a clipped pattern is no pattern's own
+    while True:
+        photograph = on_blocks(problem.data[own], valid, 1.0, factor, flat=True)
+        erased = photograph.erasures
+        if factor == 1 or erased is None or np.asarray(erased).mean() < MOST_ERASED:
+            break
+        factor //= 2
+    depths = problem.depths
+    planes = np.unique(np.linspace(0, problem.n_planes - 1, MOST_PLANES).round().astype(int))
+    if local := depths.varies and depths.field_error > VARIED:
+        calibration = reduced_calibration(problem.calibration, 1, tuple(planes.tolist()))
+    else:  # depths by number: they only have to differ
+        places = np.column_stack([np.zeros((len(planes), 2)), 1.0 + np.arange(len(planes))])
+        calibration = Calibration(depths.central[planes], places)
+    psfs = calibration.psfs[:, own if calibration.psfs.shape[1] > 1 else slice(0, 1)]
+    calibration = replace(calibration, psfs=_on_sensor(psfs, problem.sensor_shape), background=None)
+    calibration = reduced_calibration(calibration, factor, None)
+    varies = _given(problem).depths.varies
+    return _Small(photograph, calibration, varies, "local" if local else "convolution")
+
+
+def _given(problem: Problem) -> Problem:
+    """Return a problem as it was before it was reduced."""
+    return problem if problem.reduction is None else problem.reduction.given
+
+
+def _on_sensor(psfs: Floats, shape: tuple[int, int]) -> Floats:
+    """Return PSFs that were cut to a central window on the sensor's pixels."""
+    whole = np.zeros((*psfs.shape[:2], *shape), np.float32)
+    top, left = (n // 2 - m // 2 for n, m in zip(shape, psfs.shape[2:], strict=True))
+    whole[..., top : top + psfs.shape[2], left : left + psfs.shape[3]] = psfs
+    return whole
+
+
+def _score(problem: Problem, iterations: int) -> Score:
+    """Reconstruct a problem of one channel and score it."""
+    found = pilot(problem, iterations, weight=WEIGHT)
+    valid, last = problem.valid[0], found.outcome.history[-1]
+    prior = last.objective - 0.5 * last.data_residual**2
+    left = found.left[0].astype(np.float64)
+    misfit = float(np.mean(left[valid] ** 2))
+    fine = tile_means(fine_structure(left, valid) ** 2, valid)
+    return Score(misfit, misfit + 2 * prior / np.count_nonzero(valid), tuple(fine.tolist()))

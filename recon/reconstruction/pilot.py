@@ -1,0 +1,107 @@
+"""Pilots: a few iterations of a problem, to decide by, and the fine structure that they leave."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.reconstruction.part import Part
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.solvers import SOLVERS
+from recon.solvers.base import Outcome, StoppingRules
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+FINE_PX = 3.0
+"""Deviation of the Gaussian whose mean is taken off what is left, pixels: slow waves are left by unfinished
+iterations and stray light, and prefer smaller PSFs."""
+TILES = 4
+"""Along each axis of the photograph, judged apart: how much they differ tells how sure the whole is."""
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """What a few iterations found, in units of the noise.
+
+    Attributes
+    ----------
+    solution : ndarray, (n_channels, n_z, grid height, grid width)
+        At least 0.
+    background : ndarray or None, (n_channels, height, width)
+        Where the problem has a smooth one.
+    left : ndarray, (n_channels, height, width)
+        The data less what both say of them. Erased data are 0: there it is what both say, negative.
+    weight : float
+        Of the prior.
+    outcome : Outcome
+    """
+
+    solution: Array
+    background: Array | None
+    left: Array
+    weight: float
+    outcome: Outcome
+
+
+def pilot(
+    problem: Problem,
+    iterations: int,
+    *,
+    weight: float | None = None,
+    solver: str = "admm-sensor",
+    cancel: threading.Event | None = None,
+) -> Pilot:
+    """Reconstruct a problem in few iterations; its channels together, or its only one.
+
+    Parameters
+    ----------
+    problem : Problem
+    iterations : int
+    weight : float, optional
+        Of the prior, in units of the noise; else the table's.
+    solver : str
+        ADMM where that one refuses the problem.
+    cancel : threading.Event, optional
+        Set it to stop after the iteration in progress.
+    """
+    offered = SOLVERS.named(solver)
+    offered = offered if offered.accepts(problem) is None else SOLVERS.named("admm")
+    own = replace(problem, options=replace(problem.options, solver=offered.name))
+    part = Part(own, slice(0, problem.n_channels))
+    try:
+        part.weigh(None, weight)
+        rules = StoppingRules(iterations=iterations, tolerance=0.0)
+        outcome = offered.make(part, None).run(rules, cancel=cancel)
+        solution = np.maximum(part.lifted(outcome.solution), 0)
+        background = None if part.removal is None else part.background(solution)
+        # Of the data as measured: a background holds what was expected of it.
+        left = problem.data.astype(part.dtype, copy=False) - part.camera.forward(solution)
+        if background is not None:
+            left -= background
+        return Pilot(solution, background, left, part.weight, outcome)
+    finally:
+        part.close()
+
+
+def fine_structure(rest: Array, known: Bools) -> Array:
+    """Return what is left less its own local mean, (height, width); 0 where nothing is known."""
+    from scipy.ndimage import gaussian_filter
+
+    share, rest = known.astype(rest.dtype), np.where(known, rest, 0)
+    local = gaussian_filter(rest, FINE_PX) / np.maximum(gaussian_filter(share, FINE_PX), 1e-3)
+    return np.where(known, rest - local, 0)
+
+
+def tile_means(image: Array, where: Bools) -> Floats:
+    """Return the mean over the chosen pixels of each tile that has any."""
+    rows, columns = (np.arange(n) * TILES // n for n in image.shape)
+    tile = (rows[:, None] * TILES + columns)[where]
+    count, total = np.bincount(tile), np.bincount(tile, image[where])
+    means: Floats = total[count > 0] / count[count > 0]
+    return means

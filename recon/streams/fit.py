@@ -1,0 +1,118 @@
+"""Whether calibration and model fit what a live camera sees, looked at beside the pictures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import replace
+from typing import NamedTuple
+
+from recon.reconstruction.decoys import check_calibration
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.reduction import reduced_calibration
+from recon.reconstruction.selection import with_background
+from recon.streams.stillness import SceneState
+from recon.types import Calibration
+
+SHARE = 0.1
+"""Part of the time that checks may take, at most."""
+FIRST_S = 1.0
+"""The first pictures have the machine to themselves."""
+MORE_FRAMES = 4
+"""Factor in frames averaged from which a still scene may tell what it did not tell before."""
+
+
+class CalibrationWatch:
+    """Lets a calibration compete with its decoys on the newest picture's frames, in a thread of its own.
+
+    A check takes about a second of one core. The next one comes when the scene has changed since, or is
+    averaged over many more frames, and no sooner than a tenth of the time allows. What was found holds until
+    then. Stray light that a photograph would have a background for is no fault of the calibration, and is
+    said for itself: live pictures have none unless they are asked to, as it takes many times their time.
+
+    Parameters
+    ----------
+    calibration : Calibration or None
+        With all that it has of the pictures' depth; None for a PSF alone.
+
+    Attributes
+    ----------
+    advice : str
+        What pictures lack, in words; empty where nothing is known to.
+    """
+
+    def __init__(self, calibration: Calibration | None = None) -> None:
+        self._calibration = calibration
+        self.advice = self._doubt = ""
+        self._running: Future[_Found] | None = None
+        self._not_before = time.monotonic() + FIRST_S
+        self._frames = 0
+        """Averaged in the frames that were checked last; 0: they are another scene's."""
+
+    def see(self, problem: Callable[[], Problem], binning: int, scene: SceneState, frames: int) -> None:
+        """Take note of the newest picture; begin a check where one is due.
+
+        Parameters
+        ----------
+        problem : callable
+            Returns the picture's problem; only asked where a check begins.
+        binning : int
+            Of its pixels.
+        scene : SceneState
+        frames : int
+            Averaged in it.
+        """
+        if scene is not SceneState.STILL:
+            self._frames = 0
+        self._look()
+        if self._running is not None:
+            return
+        if time.monotonic() < self._not_before or (self._frames and frames < MORE_FRAMES * self._frames):
+            return
+        self._frames = frames
+        posed = problem()
+        pool = ThreadPoolExecutor(1, "calibration check")
+        self._running = pool.submit(_found, posed, self._calibration, binning)
+        pool.shutdown(wait=False)
+
+    def wait(self) -> None:
+        """Wait until the check that runs is over."""
+        if self._running is not None:
+            wait((self._running,))
+
+    @property
+    def doubt(self) -> str:
+        """Why the calibration may not be the pictures' own; empty where nothing speaks against it."""
+        self._look()
+        return self._doubt
+
+    def _look(self) -> None:
+        if self._running is not None and self._running.done():
+            self._doubt, self.advice, seconds = self._running.result()
+            self._running = None
+            self._not_before = time.monotonic() + seconds * (1 / SHARE - 1)
+
+
+class _Found(NamedTuple):
+    doubt: str
+    advice: str
+    seconds: float
+
+
+def _found(problem: Problem, calibration: Calibration | None, binning: int) -> _Found:
+    """Look for stray light, then whether the calibration explains the rest."""
+    began = time.monotonic()
+    advice = ""
+    try:
+        if calibration is not None and not problem.smooth:
+            # The quick solver of live pictures has no way for a background: that is no choice of anybody's.
+            free = replace(problem, options=replace(problem.options, solver="auto"))
+            problem = with_background(free, reduced_calibration(calibration, binning, None))
+            if problem.smooth:
+                advice = "There is smooth stray light: pictures would gain by a background (--background)."
+        check = check_calibration(problem)
+        doubt = "" if check is None else "".join(check.sentences[:1])
+    except Exception as error:  # noqa: BLE001 - pictures are worth more than what is said of them
+        doubt = f"whether the calibration fits could not be found out: {error}"
+    return _Found(doubt[:1].upper() + doubt[1:], advice, time.monotonic() - began)

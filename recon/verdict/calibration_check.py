@@ -1,0 +1,222 @@
+"""Whether a calibration belongs to a photograph: whether it explains it better than its own decoys.
+
+A right PSF explains a photograph far better than its own mirror image, and lies at the minimum over small
+turns and sizes. So the given calibration competes with such decoys on the photograph at hand, by few
+iterations on few pixels each (:mod:`recon.reconstruction.decoys`): no simulated case is asked. The score is
+the posterior's logarithm, half the squared residual in units of the noise and the prior; its differences are
+natural logarithms of odds ("nats"). Where a background or noise leaves every PSF able to explain the data,
+the prior still tells, and where it does not either, that is said.
+
+Odds alone count noise as the only error. Cameras have others (light from beyond the field, depths between
+those calibrated, a pattern that varies), of which a bright photograph makes thousands of nats. So the tiles
+of a photograph vote as well: one PSF is better than another where it leaves less fine structure tile by tile,
+by more standard errors than tiles differ.
+
+What cannot be told: a PSF that is only displaced casts the same picture, displaced; one that is somewhat
+larger is that of a nearer scene; and so is, in a volume, a depth for another between those calibrated.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recon.camera.transformed import Transformation
+
+GIVEN = Transformation()
+BETWEEN = Transformation(0.37, 0.37)
+"""The calibration itself displaced by part of a pixel, which displaces the picture alone: interpolated as its
+decoys are. The better of the two counts as the given one."""
+FAR = (
+    Transformation(mirrored=True),
+    Transformation(rotation_deg=180.0),
+    Transformation(mirrored=True, rotation_deg=180.0),
+)
+"""Decoys that have as much light at as many places, and nothing to do with the photograph."""
+EDGE_PX = 0.6
+"""By how much near decoys move a pattern's edge at least, pixels: less tells nothing."""
+TOLD_NATS = 25.0
+"""Odds from which a decoy is the better one: of right calibrations none had more than 4, of those turned by a
+degree all had 40 and more where the photograph tells anything."""
+TOLD_SHARE = 0.002
+"""The same relative to the score: what errors of the model may make of it."""
+CERTAIN = 2.0
+"""Standard errors by which tiles must prefer a decoy as well."""
+FLIPPED = 6.0
+"""The same for one that is far: of 20 mirrored 16 had 7 to 100, right ones up to 4.9."""
+SPEAKS_NATS = 150.0
+"""Odds among all that were tried from which a photograph has its say on foreign ones."""
+OWN = 2.5
+"""Standard errors by which tiles prefer the calibration to each of its far decoys where it is surely the
+photograph's own."""
+NOT_OWN = 1.5
+"""The same, up to which it is not: other diffusers' had 1.4 at most, right ones of which the photograph tells
+anything 2 to 100."""
+LIKELIER = 0.01
+"""Score of all far decoys relative to the calibration's beyond one, from which it is not called foreign."""
+EXPLAINED = 1.3
+"""Mean squared fine structure that is left, in units of the noise, from which a calibration that is no better
+than its far decoys is another camera's; below, any pattern explains the photograph."""
+LEAST = 1e-12
+"""Mean square below which tiles do not differ."""
+
+
+class Fit(enum.StrEnum):
+    """What a photograph says of a calibration."""
+
+    FITS = "fits"
+    OFF = "off"
+    FOREIGN = "foreign"
+    UNTOLD = "untold"
+
+
+class Score(NamedTuple):
+    """How well a PSF explains a photograph."""
+
+    misfit: float
+    """Mean square of the residual in units of the noise."""
+    objective: float
+    """The same and twice the prior, a pixel."""
+    fine: tuple[float, ...]
+    """Mean square of the residual less its own local mean, tile by tile of the photograph."""
+
+    def leads(self, other: Score) -> float:
+        """By how many standard errors it leaves less fine structure than another, as tiles differ."""
+        ratio = np.log(np.maximum(other.fine, LEAST) / np.maximum(self.fine, LEAST))
+        scatter = float(np.std(ratio, ddof=1)) / len(ratio) ** 0.5 if len(ratio) > 1 else np.inf
+        return float(np.mean(ratio)) / max(scatter, LEAST)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationCheck:
+    """What became of a calibration among its decoys.
+
+    Attributes
+    ----------
+    fit : Fit
+    scores : mapping
+        By transformation; :data:`GIVEN` is that of the calibration itself.
+    pixels : int
+        That they were taken on.
+    better : Transformation or None
+        The decoy that explains the photograph better, where one does.
+    """
+
+    fit: Fit
+    scores: Mapping[Transformation, Score]
+    pixels: int
+    better: Transformation | None = None
+
+    @property
+    def sure(self) -> bool:
+        """Whether it fits and is certainly ahead of all its near decoys, too."""
+        given = self.scores[GIVEN]
+        near = (score for how, score in self.scores.items() if how not in (GIVEN, BETWEEN, *FAR))
+        return self.fit is Fit.FITS and all(
+            is_told(given, score, self.pixels) and given.leads(score) > CERTAIN for score in near
+        )
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it is not the photograph's own calibration."""
+        return self.fit in (Fit.OFF, Fit.FOREIGN)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What is wrong with it, and what to do; empty where it fits."""
+        if self.fit is Fit.OFF and self.better is not None:
+            left = (self.scores[self.better].misfit / self.scores[GIVEN].misfit) ** 0.5
+            why = (
+                "one of the two was flipped or turned: give both as the camera saw them"
+                if self.better in FAR
+                else "diffuser or sensor moved since it was made, or the scene lies at another depth: "
+                "--refine-psf fits the PSF to it; else calibrate again, or choose the scene's depth"
+            )
+            return (
+                "the calibration does not fit this photograph: its PSF explains it better "
+                f"{self.better} (the residual falls to {left:.0%})",
+                f"Probably {why}",
+            )
+        if self.fit is Fit.FOREIGN:
+            return (
+                "the calibration does not belong to this photograph: its PSF explains it no better than it "
+                "would mirrored or upside down",
+                "Give the calibration of this camera and diffuser, at this binning and crop and at the "
+                "scene's depth",
+            )
+        if self.fit is Fit.UNTOLD:
+            return (
+                "the photograph does not tell whether the calibration is its own: any PSF would explain it "
+                "as well",
+            )
+        return ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it for a file."""
+        return {
+            "fit": str(self.fit),
+            "better": None if self.better is None else str(self.better),
+            "scores": {str(t): [s.misfit, s.objective] for t, s in self.scores.items()},
+            "pixels": self.pixels,
+        }
+
+
+def near_decoys(shape: tuple[int, int], *, volume: bool) -> tuple[Transformation, ...]:
+    """Return the decoys that a right calibration on so many pixels beats narrowly.
+
+    Turned by a degree and enlarged by one per cent, by more on few pixels. Of volumes the turned ones alone:
+    another size is another depth.
+    """
+    step = max(0.01, EDGE_PX / (max(shape) / 2))
+    degrees = max(1.0, float(np.rad2deg(step)))
+    turned = (Transformation(rotation_deg=degrees), Transformation(rotation_deg=-degrees))
+    return turned if volume else (*turned, Transformation(scale=1 + step), Transformation(scale=1 - step))
+
+
+def check_of(scores: Mapping[Transformation, Score], pixels: int) -> CalibrationCheck:
+    """Judge a calibration by its score and its decoys'.
+
+    Parameters
+    ----------
+    scores : mapping
+        Of :data:`GIVEN`, :data:`BETWEEN` where it was tried, near ones and farther, and of the :data:`FAR`
+        ones that do not resemble it: where all do, as of regular lenslets, only the near ones tell.
+    pixels : int
+        Valid ones.
+    """
+    as_given = (scores[how] for how in (GIVEN, BETWEEN) if how in scores)
+    given = min(as_given, key=lambda score: score.objective)
+    scores = {**scores, GIVEN: given}
+    decoys = {how: score for how, score in scores.items() if how not in (GIVEN, BETWEEN)}
+    better = min(decoys, key=lambda how: decoys[how].objective)
+    far = {how: decoys[how] for how in FAR if how in decoys}
+    objectives = [score.objective for score in (given, *decoys.values())]
+    speaks = (max(objectives) - min(objectives)) * pixels / 2 > SPEAKS_NATS
+    foreign = speaks and _no_better(given, far.values())
+    certain = FLIPPED if better in far else CERTAIN
+    if is_told(decoys[better], given, pixels) and decoys[better].leads(given) > certain:
+        others = [score for how, score in far.items() if how != better]
+        if not (foreign and _no_better(decoys[better], others)):
+            return CalibrationCheck(Fit.OFF, scores, pixels, better)
+    if foreign:
+        return CalibrationCheck(Fit.FOREIGN, scores, pixels)
+    own = all(is_told(given, score, pixels) and given.leads(score) > OWN for score in far.values())
+    return CalibrationCheck(Fit.FITS if own else Fit.UNTOLD, scores, pixels)
+
+
+def is_told(one: Score, other: Score, pixels: int) -> bool:
+    """Whether the odds for one and against another are more than chance and errors of the model make."""
+    gain = other.objective - one.objective
+    return gain * pixels / 2 > TOLD_NATS and gain > TOLD_SHARE * other.objective
+
+
+def _no_better(score: Score, far: Iterable[Score]) -> bool:
+    """Whether a PSF leaves much of the photograph unexplained, and is not ahead of all far decoys."""
+    others = list(far)
+    lead = min((score.leads(other) for other in others), default=np.inf)
+    likelier = all(other.objective > (1 + LIKELIER) * score.objective for other in others)
+    return float(np.mean(score.fine)) > EXPLAINED and bool(lead < NOT_OWN) and not likelier

@@ -1,0 +1,194 @@
+"""A PSF by random pictures on a screen, on the simulated bench: propagated light, not the solver's model."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration_routines.optics.screen_bench import ScreenProcedure, draw_pictures
+from calibration_routines.optics.screen_pictures import (
+    ScreenMap,
+    ScreenTone,
+    bars,
+    dead_leaves,
+    field_along,
+    random_cells,
+)
+from calibration_routines.optics.screen_solve import (
+    PICTURE,
+    TONE,
+    ScreenCalibration,
+    ScreenOptions,
+    findings_of,
+)
+from calibration_routines.procedure import CalibrationError
+from drivers.simulated.world import SimulatedWorld
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config, template
+from instrument.cli import main
+from instrument.files.errors import BenchError
+from instrument.runs.runner import RunStatus
+from recon.camera.registration import aligned, register
+from tests.mocks.listeners import Following
+
+ASKED = ScreenOptions(pictures=6, judged=0, average=2, dark_frames=2, z_um=300e3)
+SMALL = (
+    template("screen")
+    .replace("color = false", "color = false\nbinning = 2\nexposure_ms = 20.0")
+    .replace("[1080, 1920]", "[140, 180]")
+    .replace("270.0", "700.0")
+    .replace('preset = "tiny"', 'preset = "tiny"\naperture_mm = [0.8, 1.0]')
+)
+ASKEW = ScreenMap(((-1.2, 0.03, 240.0), (-0.02, -1.25, 200.0), (1e-4, -2e-4, 1.0)), 25, 0.0)
+
+
+def small_bench(text: str = SMALL) -> Bench:
+    return open_bench(parse_config(text, None))
+
+
+def true_psf(bench: Bench) -> np.ndarray:
+    world = bench.shared["simulated"]
+    assert isinstance(world, SimulatedWorld)
+    return world.psf((0.0, 0.0, 300e3), (0.55, 0.6, 0.5), 2)
+
+
+def test_the_psf_is_that_of_a_point_and_gamma_is_the_screens(tmp_path: Path) -> None:
+    with small_bench() as bench:
+        done = ScreenProcedure(ASKED).carry_out(bench, tmp_path)
+        truth = true_psf(bench)
+        assert not bench.slm or not bench.slm.displayed.any()
+    found = done.result
+    assert isinstance(found, ScreenCalibration)
+    assert done.good, found.findings
+    psf = found.calibration.psfs[0, 0]
+    # Where the pictures' middle is, is the calibration's to choose: within a few pixels of the axis.
+    place = register(psf, truth)
+    assert np.hypot(place.rows, place.columns) < 4
+    assert np.corrcoef(aligned(psf, place).ravel(), truth.ravel())[0, 1] > 0.95
+    assert found.calibration.source_positions_um[0, 2] == 300e3
+    assert found.tone.gamma == pytest.approx(2.2, abs=0.03)
+    quality = json.loads((done.runs[0] / "calibration" / "calibration.json").read_text())["quality"]
+    assert quality["registration_px"] < 0.2
+    assert quality["misfit"] < 0.1
+
+
+def test_a_run_that_was_cut_off_is_resumed_to_its_calibration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Cut(BaseException):
+        pass
+
+    def cut(status: RunStatus) -> None:
+        if status.done == 5:
+            raise Cut
+
+    with small_bench() as bench, pytest.raises(Cut):
+        ScreenProcedure(replace(ASKED, pictures=4)).carry_out(bench, tmp_path, listener=Following(cut))
+    (run,) = tmp_path.iterdir()
+    assert main(["resume", str(run)]) == 0
+    assert "PSF: leaves" in capsys.readouterr().out
+    assert (run / "calibration" / "calibration.json").is_file()
+
+
+def test_a_bench_without_a_screen_and_a_dark_screen_are_said_in_words(tmp_path: Path) -> None:
+    without = SMALL[: SMALL.index("\n[slm]")] + SMALL[SMALL.index("\n[scene]") :]
+    with small_bench(without) as bench, pytest.raises(BenchError, match=r"has no \[slm\]"):
+        ScreenProcedure(ASKED).outlook(bench)
+    with small_bench(template()) as bench, pytest.raises(BenchError, match="is no screen"):
+        ScreenProcedure(ASKED).outlook(bench)
+    dark = SMALL.replace("black = 0.001", "black = 0.001\nwhite = 1e-7")
+    with small_bench(dark) as bench, pytest.raises(CalibrationError, match="hardly lights the camera"):
+        ScreenProcedure(ASKED).carry_out(bench, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_map_is_found_from_marks_but_for_one_that_is_wrong() -> None:
+    screen = np.array([(r, c) for r in (20.0, 60.0, 100.0) for c in (20.0, 80.0, 140.0)])
+    sensor = ASKEW.on_sensor(screen)
+    assert ASKEW.on_screen(sensor) == pytest.approx(screen)
+    sensor[4] += 9
+    found = ScreenMap.of_marks(screen, sensor)
+    assert found is not None
+    assert found.marks == 8
+    assert found.misfit_px < 1e-3
+    assert found.on_sensor(screen[4]) == pytest.approx(sensor[4] - 9, abs=1e-2)
+    assert ScreenMap.of_marks(screen[:5], sensor[:5]) is None
+
+
+def test_what_is_drawn_for_the_sensor_is_seen_there() -> None:
+    sensor, screen = (120, 160), (170, 210)
+    picture = random_cells((8, 10), 3)
+    drawn = ASKEW.drawn(picture, (19.5, 29.5), 10.0, screen)
+    seen = ASKEW.seen(drawn.astype(np.float32) / 255, sensor)
+    middles = seen[20:100, 30:130].reshape(8, 10, 10, 10)[:, 3:7, :, 3:7].mean(axis=(1, 3))
+    assert middles == pytest.approx(picture / 255.0, abs=0.01)
+    assert seen[:15].max() == seen[:, :25].max() == 0
+    binned = ASKEW.seen(drawn.astype(np.float32) / 255, sensor, 2)
+    assert binned == pytest.approx(seen.reshape(60, 2, 80, 2).mean(axis=(1, 3)), abs=1e-6)
+
+
+def test_tone_goes_through_what_was_measured_and_must_rise() -> None:
+    levels = (32, 96, 160, 255)
+    tone = ScreenTone.of(levels, [4 * (n / 255) ** 1.8 for n in levels])
+    table = tone.of_picture(np.arange(256, dtype=np.uint8))
+    assert table == pytest.approx((np.arange(256) / 255) ** 1.8, abs=2e-3)
+    assert tone.gamma == pytest.approx(1.8, abs=1e-6)
+    with pytest.raises(ValueError, match="does not rise"):
+        ScreenTone.of(levels, [1.0, 2.0, 1.9, 3.0])
+
+
+def test_bars_tell_which_part_of_a_side_is_seen() -> None:
+    assert sum(picture.astype(int) for picture in bars((20, 30), 7, 1)) == pytest.approx(255)
+    light = np.array([0.0, 0.0, 0.5, 1.0, 1.0, 1.0, 0.5, 0.0])
+    assert field_along(light, 80) == pytest.approx((25.0, 65.0))
+    assert field_along(np.ones(8), 80) == (0.0, 80.0)
+
+
+def test_pictures_are_as_asked_and_the_same_for_a_seed() -> None:
+    drawn = draw_pictures(ASKED, ASKEW, (120, 160), (140, 180))
+    assert len(drawn[PICTURE]) == 6
+    assert all((white >= picture).all() for white in drawn[TONE][-1:] for picture in drawn[PICTURE])
+    again = draw_pictures(ASKED, ASKEW, (120, 160), (140, 180))
+    assert np.array_equal(drawn[PICTURE], again[PICTURE])
+    other = draw_pictures(replace(ASKED, seed=1), ASKEW, (120, 160), (140, 180))
+    assert not np.array_equal(drawn[PICTURE], other[PICTURE])
+    assert 0.1 < (random_cells((60, 60), 0) > 0).mean() < 0.3
+    assert len(np.unique(dead_leaves((60, 60), 0))) > 100
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"flicker": 0.05}, "5.0% from frame to frame"),
+        ({"drift": -0.04}, "changed by 4.0% during the run"),
+        ({"wander": 0.03}, "changed by 3.0% during the run"),
+        ({"saturated_frames": 2}, "2 frames have saturated pixels"),
+        ({"left_out": [{"psnr_db": 11.0, "even_db": 10.0}]}, "hardly reconstructed"),
+        ({}, None),
+    ],
+)
+def test_what_is_wrong_with_the_light_is_named(changed: dict[str, object], words: str | None) -> None:
+    good = {"flicker": 1e-4, "drift": 0.0, "wander": 0.0, "saturated_frames": 0}
+    said = findings_of({**good, "left_out": [{"psnr_db": 20.0, "even_db": 10.0}], **changed})
+    assert len(said) == (words is not None)
+    assert words is None or words in said[0]
+
+
+@pytest.mark.parametrize(
+    ("typed", "words"),
+    [
+        (["--pairs", "pairs", "--pictures", "5"], "leave out --pictures"),
+        (["--gamma", "2"], "Only with --pairs: --gamma"),
+    ],
+)
+def test_options_of_bench_and_files_do_not_mix(
+    typed: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = tmp_path / "screen.toml"
+    bench.write_text(SMALL)
+    assert main(["calibrate", "screen", *typed, *([] if "--pairs" in typed else ["-b", str(bench)])]) != 0
+    assert words in capsys.readouterr().err

@@ -1,0 +1,98 @@
+"""A driver that hangs is given up within a stated time and named; the light is off all the same."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.common.answers import within
+from drivers.errors import DeviceError, DeviceTimeoutError
+from drivers.frame import FrameMetadata
+from instrument.bench.bench import Bench
+from instrument.plan import Part, Plan
+from instrument.runs.acquire import acquire
+from instrument.runs.inspection import run_paths
+from instrument.runs.recorder import record
+from instrument.runs.run import Run, RunCondition
+from tests.instrument.conftest import mock_drivers
+from tests.instrument.runs.test_recorder import bench_with
+from tests.mocks.free_running import FreeRunningCamera
+
+__all__ = ["mock_drivers"]
+
+
+@pytest.fixture
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let what takes ten seconds take a quarter of one."""
+    for place in ("drivers.common.stream", "instrument.bench.safety", "instrument.bench.bench"):
+        monkeypatch.setattr(f"{place}.STOP_ANSWER_S", 0.25)
+    monkeypatch.setattr("instrument.bench.photograph.CALL_MARGIN_S", 0.25)
+    monkeypatch.setattr(FreeRunningCamera, "longest_silence_s", 0.1)
+
+
+def test_what_a_call_returns_and_raises_comes_through_and_a_hang_is_named() -> None:
+    assert within(5, "camera", "an answer", lambda: 7) == 7
+    with pytest.raises(ZeroDivisionError):
+        within(5, "camera", "an answer", lambda: 1 // 0)
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        within(5, "camera", "an answer", interrupted)
+    ended = threading.Event()
+    with pytest.raises(DeviceTimeoutError, match="camera: hangs: an answer has not ended"):
+        within(0.05, "camera", "an answer", lambda: ended.wait(20))
+    ended.set()
+
+
+class HangingCamera(FreeRunningCamera):
+    """Hangs in the call for its sixth frame, until it is let go."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls, self.let_go = 0, threading.Event()
+
+    def next_frame_into(self, out: Any, timeout_s: float) -> FrameMetadata:
+        self.calls += 1
+        if self.calls > 5:
+            self.let_go.wait(30)
+        return super().next_frame_into(out, timeout_s)
+
+
+def light_is_off(bench: Bench) -> bool:
+    return bench.led_array is not None and bench.led_array.pattern.description == "off"
+
+
+@pytest.mark.usefixtures("mock_drivers", "soon")
+def test_a_camera_that_hangs_ends_a_recording_with_what_came_before(tmp_path: Path) -> None:
+    camera = HangingCamera()
+    bench = bench_with(camera)
+    with pytest.raises(DeviceError, match="hangs"):
+        record(bench, tmp_path, seconds=20)
+    run = Run.open(run_paths(tmp_path)[0])
+    assert run.condition is RunCondition.FAILED
+    assert "hangs" in run.error
+    assert run.records
+    assert light_is_off(bench)
+    camera.let_go.set()
+
+
+@pytest.mark.usefixtures("mock_drivers", "soon")
+def test_a_camera_that_hangs_ends_a_run_and_the_other_devices_are_made_safe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera, let_go = FreeRunningCamera(), threading.Event()
+    bench = bench_with(camera)
+    for call in ("snap", "stop_sequence"):
+        monkeypatch.setattr(camera, call, lambda: let_go.wait(30))
+    lit = Part.model_validate({"label": "a", "light": "source"})
+    with pytest.raises(DeviceTimeoutError, match="hangs: an exposure") as failure:
+        acquire(bench, Plan(label="p", parts=(lit,)), tmp_path)
+    assert "exposure ended" in "".join(failure.value.__notes__)
+    assert Run.open(run_paths(tmp_path)[0]).condition is RunCondition.FAILED
+    assert light_is_off(bench)
+    let_go.set()

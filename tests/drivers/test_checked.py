@@ -1,0 +1,200 @@
+"""Drivers that lie, or fail in their own ways, under what the bench makes of them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from drivers.camera import Camera, Roi
+from drivers.common.checked import checked
+from drivers.device import Device
+from drivers.errors import DeviceError, LimitError
+from drivers.frame import Frame
+from drivers.led_array import OFF, LedArray, LedPattern
+from drivers.slm import Slm
+from drivers.stage import Stage
+from tests.mocks.devices import (
+    MockCamera,
+    MockLedArray,
+    MockOptions,
+    MockSlm,
+    MockStage,
+    MockWorld,
+    MockWorldOptions,
+)
+
+
+def made(driver: type[Device]) -> Any:
+    return checked(driver)(MockOptions(), MockWorld(MockWorldOptions()))
+
+
+# Cameras ---
+@pytest.mark.parametrize("said", [float("nan"), float("inf"), 0.0, -20.0, 30.0, 5000.0])
+def test_an_exposure_that_is_none_or_another_is_refused(said: float) -> None:
+    class Lying(MockCamera):
+        def set_exposure_ms(self, exposure_ms: float) -> float:
+            return said
+
+    with pytest.raises(DeviceError, match=r"was asked for an exposure \(ms\) of 20 and says "):
+        made(Lying).set_exposure_ms(20.0)
+
+
+def test_an_exposure_read_back_otherwise_is_refused() -> None:
+    class Forgetful(MockCamera):
+        def set_exposure_ms(self, exposure_ms: float) -> float:
+            return exposure_ms  # and stays at 10
+
+    with pytest.raises(DeviceError, match="of 500 and says 10"):
+        made(Forgetful).set_exposure_ms(500.0)
+
+
+def test_steps_of_honest_cameras_are_no_lies() -> None:
+    class Stepping(MockCamera):
+        def set_exposure_ms(self, exposure_ms: float) -> float:
+            return super().set_exposure_ms(max(0.1, round(exposure_ms, 1)))
+
+        def set_gain(self, gain: float) -> float:
+            return super().set_gain(10 ** (round(20 * np.log10(gain) / 2) * 2 / 20))
+
+    camera = made(Stepping)
+    for exposure_ms in np.geomspace(0.1, 900, 60):
+        camera.set_exposure_ms(float(exposure_ms))
+    for gain in np.geomspace(1, 16, 60):
+        camera.set_gain(float(gain))
+
+
+def test_settings_without_tolerance_and_frames() -> None:
+    class Stubborn(MockCamera):
+        def set_binning(self, binning: int) -> int:
+            return 1
+
+        def set_pixel_format(self, pixel_format: str) -> str:
+            return "Mono8"
+
+        def set_trigger_mode(self, mode: Any) -> Any:
+            return "free_run"
+
+        def set_roi(self, roi: Roi | None) -> Roi:
+            return Roi(0, 0, 24, 32)
+
+        def snap(self) -> Frame:
+            frame = super().snap()
+            return Frame(frame.image[:, ::2], frame.metadata)
+
+    camera: Camera = made(Stubborn)
+    for call, said in (
+        (lambda: camera.set_binning(2), "a binning of 2 and says 1"),
+        (lambda: camera.set_pixel_format("Mono12"), "a pixel format of Mono12 and says Mono8"),
+        (lambda: camera.set_trigger_mode("software"), "a trigger mode of software and says free_run"),
+        (lambda: camera.set_roi(Roi(2, 2, 8, 8)), r"the region \(2, 2, 8, 8\) and says \(0, 0, 24, 32\)"),
+        (camera.snap, r"a frame of \(24, 32\) pixels and says \(24, 16\)"),
+    ):
+        with pytest.raises(DeviceError, match=said):
+            call()
+
+
+def test_a_frame_without_an_exposure_is_none() -> None:
+    class Unsure(MockCamera):
+        def snap(self) -> Frame:
+            frame = super().snap()
+            return Frame(frame.image, replace(frame.metadata, exposure_ms=float("nan")))
+
+    with pytest.raises(DeviceError, match=r"a frame with an exposure \(ms\) and says nan"):
+        made(Unsure).snap()
+
+
+# Stages ---
+class Stays(MockStage):
+    def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
+        return dict(target)
+
+
+class Lost(MockStage):
+    def position(self) -> dict[str, float]:
+        return {"x_um": float("nan")}
+
+
+class NeverHome(MockStage):
+    is_homed = False
+
+
+def test_a_stage_that_does_not_move_is_found_out() -> None:
+    stage: Stage = made(Stays)
+    with pytest.raises(DeviceError, match="x_um = 50 and says x_um = 0"):
+        stage.move_to({"x_um": 50.0})
+    stage.move_to({"x_um": 0.2})  # within three times its resolution of where it stands
+    with pytest.raises(DeviceError, match="no number, for x_um, z_um"):
+        made(Lost).position()
+    with pytest.raises(DeviceError, match="was asked for homing and says that it is not homed"):
+        made(NeverHome).home()
+
+
+# Light, SLM ---
+class Dark(MockLedArray):
+    def set_pattern(self, pattern: LedPattern) -> LedPattern:
+        return pattern  # and shows nothing
+
+
+class Burning(MockLedArray):
+    def off(self) -> None:
+        pass
+
+
+class Frozen(MockSlm):
+    def display(self, levels: npt.NDArray[np.uint8]) -> None:
+        pass
+
+
+def test_light_that_is_not_shown_or_not_put_out_is_found_out() -> None:
+    leds: LedArray = made(Dark)
+    with pytest.raises(DeviceError, match=r"the pattern 'LED 2 .* and says 'off'"):
+        leds.set_pattern(leds.single(2))
+    leds = made(Burning)
+    assert leds.pattern == OFF
+    leds.set_pattern(leds.single(2))
+    with pytest.raises(DeviceError, match="was asked for darkness"):
+        leds.off()
+    slm: Slm = made(Frozen)
+    with pytest.raises(DeviceError, match="was asked for an image"):
+        slm.display(np.full(slm.shape, 3, np.uint8))
+
+
+# Failures of any type ---
+class Faulty(MockStage):
+    def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
+        raise ZeroDivisionError("float division by zero")
+
+    @property
+    def is_moving(self) -> bool:  # type: ignore[override]
+        raise KeyError("busy")
+
+
+def test_a_drivers_mistake_is_a_sentence_and_its_traceback_is_in_the_log(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    stage = made(Faulty)
+    with caplog.at_level(logging.ERROR), pytest.raises(DeviceError) as caught:
+        stage.move_to({"x_um": 1.0})
+    assert str(caught.value).startswith(
+        "stage (mock): its driver failed in move_to: ZeroDivisionError: float division by zero."
+    )
+    assert "Traceback" in caplog.text
+    with pytest.raises(DeviceError, match="its driver failed in is_moving: KeyError"):
+        _ = stage.is_moving
+
+
+def test_what_a_driver_says_in_words_and_an_interruption_pass() -> None:
+    stage = made(MockStage)
+    with pytest.raises(LimitError, match="x_um = 500 is outside"):
+        stage.move_to({"x_um": 500.0})
+    interrupted = checked(MockStage)(MockOptions(interrupt=("home",)), MockWorld(MockWorldOptions()))
+    with pytest.raises(KeyboardInterrupt):
+        interrupted.home()
+    assert isinstance(stage, MockStage)
+    assert type(stage).__name__ == "MockStage"

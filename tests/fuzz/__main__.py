@@ -1,0 +1,167 @@
+"""Feed damaged files to the readers: ``python -m tests.fuzz READER --seconds N`` (or ``all`` of them).
+
+Every input is the sound file, or one that broke something before, with bytes flipped, cut, repeated, moved,
+or replaced by what is hard to read: brackets without end, huge numbers, NaN, zeros. A reader passes when it
+returns, or raises a known mistake in words, within two seconds and 500 MB. What fails is kept in
+``tests/fuzz/corpus/READER`` (with ``--keep``) and is read again by tests/fuzz/test_readers.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import logging
+import random
+import resource
+import signal
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+from instrument.files.errors import in_words
+from tests.fuzz.readers import READERS, Reader
+
+CORPUS = Path(__file__).parent / "corpus"
+MOST_SECONDS = 2.0
+MOST_BYTES = 500 << 20
+TOKENS = (
+    b"[" * 6000, b'{"a":' * 6000, b"1e999", b"-1", b"0", b"99999999999999999999", b"NaN", b"null", b"true",
+    b'""', b"[]", b"{}", b"\xff\xff\xff\xff", b"\0\0\0\0", b"\x7f\xff\xff\xff", b"\0", b"\n", b'"', b"\xc3(",
+    b"1000000000", b'"a"', b"0.5",
+)  # fmt: skip
+
+
+class TooSlowError(BaseException):
+    """A reader takes longer than it may; no ``except Exception`` hides it."""
+
+
+def mutated(data: bytes, rng: random.Random) -> bytes:
+    """Return damaged bytes."""
+    changed = bytearray(data)
+    for _ in range(rng.choice((1, 1, 1, 2, 4, 16))):
+        place = rng.randrange(len(changed) + 1)
+        other = rng.randrange(len(changed) + 1)
+        low, high = min(place, other), max(place, other)
+        match rng.randrange(8):
+            case 0 if changed:
+                changed[place % len(changed)] ^= 1 << rng.randrange(8)
+            case 1 if changed:
+                changed[place % len(changed)] = rng.randrange(256)
+            case 2:
+                del changed[place:]
+            case 3:
+                del changed[place : place + rng.randrange(1, 40)]
+            case 4:
+                changed[place:place] = rng.choice(TOKENS)
+            case 5:
+                changed[place:place] = changed[low : min(high, low + 200)]
+            case 6:
+                token = rng.choice(TOKENS)
+                changed[place : place + len(token)] = token
+            case _:
+                _replace_number(changed, rng)
+    return bytes(changed)
+
+
+def _replace_number(data: bytearray, rng: random.Random) -> None:
+    """Put something else in the place of a number in text."""
+    starts = [i for i in range(len(data)) if 48 <= data[i] <= 57 and (i == 0 or not 48 <= data[i - 1] <= 57)]
+    if starts:
+        start = rng.choice(starts)
+        end = start
+        while end < len(data) and 48 <= data[end] <= 57:
+            end += 1
+        data[start:end] = rng.choice(TOKENS)
+
+
+def trouble(reader: Reader, path: Path) -> str:
+    """Read; return what is wrong with how the reader took it, empty where nothing is."""
+    began_s = time.process_time()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    signal.setitimer(signal.ITIMER_PROF, MOST_SECONDS + 1)
+    try:
+        reader.read(path)
+    except TooSlowError:
+        return "takes too long"
+    except RecursionError as error:
+        return f"RecursionError: {error}"
+    except Exception as error:  # noqa: BLE001 - that is what is looked for
+        if in_words(error) is None:
+            return f"{type(error).__name__}: {error}"[:300]
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+    if time.process_time() - began_s > MOST_SECONDS:
+        return f"takes {time.process_time() - began_s:.1f} s of the processor"
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10
+    return f"takes {grown >> 20} MB" if grown > MOST_BYTES else ""
+
+
+def inputs(sound: bytes, kept: list[bytes], rng: random.Random) -> Iterator[bytes]:
+    """Give what broke something before, then damaged files without end."""
+    yield from kept
+    while True:
+        yield mutated(rng.choice([sound, sound, sound, *kept]), rng)
+
+
+def fuzz(name: str, *, seconds: float, runs: int, seed: int, keep: bool) -> tuple[int, dict[str, bytes]]:
+    """Feed one reader; returns how many inputs it took, and one input for each way that it failed."""
+    reader, rng, found, count = READERS[name], random.Random(seed), {}, 0
+    signal.signal(signal.SIGPROF, _too_slow)
+    kept = [path.read_bytes() for path in sorted((CORPUS / name).glob("*"))]
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
+        made = reader.make(Path(folder))
+        ends = time.monotonic() + seconds
+        streams = []
+        for end in reader.spoil:
+            file = made.parent / end[3:] if end.startswith("../") else made / end if end else made
+            sound = file.read_bytes()
+            streams.append((file, sound, inputs(sound, kept, rng)))
+        while count < runs and time.monotonic() < ends:
+            file, sound, stream = streams[count % len(streams)]
+            data = next(stream)
+            file.write_bytes(data)
+            count += 1
+            problem = trouble(reader, made)
+            file.write_bytes(sound)
+            if problem and problem.split(":")[0] not in {known.split(":")[0] for known in found}:
+                found[problem] = data
+                if keep:
+                    (CORPUS / name).mkdir(parents=True, exist_ok=True)
+                    (CORPUS / name / hashlib.sha256(data).hexdigest()[:12]).write_bytes(data)
+    return count, found
+
+
+def _too_slow(_number: int, _frame: FrameType | None) -> None:
+    raise TooSlowError
+
+
+def main() -> int:
+    """Fuzz as the command line says; exit status 1 when something broke."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("reader", choices=[*READERS, "all"])
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each reader")
+    parser.add_argument("--runs", type=int, default=sys.maxsize, help="inputs of each reader, at most")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--keep", action="store_true", help="keep what broke something in the corpus")
+    options = parser.parse_args()
+    logging.disable()
+    warnings.simplefilter("ignore")
+    total, broken = 0, 0
+    for name in READERS if options.reader == "all" else [options.reader]:
+        count, found = fuzz(
+            name, seconds=options.seconds, runs=options.runs, seed=options.seed, keep=options.keep
+        )
+        total, broken = total + count, broken + len(found)
+        print(f"{name}: {count} inputs, {len(found)} ways to break it", flush=True)
+        for problem in found:
+            print(f"  {problem}")
+    print(f"{total} inputs in all, {broken} ways to break a reader")
+    return 1 if broken else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,222 @@
+"""Whatever happens to a file of a run: it is said, mended where that can be, and nothing whole is dropped."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from instrument.plan import Part, Plan
+from instrument.runs.acquire import prepare, prepare_resume, settle_recording
+from instrument.runs.inspection import verify
+from instrument.runs.run import FinishReason, Run, RunCondition
+from instrument.runs.run_files import RunError
+from instrument.runs.writer import FrameToStore, RunWriter
+from tests.instrument.runs.test_resume import open_mock_bench
+from tests.instrument.runs.test_store import BENCH, frame, new_run
+
+pytestmark = pytest.mark.usefixtures("mock_drivers")
+
+FRAMES = "frames.ome.zarr"
+FILES = {
+    "plan.json": "plan.json: ",
+    "bench.json": "bench.json: ",
+    "bench.toml": "bench.toml: ",
+    "provenance.json": "provenance.json: ",
+    "state.json": "state.json: ",
+    "log.jsonl": "log",
+    f"{FRAMES}/zarr.json": f"{FRAMES}/zarr.json: ",
+    f"{FRAMES}/0/zarr.json": f"{FRAMES}/0/zarr.json: ",
+    f"{FRAMES}/0/c/1/0/0": "frame 1: ",
+}
+
+
+def deleted(path: Path, _: Path) -> None:
+    path.unlink()
+
+
+def truncated(path: Path, _: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def one_bit(path: Path, _: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 1
+    path.write_bytes(data)
+
+
+def zeroed(path: Path, _: Path) -> None:
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+def anothers(path: Path, other: Path) -> None:
+    shutil.copyfile(other, path)
+
+
+def newer(path: Path, _: Path) -> None:
+    path.write_text(path.read_text().replace('"version": 1', '"version": 99'))
+
+
+DAMAGES = (deleted, truncated, one_bit, zeroed, anothers)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two completed runs of plans that differ, frames distinct."""
+    paths = []
+    for number in (0, 1):
+        plan = Plan(label=f"run {number}", parts=(Part(label="a", repeats=3 + number, exposures_ms=(5.0,)),))
+        with RunWriter.create(
+            tmp_path_factory.mktemp("runs"), label=plan.label, bench=BENCH, plan=plan
+        ) as writer:
+            writer.start(steps=len(plan))
+            stored = [frame(100 * number + i) for i in range(3 + number)]
+            writer.write([FrameToStore(i, one.image, one.metadata) for i, one in enumerate(stored)])
+            paths.append(writer.finish(FinishReason.COMPLETED).path)
+    return paths[0], paths[1]
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize("name", FILES)
+def test_each_damage_of_each_file_is_said_and_mended(
+    tmp_path: Path, runs: tuple[Path, Path], name: str, damage: Callable[[Path, Path], None]
+) -> None:
+    path, other = tmp_path / "run", runs[1]
+    shutil.copytree(runs[0], path)
+    before = verify(Run.open(path))
+    assert before.is_sound, before.lines()
+    whole = {i: Run.open(path).frame(i) for i in range(3)}
+    damage(path / name, other / name)
+    unchanged = (
+        path.joinpath(name).exists() and path.joinpath(name).read_bytes() == (runs[0] / name).read_bytes()
+    )
+    found = verify(Run.open(path))
+    if unchanged:
+        assert found.is_sound
+        return
+    words = "\n".join(found.lines())
+    assert FILES[name] in words, words
+    files = {p: p.read_bytes() for p in path.rglob("*") if p.is_file() and p.stat().st_size}
+
+    if found.files and found.files[0].problem.startswith("is another run's"):
+        with pytest.raises(RunError, match="another run's; nothing was changed"):
+            RunWriter.reopen(path)
+        (path / "log.jsonl").rename(path / "foreign.jsonl")  # as the sentence says
+        found = verify(Run.open(path))
+    with RunWriter.reopen(path) as writer:
+        for index in found.todo:
+            writer.write([FrameToStore(index, whole[index], frame(index).metadata)])
+        writer.finish(FinishReason.COMPLETED)
+    after = verify(Run.open(path))
+    assert after.is_sound, after.lines()
+    assert Run.open(path).condition is RunCondition.COMPLETED
+    for index, image in whole.items():
+        assert np.array_equal(Run.open(path).frame(index), image)
+    assert Run.open(path).plan == Run.open(runs[0]).plan
+    if name != "log.jsonl":  # whose whole lines stay in it
+        kept = [p.read_bytes() for p in path.rglob("*") if p.is_file()]
+        rewritten = path / "state.json", path / "log.jsonl"
+        assert all(data in kept for file, data in files.items() if file not in rewritten)
+
+
+def test_a_bad_byte_in_a_log_costs_its_line_at_most(tmp_path: Path) -> None:
+    with new_run(tmp_path) as writer:
+        writer.start(steps=5)
+        writer.write([frame(i) for i in range(5)])
+        path = writer.finish(FinishReason.COMPLETED).path
+    log = path / "log.jsonl"
+    data = log.read_bytes()
+    first = data.index(b'{"kind": "frame", "index": 2')
+    end = data.index(b"\n", first)
+    for place in (*range(first, end, 7), end):
+        for value in (data[place] ^ 1, 0, ord("\n"), ord("{"), ord('"')):
+            if value == data[place]:
+                continue
+            changed = bytearray(data)
+            changed[place] = value
+            log.write_bytes(changed)
+            lacking = set(range(5)) - set(Run.open(path).records)
+            assert lacking <= {2}, (place, value)
+            if not lacking:  # only the sum's own name or the line's end can be spared
+                assert Run.open(path).metadata(2) == frame(2).metadata
+
+
+def test_a_newer_versions_state_is_refused_and_left(tmp_path: Path, runs: tuple[Path, Path]) -> None:
+    path = tmp_path / "run"
+    shutil.copytree(runs[0], path)
+    newer(path / "state.json", path)
+    text = (path / "state.json").read_text()
+    with pytest.raises(RunError, match="Update diffuserbench"):
+        RunWriter.reopen(path)
+    assert (path / "state.json").read_text() == text
+
+
+def test_an_older_runs_log_without_sums_and_copies_gets_them(tmp_path: Path, runs: tuple[Path, Path]) -> None:
+    path = tmp_path / "run"
+    shutil.copytree(runs[0], path)
+    lines = [json.loads(line) for line in (path / "log.jsonl").read_text().splitlines()]
+    old = [{k: v for k, v in line.items() if k != "line_crc32"} for line in lines if line["kind"] != "file"]
+    (path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in old))
+    assert verify(Run.open(path)).is_sound
+    RunWriter.reopen(path).close()
+    (path / "plan.json").unlink()
+    assert Run.open(path).plan == Run.open(runs[0]).plan
+
+
+def test_a_recording_keeps_images_without_a_line_and_marks_the_rest_as_lost(tmp_path: Path) -> None:
+    with new_run(tmp_path, plan=None) as writer:
+        writer.start()
+        writer.write([frame(i) for i in range(8)])
+        path = writer.finish(FinishReason.COMPLETED).path
+    log, chunks = path / "log.jsonl", path / FRAMES / "0/c"
+    data = bytearray(log.read_bytes())
+    data[data.index(b'"frame", "index": 3') + 20] = 7
+    log.write_bytes(data)
+    (chunks / "5/0/0").write_bytes(b"short")
+    (chunks / "6/0/0").unlink()
+    found = verify(Run.open(path))
+    assert [f.index for f in found.damaged] == [5, 6]
+    assert found.without_a_line == (3,)
+    assert "marks frames 5-6 as lost" in found.remedy()
+    said = "\n".join(settle_recording(path))
+    assert "marked as lost: frames 5-6" in said
+    assert "images of frames 3" in said
+    run = Run.open(path)
+    assert verify(run).is_sound, verify(run).lines()
+    assert run.condition is RunCondition.COMPLETED
+    assert sorted(run.records) == [0, 1, 2, 4, 7]
+    assert np.array_equal(run.frame(3), frame(3).image)
+    assert run.n_frames == run.array.n_frames == 8
+    assert (chunks / "5/0/0").read_bytes() == b"short"
+    with pytest.raises(RunError, match="frame 6 is lost: its file is gone"):
+        run.frame(6)
+    assert settle_recording(path) == []
+    (chunks / "3/0/0").write_bytes(bytes(96))
+    assert [f.index for f in verify(Run.open(path)).damaged] == [3]
+
+
+def test_a_completed_run_takes_damaged_frames_again_and_keeps_the_old(tmp_path: Path) -> None:
+    images = [tmp_path / f"{value}.png" for value in range(2)]
+    for value, image in enumerate(images):
+        cv2.imwrite(str(image), np.full((4, 6), 40 + value, np.uint8))
+    plan = Plan(label="p", parts=(Part(label="a", slm_images=tuple(images), repeats=2),))
+    with open_mock_bench() as bench:
+        path = prepare(bench, plan, tmp_path / "runs").execute().path
+    chunk = Run.open(path).array.chunk_path(2)
+    chunk.write_bytes(spoilt := bytes(chunk.stat().st_size))
+    with open_mock_bench() as bench:
+        runner, findings = prepare_resume(bench, path)
+        assert findings.todo == (2,)
+        run = runner.execute()
+    assert verify(run).is_sound
+    assert [p.read_bytes() for p in (path / "kept").iterdir()] == [spoilt]
+    slm = next((path / "slm").iterdir())
+    slm.write_bytes(images[0].read_bytes()[:-3])
+    chunk.unlink()
+    with open_mock_bench() as bench, pytest.raises(RunError, match="not the image that the run began with"):
+        prepare_resume(bench, path)

@@ -1,0 +1,71 @@
+"""Stray light in pictures through one PSF: found, taken for what it is, and not looked for in vain."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon import reconstruct
+from recon.evaluation.scene import TestScene, make_scene
+from recon.reconstruction import selection
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import Part
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.residual import background_in_words
+
+
+def lit(stray: float) -> TestScene:
+    return make_scene("sparse-picture", size=40, background=stray, photons=3000.0, seed=4)
+
+
+@pytest.mark.parametrize("array", [True, False])
+def test_stray_light_is_found_through_one_psf(array: bool) -> None:
+    scene = lit(2.0)
+    psf: Any = scene.calibration.psfs[0, 0] if array else scene.calibration
+    found = reconstruct(scene.measurement, psf, prior="l1", iterations=40, judged=False)
+    assert found.background is not None
+    assert found.background.mean() == pytest.approx(scene.background.mean(), rel=0.15)
+    told = " ".join(found.warnings) if found.choice is None else " ".join(found.choice.lines())
+    assert "on pixels held out" in told
+
+
+def test_without_room_for_stray_light_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(_: object) -> None:
+        raise AssertionError("a trial was made")
+
+    monkeypatch.setattr(selection, "trial_of", never)
+    scene = lit(0.0)
+    image = scene.measurement - np.percentile(scene.measurement, 5)
+    assert reconstruct(image, scene.calibration.psfs[0, 0], iterations=5, judged=False).background is None
+
+
+def test_total_variation_leaves_even_light_to_the_background() -> None:
+    scene = lit(1.0)
+    found = reconstruct(scene.measurement, scene.calibration, estimate_background=True, judged=False)
+    assert found.background is not None
+    assert 0.6 < found.background.mean() / scene.background.mean() < 1.1
+
+
+def test_a_dark_frame_does_not_settle_the_background_of_later_ones() -> None:
+    scene = lit(1.0)
+    dark = np.random.default_rng(0).normal(0, 0.3, scene.measurement.shape)
+    options = ReconstructionOptions(estimate_background=True, model="convolution")
+    problem = Problem.of(Measurement(dark, noise=1.0), scene.calibration, options)
+    part = Part(problem, slice(0, 1))
+    assert part.removal is not None
+    before = part.removal.restraint
+    part.set_data(problem.with_data(scene.measurement))
+    assert part.removal.restraint < 0.1 * before
+    assert part.removal.taken > 0.9
+
+
+def test_a_background_below_zero_is_said() -> None:
+    scene = lit(0.0)
+    problem = Problem.of(Measurement(scene.measurement), scene.calibration)
+    mean = problem.data.mean()
+    assert background_in_words(problem, np.full(problem.data.shape, -0.1 * mean)) == []
+    (text,) = background_in_words(problem, np.full(problem.data.shape, -0.8 * mean))
+    assert "-0.80 of the data's light" in text

@@ -1,0 +1,155 @@
+"""Wrong calibrations are named, right ones are not, and where nobody can tell that is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from recon import Calibration, Geometry, reconstruct
+from recon.camera.transformed import Transformation, transformed
+from recon.errors import InputError
+from recon.optics.diffuser import smooth_diffuser
+from recon.optics.fall_off import gaussian_fall_off
+from recon.optics.grid import GREEN, PixelGrid
+from recon.optics.render import render
+from recon.optics.scene import bar_target, picture
+from recon.optics.wave import WavePropagator
+from recon.reconstruction.decoys import check_calibration
+from recon.reconstruction.options import ReconstructionOptions as Options
+from recon.reconstruction.problem import Problem
+from recon.verdict.calibration_check import BETWEEN, FAR, GIVEN, Fit, Score, check_of, near_decoys
+from recon.verdict.judge import Region, Verdict
+from tests.golden import inputs
+
+Image = npt.NDArray[np.float32]
+GRID = PixelGrid((96, 96), 13.0)
+D_UM, Z_UM = 8900.0, 150e3
+
+
+@pytest.fixture(scope="module")
+def seen() -> tuple[Image, Image]:
+    """A photograph of bars and the PSF, by propagation, with shot and read noise."""
+    rng = np.random.default_rng(1)
+    optics = WavePropagator(smooth_diffuser((880.0, 880.0), 5.0, seed=1), D_UM, workers=1)
+    psf = optics.psf((0.0, 0.0, Z_UM), GRID, GREEN.samples(1)) * 1.0
+    psf *= 20_000 / psf.max()
+    scene = picture(bar_target(128), Z_UM, 0.7 * 96 * 13.0 * Z_UM / D_UM)
+    light = render(
+        scene, (0.0, 1.0, 0.0), GRID, optics, gaussian_fall_off(20.0), layer_photons=1, bead_photons=1
+    )
+    light = light * 8000 / light.max()
+    noisy = [np.maximum(rng.poisson(i) + rng.normal(0, 3, i.shape), 0) for i in (light, psf)]
+    return noisy[0].astype(np.float32), noisy[1].astype(np.float32)
+
+
+def fit(photograph: Image, psf: Image) -> tuple[Fit, str]:
+    check = check_calibration(Problem.of(photograph, psf))
+    assert check is not None
+    return check.fit, str(check.better)
+
+
+def test_a_right_calibration_fits(seen: tuple[Image, Image]) -> None:
+    assert fit(*seen)[0] is Fit.FITS
+    moved = transformed(seen[1], Transformation(5, -3))
+    assert fit(seen[0], moved)[0] is Fit.FITS  # the picture is displaced, and nobody can tell
+
+
+@pytest.mark.parametrize(
+    ("how", "found"),
+    [
+        (Transformation(rotation_deg=1), "turned by -1 degrees"),
+        (Transformation(scale=0.985), "1.2 % larger"),
+        (Transformation(mirrored=True), "mirrored"),
+        (Transformation(rotation_deg=180), "turned by +180 degrees"),
+    ],
+)
+def test_what_became_of_a_wrong_one_is_named(
+    seen: tuple[Image, Image], how: Transformation, found: str
+) -> None:
+    assert fit(seen[0], transformed(seen[1], how)) == (Fit.OFF, found)
+
+
+def test_another_diffusers_is_foreign_and_never_reliable(seen: tuple[Image, Image]) -> None:
+    optics = WavePropagator(smooth_diffuser((880.0, 880.0), 5.0, seed=2), D_UM, workers=1)
+    other = optics.psf((0.0, 0.0, Z_UM), GRID, GREEN.samples(1))
+    result = reconstruct(seen[0], other, iterations=20)
+    assert result.verdict is not None
+    assert result.verdict.region is Region.OUTSIDE
+    first, *_ = result.verdict.sentences
+    assert first.startswith("not reliable: the calibration does not")
+
+
+def test_where_nothing_is_lit_nothing_is_told(seen: tuple[Image, Image]) -> None:
+    noise = np.random.default_rng(3).normal(1000, 30, seen[0].shape).astype(np.float32)
+    assert fit(noise, seen[1])[0] is Fit.UNTOLD
+
+
+def test_volumes_are_told_by_turns(seen: tuple[Image, Image]) -> None:
+    psfs = np.stack([seen[1], transformed(seen[1], Transformation(scale=1.1))])[:, None]
+    depths = Calibration(psfs, np.array([[0.0, 0.0, Z_UM], [0.0, 0.0, 0.6 * Z_UM]]))
+    right = check_calibration(Problem.of(seen[0], depths))
+    assert right is not None
+    assert right.fit is Fit.FITS
+    assert not any(how.scale != 1 for how in right.scores)
+
+
+@pytest.mark.parametrize("stretch", [0.2, 0.5])
+def test_psfs_that_vary_much_over_the_field_are_told_by_all_of_them(stretch: float) -> None:
+    grid = inputs.over_field(stretch=stretch)
+    own = Calibration(grid["psfs"], grid["positions_um"], geometry=Geometry(10.0, 5.0))
+    mirrored = replace(own, psfs=np.ascontiguousarray(own.psfs[..., ::-1]))
+    photograph = inputs.beads(1, stretch=stretch)
+    found = [
+        check_calibration(Problem.of(photograph, psfs, Options(estimate_background=True)))
+        for psfs in (own, mirrored)
+    ]
+    assert [check and check.wrong for check in found] == [False, True]
+
+
+NEAR = near_decoys((160, 160), volume=False)
+TILES = 1 + 0.01 * np.random.default_rng(0).normal(size=16)
+
+
+def score(misfit: float, objective: float, unlike: float = 0.0) -> Score:
+    """Return a score whose fine structure is the misfit, in tiles that differ."""
+    return Score(misfit, objective, tuple(misfit * (TILES + unlike * TILES[::-1])))
+
+
+GOOD = {GIVEN: score(1.2, 1.5), BETWEEN: score(1.2, 1.5)} | {how: score(1.6, 2.0, 0.1) for how in NEAR}
+
+
+def test_without_a_far_decoy_the_near_ones_tell() -> None:
+    assert check_of(GOOD, 10_000).fit is Fit.FITS
+    assert check_of(GOOD | {NEAR[0]: score(1.1, 1.4, 0.001)}, 10_000).better == NEAR[0]
+
+
+def test_differences_within_the_noise_accuse_nobody() -> None:
+    far = {how: score(40.0, 45.0, 0.1) for how in FAR}
+    assert check_of(GOOD | far | {NEAR[0]: score(1.2, 1.4999)}, 10_000).fit is Fit.FITS
+
+
+def test_an_untold_calibration_is_doubtful_at_best() -> None:
+    alike = {how: score(1.2, 1.5) for how in (*NEAR, *FAR)}
+    check = check_of(GOOD | alike, 10_000)
+    assert check.fit is Fit.UNTOLD
+    good = Verdict(Region.INSIDE, "admm tv", 0.0, ()).with_calibration(check)
+    assert good.region is Region.NEAR
+    assert good.sentences == (
+        "doubtful: the photograph does not tell whether the calibration is its own: any PSF would explain it "
+        "as well.",
+    )
+
+
+def test_swapped_and_identical_images_are_refused_before_the_work(seen: tuple[Image, Image]) -> None:
+    photograph, psf = seen
+    with pytest.raises(InputError, match="seem to be swapped"):
+        reconstruct(psf, photograph)
+    with pytest.raises(InputError, match="are the same image: give the photograph of the scene"):
+        reconstruct(psf + 40, psf)
+    with pytest.raises(InputError, match="are the same image"):
+        reconstruct(psf, psf, erasures=psf > 15_000)
+    point = np.random.default_rng(2).poisson(psf).astype(np.float32)
+    assert reconstruct(point, psf, iterations=2, judged=False).is_picture  # a point's photograph is none
