@@ -30,7 +30,7 @@ def offered_formats(device: VideoDevice) -> tuple[V4l2Format, ...]:
         raise DeviceError(
             device.name,
             f"offers no pixel format that can be read here, only {listed}.",
-            "Readable are grey and Bayer of 8 to 16 bits, RGB, YUYV and MJPG.",
+            "Readable are grey and Bayer of 8 to 16 bits, RGB, YUYV, UYVY, NV12 and MJPG.",
         )
     return formats
 

@@ -25,7 +25,7 @@ G_CTRL, S_CTRL, QUERYCTRL, QUERYMENU = 0xC008561B, 0xC008561C, 0xC0445624, 0xC02
 ENUM_FRAMESIZES, G_SELECTION, S_SELECTION = 0xC02C564A, 0xC040565E, 0xC040565F
 
 EXPOSURE, AUTO_EXPOSURE, GAIN, AUTOGAIN, BLACK = 0x9A0902, 0x9A0901, 0x980913, 0x980912, 0x98090B
-_BYTES = {"GREY": 1, "RGGB": 1, "Y10 ": 2, "Y16 ": 2, "RG10": 2, "YUYV": 2, "RGB3": 3}
+_BYTES = {"GREY": 1, "RGGB": 1, "Y10 ": 2, "Y16 ": 2, "RG10": 2, "YUYV": 2, "UYVY": 2, "NV12": 1, "RGB3": 3}
 
 
 @dataclass
@@ -206,7 +206,7 @@ class FakeKernel:
         if self.code == "MJPG":
             return 0, self.size[0] * self.size[1] * 3
         line = self.size[1] * _BYTES[self.code] + self.line_padding
-        return line, line * self.size[0]
+        return line, line * self.size[0] * (3 if self.code == "NV12" else 2) // 2
 
     def _g_fmt(self, d: object) -> None:
         line, n_bytes = self._layout()
@@ -365,19 +365,22 @@ class FakeKernel:
         height, width = self.size
         if self.image is not None:
             return self.image(sequence, height, width)
-        line, _ = self._layout()
+        line, n_bytes_of_all = self._layout()
         top, left = self.crop[:2]
         rows, columns = np.mgrid[top : top + height, left : left + width]
         counts = (rows * 7 + columns * 3 + sequence) % (1 << (10 if "10" in self.code else 8))
-        row_bytes = np.full((height, line), 0xEE, np.uint8)
+        row_bytes = np.full((n_bytes_of_all // line, line), 0xEE, np.uint8)
         n_bytes = _BYTES[self.code]
-        if n_bytes == 2 and self.code != "YUYV":
+        if n_bytes == 2 and self.code not in ("YUYV", "UYVY"):
             row_bytes[:, : width * 2] = (
                 (counts * (257 if "16" in self.code else 1)).astype("<u2").view(np.uint8)
             )
-        elif self.code == "YUYV":
+        elif self.code in ("YUYV", "UYVY"):
             row_bytes[:, : width * 2] = 128
-            row_bytes[:, : width * 2 : 2] = counts
+            row_bytes[:, self.code.index("Y") : width * 2 : 2] = counts
+        elif self.code == "NV12":
+            row_bytes[:height, :width] = counts
+            row_bytes[height:, :width] = 128
         else:
             row_bytes[:, : width * n_bytes] = np.repeat(counts, n_bytes, axis=1).astype(np.uint8)
         return row_bytes.tobytes()
