@@ -216,6 +216,23 @@ def test_luma_and_colours_of_video_formats(code: str, padding: int) -> None:
     np.testing.assert_array_equal(colour[..., 0], colour[..., 2])  # no chroma: grey
 
 
+def test_a_driver_of_memory_planes_gives_the_same_images() -> None:
+    shown = []
+    for planes in (0, 1):
+        kernel = FakeKernel(formats=("Y16 ", "NV12"))
+        kernel.planes, kernel.line_padding = planes, 8
+        with camera_on(kernel) as camera:
+            camera.set_pixel_format("Mono8 (NV12)")
+            shown.append(camera.snap().image)
+            camera.set_pixel_format("Mono16")
+            shown.append(camera.snap().image)
+    np.testing.assert_array_equal(shown[0], shown[2])
+    np.testing.assert_array_equal(shown[1], shown[3])
+    kernel.planes = 2
+    with pytest.raises(DeviceError, match="over 2 memory planes; one can be read here"):
+        camera_on(kernel).open()
+
+
 # Settings ---
 def test_automatics_are_off_after_opening() -> None:
     kernel = FakeKernel()

@@ -91,6 +91,8 @@ class FakeKernel:
         """Sequence numbers that the camera loses."""
         self.damaged: set[int] = set()
         self.numbered = True
+        self.planes = 0
+        """Memory planes of an image; 0: the driver does not speak of planes."""
         self.start_of_exposure = False
         self.clock_flags = 0x2000
         self.refuse: dict[int, int] = {}
@@ -181,14 +183,24 @@ class FakeKernel:
         return errno.ENOTTY if handler is None else handler(data) or 0
 
     # What it is ------------------------------------------------------------------------------------
+    @property
+    def _kind(self) -> int:
+        return 9 if self.planes else 1
+
     def _querycap(self, d: object) -> None:
-        struct.pack_into(
-            "16s32s32sIII", d, 0, b"fakecam", b"Fake Camera", b"usb-1", 0x6010A, 0x84200001, 0x04200001
-        )
+        here = 0x04201000 if self.planes else 0x04200001
+        row = (b"fakecam", b"Fake Camera", b"usb-1", 0x6010A, 0x80000000 | here, here)
+        struct.pack_into("16s32s32sIII", d, 0, *row)
+
+    def _plane(self, d: object) -> object:
+        """The plane that a buffer points to."""
+        (address,) = struct.unpack_from("Q", d, 64)
+        assert struct.unpack_from("I", d, 72) == (1,)
+        return (c_char * 64).from_address(address)
 
     def _enum_fmt(self, d: object) -> int:
         index, kind = struct.unpack_from("II", d, 0)
-        if kind != 1 or index >= len(self.formats):
+        if kind != self._kind or index >= len(self.formats):
             return errno.EINVAL
         struct.pack_into("4s", d, 44, self.formats[index].encode())
         return 0
@@ -210,6 +222,11 @@ class FakeKernel:
 
     def _g_fmt(self, d: object) -> None:
         line, n_bytes = self._layout()
+        if self.planes:
+            struct.pack_into("II4sI", d, 8, self.size[1], self.size[0], self.code.encode(), 1)
+            struct.pack_into("II", d, 28, n_bytes, line)
+            struct.pack_into("B", d, 188, self.planes)
+            return
         struct.pack_into("II4sIII", d, 8, self.size[1], self.size[0], self.code.encode(), 1, line, n_bytes)
 
     def _s_fmt(self, d: object) -> int:
@@ -293,7 +310,7 @@ class FakeKernel:
     # Buffers ---------------------------------------------------------------------------------------
     def _reqbufs(self, d: object) -> int:
         count, kind, memory = struct.unpack_from("III", d, 0)
-        assert (kind, memory) == (1, 1)
+        assert (kind, memory) == (self._kind, 1)
         count = max(count, 2) if count else 0
         self.memory = [bytearray(self._layout()[1]) for _ in range(count)]
         self.queued.clear()
@@ -303,6 +320,9 @@ class FakeKernel:
 
     def _querybuf(self, d: object) -> None:
         (index,) = struct.unpack_from("I", d, 0)
+        if self.planes:
+            struct.pack_into("III", self._plane(d), 0, 0, len(self.memory[index]), index << 12)
+            return
         struct.pack_into("I4xI", d, 64, index << 12, len(self.memory[index]))
 
     def _qbuf(self, d: object) -> int:
@@ -325,7 +345,10 @@ class FakeKernel:
         if self.start_of_exposure:
             flags |= 0x10000
             ended -= self.controls[EXPOSURE].value * 1e-4
-        struct.pack_into("IIII", d, 0, index, 1, used, flags)
+        if self.planes:
+            struct.pack_into("I", self._plane(d), 0, used)
+            used = 0
+        struct.pack_into("IIII", d, 0, index, self._kind, used, flags)
         struct.pack_into("qq", d, 24, int(ended), int(ended % 1 * 1e6))
         struct.pack_into("II", d, 56, sequence if self.numbered else 0, 1)
         return 0
