@@ -256,6 +256,8 @@ class Buffer(Structure):
     memory: int
     m: _Memory
     length: int
+    plane: Plane | None = None
+    """What ``m.planes`` points to, kept as long as the buffer is: the kernel writes to it."""
 
 
 class BufferType(Structure):

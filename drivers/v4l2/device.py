@@ -169,9 +169,9 @@ class VideoDevice:
             os.eventfd_read(self._wake_fd)
         assert self._fd is not None
         for index in range(request.count):
-            buffer, plane = self._buffer(index)
+            buffer = self._buffer(index)
             self.call(api.QUERYBUF, buffer, "describe its buffers")
-            where = buffer if plane is None else plane
+            where = buffer.plane or buffer
             self._maps.append(self._kernel.map(self._fd, where.length, where.m.offset))
             self.call(api.QBUF, buffer, "take its buffers")
         self.call(api.STREAMON, api.BufferType(self.buffer_type), "start streaming")
@@ -181,7 +181,7 @@ class VideoDevice:
         """Wait for a filled buffer; None when the time is over or after :meth:`wake`."""
         waited = False
         while True:
-            buffer, plane = self._buffer(0)
+            buffer = self._buffer(0)
             number = self.attempt(api.DQBUF, buffer)
             if number == 0:
                 break
@@ -192,6 +192,7 @@ class VideoDevice:
             waited = True
             if not self._kernel.wait(self._fd, self._wake_fd, timeout_s):
                 return None
+        plane = buffer.plane
         first, end = (0, buffer.bytesused) if plane is None else (plane.data_offset, plane.bytesused)
         data = np.frombuffer(self._maps[buffer.index], np.uint8, count=end)[first:]
         time_ns = buffer.timestamp.tv_sec * 10**9 + buffer.timestamp.tv_usec * 10**3
@@ -199,7 +200,7 @@ class VideoDevice:
 
     def give_back(self, filled: FilledBuffer) -> None:
         """Queue a buffer again."""
-        self.call(api.QBUF, self._buffer(filled.index)[0], "take a buffer back")
+        self.call(api.QBUF, self._buffer(filled.index), "take a buffer back")
 
     def wake(self) -> None:
         """End a wait in :meth:`take`."""
@@ -221,14 +222,12 @@ class VideoDevice:
         with contextlib.suppress(DeviceLostError):
             self.attempt(api.REQBUFS, none)
 
-    def _buffer(self, index: int) -> tuple[api.Buffer, api.Plane | None]:
-        """Return a buffer to ask about, and its memory plane, which must live as long, where it has one."""
+    def _buffer(self, index: int) -> api.Buffer:
         buffer = api.Buffer(index=index, type=self.buffer_type, memory=api.MEMORY_MMAP)
-        if self.buffer_type == api.BUF_TYPE_VIDEO_CAPTURE:
-            return buffer, None
-        plane = api.Plane()
-        buffer.m.planes, buffer.length = addressof(plane), 1
-        return buffer, plane
+        if self.buffer_type == api.BUF_TYPE_VIDEO_CAPTURE_MPLANE:
+            buffer.plane = api.Plane()
+            buffer.m.planes, buffer.length = addressof(buffer.plane), 1
+        return buffer
 
     # Errors ----------------------------------------------------------------------------------------
     def _gone(self) -> DeviceLostError:

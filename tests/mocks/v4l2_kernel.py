@@ -328,6 +328,8 @@ class FakeKernel:
     def _qbuf(self, d: object) -> int:
         (index,) = struct.unpack_from("I", d, 0)
         self._expose()
+        if self.planes:
+            struct.pack_into("8xI", self._plane(d), 0, index << 12)  # the kernel writes it back
         assert index not in self.queued
         self.queued.append(index)
         return 0
