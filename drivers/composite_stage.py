@@ -323,6 +323,10 @@ class CompositeStage(Stage):
             while not self._home_over.wait(_STOP_AGAIN_S):  # a part may only just have begun to home
                 self._stop_parts(self._parts)
 
+    def settles_within(self, axis: StageAxis) -> float:
+        """Return how far from its target an axis may come to rest: what its part says."""
+        return next(part.settles_within(axis) for part in self._parts.values() if axis in part.axes)
+
     def move_duration_s(self, start: Mapping[str, float], target: Mapping[str, float]) -> float:
         """Estimated seconds for a move; the parts move together, so the slowest counts."""
         durations = []

@@ -99,6 +99,10 @@ class Stage(Device):
     def stop(self) -> None:
         """Stop every axis at once. Callable from any thread; without a move it does nothing."""
 
+    def settles_within(self, axis: StageAxis) -> float:
+        """Return how far from its target an axis may come to rest, in its unit."""
+        return 3 * axis.resolution
+
     @property
     def limits(self) -> dict[str, tuple[float, float]]:
         """Soft limits by axis name."""

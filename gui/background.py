@@ -6,6 +6,9 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from PySide6.QtCore import QObject
+from shiboken6 import isValid
+
 from drivers.common.stream import FrameStream
 from drivers.errors import DeviceError
 from gui.jobs import Job, JobRunner
@@ -73,10 +76,15 @@ class NewestOnly:
             return
         epoch = self._epoch
         self._job = job = self._jobs.watch(self._title, lambda _: read())
-        job.succeeded.connect(lambda value: done(value) if epoch == self._epoch else None)
+        job.succeeded.connect(lambda value: done(value) if self._is_awaited(epoch, done) else None)
         if (failed := self._failed) is not None:
-            job.failed.connect(lambda why: failed(why) if epoch == self._epoch else None)
+            job.failed.connect(lambda why: failed(why) if self._is_awaited(epoch, failed) else None)
         job.ended.connect(self._ended)
+
+    def _is_awaited(self, epoch: int, receiver: Callable[[Any], object]) -> bool:
+        """Whether an answer is still wanted, and its receiver was not deleted with its window meanwhile."""
+        owner = getattr(receiver, "__self__", None)
+        return epoch == self._epoch and not (isinstance(owner, QObject) and not isValid(owner))
 
     def _ended(self) -> None:
         self._job = None

@@ -213,6 +213,13 @@ class JobRunner(QObject):
         self._jobs: dict[int, Job] = {}
         self._waiting: list[int] = []
         self._threads: list[threading.Thread] = []
+        self._silent = False
+
+    def silence(self) -> None:
+        """Have jobs end without a word from now on: whatever showed them is being deleted."""
+        self._silent = True
+        for job in self._jobs.values():
+            job.blockSignals(True)
 
     # Starting ------------------------------------------------------------------------------------
     def device(
@@ -314,6 +321,7 @@ class JobRunner(QObject):
     def _add(self, title: str, work: Work, lanes: frozenset[str], *, exclusive: bool) -> Job:
         number = next(self._numbers)
         job = Job(title, work, JobContext(number, self._post), lanes, exclusive=exclusive)
+        job.blockSignals(self._silent)
         self._jobs[number] = job
         self._waiting.append(number)
         # Not before the caller has connected its signals.

@@ -37,6 +37,7 @@ class Panel(QWidget):
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.session = session
+        self.destroyed.connect(session.jobs.silence)  # panels live as long as their window
         self.body = QWidget()
         """Where the panel's own widgets go: give it a layout."""
         self.body.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)

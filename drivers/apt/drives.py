@@ -79,10 +79,9 @@ class Motor:
         self._scale = SPEED_SCALE[link.controller.family]
         self._status = MOT_GET_DCSTATUSUPDATE if servo else MOT_GET_STATUSUPDATE
         request = MOT_REQ_DCSTATUSUPDATE if servo else MOT_REQ_STATUSUPDATE
-        # The protocol wants the host's sign of life at least every 50 status messages.
-        self._status_request = short(MOT_ACK_DCSTATUSUPDATE, self._address) + short(
-            request, self._address, self._channel
-        )
+        # Servos want the host's sign of life at least every 50 status messages; others do not know it.
+        sign_of_life = short(MOT_ACK_DCSTATUSUPDATE, self._address) if servo else b""
+        self._status_request = sign_of_life + short(request, self._address, self._channel)
 
     def prepare(self) -> None:
         """Switch the axis on, and its unasked status messages off."""

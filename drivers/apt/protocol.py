@@ -216,8 +216,16 @@ ActuatorName = Literal[
     "DRV250",
     "NRT100",
     "NRT150",
+    "ZST206",
+    "ZST213",
+    "ZST225",
+    "K10CR1",
+    "LTS150",
+    "LTS300",
 ]
-ControllerName = Literal["KDC101", "TDC001", "BSC201", "BSC202", "BSC203", "KIM101"]
+ControllerName = Literal[
+    "KDC101", "TDC001", "BSC201", "BSC202", "BSC203", "KST101", "K10CR1", "LTS", "KIM101"
+]
 Family = Literal["servo", "stepper", "inertia"]
 
 
@@ -231,6 +239,8 @@ class Actuator:
     turns: bool = False
     fastest: float | None = None
     """Units a second that its motor can do; None where only the controller sets a limit."""
+    built_into: ControllerName | None = None
+    """The controller that it is one unit with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,6 +269,14 @@ ACTUATORS: Mapping[ActuatorName, Actuator] = {
     "DRV250": Actuator("stepper", 409_600, 50),
     "NRT100": Actuator("stepper", 409_600, 100),
     "NRT150": Actuator("stepper", 409_600, 150),
+    # 24 steps of 2048 microsteps a turn, a gear of 40.866 and a thread of a millimetre.
+    "ZST206": Actuator("stepper", 2_008_645.63, 6),
+    "ZST213": Actuator("stepper", 2_008_645.63, 13),
+    "ZST225": Actuator("stepper", 2_008_645.63, 25),
+    # 200 steps of 2048 microsteps a turn, a gear of 120.
+    "K10CR1": Actuator("stepper", 409_600 * 120 / 360, 360, turns=True, built_into="K10CR1"),
+    "LTS150": Actuator("stepper", 409_600, 150, built_into="LTS"),
+    "LTS300": Actuator("stepper", 409_600, 300, built_into="LTS"),
 }
 
 CONTROLLERS: Mapping[ControllerName, Controller] = {
@@ -267,8 +285,20 @@ CONTROLLERS: Mapping[ControllerName, Controller] = {
     "BSC201": Controller("stepper", RACK, 1, "40"),
     "BSC202": Controller("stepper", RACK, 2, "50"),
     "BSC203": Controller("stepper", RACK, 3, "70"),
+    "KST101": Controller("stepper", USB_UNIT, 1, "26"),
+    "K10CR1": Controller("stepper", USB_UNIT, 1, "55"),
+    "LTS": Controller("stepper", USB_UNIT, 1, "45"),
     "KIM101": Controller("inertia", USB_UNIT, 4, "97"),
 }
+
+
+def can_drive(controller: ControllerName, actuator: ActuatorName) -> bool:
+    """Whether an actuator's motor suits a controller, and is its own where one is built into the other."""
+    units = {found.built_into for found in ACTUATORS.values()}
+    wanted = ACTUATORS[actuator]
+    owned = wanted.built_into == controller or (wanted.built_into is None and controller not in units)
+    return wanted.family == CONTROLLERS[controller].family and owned
+
 
 SPEED_SCALE: Mapping[Family, float] = {
     "servo": 65_536 * 2048 / 6e6,  # 65536 times the servo's sampling interval, in seconds

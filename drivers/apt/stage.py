@@ -20,6 +20,7 @@ from drivers.apt.protocol import (
     SLOWEST_COUNTS_PER_S,
     ActuatorName,
     ControllerName,
+    can_drive,
 )
 from drivers.common.polled_stage import PolledStage, StageState
 from drivers.common.stage_axes import MRAD_PER_DEG, UM_PER_MM, AxisMap, AxisName, AxisOptions
@@ -83,7 +84,7 @@ class AptAxis(AxisOptions):
         )
         if sum(value is not None for value in given) != 1:
             return "needs one of actuator, counts_per_mm and counts_per_deg"
-        if self.actuator and ACTUATORS[self.actuator].family != controller.family:
+        if self.actuator and not can_drive(self.controller, self.actuator):
             return f"a {self.controller} cannot drive a {self.actuator}"
         if self.turns == name.endswith("_um"):
             return f"an actuator that {'turns' if self.turns else 'shifts'} cannot be {name}"
@@ -140,7 +141,7 @@ _SPEED_TOLERANCE = 0.01
 
 
 class AptStage(PolledStage):
-    """Axes on KDC101, TDC001, BSC20x or KIM101 controllers, moved together.
+    """Axes on KDC101, TDC001, BSC20x, KST101 or KIM101 controllers, K10CR1 and LTS stages, moved together.
 
     Each controller has a port of its own. Limits are the actuator's travel, narrowed by ``bench.toml``: these
     controllers do not know it. An axis of a KIM101 has no reference; homing calls the present place zero, and

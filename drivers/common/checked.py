@@ -7,8 +7,9 @@ failures of any type come as a DeviceError; the bench uses no other. What a diff
 exposure              10 % or 0.2 ms, whichever is more: cameras count in lines and tenths of milliseconds
 gain                  25 % or 0.5, whichever is more: some have steps of 2 dB
 binning, format, ...  none; a region lies within the one asked for
-place of an axis      3 times its resolution, read once more after the move; of a homed stage at any
-                      time, 100 times its travel beyond its ends
+ place of an axis      what its driver lets it settle within (3 times its resolution by default), read
+                       once more after the move; of a homed stage at any time, 100 times its travel
+                       beyond its ends
 pattern, SLM image    none
 ====================  ==============================================================================
 
@@ -39,7 +40,7 @@ from drivers.stage import Stage, StageAxis
 _log = logging.getLogger(__name__)
 _D = TypeVar("_D", bound=type[Device])
 _T = TypeVar("_T")
-_RESOLUTIONS, _TRAVELS = 3, 100
+_TRAVELS = 100
 _REMEDY = "Its readings cannot be trusted: check the device, its firmware and its driver."
 
 
@@ -127,7 +128,7 @@ def _arrived(stage: Stage, target: Mapping[str, float], said: Mapping[str, float
         axis.name: said.get(axis.name, math.nan)
         for axis in stage.axes
         if axis.name in target
-        and not abs(said.get(axis.name, math.nan) - target[axis.name]) <= _RESOLUTIONS * axis.resolution
+        and not abs(said.get(axis.name, math.nan) - target[axis.name]) <= stage.settles_within(axis)
     }
     if strays:
         wanted = ", ".join(f"{name} = {target[name]:g}" for name in strays)

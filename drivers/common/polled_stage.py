@@ -114,6 +114,10 @@ class PolledStage(Stage):
         """Return how far from its target an axis may come to rest, in its unit."""
         return 1.01 * axis.resolution
 
+    def settles_within(self, axis: StageAxis) -> float:
+        """Return how far from its target an axis may come to rest, in its unit."""
+        return max(super().settles_within(axis), self._tolerance(axis))
+
     # Device ----------------------------------------------------------------------------------------
     def open(self) -> None:
         """Connect and stop whatever moves; see the interface."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 
 from drivers.common.serial_transport import SerialTransport
 from drivers.errors import DeviceError, DeviceTimeoutError
@@ -52,7 +53,7 @@ class GrblLink(SerialTransport):
         )
         self._offset: tuple[float, ...] | None = None
         self._heard = threading.Condition()
-        self._banners = 0
+        self._banners = self._reports = 0
         self._alarm: int | None = None
         self._ends: list[bytes] = []
         self._said: list[str] = []
@@ -61,6 +62,33 @@ class GrblLink(SerialTransport):
         """Open the port."""
         super().open()
         self._offset = None
+
+    def meet(self, within_s: float, *, reset: bool) -> None:
+        """Wait until a GRBL controller says something, or refuse the port.
+
+        With ``reset`` a controller that is silent for half the time is reset: stuck in a critical alarm it
+        hears nothing else. Boards that start anew when their port is opened greet within two seconds.
+        """
+        began_s = time.monotonic()
+        with self._heard:
+            before = self._banners + self._reports
+            while self._banners + self._reports == before:
+                waited_s = time.monotonic() - began_s
+                if waited_s > within_s:
+                    raise self._stranger(f"nothing that it says was heard in {within_s:g} s")
+                if reset and waited_s > within_s / 2:
+                    self.send_now(SOFT_RESET)
+                    reset = False
+                self.send_now(STATUS)
+                self._heard.wait(within_s / 8)
+
+    def _stranger(self, found: str) -> DeviceTimeoutError:
+        return DeviceTimeoutError(
+            self.device,
+            f"no GRBL controller answers on {self._place}: {found}.",
+            "Check that port and baud_rate are this controller's (115200 unless changed), its cable "
+            "and its power. Switch it off and on, then open it again.",
+        )
 
     # Asking ----------------------------------------------------------------------------------------
     def report(self) -> Report:
@@ -132,12 +160,7 @@ class GrblLink(SerialTransport):
             before = self._banners
             self.overtake(SOFT_RESET)
             if not self._heard.wait_for(lambda: self._banners > before, _RESET_S):
-                raise DeviceTimeoutError(
-                    self.device,
-                    f"no GRBL controller answers on {self._place}: it does not answer a reset.",
-                    "Check that port and baud_rate are this controller's (115200 unless changed), its cable "
-                    "and its power. Switch it off and on, then open it again.",
-                )
+                raise self._stranger("it does not answer a reset")
 
     # What it says unasked --------------------------------------------------------------------------
     @property
@@ -164,6 +187,8 @@ class GrblLink(SerialTransport):
             elif is_banner(line):
                 self._banners += 1
                 self._offset = None
+            elif parse_report(line) is not None:
+                self._reports += 1
             elif line == b"ok" or parse_error(line) is not None:
                 self._ends.append(line)
             elif line.startswith(b"[MSG:"):

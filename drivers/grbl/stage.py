@@ -48,6 +48,8 @@ class GrblStage(PolledStage):
     Options = GrblOptions
     reply_s = 1.0
     """What a reply may take."""
+    meet_s = 2.0
+    """How long a controller may be silent after its port was opened."""
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         super().__init__()
@@ -59,7 +61,7 @@ class GrblStage(PolledStage):
         self._zero: tuple[float, ...] = ()
         self._planned: dict[str, float] = {}
         self._banners = 0
-        self._homed = self._homing = self._halting = False
+        self._homed = self._homing = self._halting = self._locked = False
         self._fault = ""
         """What happened since the last homing that ended it."""
 
@@ -74,6 +76,7 @@ class GrblStage(PolledStage):
         link = GrblLink(port, f"port {port}", 115_200, cls.reply_s)
         link.open()
         try:
+            link.meet(cls.meet_s, reset=False)
             axes = len(link.report().places)
             settings = ControllerSettings({}, parse_info(link.command(b"$I\n")))
         except DeviceError:
@@ -142,11 +145,8 @@ class GrblStage(PolledStage):
 
     def _first_report(self) -> Report:
         """Return a report of a controller at rest: others are refused their questions."""
-        try:
-            report = self._link.report()
-        except DeviceTimeoutError:
-            self._link.reset()  # it may be stuck in a critical alarm, in which only this is heard
-            report = self._link.report()
+        self._link.meet(self.meet_s, reset=True)
+        report = self._link.report()
         deadline_s = time.monotonic() + self.stop_s
         self._halting = True
         while report.state in MOVING_STATES or report.state == "Hold:0":
@@ -239,7 +239,8 @@ class GrblStage(PolledStage):
             raise DeviceError(
                 self.name, f"reports {len(report.places)} axes, not {len(self._zero)}.", "Open it again."
             )
-        if report.state == "Alarm" and self._homed:
+        self._locked = report.state == "Alarm"
+        if self._locked and self._homed:
             self._homed, self._fault = False, self._fault or "it is in alarm"
         if self._halting:
             self._press_on(report.state)
@@ -297,20 +298,43 @@ class GrblStage(PolledStage):
 
     def _start_homing(self) -> None:
         self._halting = False
-        self._fault = ""
+        self._alarmed, self._fault = self._fault, ""
         if self.options.homing == "here":
+            if self._locked:
+                raise DeviceError(
+                    self.name,
+                    f"is locked by an alarm{f' ({self._alarmed})' if self._alarmed else ''}, and nothing but "
+                    "unlocking ends that where it has no homing; what it knew of its position is lost then.",
+                    "Look what the alarm was for and free the axes by hand; then bench.stage.unlock() from "
+                    "Python, and home.",
+                )
             self._zero, self._homed = self._places, True
             return
         if not self._controller.homing:
             raise DeviceError(
                 self.name,
                 "has homing switched off ($22=0).",
-                'Send $22=1 if it has switches; if not, set homing = "here" in bench.toml.',
+                'Send $22=1 if it has switches; if not, set homing = "here" in bench.toml. '
+                "Locked by an alarm, bench.stage.unlock() from Python releases it.",
             )
         self._homed = False
         self.stuck_s = self.options.homing_timeout_s
         self._link.begin(b"$H\n")
         self._homing = True
+
+    def unlock(self) -> None:
+        """Release the lock of an alarm (``$X``) where no homing does; the position has no reference after it.
+
+        Raises DeviceError where the stage homes by switches, which is its way out of an alarm.
+        """
+        self._require()
+        if self.options.homing == "switches" and self._controller.homing:
+            raise DeviceError(self.name, "homes by its switches, which ends an alarm too.", "Home it.")
+        with self._commanding:
+            self._state()  # a critical alarm is ended by a reset before
+            self._link.command(b"$X\n")
+            self._homed, self._fault = False, "was unlocked: its position has no reference until it is homed"
+            _log.warning("%s: %s", self.name, self._fault)
 
     def _halt(self) -> None:
         self._halting = True

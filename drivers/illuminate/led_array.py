@@ -13,7 +13,7 @@ from pydantic import Field
 from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.illuminate.geometry import ArrayGeometry, read_geometry
-from drivers.illuminate.link import Link
+from drivers.illuminate.link import SAFE_LINE, Link
 from drivers.illuminate.sequencer import Sequencer
 from drivers.led_array import OFF, LedArray, LedPattern, Rgb
 from drivers.registry.buses import lasting_name
@@ -39,6 +39,13 @@ class IlluminateOptions(DriverOptions):
     wavelengths_nm: tuple[float, float, float] | None = Field(
         None, description="Red, green and blue, where the array does not say."
     )
+    longest_line: int = Field(
+        SAFE_LINE,
+        ge=32,
+        le=8192,
+        description="Longest line in bytes for firmware 2. More holds more LEDs in a sequence's pattern, but "
+        "some builds (2.32) lose bytes behind the 64th and light other LEDs: raise it only after looking.",
+    )
 
 
 class IlluminateLedArray(LedArray):
@@ -54,7 +61,7 @@ class IlluminateLedArray(LedArray):
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         self.options = options = IlluminateOptions.of(options)
-        self.link = Link(options.port, self.name, self.reply_s)
+        self.link = Link(options.port, self.name, self.reply_s, options.longest_line)
         self.commanding = threading.RLock()
         self._darkenings = 0
         self._confirming = False
@@ -211,8 +218,8 @@ class IlluminateLedArray(LedArray):
     def set_pattern(self, pattern: LedPattern) -> LedPattern:
         """Show a pattern; returns once the array has confirmed.
 
-        LEDs of one colour light together; a pattern of several colours, or a long one on firmware 1, builds
-        up over some milliseconds, from dark.
+        LEDs of one colour light together; a pattern of several colours, or of more LEDs than a line holds,
+        builds up over some milliseconds, from dark.
         """
         self.check(pattern)
         groups: dict[Rgb, list[int]] = {}
@@ -323,19 +330,10 @@ class IlluminateLedArray(LedArray):
 
     def set_color(self, rgb: Rgb) -> None:
         """Have the LEDs that are lit next, or by a sequence, shine with these levels."""
-        if rgb == self._color:
+        if rgb in (self._color, (0, 0, 0)):  # no LED is lit with the latter
             return
         self._color = None
-        *before, last = self.link.dialect.color(rgb)[: self.geometry.channels]
-        for words in before:
-            self.link.command(words)
-        echoed = self.link.setting(last, "CO")
-        if echoed != rgb[: self.geometry.channels]:
-            raise DeviceError(
-                self.name,
-                f"has levels {echoed} after it was told {rgb}.",
-                "Another program may be using it; open it again.",
-            )
+        self.link.set_color(rgb, self.geometry.channels)
         self._color = rgb
 
     def darken_after(self, error: BaseException) -> None:

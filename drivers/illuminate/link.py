@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 from drivers.common.serial_transport import SerialTransport
 from drivers.errors import DeviceError
@@ -19,6 +21,14 @@ from drivers.led_array import Rgb
 
 OLDEST = Version(1, 16)
 """The first with brightness and a machine mode."""
+
+
+class Told(NamedTuple):
+    """A command, and the machine-mode reply ``KEY.n.n`` expected to it; an empty key is not looked at."""
+
+    words: bytes
+    key: str = ""
+    echo: tuple[int, ...] = ()
 
 
 class Dialect(ABC):
@@ -39,8 +49,12 @@ class Dialect(ABC):
     most_arguments: int
 
     @abstractmethod
-    def color(self, rgb: Rgb) -> tuple[bytes, ...]:
-        """Return the commands after which LEDs light with exactly these levels; the last echoes them."""
+    def color(self, rgb: Rgb, channels: int) -> tuple[Told, ...]:
+        """Return the commands after which LEDs of so many colours light with exactly these levels."""
+
+    def by_echo(self, rgb: Rgb, echoed: tuple[int, ...]) -> Dialect | None:
+        """Return the dialect whose firmware echoes so what this one told it; None when there is none."""
+        return None
 
     @abstractmethod
     def sequence_pattern(self, leds: Sequence[int]) -> bytes:
@@ -89,9 +103,15 @@ class Firmware1(Dialect):
     prepare_sequence = (b"ssbd.1",)
     shortest_interval_ms = 1
 
-    def color(self, rgb: Rgb) -> tuple[bytes, ...]:
-        """Return one command: firmware 1 takes colours as they are."""
-        return (b"sc.%d.%d.%d" % rgb,)
+    def color(self, rgb: Rgb, channels: int) -> tuple[Told, ...]:
+        """Return one command: this firmware takes colours as they are."""
+        return (Told(b"sc.%d.%d.%d" % rgb, "CO", rgb),)
+
+    def by_echo(self, rgb: Rgb, echoed: tuple[int, ...]) -> Dialect | None:
+        """Return the dialect of builds that scale a colour to its largest channel, when one has done so."""
+        largest = max(rgb)
+        scaled = tuple((510 * level + largest) // (2 * largest) for level in rgb)  # halves rounded up
+        return NormalisingFirmware1() if echoed == scaled else None
 
     def sequence_pattern(self, leds: Sequence[int]) -> bytes:
         """Return the count, and a value of one bit behind each LED's number."""
@@ -105,16 +125,50 @@ class Firmware1(Dialect):
         return b".".join((b"rseq.%d.%d" % (interval_ms, repeats), *(b"%d" % mode for mode in padded)))
 
 
+class NormalisingFirmware1(Firmware1):
+    """Builds of firmware 1.32 that scale a colour to its largest channel, as those since 2021 do.
+
+    An LED's level is ``ceil(color / 255 * brightness)`` once the brightness was set after the colour.
+    """
+
+    def color(self, rgb: Rgb, channels: int) -> tuple[Told, ...]:
+        """Return a colour that scaling leaves alone, and the brightness that makes these levels of it."""
+        largest = max(rgb)
+        # The largest whose product is below the level, not at it: rounding cannot lift it to the next.
+        shares = [level if largest == 255 else max(255 * level - 1, 0) // largest for level in rgb]
+        red, green, blue = (
+            255 if level == largest else share for level, share in zip(rgb, shares, strict=True)
+        )
+        color = (red, green, blue)
+        return Told(b"sc.%d.%d.%d" % color, "CO", color), Told(b"sb.%d" % largest, "SB", (largest,))
+
+
+SAFE_LINE = 64
+"""Bytes of a line, its end included, that arrive together in one USB packet."""
+
+
 class Firmware2(Dialect):
-    """Firmware 2, which scales a colour to its largest channel; single channels are taken as they are."""
+    """Firmware 2, which scales a colour to its largest channel; single channels are taken as they are.
+
+    The parser of some builds (2.32) does not wait for a byte that has not arrived: of a line longer than a
+    USB packet it may lose some, and light LED 11 for 115.
+
+    Parameters
+    ----------
+    longest_line : int
+        More than ``SAFE_LINE`` for builds that wait; their buffer holds 16 KiB.
+    """
 
     properties = b"pprops"
-    longest_line = 8192  # its buffer holds 16 KiB
     most_arguments = 250  # it keeps room for 300 words
 
-    def color(self, rgb: Rgb) -> tuple[bytes, ...]:
-        """Return one command a channel."""
-        return tuple(b"ssc.%d.%d" % (channel, level) for channel, level in enumerate(rgb))
+    def __init__(self, longest_line: int = SAFE_LINE) -> None:
+        self.longest_line = longest_line
+
+    def color(self, rgb: Rgb, channels: int) -> tuple[Told, ...]:
+        """Return one command a channel; the last echoes all."""
+        commands = [b"ssc.%d.%d" % (channel, level) for channel, level in enumerate(rgb[:channels])]
+        return *map(Told, commands[:-1]), Told(commands[-1], "CO", rgb[:channels])
 
     def sequence_pattern(self, leds: Sequence[int]) -> bytes:
         """Return the LEDs' numbers, or ``none``."""
@@ -130,13 +184,14 @@ class Firmware2(Dialect):
         return b".".join(words)
 
 
-def dialect_of(version: Version) -> Dialect | None:
+def dialect_of(version: Version, longest_line: int = SAFE_LINE) -> Dialect | None:
     """Return how to speak to a firmware; None when it is too old or newer than what is known."""
     if version < OLDEST or version.major > 2:
         return None
-    return Firmware1() if version.major == 1 else Firmware2()
+    return Firmware1() if version.major == 1 else Firmware2(longest_line)
 
 
+_log = logging.getLogger(__name__)
 BAUD_RATE = 115_200
 _POWER_CODES = (3,)
 _SHOWN_BYTES = 60
@@ -155,9 +210,11 @@ class Link(SerialTransport):
         The array as error messages name it.
     timeout_s : float
         For replies.
+    longest_line : int
+        Longest line for firmware 2, bytes.
     """
 
-    def __init__(self, port: str, device: str, timeout_s: float = 1.0) -> None:
+    def __init__(self, port: str, device: str, timeout_s: float = 1.0, longest_line: int = SAFE_LINE) -> None:
         super().__init__(
             port,
             device,
@@ -165,6 +222,7 @@ class Link(SerialTransport):
             probe=(b"version\n", version_matcher()),
             timeout_s=timeout_s,
         )
+        self._longest_line = longest_line
         self._version: Version | None = None
         self._dialect: Dialect | None = None
 
@@ -191,7 +249,7 @@ class Link(SerialTransport):
             version = parse_version(lines)
             if version is None:  # the matcher lets no other reply through
                 raise DeviceError(self.device, f"answered {lines!r} when asked for its version.")
-            dialect = dialect_of(version)
+            dialect = dialect_of(version, self._longest_line)
             if dialect is None:
                 raise DeviceError(
                     self.device,
@@ -238,6 +296,38 @@ class Link(SerialTransport):
                 self.device, f"answered {lines!r} to {words.decode()!r}; {key}.NUMBER was expected."
             )
         return numbers
+
+    def set_color(self, rgb: Rgb, channels: int) -> None:
+        """Have LEDs of so many colours that are lit next shine with exactly these levels, not all zero.
+
+        A firmware that scales colours is found by what it echoes, and spoken to accordingly from then on.
+        Raises DeviceError when the array has other levels than it was told.
+        """
+        for told in self.dialect.color(rgb, channels):
+            if not told.key:
+                self.command(told.words)
+                continue
+            echoed = self.setting(told.words, told.key)
+            if echoed == told.echo:
+                continue
+            other = self.dialect.by_echo(rgb, echoed)
+            if other is None:
+                raise DeviceError(
+                    self.device,
+                    f"has levels {echoed} after it was told {told.echo}.",
+                    "Another program may be using it; open it again.",
+                )
+            _log.info(
+                "%s: its firmware %s scales colours to their largest channel (%s became %s); colour and "
+                "brightness are sent apart.",
+                self.device,
+                self.version,
+                rgb,
+                echoed,
+            )
+            self._dialect = other
+            self.set_color(rgb, channels)
+            return
 
     def darken_at_once(self) -> None:
         """Send what turns the light off, ahead of everything; whoever awaits a reply gets a StoppedError."""

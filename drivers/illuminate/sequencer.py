@@ -59,7 +59,7 @@ class Sequencer:
                     array.name,
                     f"pattern {place} ({pattern.description}) has {len(lit)} LEDs, more than firmware "
                     f"{array.link.version} takes in one command of {dialect.longest_line} bytes.",
-                    "Use fewer LEDs, set_pattern for each, or newer firmware.",
+                    "Use fewer LEDs, or set_pattern for each; for firmware 2 see longest_line.",
                 )
             commands.append(words)
         if len(colors) > 1:

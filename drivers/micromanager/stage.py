@@ -17,6 +17,8 @@ from drivers.stage import StageAxis
 
 _log = logging.getLogger(__name__)
 _XY_STAGE, _STAGE = 6, 5
+_NO_COMMAND = "Unsupported device command"
+"""How Micro-Manager's core says that an adapter has no such command (its error 11)."""
 
 
 class MicroManagerAxis(AxisOptions):
@@ -201,6 +203,8 @@ class MicroManagerStage(MicroManagerDevice, PolledStage):
             try:
                 part.call("home", "home")
             except DeviceError as error:
+                if _NO_COMMAND not in error.problem:
+                    raise
                 # Most of Micro-Manager's stages have no such command: their own count is the reference.
                 _log.warning(
                     "%s: %s keeps its own count as the reference: %s", self.name, label, error.problem

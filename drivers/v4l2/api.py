@@ -10,7 +10,20 @@ import fcntl
 import mmap
 import os
 import select
-from ctypes import Structure, Union, c_char, c_int32, c_int64, c_uint8, c_uint32, c_uint64, sizeof
+from ctypes import (
+    Array,
+    Structure,
+    Union,
+    c_char,
+    c_int32,
+    c_int64,
+    c_uint8,
+    c_uint16,
+    c_uint32,
+    c_uint64,
+    c_void_p,
+    sizeof,
+)
 from typing import Any, Protocol
 
 
@@ -96,10 +109,45 @@ class PixFormat(Structure):
     sizeimage: int
 
 
+class _PlaneFormat(Structure):
+    _pack_ = 1
+    _fields_ = (("sizeimage", c_uint32), ("bytesperline", c_uint32), ("reserved", c_uint16 * 6))
+    sizeimage: int
+    bytesperline: int
+
+
+class PixFormatPlanes(Structure):
+    """``v4l2_pix_format_mplane``: the format of a device whose buffers have memory planes."""
+
+    _pack_ = 1
+    _fields_ = (
+        ("width", c_uint32),
+        ("height", c_uint32),
+        ("pixelformat", c_uint32),
+        ("field", c_uint32),
+        ("colorspace", c_uint32),
+        ("plane_fmt", _PlaneFormat * 8),
+        ("num_planes", c_uint8),
+        ("rest", c_uint8 * 11),
+    )
+    width: int
+    height: int
+    pixelformat: int
+    field: int
+    plane_fmt: Array[_PlaneFormat]
+    num_planes: int
+
+
 class _FormatUnion(Union):
     # Other members of the kernel's union hold pointers: it is aligned to 8 bytes.
-    _fields_ = (("pix", PixFormat), ("raw_data", c_uint8 * 200), ("_align", c_uint64))
+    _fields_ = (
+        ("pix", PixFormat),
+        ("planes", PixFormatPlanes),
+        ("raw_data", c_uint8 * 200),
+        ("_align", c_uint64),
+    )
     pix: PixFormat
+    planes: PixFormatPlanes
 
 
 class Format(Structure):
@@ -164,8 +212,23 @@ class Timecode(Structure):
 
 
 class _Memory(Union):
-    _fields_ = (("offset", c_uint32), ("userptr", c_uint64), ("fd", c_int32))
+    _fields_ = (("offset", c_uint32), ("userptr", c_uint64), ("planes", c_void_p), ("fd", c_int32))
     offset: int
+    planes: int
+
+
+class Plane(Structure):
+    _fields_ = (
+        ("bytesused", c_uint32),
+        ("length", c_uint32),
+        ("m", _Memory),
+        ("data_offset", c_uint32),
+        ("reserved", c_uint32 * 11),
+    )
+    bytesused: int
+    length: int
+    m: _Memory
+    data_offset: int
 
 
 class Buffer(Structure):
@@ -193,6 +256,8 @@ class Buffer(Structure):
     memory: int
     m: _Memory
     length: int
+    plane: Plane | None = None
+    """What ``m.planes`` points to, kept as long as the buffer is: the kernel writes to it."""
 
 
 class BufferType(Structure):
@@ -320,9 +385,11 @@ G_SELECTION = _request(_READ | _WRITE, 94, Selection)
 S_SELECTION = _request(_READ | _WRITE, 95, Selection)
 
 BUF_TYPE_VIDEO_CAPTURE = 1
+BUF_TYPE_VIDEO_CAPTURE_MPLANE = 9
 MEMORY_MMAP = 1
 FIELD_NONE = 1
 CAP_VIDEO_CAPTURE = 0x1
+CAP_VIDEO_CAPTURE_MPLANE = 0x1000
 CAP_STREAMING = 0x04000000
 CAP_DEVICE_CAPS = 0x80000000
 BUF_FLAG_ERROR = 0x40
@@ -347,12 +414,16 @@ CTRL_TYPE_INTEGER_MENU = 9
 
 CID_BLACK_LEVEL = 0x0098090B
 CID_AUTO_WHITE_BALANCE = 0x0098090C
+CID_HUE_AUTO = 0x00980919
+CID_AUTO_BRIGHTNESS = 0x00980920
 CID_EXPOSURE = 0x00980911
 CID_AUTOGAIN = 0x00980912
 CID_GAIN = 0x00980913
 CID_EXPOSURE_AUTO = 0x009A0901
 CID_EXPOSURE_ABSOLUTE = 0x009A0902
 CID_EXPOSURE_AUTO_PRIORITY = 0x009A0903
+CID_FOCUS_AUTO = 0x009A090C
+CID_AUTO_N_PRESET_WHITE_BALANCE = 0x009A0914
 CID_ANALOGUE_GAIN = 0x009E0903
 EXPOSURE_MANUAL = 1
 EXPOSURE_SHUTTER_PRIORITY = 2

@@ -28,6 +28,10 @@ _AUTOMATICS = {
     api.CID_AUTOGAIN: 0,
     api.CID_EXPOSURE_AUTO_PRIORITY: 0,  # else the frame rate follows the exposure
     api.CID_AUTO_WHITE_BALANCE: 0,
+    api.CID_AUTO_N_PRESET_WHITE_BALANCE: 0,
+    api.CID_AUTO_BRIGHTNESS: 0,
+    api.CID_HUE_AUTO: 0,
+    api.CID_FOCUS_AUTO: 0,  # a lens that moves is another calibration
 }
 
 
@@ -125,10 +129,11 @@ class Controls:
             ) from None
 
     def switch_automatics_off(self) -> None:
-        """Have nothing set by the camera itself.
+        """Have nothing set by the camera itself; say what it did set until now.
 
         Raises DeviceError when its exposure cannot be set by hand.
         """
+        off = dict(_AUTOMATICS)
         auto = self.find(api.CID_EXPOSURE_AUTO)
         if auto is not None:
             manual = [
@@ -140,11 +145,20 @@ class Controls:
                     f"its exposure cannot be set by hand: {auto.name} offers {auto.range_text}.",
                     "Use another camera.",
                 )
-            self.set(auto, manual[0])
-        for number, off in _AUTOMATICS.items():
+            off = {api.CID_EXPOSURE_AUTO: manual[0]} | off
+        switched = []
+        for number, value in off.items():
             control = self.find(number)
-            if control is not None:
-                self.set(control, off)
+            if control is not None and self.get(control) != value:
+                self.set(control, value)
+                switched.append(control.name)
+        if switched:
+            _log.warning(
+                "%s: switched off what it set by itself (%s); what it had set stays until controls in "
+                "bench.toml say otherwise.",
+                self._device.name,
+                ", ".join(switched),
+            )
 
     def get(self, control: Control) -> int:
         """Read a control."""

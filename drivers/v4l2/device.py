@@ -6,7 +6,7 @@ import contextlib
 import errno
 import os
 from collections.abc import Callable, Iterator
-from ctypes import Structure
+from ctypes import Structure, addressof
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,8 @@ class VideoDevice:
         self._fd: int | None = None
         self._wake_fd = -1
         self._maps: list[Any] = []
+        self.buffer_type = api.BUF_TYPE_VIDEO_CAPTURE
+        """How the driver is spoken to: with memory planes (of which images here have one), or without."""
         self._requested = False
 
     @property
@@ -81,7 +83,12 @@ class VideoDevice:
         self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         try:
             found = self.capability()
-            if not found.device_caps & api.CAP_VIDEO_CAPTURE or not found.device_caps & api.CAP_STREAMING:
+            plain = bool(found.device_caps & api.CAP_VIDEO_CAPTURE)
+            planes = bool(found.device_caps & api.CAP_VIDEO_CAPTURE_MPLANE)
+            self.buffer_type = (
+                api.BUF_TYPE_VIDEO_CAPTURE_MPLANE if planes and not plain else api.BUF_TYPE_VIDEO_CAPTURE
+            )
+            if not (plain or planes) or not found.device_caps & api.CAP_STREAMING:
                 raise DeviceError(
                     self.name,
                     f"{self.path} is no camera that streams ({found.card.decode(errors='replace')}).",
@@ -155,7 +162,7 @@ class VideoDevice:
     # Buffers ---------------------------------------------------------------------------------------
     def start(self, n_buffers: int) -> int:
         """Queue buffers and start streaming; returns how many buffers the driver gave."""
-        request = api.RequestBuffers(count=n_buffers, type=api.BUF_TYPE_VIDEO_CAPTURE, memory=api.MEMORY_MMAP)
+        request = api.RequestBuffers(count=n_buffers, type=self.buffer_type, memory=api.MEMORY_MMAP)
         self.call(api.REQBUFS, request, "give buffers")
         self._requested = True
         with contextlib.suppress(BlockingIOError):
@@ -164,9 +171,10 @@ class VideoDevice:
         for index in range(request.count):
             buffer = self._buffer(index)
             self.call(api.QUERYBUF, buffer, "describe its buffers")
-            self._maps.append(self._kernel.map(self._fd, buffer.length, buffer.m.offset))
+            where = buffer.plane or buffer
+            self._maps.append(self._kernel.map(self._fd, where.length, where.m.offset))
             self.call(api.QBUF, buffer, "take its buffers")
-        self.call(api.STREAMON, api.BufferType(api.BUF_TYPE_VIDEO_CAPTURE), "start streaming")
+        self.call(api.STREAMON, api.BufferType(self.buffer_type), "start streaming")
         return int(request.count)
 
     def take(self, timeout_s: float) -> FilledBuffer | None:
@@ -184,7 +192,9 @@ class VideoDevice:
             waited = True
             if not self._kernel.wait(self._fd, self._wake_fd, timeout_s):
                 return None
-        data = np.frombuffer(self._maps[buffer.index], np.uint8, count=buffer.bytesused)
+        plane = buffer.plane
+        first, end = (0, buffer.bytesused) if plane is None else (plane.data_offset, plane.bytesused)
+        data = np.frombuffer(self._maps[buffer.index], np.uint8, count=end)[first:]
         time_ns = buffer.timestamp.tv_sec * 10**9 + buffer.timestamp.tv_usec * 10**3
         return FilledBuffer(buffer.index, data, buffer.sequence, buffer.flags, time_ns)
 
@@ -202,9 +212,9 @@ class VideoDevice:
         if not self._requested:
             return
         self._requested = False
-        none = api.RequestBuffers(count=0, type=api.BUF_TYPE_VIDEO_CAPTURE, memory=api.MEMORY_MMAP)
+        none = api.RequestBuffers(count=0, type=self.buffer_type, memory=api.MEMORY_MMAP)
         with contextlib.suppress(DeviceLostError):
-            self.attempt(api.STREAMOFF, api.BufferType(api.BUF_TYPE_VIDEO_CAPTURE))
+            self.attempt(api.STREAMOFF, api.BufferType(self.buffer_type))
         maps, self._maps = self._maps, []
         for memory in maps:
             with contextlib.suppress(BufferError):  # somebody still looks at it: it goes with the last look
@@ -213,7 +223,11 @@ class VideoDevice:
             self.attempt(api.REQBUFS, none)
 
     def _buffer(self, index: int) -> api.Buffer:
-        return api.Buffer(index=index, type=api.BUF_TYPE_VIDEO_CAPTURE, memory=api.MEMORY_MMAP)
+        buffer = api.Buffer(index=index, type=self.buffer_type, memory=api.MEMORY_MMAP)
+        if self.buffer_type == api.BUF_TYPE_VIDEO_CAPTURE_MPLANE:
+            buffer.plane = api.Plane()
+            buffer.m.planes, buffer.length = addressof(buffer.plane), 1
+        return buffer
 
     # Errors ----------------------------------------------------------------------------------------
     def _gone(self) -> DeviceLostError:

@@ -10,7 +10,7 @@ import numpy as np
 from drivers.common.pixels import Bytes, Packing, PixelFormat, Pixels, unpack
 from drivers.v4l2.api import fourcc
 
-Coding = Literal["plain", "YUYV luma", "YUYV colour", "MJPG luma", "MJPG colour"]
+Coding = Literal["plain", "YUYV", "UYVY", "NV12", "MJPG"]
 
 _JPEG_END = b"\xff\xd9"
 
@@ -28,7 +28,7 @@ class V4l2Format:
     pixels : PixelFormat
         What the image is, after decoding.
     coding : str
-        How to get there.
+        How to get there: luma into images of one channel, colours into those of three.
     """
 
     name: str
@@ -68,15 +68,22 @@ def _table() -> tuple[V4l2Format, ...]:
         found.append(_plain(p10, f"Bayer{order}10 (MIPI)", 10, "mipi 10"))
         found.append(_plain(p12, f"Bayer{order}12 (MIPI)", 12, "mipi 12"))
     mono, colour = PixelFormat("Mono8", 8, "bytes"), PixelFormat("RGB8", 8, "bytes", 3)
-    found += [
-        V4l2Format("Mono8 (YUYV)", fourcc("YUYV"), mono, "YUYV luma"),
-        V4l2Format("RGB8 (YUYV)", fourcc("YUYV"), colour, "YUYV colour"),
-        V4l2Format("Mono8 (MJPG)", fourcc("MJPG"), mono, "MJPG luma"),
-        V4l2Format("RGB8 (MJPG)", fourcc("MJPG"), colour, "MJPG colour"),
-    ]
+    codings: tuple[Coding, ...] = ("YUYV", "UYVY", "NV12", "MJPG")
+    for coding in codings:
+        found.append(V4l2Format(f"Mono8 ({coding})", fourcc(coding), mono, coding))
+        found.append(V4l2Format(f"RGB8 ({coding})", fourcc(coding), colour, coding))
     # The best for measuring first: many bits, unpacked, one sample a pixel, uncompressed.
     return tuple(
-        sorted(found, key=lambda f: (f.coding != "plain", f.pixels.channels, -f.pixels.bits, "(" in f.name))
+        sorted(
+            found,
+            key=lambda f: (
+                f.coding != "plain",
+                f.pixels.channels,
+                -f.pixels.bits,
+                f.coding == "MJPG",
+                "(" in f.name,
+            ),
+        )
     )
 
 
@@ -111,23 +118,42 @@ def decode(data: Bytes, wanted: V4l2Format, line_bytes: int, out: Pixels) -> boo
     match wanted.coding:
         case "plain":
             return unpack(data, wanted.pixels.packing, out, line_bytes)
-        case "YUYV luma" | "YUYV colour":
-            return _yuyv(data, line_bytes, out)
-        case "MJPG luma" | "MJPG colour":
+        case "YUYV" | "UYVY":
+            return _pairs(data, line_bytes, out, luma=wanted.coding.index("Y"))
+        case "NV12":
+            return _planes(data, line_bytes, out)
+        case "MJPG":
             return _jpeg(data, out)
 
 
-def _yuyv(data: Bytes, line_bytes: int, out: Pixels) -> bool:
+def _pairs(data: Bytes, line_bytes: int, out: Pixels, luma: int) -> bool:
+    """Decode pixels of two bytes, luma in byte ``luma`` and half of a chroma in the other."""
     height, width = out.shape[:2]
     pairs = np.empty((height, width * 2), np.uint8)
     if not unpack(data, "bytes", pairs, line_bytes):
         return False
     if out.ndim == 2:
-        out[...] = pairs[:, 0::2]
+        out[...] = pairs[:, luma::2]
     else:
         import cv2
 
-        cv2.cvtColor(pairs.reshape(height, width, 2), cv2.COLOR_YUV2RGB_YUYV, dst=out)
+        order = cv2.COLOR_YUV2RGB_UYVY if luma else cv2.COLOR_YUV2RGB_YUYV
+        cv2.cvtColor(pairs.reshape(height, width, 2), order, dst=out)
+    return True
+
+
+def _planes(data: Bytes, line_bytes: int, out: Pixels) -> bool:
+    """Decode the luma of all pixels, and behind it the chroma of each two by two."""
+    height, width = out.shape[:2]
+    lines = np.empty((height + (height + 1) // 2, width), np.uint8)
+    if height % 2 or width % 2 or not unpack(data, "bytes", lines, line_bytes):
+        return False
+    if out.ndim == 2:
+        out[...] = lines[:height]
+    else:
+        import cv2
+
+        cv2.cvtColor(lines, cv2.COLOR_YUV2RGB_NV12, dst=out)
     return True
 
 

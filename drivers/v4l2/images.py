@@ -22,7 +22,7 @@ def offered_formats(device: VideoDevice) -> tuple[V4l2Format, ...]:
 
     Raises DeviceError when there is none, naming those that it has.
     """
-    found = device.enumerate(api.ENUM_FMT, api.FormatDescription, type=api.BUF_TYPE_VIDEO_CAPTURE)
+    found = device.enumerate(api.ENUM_FMT, api.FormatDescription, type=device.buffer_type)
     codes = [item.pixelformat for item in found]
     formats = tuple(known for known in FORMATS if known.code in codes)
     if not formats:
@@ -30,7 +30,7 @@ def offered_formats(device: VideoDevice) -> tuple[V4l2Format, ...]:
         raise DeviceError(
             device.name,
             f"offers no pixel format that can be read here, only {listed}.",
-            "Readable are grey and Bayer of 8 to 16 bits, RGB, YUYV and MJPG.",
+            "Readable are grey and Bayer of 8 to 16 bits, RGB, YUYV, UYVY, NV12 and MJPG.",
         )
     return formats
 
@@ -51,17 +51,32 @@ def largest_shape(device: VideoDevice, code: int) -> tuple[int, int] | None:
 def set_format(device: VideoDevice, wanted: V4l2Format, shape: tuple[int, int] | None) -> api.PixFormat:
     """Set format and image size (None: as it is); returns what the driver made of them.
 
-    Raises DeviceError when the driver takes another format instead.
+    Raises DeviceError when the driver takes another format instead, or spreads an image over memory planes.
     """
-    asked = api.Format(type=api.BUF_TYPE_VIDEO_CAPTURE)
+    asked = api.Format(type=device.buffer_type)
     device.call(api.G_FMT, asked, "say its image format")
+    planes = device.buffer_type == api.BUF_TYPE_VIDEO_CAPTURE_MPLANE
+    image = asked.fmt.planes if planes else asked.fmt.pix
+    layout = asked.fmt.planes.plane_fmt[0] if planes else asked.fmt.pix
     if shape is not None:
-        asked.fmt.pix.height, asked.fmt.pix.width = shape
-    asked.fmt.pix.pixelformat = wanted.code
-    asked.fmt.pix.field = api.FIELD_NONE
-    asked.fmt.pix.bytesperline = asked.fmt.pix.sizeimage = 0
+        image.height, image.width = shape
+    image.pixelformat, image.field = wanted.code, api.FIELD_NONE
+    layout.bytesperline = layout.sizeimage = 0
     device.call(api.S_FMT, asked, f"take the image format {wanted.name}")
-    made = asked.fmt.pix
+    if planes and asked.fmt.planes.num_planes != 1:
+        raise DeviceError(
+            device.name,
+            f"spreads {wanted.name} over {asked.fmt.planes.num_planes} memory planes; one can be read here.",
+            "Choose another format.",
+        )
+    made = api.PixFormat(
+        width=image.width,
+        height=image.height,
+        pixelformat=image.pixelformat,
+        field=image.field,
+        bytesperline=layout.bytesperline,
+        sizeimage=layout.sizeimage,
+    )
     if made.pixelformat != wanted.code:
         raise DeviceError(
             device.name,
@@ -105,7 +120,7 @@ def frame_period_s(device: VideoDevice, frames_per_s: float | None) -> float | N
 
     None when the driver knows no frame rate.
     """
-    parm = api.StreamParm(type=api.BUF_TYPE_VIDEO_CAPTURE)
+    parm = api.StreamParm(type=device.buffer_type)
     if device.attempt(api.G_PARM, parm):
         return None
     if frames_per_s is not None and parm.parm.capture.capability & api.CAP_TIMEPERFRAME:

@@ -257,14 +257,13 @@ def _decode_tiff(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, 
 
 
 def _decode_with_opencv(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
-    loudness = cv2.utils.logging.setLogLevel(
-        cv2.utils.logging.LOG_LEVEL_SILENT
-    )  # a damaged file is told of once, in our words
     if data.startswith(_PNG_MAGIC) and not _png_is_whole(data):
         raise FileError(path, "is a damaged PNG: its parts are longer than the file, or out of order.")
     shape = _shape_by_header(data)
     if shape is not None:
         reading.require_plausible(path, 8 * math.prod(shape), len(data))
+    # A damaged file is told of once, in our words.
+    loudness = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except (cv2.error, MemoryError):

@@ -59,16 +59,24 @@ def _too_large(n_bytes: int, most: int) -> str:
     return f"has {size(n_bytes)}; a file of this kind has at most {size(most)}."
 
 
-_SMALL_BYTES = 1 << 28
+_SMALL_BYTES = 1 << 29
 _MOST_EXPANSION = 200
 """No photograph shrinks so much when it is compressed; a bomb or a damaged header does."""
 
 
 def require_plausible(
-    path: Path, n_bytes: int, stored_bytes: int, *, error: type[FileError] = FileError
+    path: Path,
+    n_bytes: int,
+    stored_bytes: int,
+    *,
+    small: int = _SMALL_BYTES,
+    error: type[FileError] = FileError,
 ) -> None:
-    """Refuse pixels that say they are far more than their file can hold, before memory is taken for them."""
-    if n_bytes > _SMALL_BYTES and n_bytes > _MOST_EXPANSION * stored_bytes:
+    """Refuse pixels that say they are far more than their file can hold, before memory is taken for them.
+
+    ``small`` bytes are taken whatever the file's size: sparse volumes and even masks shrink without end.
+    """
+    if n_bytes > small and n_bytes > _MOST_EXPANSION * stored_bytes:
         raise error(
             path,
             f"says that it holds {size(n_bytes)} in {size(stored_bytes)} of file: it is damaged, or made to "

@@ -14,7 +14,7 @@ from instrument.plan import BenchAbilities, Plan, check
 from instrument.runs.inspection import Verification, verify
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_control import RunControl
-from instrument.runs.run_files import SLM_IMAGES, RunError
+from instrument.runs.run_files import SLM_IMAGES, RunError, log_size
 from instrument.runs.runner import Runner, RunProgress
 from instrument.runs.writer import BenchRecord, RunWriter
 
@@ -148,10 +148,11 @@ def prepare_resume(
     bench cannot do what is left; DeviceError or BenchError when the camera does not take the settings of the
     run.
     """
-    findings = verify(Run.open(path), on_verify)  # before this program's own lock answers "running"
+    size = log_size(path)
+    findings = verify(_at_rest(path), on_verify)  # before this program's own lock answers "running"
     if findings.is_recording:
         raise RunError(Path(path), "is a recording; only runs of a plan can be continued.")
-    writer = RunWriter.reopen(path)
+    writer = RunWriter.reopen(path, log_bytes=size)
     try:
         run = Run.open(path)
         plan = run.plan
@@ -175,6 +176,14 @@ def _require_slm_images(findings: Verification, plan: Plan) -> None:
             raise RunError(image, "is not the image that the run began with.", "Put it back from a backup.")
 
 
+def _at_rest(path: Path | str) -> Run:
+    """Return a run that no program writes to; raises RunError where one does."""
+    run = Run.open(path)
+    if run.is_being_written:
+        raise RunError(run.path, "another program is writing to this run.", "Wait until it ends.")
+    return run
+
+
 def settle_recording(path: Path | str, on_verify: Callable[[int, int], None] | None = None) -> list[str]:
     """Mend a recording's files, and mark frames that are missing or damaged as lost; returns it in words.
 
@@ -182,10 +191,11 @@ def settle_recording(path: Path | str, on_verify: Callable[[int, int], None] | N
 
     Raises RunError when some program writes to it, or its log is another run's.
     """
-    found = verify(Run.open(path), on_verify)
+    size = log_size(path)
+    found = verify(_at_rest(path), on_verify)
     if found.is_sound and found.condition is not RunCondition.CRASHED:
         return []
-    with RunWriter.reopen(path) as writer:
+    with RunWriter.reopen(path, log_bytes=size) as writer:
         words = [*(writer.mended or ()), *writer.settle({f.index: f.problem for f in found.damaged})]
         reason, error = FinishReason.ABORTED, "its program ended without finishing it"
         if found.condition is RunCondition.CRASHED:

@@ -139,3 +139,11 @@ def _identifier(provenance: str | None) -> Any:
     except ValueError:
         return None
     return found.get("id") if isinstance(found, dict) else None
+
+
+def log_size(path: Path | str) -> int:
+    """Return the bytes of a run's log, 0 without one: it grows with everything that is written."""
+    try:
+        return (Path(path) / LOG).stat().st_size
+    except OSError:
+        return 0

@@ -43,6 +43,7 @@ from instrument.runs.run_files import (
     SLM_IMAGES,
     STATE,
     RunError,
+    log_size,
     slm_image_name,
 )
 
@@ -103,6 +104,8 @@ def _disk(path: Path, what: str) -> Iterator[None]:
 
 _FULL, _FORBIDDEN = (errno.ENOSPC, errno.EDQUOT), (errno.EACCES, errno.EPERM, errno.EROFS)
 _FIRST_CAPACITY = 256
+_TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]+)?")
+"""Names that a file has while it is written whole."""
 """Frames that a recording's array is made for at first; it doubles as needed."""
 
 
@@ -217,17 +220,22 @@ class RunWriter:
         return cls(path, held)
 
     @classmethod
-    def reopen(cls, path: Path | str) -> RunWriter:
+    def reopen(cls, path: Path | str, *, log_bytes: int | None = None) -> RunWriter:
         """Open a run folder to continue it; its damaged files are made again (``mended`` says which).
 
-        Raises RunError when it is no run, some program writes to it now, or its log is another run's.
+        ``log_bytes`` is the log's size when the run was looked at: what was found then still holds.
+
+        Raises RunError when it is no run, some program writes to it now or has since it was looked at, or its
+        log is another run's.
         """
         path = Run.open(path).path
         with _disk(path, "cannot be continued"):
             held = lock_run(path)
             try:
+                if log_bytes not in (None, log_size(path)):
+                    raise RunError(path, "was written to while it was looked at.", "Try once more.")
                 for leftover in path.glob(".*"):  # of a write that a crash cut off
-                    if leftover.is_file():
+                    if leftover.is_file() and _TEMPORARY.fullmatch(leftover.name):
                         leftover.unlink()
                 mended = mend_files(path)
             except BaseException:

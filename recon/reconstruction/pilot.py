@@ -80,7 +80,8 @@ def pilot(
         outcome = offered.make(part, None).run(rules, cancel=cancel)
         solution = np.maximum(part.lifted(outcome.solution), 0)
         background = None if part.removal is None else part.background(solution)
-        left = part.data - part.camera.forward(solution)
+        # Of the data as measured: a background holds what was expected of it.
+        left = problem.data.astype(part.dtype, copy=False) - part.camera.forward(solution)
         if background is not None:
             left -= background
         return Pilot(solution, background, left, part.weight, outcome)

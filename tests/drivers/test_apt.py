@@ -50,6 +50,7 @@ def rack(tmp_path: Path) -> Iterator[AptController]:
     controller = AptController(tmp_path / "rack", "BSC203", axes, 70_000_001)
     yield controller
     controller.close()
+    assert controller.strange == []
 
 
 @pytest.fixture
@@ -76,6 +77,33 @@ def rack_axis(controller: AptController, bay: int, **more: object) -> dict[str, 
 def inertia_axis(controller: AptController, channel: int, **more: object) -> dict[str, object]:
     place = {"port": str(controller.port.link), "controller": "KIM101", "channel": channel}
     return place | {"counts_per_mm": 50_000.0, "lower_limit": -60.0, "upper_limit": 60.0} | more
+
+
+@pytest.mark.parametrize(
+    ("model", "controller", "actuator", "axis", "counts"),
+    [
+        ("KST101", "KST101", "ZST213", "x_um", 2008.64563),
+        ("LTS300", "LTS", "LTS300", "x_um", 409.6),
+        ("K10CR1", "K10CR1", "K10CR1", "yaw_mrad", 409_600 * 120 / 6283.185307),
+    ],
+)
+def test_stepper_units_without_a_rack(
+    tmp_path: Path, model: str, controller: str, actuator: str, axis: str, counts: float
+) -> None:
+    emulated = AptController(tmp_path / "unit", model, [MovingAxis(0, 200_000_000, 3e7, 0)], 45_000_001)
+    place = {"port": str(emulated.port.link), "controller": controller, "actuator": actuator}
+    with stage_of(**{axis: place}) as stage:
+        stage.home()
+        assert stage.move_to({axis: 1000.0})[axis] == pytest.approx(1000.0, abs=1 / counts)
+        assert emulated.axes[0].motion.place == pytest.approx(1000 * counts, abs=1)
+    emulated.close()
+    assert emulated.strange == []
+
+
+def test_what_is_built_into_a_controller_is_driven_by_no_other() -> None:
+    for controller, actuator in (("KST101", "LTS150"), ("LTS", "NRT150"), ("K10CR1", "LTS300")):
+        with pytest.raises(ValidationError, match=f"a {controller} cannot drive a {actuator}"):
+            stage_of(x_um={"port": "/dev/none", "controller": controller, "actuator": actuator})
 
 
 @pytest.fixture

@@ -38,6 +38,7 @@ def plain(tmp_path: Path) -> Iterator[GrblController]:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests of silence: less of it."""
     monkeypatch.setattr(GrblStage, "reply_s", 0.4)
+    monkeypatch.setattr(GrblStage, "meet_s", 0.8)
 
 
 def stage_on(board: GrblController, **options: object) -> GrblStage:
@@ -359,6 +360,38 @@ def test_homing_switched_off_says_what_to_do(plain: GrblController) -> None:
         stage.home()
 
 
+HERE = {"homing": "here", "axes": {"x_um": {"lower_limit": -9e3, "upper_limit": 9e3}}}
+
+
+@pytest.mark.parametrize("while_open", [False, True])
+def test_without_homing_an_alarm_is_unlocked_by_who_asks_for_it(
+    plain: GrblController, *, while_open: bool
+) -> None:
+    plain.settings |= {20: 0, 21: 1, 22: 0}
+    if not while_open:
+        plain._raise_alarm(3, critical=False)
+    with stage_on(plain, **HERE) as stage:
+        if while_open:
+            plain.press_reset()
+            stage.home()
+            stage.move_to({"x_um": 100.0})
+            plain.hit_limit_switch()
+            wait_until(lambda: not stage.is_homed)
+        with pytest.raises(DeviceError, match=r"locked by an alarm.*is lost then.*unlock\(\) from Python"):
+            stage.home()
+        stage.unlock()
+        assert not stage.is_homed
+        with pytest.raises(DeviceError, match="was unlocked: its position has no reference"):
+            stage.move_to({"x_um": 50.0})
+        stage.home()
+        assert stage.move_to({"x_um": 50.0}) == pytest.approx({"x_um": 50.0}, abs=4.0)
+
+
+def test_what_homes_by_switches_is_not_unlocked(plain_stage: GrblStage) -> None:
+    with pytest.raises(DeviceError, match=r"homes by its switches.*Home it"):
+        plain_stage.unlock()
+
+
 def test_soft_limits_switched_off_are_warned_of(
     plain: GrblController, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -395,8 +428,10 @@ def test_probe_recognises_a_controller(board: GrblController, monkeypatch: pytes
     assert ("grblHAL" if board.hal else "GRBL 1.1h") in found.description
     assert "3 axes" in found.description
     board.silent = True
-    monkeypatch.setattr(GrblStage, "reply_s", 0.1)
+    monkeypatch.setattr(GrblStage, "meet_s", 0.2)
+    before = board.received.count(b"\x18")
     assert GrblStage.probe(str(board.link)) is None
+    assert board.received.count(b"\x18") == before, "probing resets nobody"
 
 
 # Faults ------------------------------------------------------------------------------------------
@@ -442,7 +477,7 @@ def test_a_late_ok_is_not_taken_for_the_next_moves(plain: GrblController, plain_
 
 
 def test_silence_is_an_error_in_words(plain: GrblController, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(GrblStage, "reply_s", 0.1)
+    monkeypatch.setattr(GrblStage, "meet_s", 0.4)
     plain.silent = True
     with pytest.raises(
         DeviceTimeoutError,

@@ -17,16 +17,18 @@ from instrument.plan.led_shapes import BrightField
 from tests.mocks.illuminate_emulator import IlluminateEmulator
 from tests.mocks.pty_device import Answer
 
-VERSIONS = ("1.32", "2.32")
+BUILDS = {"1.32": ("1.32", False), "1.32 of 2021": ("1.32", True), "2.32": ("2.32", True)}
+"""Version, and whether ``sc`` scales colours."""
 
 
 def driver_of(array: IlluminateEmulator, **options: object) -> IlluminateLedArray:
     return IlluminateLedArray(IlluminateOptions.model_validate({"port": str(array.link), **options}))
 
 
-@pytest.fixture(params=VERSIONS)
+@pytest.fixture(params=BUILDS)
 def array(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[IlluminateEmulator]:
-    array = IlluminateEmulator(tmp_path, request.param)
+    version, normalises = BUILDS[request.param]
+    array = IlluminateEmulator(tmp_path, version, normalises=normalises)
     yield array
     array.unplug()
     assert array.corrupted == []
@@ -100,6 +102,44 @@ def test_leds_shine_with_exactly_the_levels_asked_for(
     expected = np.zeros_like(array.lit)
     expected[[led for led, _ in pattern.levels]] = rgb
     np.testing.assert_array_equal(array.lit, expected)
+
+
+def test_firmware_that_scales_colours_shows_every_level_exactly(tmp_path: Path) -> None:
+    array = IlluminateEmulator(tmp_path, "1.32", normalises=True)
+    with driver_of(array) as leds:
+        for level in range(1, 256):
+            rgb = (level, level // 3, max(level - 1, 0))
+            leds.set_pattern(leds.single(0, rgb))
+            assert tuple(array.lit[0]) == rgb
+        leds.sequencer.load([leds.single(3, (9, 9, 9)), LedPattern("dark")])
+        thread, outcome = in_background(lambda: leds.sequencer.run(300))
+        wait_until(lambda: array.lit[3].all())
+        assert array.lit[3].tolist() == [9, 9, 9]
+        thread.join(20)
+        assert outcome == [None]
+    array.unplug()
+
+
+def test_lines_are_short_where_the_parser_loses_bytes(tmp_path: Path) -> None:
+    for waits, longest_line in ((False, 64), (True, 8192)):
+        array = IlluminateEmulator(tmp_path, "2.32", waits=waits)
+        with driver_of(array, longest_line=longest_line) as leds:
+            pattern = LedPattern("many", tuple((led, (5, 5, 5)) for led in range(100, 200)))
+            leds.set_pattern(pattern)
+            assert array.lit[:, 0].nonzero()[0].tolist() == list(range(100, 200))
+            assert max(map(len, array.received)) < longest_line
+            if waits:
+                leds.sequencer.load([pattern])
+                assert array.sequence == [tuple(range(100, 200))]
+            else:
+                with pytest.raises(LimitError, match="for firmware 2 see longest_line"):
+                    leds.sequencer.load([pattern])
+        array.unplug()
+    lossy = IlluminateEmulator(tmp_path, "2.32")
+    with driver_of(lossy, longest_line=8192) as leds:
+        leds.set_pattern(pattern)
+        assert lossy.lit[:, 0].nonzero()[0].tolist() != list(range(100, 200))  # what short lines avoid
+    lossy.unplug()
 
 
 def test_several_colours_at_once_and_then_one_leaves_nothing_behind(

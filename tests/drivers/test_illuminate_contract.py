@@ -1,4 +1,4 @@
-"""The Illuminate driver keeps the LED arrays' contract, over firmware 1.32 and 2.32."""
+"""The Illuminate driver keeps the LED arrays' contract, over firmware 1.32, old and new, 2.26 and 2.32."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from tests.mocks.illuminate_emulator import IlluminateEmulator
 
 class IlluminateContract(LedArrayContract):
     version: str
+    normalises = False
 
     @pytest.fixture(autouse=True)
     def _array(self, tmp_path: Path) -> Iterator[None]:
-        self.array = IlluminateEmulator(tmp_path, self.version)
+        self.array = IlluminateEmulator(tmp_path, self.version, normalises=self.normalises)
         yield
         self.array.unplug()
         assert self.array.corrupted == []
@@ -31,5 +32,14 @@ class TestFirmware1(IlluminateContract):
     version = "1.32"
 
 
-class TestFirmware2(IlluminateContract):
+class TestNormalisingFirmware1(IlluminateContract):
+    version = "1.32"
+    normalises = True
+
+
+class TestFirmware226(IlluminateContract):
+    version = "2.26"
+
+
+class TestFirmware232(IlluminateContract):
     version = "2.32"

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import threading
 
+from PySide6.QtWidgets import QProgressBar
 from pytestqt.qtbot import QtBot
+from shiboken6 import delete
 
 from gui.background import NewestOnly
 from gui.jobs import JobRunner
@@ -58,4 +60,29 @@ def test_everything_that_is_to_be_closed_is_closed(qtbot: QtBot) -> None:
     go_on.set()
     qtbot.waitUntil(lambda: len(closed) == 3, timeout=WAIT_MS)
     assert closed == ["first", "second", "read"]
+    assert jobs.join(10)
+
+
+def test_what_is_read_for_a_widget_that_was_closed_meanwhile_is_dropped(qtbot: QtBot) -> None:
+    jobs = JobRunner()
+    failures: list[str] = []
+    reader = NewestOnly(jobs, "reading", failures.append)
+    go_on, begun = threading.Event(), threading.Event()
+
+    class Bar(QProgressBar):
+        def show_value(self, value: int) -> None:
+            self.setValue(value)  # raises once the widget is gone
+
+    def read() -> int:
+        begun.set()
+        go_on.wait(20)
+        return 1
+
+    bar = Bar()
+    reader.ask(read, bar.show_value)
+    qtbot.waitUntil(begun.is_set, timeout=WAIT_MS)
+    delete(bar)
+    go_on.set()
+    qtbot.waitUntil(lambda: not reader.is_reading, timeout=WAIT_MS)  # an exception in Qt's loop would fail it
+    assert failures == []
     assert jobs.join(10)

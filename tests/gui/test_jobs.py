@@ -184,3 +184,18 @@ def test_no_job_that_waits_begins_while_those_before_it_are_cancelled(qtbot: QtB
     qtbot.waitUntil(lambda: first.is_over, timeout=WAIT_MS)
     assert jobs.join(WAIT_MS / 1000)
     assert begun == []
+
+
+def test_jobs_end_without_a_word_once_what_shows_them_is_gone(jobs: JobRunner, qtbot: QtBot) -> None:
+    go_on = threading.Event()
+    heard: list[object] = []
+    running = jobs.compute("looking", lambda _: go_on.wait(20))
+    running.succeeded.connect(heard.append)
+    qtbot.waitUntil(lambda: running.state is JobState.RUNNING, timeout=WAIT_MS)
+    jobs.silence()
+    later = jobs.compute("looking again", lambda _: 1)
+    later.ended.connect(lambda: heard.append("ended"))
+    go_on.set()
+    qtbot.waitUntil(lambda: running.is_over and later.is_over, timeout=WAIT_MS)
+    assert heard == []
+    assert not jobs.jobs

@@ -22,6 +22,10 @@ HDMI = {"device": NODE, "pixel_pitch_um": 3.0, "input": 1}
 GREYS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16, "Mono16 (big endian)": 16}
 
 
+WITHOUT_OUTPUTS = ("num_outputs=0", "node_types=0x1")
+VIVID = ("vivid", "n_devs=1", "num_inputs=2", "input_types=12", *WITHOUT_OUTPUTS, "no_error_inj=0")
+
+
 @pytest.fixture
 def camera() -> Iterator[V4l2Camera]:
     with V4l2Camera(V4l2Camera.Options(**WEBCAM)) as camera:
@@ -232,19 +236,32 @@ def test_unplugging_is_an_error_that_names_the_device_and_opening_again_restores
     remove_module("vivid")
     with pytest.raises(DeviceError, match="there is no"):
         camera.open()
-    load_module(
-        "vivid",
-        "n_devs=1",
-        "num_inputs=2",
-        "input_types=12",
-        "num_outputs=0",
-        "node_types=0x1",
-        "no_error_inj=0",
-    )
+    load_module(*VIVID)
     camera.open()
     assert (camera.pixel_format, camera.gain, camera.roi) == ("Mono12", 33.0, Roi(10, 20, 50, 60))
     assert camera.snap().image.shape == (50, 60)
     camera.close()
+
+
+@pytest.mark.parametrize("planes", [1, 2], ids=["without planes", "with planes"])
+def test_video_formats_with_and_without_memory_planes(planes: int) -> None:
+    remove_module("vivid")
+    load_module(*VIVID, f"multiplanar={planes}")
+    try:
+        with V4l2Camera(V4l2Camera.Options(**WEBCAM)) as camera:
+            camera.set_control("osd_text_mode", 2)
+            for name in ("RGB8", "RGB8 (YUYV)", "RGB8 (UYVY)", "RGB8 (NV12)"):
+                camera.set_pixel_format(name)
+                image = camera.snap().image
+                white, yellow, cyan = (image[90, 20 + 40 * bar].astype(int) for bar in range(3))
+                assert np.ptp(white) <= 12, name
+                assert yellow[2] < 12 < yellow[0], name
+                assert cyan[0] < 12 < cyan[1], name
+            camera.set_pixel_format("Mono8 (NV12)")
+            np.testing.assert_allclose(camera.snap().image[90, 20], 180, atol=12)
+    finally:
+        remove_module("vivid")
+        load_module(*VIVID)
 
 
 def _fetch(camera: V4l2Camera, n_frames: int) -> None:

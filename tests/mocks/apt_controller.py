@@ -39,7 +39,7 @@ class AptAxis:
 
 
 class AptController:
-    """A KDC101, TDC001, BSC20x or KIM101; ``spoil`` holds what is to be done to the next replies."""
+    """A controller of each type; ``spoil`` holds what is to be done to the next replies."""
 
     def __init__(
         self,
@@ -55,6 +55,8 @@ class AptController:
         self.spoil: list[Callable[[bytes], list[Answer]]] = []
         self.driven = 0
         """The channel that a KIM101 can move."""
+        self.strange: list[int] = []
+        """Numbers of messages that this type does not know."""
         self._unacknowledged = 0
         self._servo = model[:3] in ("KDC", "TDC")
         self._scale = 65_536 * 2048 / 6e6 if self._servo else 53.68
@@ -139,8 +141,10 @@ class AptController:
                 return self._counted(self._long(0x0491, to, self._status(axis)))
             case 0x0480 if not self._servo:
                 return self._counted(self._long(0x0481, to, self._status(axis)))
-            case 0x0492:
+            case 0x0492 if self._servo:
                 self._unacknowledged = 0
+            case 0x0492 | 0x0490 | 0x0480:
+                self.strange.append(number)
             case 0x0210:
                 axis.enabled = second == 1
             case 0x0211:

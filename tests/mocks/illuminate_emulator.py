@@ -3,7 +3,8 @@
 Written from the firmware's command list and README; it has the firmware's traps on purpose: errors without a
 terminator (2.x), a command longer than a USB packet lost and what came during a command thrown away (1.x), no
 bounds check (``corrupted`` lists what was written beyond the LEDs), single-digit ``na``, commas missing in
-its JSON, and colours scaled to their largest channel (2.x).
+its JSON, colours scaled to their largest channel (2.x, and 1.32 as built since 2021), and a byte lost
+wherever a line goes on in another USB packet (2.x).
 """
 
 from __future__ import annotations
@@ -44,10 +45,21 @@ class IlluminateEmulator(PtyDevice):
     """``lit`` is what shines: ``(n_leds, 3)`` levels. ``fault(command, reply)`` spoils what is sent."""
 
     def __init__(
-        self, folder: Path, version: str = "2.32", *, n_leds: int = 257, channels: int = 3, lines: int = 2
+        self,
+        folder: Path,
+        version: str = "2.32",
+        *,
+        n_leds: int = 257,
+        channels: int = 3,
+        lines: int = 2,
+        normalises: bool = False,
+        waits: bool = False,
     ) -> None:
         self.version = version
         self.old = version.startswith("1.")
+        self.normalises = normalises or not self.old
+        self.waits = waits
+        """Whether firmware 2 waits for a line's next packet."""
         self.channels, self.lines = channels, lines
         self.places_mm = round_array(n_leds)
         self.fault: Callable[[bytes, bytes], list[Answer]] | None = None
@@ -109,6 +121,10 @@ class IlluminateEmulator(PtyDevice):
         if not line:
             return
         self.received.append(line)
+        if not self.waits:
+            line = b"".join(
+                line[at + bool(at) : at + PACKET_BYTES] for at in range(0, len(line) + 1, PACKET_BYTES)
+            )
         words = [word for word in line.decode(errors="replace").split(".") if word]
         try:
             reply = self._execute(words, master, stopping) + b"-==-\n"
@@ -210,7 +226,9 @@ class IlluminateEmulator(PtyDevice):
     def _set_brightness(self, rest: list[str]) -> bytes:
         if rest:
             self.brightness = 255 if rest[0] == "max" else int(rest[0]) % 256
-        self.value = [math.ceil(color / 255 * self.brightness) for color in self.color]
+        self.value = [
+            math.ceil(np.float32(color) / np.float32(255) * self.brightness) for color in self.color
+        ]
         return self._say(f"SB.{self.brightness}", f"Current brightness value is {self.brightness}.")
 
     def _set_color(self, rest: list[str]) -> bytes:
@@ -218,9 +236,9 @@ class IlluminateEmulator(PtyDevice):
             raise RefusedError(8)
         if rest:
             self.color = [int(word) % 256 for word in rest]
-        if not self.old:
+        if self.normalises:
             largest = max(self.color) or 1
-            self.color = [round(255 * color / largest) for color in self.color]
+            self.color = [math.floor(255 * color / largest + 0.5) for color in self.color]
         self.value = [int(np.float32(color) / np.float32(255) * self.brightness) for color in self.color]
         numbers = ".".join(map(str, self.color))
         return self._say(f"CO.{numbers}", f"Current color value is {numbers}")

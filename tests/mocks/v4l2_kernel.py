@@ -25,7 +25,7 @@ G_CTRL, S_CTRL, QUERYCTRL, QUERYMENU = 0xC008561B, 0xC008561C, 0xC0445624, 0xC02
 ENUM_FRAMESIZES, G_SELECTION, S_SELECTION = 0xC02C564A, 0xC040565E, 0xC040565F
 
 EXPOSURE, AUTO_EXPOSURE, GAIN, AUTOGAIN, BLACK = 0x9A0902, 0x9A0901, 0x980913, 0x980912, 0x98090B
-_BYTES = {"GREY": 1, "RGGB": 1, "Y10 ": 2, "Y16 ": 2, "RG10": 2, "YUYV": 2, "RGB3": 3}
+_BYTES = {"GREY": 1, "RGGB": 1, "Y10 ": 2, "Y16 ": 2, "RG10": 2, "YUYV": 2, "UYVY": 2, "NV12": 1, "RGB3": 3}
 
 
 @dataclass
@@ -91,6 +91,8 @@ class FakeKernel:
         """Sequence numbers that the camera loses."""
         self.damaged: set[int] = set()
         self.numbered = True
+        self.planes = 0
+        """Memory planes of an image; 0: the driver does not speak of planes."""
         self.start_of_exposure = False
         self.clock_flags = 0x2000
         self.refuse: dict[int, int] = {}
@@ -181,14 +183,24 @@ class FakeKernel:
         return errno.ENOTTY if handler is None else handler(data) or 0
 
     # What it is ------------------------------------------------------------------------------------
+    @property
+    def _kind(self) -> int:
+        return 9 if self.planes else 1
+
     def _querycap(self, d: object) -> None:
-        struct.pack_into(
-            "16s32s32sIII", d, 0, b"fakecam", b"Fake Camera", b"usb-1", 0x6010A, 0x84200001, 0x04200001
-        )
+        here = 0x04201000 if self.planes else 0x04200001
+        row = (b"fakecam", b"Fake Camera", b"usb-1", 0x6010A, 0x80000000 | here, here)
+        struct.pack_into("16s32s32sIII", d, 0, *row)
+
+    def _plane(self, d: object) -> object:
+        """The plane that a buffer points to."""
+        (address,) = struct.unpack_from("Q", d, 64)
+        assert struct.unpack_from("I", d, 72) == (1,)
+        return (c_char * 64).from_address(address)
 
     def _enum_fmt(self, d: object) -> int:
         index, kind = struct.unpack_from("II", d, 0)
-        if kind != 1 or index >= len(self.formats):
+        if kind != self._kind or index >= len(self.formats):
             return errno.EINVAL
         struct.pack_into("4s", d, 44, self.formats[index].encode())
         return 0
@@ -206,10 +218,15 @@ class FakeKernel:
         if self.code == "MJPG":
             return 0, self.size[0] * self.size[1] * 3
         line = self.size[1] * _BYTES[self.code] + self.line_padding
-        return line, line * self.size[0]
+        return line, line * self.size[0] * (3 if self.code == "NV12" else 2) // 2
 
     def _g_fmt(self, d: object) -> None:
         line, n_bytes = self._layout()
+        if self.planes:
+            struct.pack_into("II4sI", d, 8, self.size[1], self.size[0], self.code.encode(), 1)
+            struct.pack_into("II", d, 28, n_bytes, line)
+            struct.pack_into("B", d, 188, self.planes)
+            return
         struct.pack_into("II4sIII", d, 8, self.size[1], self.size[0], self.code.encode(), 1, line, n_bytes)
 
     def _s_fmt(self, d: object) -> int:
@@ -293,7 +310,7 @@ class FakeKernel:
     # Buffers ---------------------------------------------------------------------------------------
     def _reqbufs(self, d: object) -> int:
         count, kind, memory = struct.unpack_from("III", d, 0)
-        assert (kind, memory) == (1, 1)
+        assert (kind, memory) == (self._kind, 1)
         count = max(count, 2) if count else 0
         self.memory = [bytearray(self._layout()[1]) for _ in range(count)]
         self.queued.clear()
@@ -303,11 +320,16 @@ class FakeKernel:
 
     def _querybuf(self, d: object) -> None:
         (index,) = struct.unpack_from("I", d, 0)
+        if self.planes:
+            struct.pack_into("III", self._plane(d), 0, 0, len(self.memory[index]), index << 12)
+            return
         struct.pack_into("I4xI", d, 64, index << 12, len(self.memory[index]))
 
     def _qbuf(self, d: object) -> int:
         (index,) = struct.unpack_from("I", d, 0)
         self._expose()
+        if self.planes:
+            struct.pack_into("8xI", self._plane(d), 0, index << 12)  # the kernel writes it back
         assert index not in self.queued
         self.queued.append(index)
         return 0
@@ -325,7 +347,10 @@ class FakeKernel:
         if self.start_of_exposure:
             flags |= 0x10000
             ended -= self.controls[EXPOSURE].value * 1e-4
-        struct.pack_into("IIII", d, 0, index, 1, used, flags)
+        if self.planes:
+            struct.pack_into("I", self._plane(d), 0, used)
+            used = 0
+        struct.pack_into("IIII", d, 0, index, self._kind, used, flags)
         struct.pack_into("qq", d, 24, int(ended), int(ended % 1 * 1e6))
         struct.pack_into("II", d, 56, sequence if self.numbered else 0, 1)
         return 0
@@ -365,19 +390,22 @@ class FakeKernel:
         height, width = self.size
         if self.image is not None:
             return self.image(sequence, height, width)
-        line, _ = self._layout()
+        line, n_bytes_of_all = self._layout()
         top, left = self.crop[:2]
         rows, columns = np.mgrid[top : top + height, left : left + width]
         counts = (rows * 7 + columns * 3 + sequence) % (1 << (10 if "10" in self.code else 8))
-        row_bytes = np.full((height, line), 0xEE, np.uint8)
+        row_bytes = np.full((n_bytes_of_all // line, line), 0xEE, np.uint8)
         n_bytes = _BYTES[self.code]
-        if n_bytes == 2 and self.code != "YUYV":
+        if n_bytes == 2 and self.code not in ("YUYV", "UYVY"):
             row_bytes[:, : width * 2] = (
                 (counts * (257 if "16" in self.code else 1)).astype("<u2").view(np.uint8)
             )
-        elif self.code == "YUYV":
+        elif self.code in ("YUYV", "UYVY"):
             row_bytes[:, : width * 2] = 128
-            row_bytes[:, : width * 2 : 2] = counts
+            row_bytes[:, self.code.index("Y") : width * 2 : 2] = counts
+        elif self.code == "NV12":
+            row_bytes[:height, :width] = counts
+            row_bytes[height:, :width] = 128
         else:
             row_bytes[:, : width * n_bytes] = np.repeat(counts, n_bytes, axis=1).astype(np.uint8)
         return row_bytes.tobytes()

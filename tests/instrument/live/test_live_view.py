@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -39,7 +40,7 @@ class Slow(LiveReconstructor):
     """Takes a time for each picture, and remembers what it was fed."""
 
     def __init__(self, seconds: float) -> None:
-        self.seconds = seconds
+        self.work: Callable[[], object] = lambda: time.sleep(seconds)
         self.warnings = ()
         self.fed: list[int] = []
         self.at_once = threading.Semaphore(1)
@@ -50,7 +51,7 @@ class Slow(LiveReconstructor):
         assert self.at_once.acquire(blocking=False)
         self.fed.append(int(image[0, 0]) % 1000)
         self.refined = 0
-        time.sleep(self.seconds)
+        self.work()
         self.at_once.release()
         return self._picture(0)
 
@@ -69,8 +70,17 @@ def test_the_newest_frame_is_next_and_no_queue_grows() -> None:
     camera.deep_ring = 1000
     slow = Slow(0.03)
     stream = FrameStream(camera, 3)
+
+    def six_frames() -> None:
+        """Take as long as six more frames do, however busy the machine."""
+        while stream.ring and int(stream.ring[-1].frame.image[0, 0]) % 1000 < slow.fed[-1] + 6:
+            time.sleep(0.002)
+
+    slow.work = six_frames
     with LiveView(stream, slow) as view:
-        time.sleep(0.6)
+        seen = None
+        for _ in range(8):
+            seen = view.wait_newer(seen, 20.0)
         status = view.status
         assert len(stream.ring) <= 3
     gaps = np.diff(slow.fed)

@@ -20,9 +20,14 @@ from recon.priors import (
     NamedPrior,
     NonNegativity,
     Prior,
+    Sum,
     TotalVariation,
     Zero,
 )
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.solvers import SOLVERS
 from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules
 from recon.solvers.douglas_rachford import DouglasRachford, SparseDouglasRachford
 from recon.solvers.operator_admm import OperatorAdmm
@@ -259,3 +264,11 @@ def test_each_prior_has_its_solver():
         assert type(volume_solver(camera, measured, prior)) is kind
     with pytest.raises(StructureError, match="HaarTotalVariation"):
         volume_solver(camera, measured, HaarTotalVariation(1.0))
+
+
+def test_a_sum_without_a_common_prox_is_refused_by_fista_before_the_work() -> None:
+    scene = np.random.default_rng(0).random((16, 16))
+    problem = Problem.of(
+        Measurement(scene), scene**4, ReconstructionOptions(prior=Sum(L1(1.0), TotalVariation(1.0)))
+    )
+    assert "without a common prox" in str(SOLVERS["fista"].accepts(problem))
