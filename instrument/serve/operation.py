@@ -59,8 +59,10 @@ class Operation:
     def __init__(self, config: BenchConfig, say: Callable[[str], None]) -> None:
         self.config = config
         self._say = say
-        self._taking = threading.RLock()
+        self._taking, self._dropping = threading.RLock(), threading.Lock()
         self._bench: Bench | None = None
+        self._dropped: Bench | None = None
+        """One whose operation is being ended: once is enough, however many connections break."""
         self._holds: dict[Kind, _Hold] = {}
         self.operator: Operator | None = None
         self.newest_frame: Frame | None = None
@@ -123,9 +125,13 @@ class Operation:
 
         Raises StepsFailedError naming what could not be made safe; all was tried.
         """
-        bench = self._bench
-        if bench is None or self.operator is None or self.operator.key != operator.key:
-            return
+        with self._dropping:
+            bench = self._bench
+            if bench is None or self.operator is None or self.operator.key != operator.key:
+                return
+            if self._dropped is bench:
+                return
+            self._dropped = bench
         for hold in self._holds.values():
             hold.stopped_at = 1 << 62  # nothing that is still on its way is carried out
         failure: StepsFailedError | None = None
@@ -157,8 +163,8 @@ class Operation:
     def _end(self, bench: Bench) -> None:
         words = self.operator.words if self.operator else "nobody"
         self._holds.clear()
-        self._bench, self.operator = None, None
         self._close(bench)
+        self._bench, self.operator = None, None
         self._say(f"No longer operated by {words}.")
 
     def _close(self, bench: Bench) -> None:

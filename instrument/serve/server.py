@@ -192,6 +192,8 @@ class BenchServer:
             problem = f"takes no {request.method} {name}."
             return _error(404, DeviceError(kind, problem, "Both ends need the same version of the program."))
         arguments = await request.json() if request.can_read_body else {}
+        if not isinstance(arguments, dict):
+            raise ValueError("arguments come by name, in a JSON object")
         number = int(request.headers.get(NUMBER_HEADER, "0"))
         pool = self._overtaking if call.verb == "PUT" else self._pool
         key = self._operator(request).key
