@@ -33,6 +33,10 @@ class Operator:
     since: datetime = field(default_factory=lambda: datetime.now(UTC))
 
 
+WATCHER = Operator("the page", "the page in the browser")
+"""Who looks while nobody operates, and gives way to whoever wants to."""
+
+
 @dataclass
 class _Hold:
     """A device that the operator has open."""
@@ -63,6 +67,7 @@ class Operation:
         self._bench: Bench | None = None
         self._dropped: Bench | None = None
         """One whose operation is being ended: once is enough, however many connections break."""
+        self._ended: DeviceError | None = None
         self._holds: dict[Kind, _Hold] = {}
         self.operator: Operator | None = None
         self.newest_frame: Frame | None = None
@@ -78,6 +83,10 @@ class Operation:
         cannot be opened.
         """
         with self._taking:
+            if self._ended is not None:
+                raise self._ended
+            if self.operator == WATCHER and operator != WATCHER:
+                self.let_go("camera", WATCHER)
             present = self.operator
             if present is not None and present.key != operator.key:
                 raise DeviceBusyError(
@@ -98,7 +107,7 @@ class Operation:
                 if self._bench is None:
                     self._close(bench)
                 raise
-            if self.operator is None:
+            if self.operator is None and operator != WATCHER:
                 self._say(f"Operated by {operator.words}.")
             self._bench, self.operator = bench, present or operator
             self._holds[kind] = _Hold(device, on_end)
@@ -160,12 +169,19 @@ class Operation:
             reason = StoppedError("bench", f"STOP was pressed by {who}.", "Open it again to go on.")
             self.drop(operator, reason)
 
+    def end(self, reason: DeviceError) -> None:
+        """Make the bench safe and close it for good; errors as ``stop``."""
+        self._ended = reason
+        if self.operator is not None:
+            self.drop(self.operator, reason)
+
     def _end(self, bench: Bench) -> None:
-        words = self.operator.words if self.operator else "nobody"
+        operator = self.operator
         self._holds.clear()
         self._close(bench)
         self._bench, self.operator = None, None
-        self._say(f"No longer operated by {words}.")
+        if operator is not None and operator != WATCHER:
+            self._say(f"No longer operated by {operator.words}.")
 
     def _close(self, bench: Bench) -> None:
         try:
