@@ -85,6 +85,9 @@ def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
         led_array=bench.led_array,
         slm_shape=slm.shape if slm is not None else None,
         slm_settle_ms=slm.settle_ms if slm is not None else 0.0,
+        has_trigger_wire=bench.trigger_source is not None,
+        trigger_lines=camera.trigger_lines,
+        trigger_edges=camera.trigger_edges,
         free_bytes=free_bytes(folder) if folder is not None else None,
     )
 
