@@ -7,7 +7,6 @@ import threading
 import time
 from collections import deque
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ from drivers.device import DriverOptions, SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from drivers.simulated.camera_settings import SimulatedCameraSettings
+from drivers.simulated.faults import disturbed, disturbs
 from drivers.simulated.wire import Pulse
 from drivers.simulated.world import Rgb
 from recon.optics.sensor import FixedPattern, Readout, expose
@@ -257,6 +257,9 @@ class SimulatedCamera(SimulatedCameraSettings):
             raise StoppedError(self.name, "the exposure was stopped.")
         self._require()
         light = self._electrons_per_s() if pulse is None else self._light_during(pulse, exposure_ms)
+        faults = self.world.options
+        if disturbs(faults):
+            light = disturbed(light, faults, (faults.seed, frame_id), self.world.clock.now_s, self._binning)
         if not self.world.clock.wait(half, self._abort):
             raise StoppedError(self.name, "the exposure was stopped.")
         ended_ns = time.monotonic_ns() if pulse is None else pulse.time_ns + round(1e6 * exposure_ms)
@@ -267,7 +270,7 @@ class SimulatedCamera(SimulatedCameraSettings):
                 frame_id=frame_id,
                 device_time_ns=ended_ns,
                 host_time_ns=time.monotonic_ns(),
-                utc=datetime.now(UTC),
+                utc=self.world.clock.utc,
                 exposure_ms=exposure_ms,
                 gain=gain,
                 pixel_format=self._pixel_format,
@@ -365,8 +368,9 @@ class SimulatedCamera(SimulatedCameraSettings):
         return filters
 
     def _pixels(self) -> FixedPattern:
-        key = (self._roi, self._binning)
+        late = self.world.late_hot
+        key = (self._roi, self._binning, late)
         if self._pattern is None or self._pattern[0] != key:
-            pattern = self.world.fixed_pattern().binned(self._binning).cropped(*self._region())
+            pattern = self.world.fixed_pattern(late=late).binned(self._binning).cropped(*self._region())
             self._pattern = (key, pattern)
         return self._pattern[1]

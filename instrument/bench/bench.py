@@ -325,8 +325,8 @@ class Bench:
         """
         steps = self._safe_steps()
         steps += [
-            (f"close {device.name}", partial(self._close_device, device))
-            for device in reversed(list(self.devices.values()))
+            (f"close {device.name}", partial(self.close_device, kind))
+            for kind, device in reversed(list(self.devices.items()))
         ]
         steps += [(f"release {claim.resource}", claim.release) for claim in self._claims]
         self._claims = []
@@ -335,7 +335,12 @@ class Bench:
         finally:
             _at_exit.forget(self)
 
-    def _close_device(self, device: Device) -> None:
+    def close_device(self, kind: Kind) -> None:
+        """Bring one device to its safe state and close it; what it was claimed by stays claimed.
+
+        Raises DeviceError when it fails, or hangs.
+        """
+        device = self.devices[kind]
         self._opened.discard(device)
         within(2 * STOP_ANSWER_S, device.name, "closing", device.close)
 

@@ -34,6 +34,10 @@ BUILT_IN = "built-in bench.toml"
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
+TEMPLATES = ("default", "display", "led_microscope", "screen")
+"""The simulated benches."""
+
+
 def template(name: str = "default") -> str:
     """Return a commented simulated bench: ``default``, ``display``, ``led_microscope`` or ``screen``."""
     return resources.files("instrument.bench").joinpath(f"{name}_bench.toml").read_text("utf-8")

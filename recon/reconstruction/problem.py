@@ -129,6 +129,11 @@ class Problem:
                     f"The {options.model} model needs a calibration with PSFs from several places of the "
                     "field."
                 )
+            if options.z_um is not None:
+                raise InputError(
+                    f"z_um = {options.z_um:g} asks for the picture at a depth; a bare PSF image has none: "
+                    "leave z_um out, or give a Calibration with the depths of its PSFs."
+                )
             psfs = as_channels(calibration, "PSF")
             calibration = Calibration(psfs[None], np.full((1, 3), np.nan))
             options = settled(options, model="convolution")

@@ -285,7 +285,7 @@ def test_a_sweep_that_was_cut_off_is_resumed_and_becomes_a_calibration(bench: Be
         pass
 
     def cut(status: RunStatus) -> None:
-        if status.done == 9:
+        if status.done == 7:
             raise Cut
 
     with pytest.raises(Cut):
@@ -294,7 +294,7 @@ def test_a_sweep_that_was_cut_off_is_resumed_and_becomes_a_calibration(bench: Be
     with pytest.raises(CalibrationError, match="ended early"):
         finish_sweep(run)
     runner, findings = prepare_resume(bench, run)
-    assert findings.frames >= 9
+    assert findings.frames >= 7
     events: list[SweepEvent] = []
     watch_sweep(bench, runner, Following(on_event=events.append))
     assert runner.execute().condition is RunCondition.COMPLETED
