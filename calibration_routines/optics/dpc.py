@@ -249,7 +249,7 @@ def _halves(run: Run) -> dict[str, Image]:
     for side in SIDES:
         if np.any((run.images(side) >= full_scale(run)).any(axis=0) & ~dark.hot):
             raise CalibrationError(f"The half {side!r} saturates; lower the light. The run is in {run.path}.")
-        halves[side] = light_of(run, [step.index for step in run.steps(side)], dark)
+        halves[side] = light_of(run, [step.index for step in run.steps(side)], dark).mean
     return halves
 
 

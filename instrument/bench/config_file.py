@@ -111,6 +111,7 @@ def parse_config(text: str, path: Path | None) -> BenchConfig:
     reader = _Reader(tables, Mistakes(key_lines(text)))
     plain = {name: reader.plain_table(name, model) for name, model in PLAIN_TABLES.items()}
     devices = {kind: device for kind in DEVICE_TABLES if (device := reader.device(kind))}
+    reader.refuse_wire_from_nowhere(plain["trigger"])
     shared = reader.shared_parts()
     reader.refuse_unknown_tables()
     if reader.mistakes:
@@ -157,6 +158,15 @@ class _Reader:
         if settings is None or options is None:
             return None
         return DeviceConfig(kind, str(name), driver, options, settings)
+
+    def refuse_wire_from_nowhere(self, trigger: object) -> None:
+        sent_by = getattr(trigger, "sent_by", None)
+        if sent_by is not None and sent_by not in self._tables:
+            self.mistakes.add(
+                ("trigger", "sent_by"),
+                "[trigger] sent_by",
+                f"this bench has no [{sent_by}] that sends pulses.",
+            )
 
     def _driver(self, kind: Kind, name: object) -> type[Device] | None:
         """Return the driver; of a misspelt name the nearest one, so that the table's other mistakes show."""
