@@ -114,7 +114,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
     Raises FileError or BenchError when a file cannot be used, the two do not belong together, or the window
     or binning does not fit.
     """
-    psf, image = read_image(psf_file), read_image(image_file)
+    psf, image = read_image(psf_file), read_image(image_file, holes=True)
     crop, binning = inputs.crop, inputs.binning
     _refuse_constant(image)
     warnings = check_psf(psf, allow_saturated=inputs.allow_saturated)
@@ -184,7 +184,7 @@ def job_with(
     calibration: Calibration, folder: Path, image_file: Path | ImageFile, inputs: InputOptions
 ) -> Job:
     """Prepare an image for a calibration that came from ``folder``; as :func:`job_from_calibration`."""
-    image = read_image(image_file)
+    image = read_image(image_file, holes=True)
     crop = inputs.crop
     _refuse_constant(image)
     shape = calibration.psfs.shape[-2:]
