@@ -154,7 +154,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
             **noise_note(noise_of(image)),
         },
         valid,
-        (*warnings, *_saturation(image, erased)),
+        (*warnings, *_converted(psf, image), *_saturation(image, erased)),
         {
             "psf": source_record(psf),
             "image": source_record(image),
@@ -237,6 +237,12 @@ def job_with(
     )
 
 
+_PLAIN_PSFS = (
+    "PSF images by themselves tell no places: reconstruct takes one by --psf FILE, one a depth by "
+    "--volume FOLDER."
+)
+
+
 def find_calibration(folder: Path) -> Path:
     """Return the calibration folder that ``folder`` is, or the one that it holds.
 
@@ -244,7 +250,11 @@ def find_calibration(folder: Path) -> Path:
     """
     if not folder.is_dir():
         found = "is no folder" if folder.exists() else "does not exist"
-        raise FileError(folder, f"{found}; a calibration or a run folder is expected.")
+        raise FileError(
+            folder,
+            f"{found}; a calibration or a run folder is expected.",
+            "" if folder.is_dir() or not folder.exists() else _PLAIN_PSFS,
+        )
     if is_calibration(folder):
         return folder
     # In the folder, in a run in it, or in that run's calibration folder (a demo's).
@@ -256,7 +266,10 @@ def find_calibration(folder: Path) -> Path:
             if inside
             else "no calibration"
         )
-        raise FileError(folder, f"holds {found}; exactly one is expected.")
+        plain = not inside and any(
+            f.suffix.lower() in (".tif", ".tiff", ".png", ".npy") for f in folder.iterdir()
+        )
+        raise FileError(folder, f"holds {found}; exactly one is expected.", _PLAIN_PSFS if plain else "")
     return inside[0]
 
 
@@ -319,6 +332,17 @@ def _refuse_constant(image: ImageFile) -> None:
         raise FileError(
             image.path, f"the image is constant (every pixel is {highest:g}).", "Was the scene lit?"
         )
+
+
+def _converted(psf: ImageFile, image: ImageFile) -> tuple[str, ...]:
+    """Doubt a photograph that was made into fractions while its PSF is raw."""
+    kinds = psf.pixels.dtype.kind, image.pixels.dtype.kind
+    if kinds != ("u", "f"):
+        return ()
+    return (
+        f"The photograph is {image.pixels.dtype} and its PSF {psf.pixels.dtype}: it was converted, and its "
+        "dark level is estimated by itself. Take the raw file, or give --dark.",
+    )
 
 
 def _saturation(image: ImageFile, erased: Erased) -> tuple[str, ...]:
