@@ -296,6 +296,8 @@ class Routine:
     """More about it, for the command's help."""
     needs: tuple[str, ...] = ()
     """Devices that it needs besides the camera."""
+    tried_on: str = "default"
+    """The simulated bench that it can be tried on, one of ``instrument.bench.config_file.TEMPLATES``."""
     examples: tuple[str, ...] = ()
     """Command lines."""
     start: Callable[[Bench], Mapping[str, Any]] | None = None

@@ -94,14 +94,15 @@ def load_and_say(bench: Path | None) -> BenchConfig:
     return config
 
 
-def open_and_say(bench: Path | None, *, as_is: bool = False) -> Bench:
+def open_and_say(bench: BenchConfig | Path | None, *, as_is: bool = False) -> Bench:
     """Open the bench, ready to ask the operator in a terminal; say on stderr what it is.
 
     With ``as_is`` nobody is asked: what the operator would have to do is said, and taken for done.
     """
     from instrument.bench.bench import open_bench
 
-    opened = open_bench(load_and_say(bench), ask=_taken_for_done if as_is else operator())
+    config = load_and_say(bench) if bench is None or isinstance(bench, Path) else bench
+    opened = open_bench(config, ask=_taken_for_done if as_is else operator())
     typer.echo(f"Bench: {opened.label}", err=True)
     return opened
 

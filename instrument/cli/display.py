@@ -363,3 +363,4 @@ def _print(label: str, result: HologramResult, options: HologramOptions) -> None
         f"  (computed on the alias-free grid, envelope {options.envelope}, {options.frames} frame(s), "
         "through the eye's low-pass)"
     )
+    typer.echo(f"  light: {result.efficiency:.1%} of what falls on the SLM reaches the field")

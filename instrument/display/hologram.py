@@ -73,6 +73,8 @@ class HologramResult:
     """Target and image through the eye's low-pass, and the image before; in units of the target's white."""
     scores: tuple[Scores, ...]
     """Alias-free, with the envelope that was asked for and all frames."""
+    efficiency: float
+    """Part of the light on the SLM that reaches the field, DC term and envelope included."""
 
     def facts(self, options: HologramOptions) -> dict[str, Any]:
         """Return metrics and options, JSON-compatible."""
@@ -80,6 +82,7 @@ class HologramResult:
         return {
             "computed": True,
             "metrics": [asdict(score) for score in self.scores],
+            "efficiency": round(self.efficiency, 6),
             "metrics_computed_for": {
                 "grid": "alias-free",
                 "envelope": options.envelope,
@@ -112,7 +115,7 @@ def compute_and_judge(
     seen = tuple(np.asarray(model.seen(hologram.slm, p), float) / model.peaks[p] for p in planes)
     raw = tuple(np.asarray(model.intensity(hologram.slm, p), float) / model.peaks[p] for p in planes)
     scores = tuple(compare(s, w, 1.0) for s, w in zip(seen, wanted, strict=True))
-    return HologramResult(hologram, wanted, seen, raw, scores)
+    return HologramResult(hologram, wanted, seen, raw, scores, model.efficiency(hologram.slm))
 
 
 def prepare_target(

@@ -94,6 +94,7 @@ class HologramFiles:
             ("loss, method", f"{loss_of(self.options.loss).name}, {self.options.method}"),
             ("judged", f"alias-free grid, envelope {self.options.envelope}, {self.options.frames} frame(s)"),
             ("crop", f"{result.scores[0].crop_psnr_db:.1f} dB in the middle quarter"),
+            ("light", f"{result.efficiency:.2%} of what falls on the SLM reaches the field"),
             ("stopped", str(result.hologram.stop_reason)),
             ("iterations", f"{result.hologram.history[-1].iteration}"),
         ]

@@ -1,4 +1,4 @@
-"""Image files: TIFF, PNG, JPEG, BMP, NumPy, 8 to 16 bit and float, grey and colour, single, stacked, filmed.
+"""Image files: TIFF, PNG, JPEG, BMP, NumPy, 8 to 16 bit and float, grey and colour, single and stacked.
 
 Arrays are ``(height, width)`` or ``(height, width, 3)`` in the order red, green, blue; stacks have one more
 axis in front. The dtype is the file's own (uint8, uint16 or float32) and pixel values are never rescaled.
@@ -13,7 +13,7 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ import tifffile
 from instrument.files import reading
 from instrument.files.atomic import whole_file, write_text
 from instrument.files.errors import FileError
+from instrument.files.seen import as_seen, png_bytes
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
 
@@ -36,9 +37,9 @@ _OPENCV_MAGIC = (_PNG_MAGIC, b"\xff\xd8", b"BM")
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False, eq=False)
 class ImageFile:
-    """What was read from an image file."""
+    """What was read from an image file: NumPy takes it as an array, a notebook shows it."""
 
     path: Path
     pixels: Pixels
@@ -58,22 +59,43 @@ class ImageFile:
         """Whether a single image has three channels."""
         return self.pixels.ndim == 3
 
+    @property
+    def is_stack(self) -> bool:
+        """Whether it holds several images."""
+        return self.pixels.ndim == 4 or (self.pixels.ndim == 3 and self.pixels.shape[-1] != 3)
+
     def describe(self) -> str:
         """Return size, channels and dtype in words, e.g. ``"1200 x 1600 grey uint16"``."""
         height, width = self.pixels.shape[:2]
         return f"{height} x {width} {'colour' if self.is_colour else 'grey'} {self.pixels.dtype}"
 
+    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        """Return the pixels."""
+        return np.array(self.pixels, dtype, copy=copy)
 
-def read_image(path: Path | str) -> ImageFile:
-    """Read one image.
+    def __repr__(self) -> str:
+        """Say in a line what it is."""
+        if self.is_stack:
+            return f"<{self.path}: {len(self.pixels)} images {self.pixels.shape[1:]} {self.pixels.dtype}>"
+        return f"<{self.path}: {self.describe()}>"
+
+    def _repr_png_(self) -> bytes | None:
+        return None if self.is_stack else png_bytes(as_seen(self.pixels, raw=True))
+
+
+def read_image(path: Path | str | ImageFile, *, holes: bool = False) -> ImageFile:
+    """Read one image; one that was read already is returned. With ``holes`` it may have NaN pixels.
 
     Raises FileError when the file is missing, a folder, empty, unreadable, no image, several images, or holds
     values that are no finite numbers.
     """
+    if isinstance(path, ImageFile):
+        _refuse_non_finite(path.path, path.pixels, holes=holes)
+        return path
     path = Path(path)
     array, notes = _decode(path)
     array, more = _one_image(path, array)
-    pixels, converted = _standard_dtype(path, array)
+    pixels, converted = _standard_dtype(path, array, holes=holes)
     return ImageFile(path, pixels, (*notes, *more, *converted), _metadata(path))
 
 
@@ -98,6 +120,20 @@ def read_stack(path: Path | str, *, leave_out: Path | None = None) -> ImageFile:
         raise FileError(path, f"holds an array of shape {array.shape}; a stack of images is expected.")
     pixels, converted = _standard_dtype(path, array)
     return ImageFile(path, pixels, (*notes, *more, *converted))
+
+
+def read(path: Path | str) -> ImageFile:
+    """Read what a file holds, or a folder: one image, or a stack. Errors as :func:`read_image`."""
+    if Path(path).is_dir():
+        return read_stack(path)
+    try:
+        return read_image(path, holes=True)
+    except FileError:
+        try:
+            return read_stack(path)
+        except FileError:
+            pass
+        raise
 
 
 def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str, Any] | None = None) -> None:
@@ -356,7 +392,9 @@ def _drop_alpha(array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], tuple[str, .
     return array, ()
 
 
-def _standard_dtype(path: Path, array: npt.NDArray[Any]) -> tuple[Pixels, tuple[str, ...]]:
+def _standard_dtype(
+    path: Path, array: npt.NDArray[Any], *, holes: bool = False
+) -> tuple[Pixels, tuple[str, ...]]:
     """Return the pixels as uint8, uint16 or float32, unscaled, and what was converted."""
     if array.dtype == np.bool_:
         return array.astype(np.uint8), ("true and false taken as 1 and 0",)
@@ -366,17 +404,19 @@ def _standard_dtype(path: Path, array: npt.NDArray[Any]) -> tuple[Pixels, tuple[
     if native.dtype in (np.uint8, np.uint16):
         return np.ascontiguousarray(native), ()
     if native.dtype.kind == "f":
-        _refuse_non_finite(path, native)
+        _refuse_non_finite(path, native, holes=holes)
     elif native.size and native.min() >= 0 and native.max() <= 0xFFFF:
         return native.astype(np.uint16), (f"{native.dtype} taken as uint16",)
     with np.errstate(over="ignore"):
         pixels = np.ascontiguousarray(native, np.float32)
-    _refuse_non_finite(path, pixels)
+    _refuse_non_finite(path, pixels, holes=holes)
     return pixels, () if native.dtype == np.float32 else (f"{native.dtype} taken as float32",)
 
 
-def _refuse_non_finite(path: Path, array: npt.NDArray[Any]) -> None:
+def _refuse_non_finite(path: Path, array: npt.NDArray[Any], *, holes: bool) -> None:
     finite = np.isfinite(array)
+    if holes and finite.any():
+        finite |= np.isnan(array)
     if not finite.all():
         where = tuple(int(i) for i in np.argwhere(~finite)[0])
         raise FileError(
@@ -393,48 +433,3 @@ def _write_png(path: Path, image: npt.NDArray[Any]) -> None:
     if not done:
         raise FileError(path, f"could not be encoded as PNG: {image.dtype} {image.shape}.")
     path.write_bytes(data.tobytes())
-
-
-# Films ---------------------------------------------------------------------------------------------
-def as_shown(picture: npt.NDArray[Any], black: float, white: float) -> npt.NDArray[np.uint8]:
-    """Return a picture as 8-bit RGB, (height, width, 3); NaN is black."""
-    level = np.nan_to_num((picture - black) / (white - black), nan=0.0)
-    shown = np.round(255 * np.clip(level, 0, 1)).astype(np.uint8)
-    return np.repeat(shown[..., None], 3, axis=2) if shown.ndim == 2 else shown
-
-
-def write_mp4(
-    path: Path, pictures: Iterable[npt.NDArray[np.uint8]], fps: float, *, codec: str = "vp09"
-) -> int:
-    """Write pictures, 8-bit RGB (height, width, 3), whole or not at all; returns how many.
-
-    VP9, the default, is what browsers and players show: OpenCV's wheels carry no H.264 encoder (its licence).
-    MPEG-4 (``"mp4v"``) is encoded a hundred times as fast. Sides are made even by repeating the last row or
-    column, as codecs need.
-
-    Raises FileError when OpenCV here cannot encode, or the folder cannot be written to.
-    """
-    count = 0
-    writer: Any = None
-    with whole_file(path) as temporary:
-        try:
-            for picture in pictures:
-                height, width = picture.shape[:2]
-                even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-                if writer is None:
-                    size = (even.shape[1], even.shape[0])
-                    writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*codec), fps, size)
-                    if not writer.isOpened():
-                        raise FileError(
-                            path,
-                            f"OpenCV {cv2.__version__} here cannot encode {codec}.",
-                            "Install opencv-contrib-python-headless from PyPI, or do without the MP4.",
-                        )
-                writer.write(np.ascontiguousarray(even[..., ::-1]))
-                count += 1
-        finally:
-            if writer is not None:
-                writer.release()
-        if count == 0:
-            raise FileError(path, "there is no picture to make a film of.")
-    return count

@@ -13,7 +13,7 @@ from drivers.stage import StageAxis
 from instrument.files.errors import FileError, ranges
 from instrument.files.slm_image import read_slm_levels
 from instrument.plan.led_shapes import LedPlaces
-from instrument.plan.model import Plan, PlanError, Step
+from instrument.plan.model import Part, Plan, PlanError, Step
 from instrument.plan.positions import SourcePosition
 
 SPARE_BYTES = 256 * 2**20
@@ -51,6 +51,11 @@ class BenchAbilities:
     """Where its LEDs are, for patterns by name."""
     slm_shape: tuple[int, int] | None = None
     slm_settle_ms: float = 0.0
+    has_trigger_wire: bool = False
+    """Whether a wire of ``[trigger]`` lets hardware time the frames."""
+    trigger_lines: tuple[str, ...] = ()
+    trigger_edges: tuple[str, ...] = ()
+    """What the camera's hardware trigger offers."""
     free_bytes: int | None = None
     """Free space where the run will be kept; None leaves the disk unchecked."""
 
@@ -144,6 +149,8 @@ def check(
     problems = [
         f"step{'s' if len(steps) > 1 else ''} {ranges(steps)}: {problem}" for problem, steps in found.items()
     ]
+    for number in sorted({step.part for step in steps}):
+        problems.extend(_trigger_problems(plan.parts[number], abilities))
     for path in sorted({step.slm_image for step in steps if step.slm_image is not None}):
         problems.extend(_slm_image_problems(path, abilities))
     need = estimate(plan, abilities, todo=todo, start=start).total_bytes
@@ -181,6 +188,25 @@ def _step_problems(step: Step, abilities: BenchAbilities) -> Iterable[str]:
         yield f"gain {step.gain:g} is outside the camera's {low:g} to {high:g}."
     if step.slm_image is not None and abilities.slm_shape is None:
         yield f"SLM image {step.slm_image}, but the bench has no SLM."
+
+
+def _trigger_problems(part: Part, abilities: BenchAbilities) -> Iterable[str]:
+    if part.timing == "stepped":
+        return
+    if part.timing == "hardware" and not abilities.has_trigger_wire:
+        yield (
+            f'part {part.label}: timing = "hardware", but the bench has no trigger wire: '
+            "see [trigger] in bench.toml."
+        )
+    for what, asked, offered in (
+        ("line", part.trigger_line, abilities.trigger_lines),
+        ("edge", part.trigger_edge, abilities.trigger_edges),
+    ):
+        if asked is not None and asked not in offered:
+            yield (
+                f"part {part.label}: trigger_{what} {asked!r}, but the camera's are "
+                f"{', '.join(offered) or 'none that can be chosen'}."
+            )
 
 
 def _position_problems(step: Step, abilities: BenchAbilities) -> Iterable[str]:

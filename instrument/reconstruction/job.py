@@ -42,6 +42,7 @@ from instrument.reconstruction.preparation import (
 )
 from recon.base.noise import NoiseModel, averaged_noise
 from recon.camera.factors import Pattern
+from recon.reconstruction.measurement import Measurement
 from recon.types import Calibration
 
 
@@ -98,12 +99,13 @@ class Job:
             factor /= 2  # red and blue have a quarter of the pixels
         return averaged_noise(noise, factor**2)
 
+    def as_measurement(self, noise: NoiseChoice) -> Measurement:
+        """Return the photograph with what is known of it."""
+        erasures = None if self.valid is None else ~self.valid
+        return Measurement(self.measurement, self.binned_noise(noise), erasures=erasures)
 
-def job_from_files(
-    psf_path: Path,
-    image_path: Path,
-    inputs: InputOptions,
-) -> Job:
+
+def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inputs: InputOptions) -> Job:
     """Prepare a PSF and an image from anywhere.
 
     Where a grey image is the raw frame of a colour mosaic, its PSF, when grey as well, is taken to be one
@@ -112,7 +114,7 @@ def job_from_files(
     Raises FileError or BenchError when a file cannot be used, the two do not belong together, or the window
     or binning does not fit.
     """
-    psf, image = read_image(psf_path), read_image(image_path)
+    psf, image = read_image(psf_file), read_image(image_file, holes=True)
     crop, binning = inputs.crop, inputs.binning
     _refuse_constant(image)
     warnings = check_psf(psf, allow_saturated=inputs.allow_saturated)
@@ -168,28 +170,21 @@ def job_from_files(
     )
 
 
-def job_from_calibration(
-    folder: Path,
-    image_path: Path,
-    inputs: InputOptions,
-) -> Job:
+def job_from_calibration(folder: Path, image: Path | ImageFile, inputs: InputOptions) -> Job:
     """Prepare an image for a calibration folder, or a run folder with one calibration inside.
 
     An image with a whole multiple of the calibration's pixels is binned to them first; window and
     binning then act on the pixels of both. Errors as ``job_from_files``.
     """
     folder = find_calibration(folder)
-    return job_with(load_calibration(folder), folder, image_path, inputs)
+    return job_with(load_calibration(folder), folder, image, inputs)
 
 
 def job_with(
-    calibration: Calibration,
-    folder: Path,
-    image_path: Path,
-    inputs: InputOptions,
+    calibration: Calibration, folder: Path, image_file: Path | ImageFile, inputs: InputOptions
 ) -> Job:
     """Prepare an image for a calibration that came from ``folder``; as :func:`job_from_calibration`."""
-    image = read_image(image_path)
+    image = read_image(image_file, holes=True)
     crop = inputs.crop
     _refuse_constant(image)
     shape = calibration.psfs.shape[-2:]
