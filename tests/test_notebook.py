@@ -84,6 +84,23 @@ def test_options_are_completed_and_nothing_is_ignored(scene: tuple[np.ndarray, n
             db.reconstruct(photo, psf, **given)
 
 
+def test_nan_pixels_are_erased_and_said(scene: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    photo, psf = plain(scene)
+    photo[3:6, 4] = np.nan
+    erased = np.isnan(photo)
+    given = {"iterations": 5, "judged": False}
+    found = db.reconstruct(photo, psf, **given)
+    assert "3 pixels of the measurement are NaN: they are erased." in found.warnings
+    np.testing.assert_array_equal(
+        found.image, db.reconstruct(np.where(erased, 0, photo), psf, erasures=erased, **given).image
+    )
+    for name, image in (("photo.tif", photo), ("psf.tif", psf)):
+        db.write_image(tmp_path / name, image)
+    assert "3 pixels" in db.reconstruct(tmp_path / "photo.tif", tmp_path / "psf.tif", **given).warnings[0]
+    with pytest.raises(db.FileError, match="no finite numbers"):
+        db.reconstruct(tmp_path / "psf.tif", tmp_path / "photo.tif", **given)
+
+
 def test_a_stack_of_psfs_gives_a_volume_in_colours_of_depth(
     scene: tuple[np.ndarray, np.ndarray], tmp_path: Path
 ) -> None:

@@ -76,17 +76,18 @@ class ImageFile:
         return None if self.is_stack else png_bytes(as_seen(self.pixels, raw=True))
 
 
-def read_image(path: Path | str | ImageFile) -> ImageFile:
-    """Read one image; one that was read already is returned.
+def read_image(path: Path | str | ImageFile, *, holes: bool = False) -> ImageFile:
+    """Read one image; one that was read already is returned. With ``holes`` it may have NaN pixels.
 
     Raises FileError when the file is missing, a folder, empty, unreadable, no image, several images, or holds
     values that are no finite numbers.
     """
     if isinstance(path, ImageFile):
+        _refuse_non_finite(path.path, path.pixels, holes=holes)
         return path
     path, array, notes = _decoded(Path(path))
     array, more = _one_image(path, array)
-    pixels, converted = _standard_dtype(path, array)
+    pixels, converted = _standard_dtype(path, array, holes=holes)
     return ImageFile(path, pixels, (*notes, *more, *converted), _metadata(path))
 
 
@@ -109,7 +110,7 @@ def read(path: Path | str) -> ImageFile:
     if Path(path).is_dir() and not is_zarr(Path(path)):
         return read_stack(path)
     try:
-        return read_image(path)
+        return read_image(path, holes=True)
     except FileError:
         try:
             return read_stack(path)
@@ -267,7 +268,9 @@ def _drop_alpha(array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], tuple[str, .
     return array, ()
 
 
-def _standard_dtype(path: Path, array: npt.NDArray[Any]) -> tuple[Pixels, tuple[str, ...]]:
+def _standard_dtype(
+    path: Path, array: npt.NDArray[Any], *, holes: bool = False
+) -> tuple[Pixels, tuple[str, ...]]:
     """Return the pixels as uint8, uint16 or float32, unscaled, and what was converted."""
     if array.dtype == np.bool_:
         return array.astype(np.uint8), ("true and false taken as 1 and 0",)
@@ -277,17 +280,19 @@ def _standard_dtype(path: Path, array: npt.NDArray[Any]) -> tuple[Pixels, tuple[
     if native.dtype in (np.uint8, np.uint16):
         return np.ascontiguousarray(native), ()
     if native.dtype.kind == "f":
-        _refuse_non_finite(path, native)
+        _refuse_non_finite(path, native, holes=holes)
     elif native.size and native.min() >= 0 and native.max() <= 0xFFFF:
         return native.astype(np.uint16), (f"{native.dtype} taken as uint16",)
     with np.errstate(over="ignore"):
         pixels = np.ascontiguousarray(native, np.float32)
-    _refuse_non_finite(path, pixels)
+    _refuse_non_finite(path, pixels, holes=holes)
     return pixels, () if native.dtype == np.float32 else (f"{native.dtype} taken as float32",)
 
 
-def _refuse_non_finite(path: Path, array: npt.NDArray[Any]) -> None:
+def _refuse_non_finite(path: Path, array: npt.NDArray[Any], *, holes: bool) -> None:
     finite = np.isfinite(array)
+    if holes and finite.any():
+        finite |= np.isnan(array)
     if not finite.all():
         where = tuple(int(i) for i in np.argwhere(~finite)[0])
         raise FileError(

@@ -122,6 +122,7 @@ class Problem:
         extent = extent or Extent()
         _require(options)
         measurement = measurement if isinstance(measurement, Measurement) else Measurement(measurement)
+        measurement, holes = measurement.with_holes_erased()
         counts = measurement.counts()
         if not isinstance(calibration, Calibration):
             if options.model not in ("auto", "convolution"):
@@ -166,7 +167,7 @@ class Problem:
             (not one and measurement.background is None) if asked is None else asked,
             "float32" if options.precision == "auto" else options.precision,
             extent,
-            tuple(dict.fromkeys((*doubts, *depths.warnings, *counts.warnings))),
+            tuple(dict.fromkeys((*filter(None, (holes,)), *doubts, *depths.warnings, *counts.warnings))),
         )
         if options.axis_weights is not None:
             problem._require_axis_weights(options.axis_weights)
