@@ -21,6 +21,7 @@ from instrument.reconstruction.mosaic import (
     on_every_pixel,
     pattern_of,
     reduce_mosaic,
+    suspected_mosaic,
 )
 from instrument.reconstruction.options import InputOptions, NoiseChoice
 from instrument.reconstruction.preparation import (
@@ -154,7 +155,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
             **noise_note(noise_of(image)),
         },
         valid,
-        (*warnings, *_converted(psf, image), *_saturation(image, erased)),
+        (*warnings, *_converted(psf, image), *_saturation(image, erased), *_suspicion(inputs, image)),
         {
             "psf": source_record(psf),
             "image": source_record(image),
@@ -220,7 +221,7 @@ def job_with(
             **noise_note(noise_of(image)),
         },
         valid,
-        _saturation(image, erased),
+        (*_saturation(image, erased), *_suspicion(inputs, image)),
         {
             "calibration": str(folder.resolve()),
             "image": source_record(image),
@@ -351,6 +352,11 @@ def _saturation(image: ImageFile, erased: Erased) -> tuple[str, ...]:
         return ()
     share = f"{count / image.pixels.size:.2%}"
     return (f"{count} pixels of the image ({share}) are saturated and used: expect halos there.",)
+
+
+def _suspicion(inputs: InputOptions, image: ImageFile) -> tuple[str, ...]:
+    asked = suspected_mosaic(image) if inputs.mosaic == "auto" else ""
+    return (asked,) if asked else ()
 
 
 # As it is shown, and kept beside the result -------------------------------------------------------------
