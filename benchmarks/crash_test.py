@@ -90,7 +90,7 @@ def acquire(bench: Bench, folder: Path, promises: int) -> None:
     RunWriter.write = reporting  # type: ignore[method-assign]
     runs = runs_in(folder)
     if runs:
-        prepare_resume(bench, runs[0])[0].execute()
+        prepare_resume(bench, runs[0]).execute()
     else:
         prepare(bench, PLAN, folder).execute()
 

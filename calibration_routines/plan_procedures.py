@@ -18,8 +18,8 @@ from calibration_routines.procedure import (
 )
 from instrument.bench.bench import Bench
 from instrument.plan import Plan, check, estimate
-from instrument.runs.acquire import abilities_of, acquire, prepare_resume, settle_recording
-from instrument.runs.inspection import verify
+from instrument.runs.acquire import abilities_of, acquire, look, prepare_resume, settle
+from instrument.runs.inspection import Verification, verify
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import discarded
@@ -49,6 +49,8 @@ class ResumeProcedure(Procedure):
     """Go on with a run that did not end, and make what a routine's run was taken for."""
 
     run: Path
+    found: Verification | None = None
+    """What looking at it found, by whoever looked before; None: it is looked when it goes on."""
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Say what is left to do, by the run's log and files; its frames are read when it goes on."""
@@ -67,41 +69,48 @@ class ResumeProcedure(Procedure):
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Verify what is stored, take the rest, and make the calibration, response or surface."""
-        found, routine = Run.open(self.run), routine_of(self.run)
-        if found.plan is None:
-            return mended_recording(self.run, listener)
-        if found.condition is not RunCondition.COMPLETED or not verify(found, listener.share).is_sound:
-            home_if_needed(bench, listener, found.plan)
+        if self.found is None:
             listener.step("verifying the frames")
-            runner, findings = prepare_resume(
-                bench, self.run, on_verify=listener.share, on_progress=listener.frame
-            )
-            with discarded(runner):
-                listener.said(f"Found {findings}")
-                for words in runner.mended:
-                    listener.said(words)
-                if routine is not None and routine.watch is not None:
-                    routine.watch(bench, runner, listener)
-                listener.step(found.label)
-                control.follow(runner)
-            found = runner.execute()
-        frames = run_outcome(found)
-        if found.condition is RunCondition.COMPLETED and lacks_result(self.run):
+        looked = self.found or look(self.run, listener.share)
+        if not looked.todo:
+            return settled(self.run, looked, bench, control, listener)
+        run, routine = Run.open(self.run), routine_of(self.run)
+        home_if_needed(bench, listener, run.plan)
+        runner = prepare_resume(bench, self.run, looked, on_progress=listener.frame)
+        with discarded(runner):
+            listener.said(f"Found {looked}")
+            for words in runner.mended:
+                listener.said(words)
+            if routine is not None and routine.watch is not None:
+                routine.watch(bench, runner, listener)
+            listener.step(run.label)
+            control.follow(runner)
+        run = runner.execute()
+        frames = run_outcome(run)
+        if run.condition is RunCondition.COMPLETED and lacks_result(self.run):
             for words in frames.verdict:
                 listener.said(words)
-        return finished(found, bench, control, listener) or frames
+        return finished(run, bench, control, listener) or frames
 
 
-def mended_recording(path: Path, listener: Listener) -> Outcome:
-    """Mend a recording's files, and mark what is missing or damaged as lost."""
-    listener.step("verifying the frames")
-    before = Run.open(path)
-    done = settle_recording(path, listener.share)
+def settled(
+    path: Path, found: Verification, bench: Bench | None, control: RunControl, listener: Listener
+) -> Outcome:
+    """Mend a run that needs no frames taken, and make the result that it lacks (``bench`` if it is open)."""
+    done = settle(path, found)
     run = Run.open(path)
-    verdict = f"a recording, {before.condition}; there is nothing to go on with."
-    if done:
-        verdict = f"a recording, {run.condition}, with {len(run.records)} of {run.n_frames} frames."
-    return Outcome(verdict=(*done, verdict), good=True, runs=(path,), result=run)
+    if run.plan is None:
+        words = f"a recording, {found.condition}; there is nothing to go on with."
+        if done:
+            words = f"a recording, {run.condition}, with {len(run.records)} of {run.n_frames} frames."
+    else:
+        words = f"complete already, {run.n_frames} frames read back, all as they were written."
+    if lacks_result(path):
+        for line in (*done, words):
+            listener.said(line)
+    return finished(run, bench, control, listener) or Outcome(
+        verdict=(*done, words), good=True, runs=(path,), result=run
+    )
 
 
 def routine_of(run: Path) -> Routine | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("recon", "drivers", "instrument", "calibration_routines", "gui")
+PACKAGES = ("diffuserbench", "recon", "drivers", "instrument", "calibration_routines", "gui")
 MOST_MODULES = 25
 
 

@@ -262,7 +262,8 @@ def _images(
         brightness = 1.0
         if drift is not None and began is not None:
             brightness = drift.brightness_at((run.metadata(taken[point][0]).utc - began).total_seconds())
-        images.append(light_of(run, taken[point], dark) * np.float32(reference_ms / exposure_ms / brightness))
+        steady = light_of(run, taken[point], dark)
+        images.append(steady.mean * np.float32(reference_ms / exposure_ms / brightness))
     return images
 
 

@@ -249,7 +249,7 @@ def _halves(run: Run) -> dict[str, Image]:
     for side in SIDES:
         if np.any((run.images(side) >= full_scale(run)).any(axis=0) & ~dark.hot):
             raise CalibrationError(f"The half {side!r} saturates; lower the light. The run is in {run.path}.")
-        halves[side] = light_of(run, [step.index for step in run.steps(side)], dark)
+        halves[side] = light_of(run, [step.index for step in run.steps(side)], dark).mean
     return halves
 
 
@@ -341,10 +341,11 @@ ROUTINES = (
         options=DpcSetup,
         procedure=DpcProcedure,
         needs=("led_array",),
+        tried_on="led_microscope",
         purpose=DPC,
         finish=_finish,
         examples=(
-            "diffuserbench new microscope.toml --led-microscope",
+            "diffuserbench new microscope.toml --microscope",
             "diffuserbench calibrate dpc --bench microscope.toml --na 0.1 --magnification 4",
         ),
         start=lambda _: {"objective_na": 0.1, "magnification": 4.0},

@@ -247,7 +247,7 @@ def measure_field_response(
 
 def _light(run: Run, place: tuple[float, float, float]) -> float:
     indices = [step.index for step in run.steps(PSF) if step.source_um == place]
-    light = light_of(run, indices, dark_model(run))
+    light = light_of(run, indices, dark_model(run)).mean
     clipped = measure_psf(light[np.newaxis], z_um=place[2], noise=0.0).clipped
     if clipped > MAX_CLIPPED:
         raise CalibrationError(

@@ -20,6 +20,7 @@ from calibration_routines.psf.psf_quality import (
 from calibration_routines.psf.stage_fit import Drift, StageFit, judge_drift, judge_points
 from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import DARK, REFERENCE
+from calibration_routines.scatter import STEADY, TOLERATED, Scatter, Steadied, pooled, steadied
 from instrument.runs.run import Run
 from recon.base.blocks import block_mean
 from recon.types import Geometry
@@ -61,16 +62,37 @@ class DarkModel:
         One or two different exposures.
     frames : sequence of ndarray
         For each exposure its dark frames, (n_frames, height, width) or (n_frames, height, width, 3).
+    early : sequence of int, optional
+        For each exposure how many of them were taken before the others, at the sweep's beginning; all by
+        default.
     """
 
-    def __init__(self, exposures_ms: Sequence[float], frames: Sequence[Counts], full_scale: int) -> None:
+    def __init__(
+        self,
+        exposures_ms: Sequence[float],
+        frames: Sequence[Counts],
+        full_scale: int,
+        early: Sequence[int] = (),
+    ) -> None:
         if len(exposures_ms) not in (1, 2) or len(frames) != len(exposures_ms):
             raise ValueError("Dark frames are needed at one or two exposures.")
         self._exposures_ms = tuple(exposures_ms)
         self._means: list[Float] = [_mean(stack) for stack in frames]
         longest = int(np.argmax(self._exposures_ms))
-        self.hot = hot_pixels(np.min(frames[longest], axis=0), full_scale)
-        """Pixels that are bright without light at the longer exposure, in every frame."""
+        stack = frames[longest]
+        first = early[longest] if early else len(stack)
+        self.hot = hot_pixels(np.min(stack[:first], axis=0), full_scale)
+        """Pixels that are bright without light at the longer exposure, in every frame of the first or of the
+        last ones."""
+        self.late_hot = 0
+        """Pixels among them that were not so in the first dark frames."""
+        self.brightening_per_ms = 0.0
+        """Counts a millisecond by which the last dark frames are brighter than the first, in the median."""
+        if first < len(stack):
+            late = hot_pixels(np.min(stack[first:], axis=0), full_scale) & ~self.hot
+            self.late_hot, self.hot = int(np.count_nonzero(late)), self.hot | late
+            more = float(np.median(_mean(stack[first:]) - _mean(stack[:first])))
+            self.brightening_per_ms = more / self._exposures_ms[longest]
 
     def at(self, exposure_ms: float) -> Float:
         """Return the expected dark frame, float32 counts."""
@@ -95,6 +117,10 @@ class SweepAnalysis:
     reference_exposure_ms: float
     stages: tuple[StageFit, ...] = ()
     """For each depth with several points: the measured shifts against the stage's."""
+    scatter: Scatter = STEADY
+    """Of the frames of all points."""
+    findings: tuple[str, ...] = ()
+    """What is wrong with light, place or dark frames, whatever the point."""
 
 
 def analyse_sweep(
@@ -122,14 +148,20 @@ def analyse_sweep(
     """
     psfs: list[Float] = []
     quality: list[PsfQuality] = []
+    scatters: list[Scatter] = []
+    ambient: list[float] = []
     removed_in_all: Float | None = None
     reference_ms = 0.0
     for plane in planes:
         reference_ms = reference_ms or plane.exposure_ms
         scale = np.float32(reference_ms / plane.exposure_ms / plane.brightness)
-        light = block_mean(channels_first(plane_light(plane, dark)), binning)
+        steady = plane_light(plane, dark)
+        mean = steady.mean
+        scatters.append(steady.scatter)
+        ambient.append(dark.brightening_per_ms * plane.exposure_ms / max(float(mean.mean()), 1e-9))
+        light = block_mean(channels_first(mean), binning)
         cleaned, stray = remove_low_frequencies(light, dct_order)
-        quality.append(measure_point(plane, light - stray, dark, binning))
+        quality.append(measure_point(plane, light - stray, steady, dark, binning))
         psfs.append(cleaned * scale)
         removed = channels_first(replace_hot(dark.at(reference_ms), dark.hot))
         background = block_mean(removed, binning) + stray * scale
@@ -138,31 +170,51 @@ def analyse_sweep(
         raise ValueError("A sweep needs at least one point.")
     stacked = np.stack(psfs)
     judged, stages = judge_points(quality, stacked, binned(geometry, binning))
+    scatter = pooled(scatters)
     return SweepAnalysis(
         psfs=stacked,
         background=removed_in_all / np.float32(len(psfs)),
         quality=judged,
         reference_exposure_ms=reference_ms,
         stages=stages,
+        scatter=scatter,
+        findings=(*scatter.findings(), *ambient_findings(max(ambient, key=abs))),
     )
 
 
-def measure_point(plane: PlaneFrames, light: Float, dark: DarkModel, binning: int) -> PsfQuality:
+def ambient_findings(share: float) -> tuple[str, ...]:
+    """Return what is to be said of other light, by which the last dark frames are brighter than the first.
+
+    ``share`` is of the mean light of what was measured.
+    """
+    if abs(share) <= TOLERATED:
+        return ()
+    return (
+        f"the dark frames after the last point are {'brighter' if share > 0 else 'darker'} than those before "
+        f"the first, by {abs(share):.1%} of the mean light: other light came or went meanwhile. Keep it out, "
+        "and take it again.",
+    )
+
+
+def measure_point(
+    plane: PlaneFrames, light: Float, steady: Steadied, dark: DarkModel, binning: int
+) -> PsfQuality:
     """Measure a point's PSF alone, from its light (n_channels, height, width) and its frames."""
     x_um, y_um, z_um = plane.source_um
     ever = (plane.frames >= plane.full_scale).any(axis=0)
     measured = measure_psf(
         light,
         z_um=z_um,
-        noise=noise_of_mean(plane.frames) / binning,
+        noise=noise_of_mean(steady.frames) / binning,
         saturated_pixels=int(np.count_nonzero(ever & ~dark.hot)),
         may_be_clipped=plane.off_axis,
     )
-    return replace(measured, x_um=x_um, y_um=y_um)
+    scatter = steady.scatter
+    return replace(measured, x_um=x_um, y_um=y_um, flicker=scatter.flicker, motion_px=scatter.motion_px)
 
 
-def plane_light(plane: PlaneFrames, dark: DarkModel) -> Float:
-    """Return the mean of a point's frames without dark frame and hot pixels, float32 counts.
+def plane_light(plane: PlaneFrames, dark: DarkModel) -> Steadied:
+    """Return a point's frames without dark frame, hot pixels, flicker and motion, float32 counts.
 
     Raises ValueError when the dark frames have another shape.
     """
@@ -172,7 +224,12 @@ def plane_light(plane: PlaneFrames, dark: DarkModel) -> Float:
             f"The frames at z = {plane.source_um[2] / 1e3:g} mm are {plane.frames.shape[1:]}, "
             f"the dark frames {dark_frame.shape}."
         )
-    return replace_hot(_mean(plane.frames) - dark_frame, dark.hot)
+    return light_frames(plane.frames, dark_frame, dark.hot)
+
+
+def light_frames(frames: Counts, dark_frame: Float, hot: npt.NDArray[np.bool_]) -> Steadied:
+    """Return frames of the same thing, (n_frames, height, width[, 3]) without dark frame and hot pixels."""
+    return steadied(np.stack([replace_hot(frame - dark_frame, hot) for frame in frames]))
 
 
 def replace_hot(image: Float, hot: npt.NDArray[np.bool_]) -> Float:
@@ -203,7 +260,7 @@ def _mean(frames: Counts) -> Float:
     return mean
 
 
-def noise_of_mean(frames: Counts) -> float:
+def noise_of_mean(frames: Counts | Float) -> float:
     """Return the noise of one pixel of the frames' mean; a dark average adds little and is left out."""
     frames = frames[:, :: max(1, frames[0].size // _NOISE_PX)]  # rows enough to tell a noise by
     if len(frames) > 1:
@@ -263,18 +320,21 @@ def full_scale(run: Run) -> int:
 
 def dark_model(run: Run) -> DarkModel:
     """Return what a sweep's run shows without light."""
-    steps: dict[float, list[int]] = {}
-    for step in run.steps(DARK):
-        steps.setdefault(run.metadata(step).exposure_ms, []).append(step.index)
-    stacks = [np.stack([run.frame(index) for index in indices]) for indices in steps.values()]
-    return DarkModel(list(steps), stacks, full_scale(run))
+    steps = run.steps(DARK)
+    first = min(step.part for step in steps)
+    taken: dict[float, list[list[int]]] = {}
+    for step in steps:
+        early_and_late = taken.setdefault(run.metadata(step).exposure_ms, [[], []])
+        early_and_late[step.part != first].append(step.index)
+    stacks = [np.stack([run.frame(index) for index in early + late]) for early, late in taken.values()]
+    return DarkModel(list(taken), stacks, full_scale(run), [len(early) for early, _ in taken.values()])
 
 
-def light_of(run: Run, indices: Sequence[int], dark: DarkModel) -> Float:
-    """Return the light of some frames of one exposure, (height, width): their mean, colours averaged."""
-    mean = np.mean([run.frame(index) for index in indices], axis=0, dtype=np.float32)
-    light = replace_hot(mean - dark.at(run.metadata(indices[0]).exposure_ms), dark.hot)
-    return np.asarray(light.mean(axis=-1) if light.ndim == 3 else light, np.float32)
+def light_of(run: Run, indices: Sequence[int], dark: DarkModel) -> Steadied:
+    """Return the light of some frames of one exposure and place, colours averaged."""
+    frames = np.stack([run.frame(index) for index in indices])
+    steady = light_frames(frames, dark.at(run.metadata(indices[0]).exposure_ms), dark.hot)
+    return Steadied(steady.frames.mean(axis=-1), steady.scatter) if steady.frames.ndim == 4 else steady
 
 
 def drift_of(run: Run, sweep: PointSweep, dark: DarkModel) -> Drift | None:
@@ -284,8 +344,14 @@ def drift_of(run: Run, sweep: PointSweep, dark: DarkModel) -> Drift | None:
         visits.setdefault(step.part, []).append(step.index)
     if not visits:
         return None
-    images = [light_of(run, indices, dark) for indices in visits.values()]
+    steady = [light_of(run, indices, dark) for indices in visits.values()]
     total = len(sweep.points_um)
-    before = [min(k * sweep.reference_every, total) for k in range(len(images))]
+    before = [min(k * sweep.reference_every, total) for k in range(len(steady))]
     times = [run.metadata(indices[0]).utc for indices in visits.values()]
-    return judge_drift(images, before, total, [(time - times[0]).total_seconds() for time in times])
+    return judge_drift(
+        [one.mean for one in steady],
+        before,
+        total,
+        [(time - times[0]).total_seconds() for time in times],
+        pooled([one.scatter for one in steady]),
+    )

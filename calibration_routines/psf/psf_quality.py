@@ -100,6 +100,10 @@ class PsfQuality:
     """Where the source stood laterally."""
     similarity: float | None = None
     """Inner product with the central PSF of its depth once registered; None where that is itself."""
+    flicker: float = 0.0
+    motion_px: float = 0.0
+    """Standard deviations from frame to frame beyond noise: of brightness, relative, and of the place, pixels
+    of the camera."""
 
     @property
     def source_um(self) -> tuple[float, float, float]:

@@ -26,6 +26,7 @@ from calibration_routines.psf.psf_quality import (
     judge_sweep,
     with_finding,
 )
+from calibration_routines.scatter import NO_CHANGE, STEADY, TOLERATED, Change, Scatter, compare, reduction
 from recon.base.blocks import block_mean
 from recon.camera.registration import Registration, register
 from recon.types import Geometry
@@ -35,11 +36,11 @@ Floats = npt.NDArray[np.float64]
 
 MAX_BRIGHTNESS_DRIFT = 0.1
 """Change of the source's light between two visits beyond which a straight line is not to be relied on."""
+_LEAST_VISITS = 3  # of a lamp that flickers: fewer do not tell a slope
+_SURE = 3.0  # standard deviations of a visit's brightness: what is less is not called a drift
 _CORRECTABLE = (0.2, 5.0)  # brightness over the first visit's: beyond, it is another light, not a drift
 MAX_PLACE_DRIFT_PX = 0.5
 """Shift of the reference's pattern that is called a drift, pixels."""
-LARGEST_PX = 500_000
-"""Larger images are binned before patterns are registered: a twentieth of a pixel is told still."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +57,10 @@ class Drift:
     """Empty when the source stayed what it was."""
     seconds: tuple[float, ...]
     """When each visit was, from the first."""
+    brightness_error: float = 0.0
+    """Standard deviation of a visit's brightness, as its frames scatter."""
+    ambient: tuple[float, ...] = ()
+    """Even light that came in since the first visit, in units of its mean."""
 
     @property
     def is_correctable(self) -> bool:
@@ -67,13 +72,26 @@ class Drift:
     def brightness_at(self, seconds: float) -> float:
         """Return the source's brightness, relative to the first visit, so long after that.
 
-        After the last visit it stays what it was then; 1 where the drift is not correctable.
+        After the last visit it stays what it was then; 1 where the drift is not correctable. Where visits
+        differ no more than a lamp that flickers makes them, one straight line through all of them is taken.
         """
-        return float(np.interp(seconds, self.seconds, self.brightness)) if self.is_correctable else 1.0
+        if not self.is_correctable:
+            return 1.0
+        brightness, times = np.array(self.brightness), np.array(self.seconds)
+        if self.brightness_error > 0:
+            line = np.polyfit(times, brightness, 1) if len(times) > _LEAST_VISITS else [brightness.mean()]
+            smooth = np.polyval(line, times)
+            if np.std(brightness - smooth) <= _SURE * self.brightness_error:
+                brightness = smooth
+        return float(np.interp(seconds, times, brightness))
 
 
 def judge_drift(
-    visits: Sequence[Float], before_point: Sequence[int], last_point: int, seconds: Sequence[float]
+    visits: Sequence[Float],
+    before_point: Sequence[int],
+    last_point: int,
+    seconds: Sequence[float],
+    scatter: Scatter = STEADY,
 ) -> Drift:
     """Compare each visit to the reference with the first.
 
@@ -87,58 +105,53 @@ def judge_drift(
         How many points the sweep has.
     seconds : sequence of float
         When each visit was, from the first.
+    scatter : Scatter
+        Of the visits' frames: what it explains is not called a drift.
     """
-    compared = [(1.0, 0.0), *(compare_visit(visit, visits[0]) for visit in visits[1:])]
-    brightness, shifts = zip(*compared, strict=True)
+    compared = [NO_CHANGE, *(compare(visit, visits[0]) for visit in visits[1:])]
     findings: list[str] = []
     for k in range(1, len(visits)):
         points = (before_point[k - 1], min(before_point[k], last_point))
-        findings += judge_visit(brightness[k - 1 : k + 1], shifts[k - 1 : k + 1], points)
-    return Drift(tuple(before_point), brightness, shifts, tuple(findings), tuple(seconds))
-
-
-def reduction(image: Float) -> int:
-    """Return by how much an image is binned before it is registered."""
-    return max(1, int(np.ceil(np.sqrt(image.size / LARGEST_PX))))
-
-
-def compare_visit(visit: Float, first: Float) -> tuple[float, float]:
-    """Return brightness and shift (pixels of these images) of a visit against the first.
-
-    The shift is infinite where the pattern is not found again; both are nan where there is no light.
-    """
-    factor = reduction(first)
-    light = float(first.sum(dtype=np.float64))
-    brightness = float(visit.sum(dtype=np.float64)) / light if light > 0 else float("nan")
-    if not light > 0 or not np.ptp(visit) > 0:
-        return brightness, float("nan")
-    found = register(block_mean(visit, factor), block_mean(first, factor))
-    shift_px = factor * float(np.hypot(found.rows, found.columns))
-    return brightness, shift_px if found.reliable else float("inf")
+        findings += judge_visit((compared[k - 1], compared[k]), points, scatter)
+    return Drift(
+        tuple(before_point),
+        tuple(change.brightness for change in compared),
+        tuple(change.shift_px for change in compared),
+        tuple(findings),
+        tuple(seconds),
+        scatter.brightness_error,
+        tuple(change.ambient for change in compared),
+    )
 
 
 def judge_visit(
-    brightness: tuple[float, ...], shift_px: tuple[float, ...], points: tuple[int, int]
+    visits: tuple[Change, Change], points: tuple[int, int], scatter: Scatter = STEADY
 ) -> tuple[str, ...]:
-    """Return what changed between two visits, in words.
+    """Return what changed between two visits beyond what their frames' scatter explains, in words.
 
-    Each pair is of the earlier and of the later visit: brightness and shift relative to the first visit of
-    all, and how many of the sweep's points had been taken before.
+    Each visit is relative to the first of all; ``points`` are how many of the sweep's had been taken before.
     """
     findings = []
+    before, after = visits
     where = f"between points {points[0] + 1} and {points[1]}"
-    change = brightness[1] / brightness[0] - 1 if brightness[0] else float("nan")
-    if not abs(change) <= MAX_BRIGHTNESS_DRIFT:
+    change = after.brightness / before.brightness - 1 if before.brightness else float("nan")
+    if not abs(change) <= MAX_BRIGHTNESS_DRIFT + _SURE * scatter.brightness_error:
         findings.append(
             f"{where} the source became {abs(change):.1%} {'brighter' if change > 0 else 'dimmer'} "
             f"(up to {MAX_BRIGHTNESS_DRIFT:.0%} can be corrected for): let it warm up, keep other light out, "
             "and take the sweep again where PSFs must compare in brightness."
         )
-    if not abs(shift_px[1] - shift_px[0]) <= MAX_PLACE_DRIFT_PX:
+    came = after.ambient - before.ambient
+    if abs(came) > TOLERATED:
         findings.append(
-            f"{where} the reference's pattern moved from {shift_px[0]:.1f} to {shift_px[1]:.1f} pixels "
-            f"off its first place (up to {MAX_PLACE_DRIFT_PX:g} expected): the source, the stage or the "
-            "camera moved. Fix it and take the sweep again."
+            f"{where} other light {'came in' if came > 0 else 'went'}, {abs(came):.1%} of the reference's "
+            "mean: keep daylight, lamps and screens out, and take the sweep again."
+        )
+    if not abs(after.shift_px - before.shift_px) <= MAX_PLACE_DRIFT_PX + _SURE * scatter.place_error_px:
+        findings.append(
+            f"{where} the reference's pattern moved from {before.shift_px:.1f} to {after.shift_px:.1f} "
+            f"pixels off its first place (up to {MAX_PLACE_DRIFT_PX:g} expected): the source, the stage or "
+            "the camera moved. Fix it and take the sweep again."
         )
     return tuple(findings)
 

@@ -48,6 +48,7 @@ from calibration_routines.psf.sweep_plan import (
     sweep_plan,
 )
 from calibration_routines.psf.sweep_watch import SweepWatch, TakeAgain, retake_dimming
+from calibration_routines.scatter import STEADY, Scatter
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import Snapshot
 from instrument.files.atomic import write_text
@@ -81,13 +82,20 @@ class SweepCalibration:
     """For each depth with several points: measured shifts against the stage's."""
     drift: Drift | None = None
     """The source at the reference point; None for a sweep too short to have one."""
+    scatter: Scatter = STEADY
+    """Of the frames that were averaged, all points together."""
+    bench_findings: tuple[str, ...] = ()
+    """What is wrong with light, place and dark frames, whatever the point."""
+    late_hot: int = 0
+    """Pixels that turned hot during the sweep; they were replaced like the others."""
 
     @property
     def findings(self) -> tuple[str, ...]:
         """What is wrong with which PSF, stage or source, in words; empty when the sweep is good."""
         psfs = tuple(f"{place_of(q)}: {finding}" for q in self.quality for finding in q.findings)
         stages = tuple(finding for stage in self.stages for finding in stage.findings)
-        return psfs + stages + (self.drift.findings if self.drift is not None else ())
+        drift = self.drift.findings if self.drift is not None else ()
+        return self.bench_findings + psfs + stages + drift
 
 
 def calibrate_sweep(
@@ -273,7 +281,7 @@ class _TakenSweep:
     def _optical_binning(self) -> int:
         """Return the binning by the finest structure, which is that of the farthest central PSF."""
         steps = self._steps(self.sweep.axis_point(self.sweep.depths_um[-1]))[:2]
-        frames = [light_of(self.run, [step.index], self.dark) for step in steps]
+        frames = [light_of(self.run, [step.index], self.dark).mean for step in steps]
         return optical_binning(frames[0], frames[-1])
 
     def saved(self, analysis: SweepAnalysis) -> SweepCalibration:
@@ -282,6 +290,7 @@ class _TakenSweep:
         exposures_ms = tuple(self._exposure_ms(point) for point in sweep.points_um)
         exposures = replace(record.exposures, exposures_ms=exposures_ms)
         findings = [q.findings for q in analysis.quality] + [stage.findings for stage in analysis.stages]
+        findings.append(analysis.findings)
         calibration = Calibration(
             psfs=analysis.psfs,
             source_positions_um=np.array(sweep.points_um),
@@ -291,13 +300,24 @@ class _TakenSweep:
                 "psfs": [plain(q) for q in analysis.quality],
                 "stages": [plain(stage) for stage in analysis.stages],
                 "drift": None if drift is None else plain(drift) | {"corrected": drift.is_correctable},
+                "scatter": plain(analysis.scatter) | {"findings": list(analysis.findings)},
+                "late_hot_pixels": self.dark.late_hot,
                 "good": not any(findings) and not (drift and drift.findings),
             },
             provenance=self._provenance(exposures, analysis.reference_exposure_ms),
         )
         path = save_calibration(calibration, self.run.path / SWEEP.result)
         return SweepCalibration(
-            calibration, path, analysis.quality, tuple(self.runs), exposures, analysis.stages, drift
+            calibration,
+            path,
+            analysis.quality,
+            tuple(self.runs),
+            exposures,
+            analysis.stages,
+            drift,
+            analysis.scatter,
+            analysis.findings,
+            self.dark.late_hot,
         )
 
     def _provenance(self, exposures: SweepExposures, reference_ms: float) -> dict[str, Any]:

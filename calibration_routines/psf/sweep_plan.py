@@ -51,7 +51,10 @@ def check_image_settings(sweep: PointSweep, frame_shape: Sequence[int]) -> None:
 
 
 def sweep_plan(sweep: PointSweep, exposures_ms: Sequence[float]) -> Plan:
-    """Return the plan: dark frames at the shortest and longest exposure, then every point in order.
+    """Return the plan: every point in order, and dark frames at the shortest and longest exposure.
+
+    Half of the dark frames come first, half last: other light that came in meanwhile and pixels that turned
+    hot are seen in the difference.
 
     The reference point is visited before the first point, after every ``reference_every``, and after the
     last, with its own exposure. ``exposures_ms`` has one a point.
@@ -70,14 +73,16 @@ def sweep_plan(sweep: PointSweep, exposures_ms: Sequence[float]) -> Plan:
         parts += [_point(sweep, PSF, point, exposure_ms) for point, exposure_ms in points]
     if reference is not None:
         parts.append(parts[0])
-    return Plan(label=f"{sweep.kind} sweep", parts=(_dark(sweep, exposures_ms), *parts))
+    late = sweep.dark_frames // 2
+    first, last = (_dark(exposures_ms, frames) for frames in (sweep.dark_frames - late, late))
+    return Plan(label=f"{sweep.kind} sweep", parts=(*first, *parts, *last))
 
 
 def retake_plan(sweep: PointSweep, points: Sequence[tuple[Position, float]]) -> Plan:
     """Return the plan for some points again, each with its exposure; dark frames of their own first."""
     parts = [_point(sweep, PSF, point, exposure_ms) for point, exposure_ms in points]
-    dark = _dark(sweep, [exposure_ms for _, exposure_ms in points])
-    return Plan(label=f"{sweep.kind} sweep retake", parts=(dark, *parts))
+    dark = _dark([exposure_ms for _, exposure_ms in points], sweep.dark_frames)
+    return Plan(label=f"{sweep.kind} sweep retake", parts=(*dark, *parts))
 
 
 def check_sweep(bench: Bench, sweep: PointSweep, folder: Path | None = None) -> Plan:
@@ -102,9 +107,9 @@ def check_sweep(bench: Bench, sweep: PointSweep, folder: Path | None = None) -> 
     return plan
 
 
-def _dark(sweep: PointSweep, exposures_ms: Sequence[float]) -> Part:
+def _dark(exposures_ms: Sequence[float], frames: int) -> tuple[Part, ...]:
     ends = tuple(sorted({min(exposures_ms), max(exposures_ms)}))
-    return Part(label=DARK, light=(OFF,), exposures_ms=ends, repeats=sweep.dark_frames)
+    return (Part(label=DARK, light=(OFF,), exposures_ms=ends, repeats=frames),) if frames else ()
 
 
 def _point(sweep: PointSweep, label: str, point: Position, exposure_ms: float) -> Part:
@@ -143,6 +148,12 @@ def plan_lines(bench: Bench, sweep: PointSweep, plan: Plan, folder: Path | None)
         f"= {count(cost.frames, 'frame')}, {cost.total_bytes / 1e6:.0f} MB at most, "
         f"{cost.seconds:.0f} s of exposure and motion."
     )
+    if cost.approaches:
+        axes = ", ".join(f"{name[0]} {play:g} um" for name, play in bench.play.items())
+        lines.append(
+            f"Because of the stage's play ({axes}) {count(cost.approaches, 'move')} go below the place "
+            f"first, which costs {cost.approach_seconds:.0f} s of these."
+        )
     if cost.total_bytes > _MUCH_BYTES:
         lines.append(
             f"Note: {cost.total_bytes / 1e9:.0f} GB are much. Fewer frames a PSF (--average), a larger "

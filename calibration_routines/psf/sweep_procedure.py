@@ -13,7 +13,9 @@ from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep, fi
 from calibration_routines.psf.sweep_options import AskedSweep, AxialSweep, LateralSweep, VolumeSweep
 from calibration_routines.psf.sweep_plan import SWEEP, SweepExposures, check_sweep, plan_lines
 from calibration_routines.psf.sweep_watch import SourceVisit, SweepEvent
+from calibration_routines.scatter import TOLERATED
 from instrument.bench.bench import Bench
+from instrument.files.errors import count
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 
@@ -118,17 +120,29 @@ def quality_lines(done: SweepCalibration) -> list[str]:
             f"{stage.residual_median_px:.3f} (median) and {stage.residual_95_px:.3f} (95 %) pixels."
         )
     if done.drift is not None and not done.drift.findings:
+        known = done.drift.brightness_error
+        taken = f"each known to {known:.1%}" if known > TOLERATED else "taken out of the PSFs"
         lines.append(
             f"Source: {len(done.drift.brightness)} visits to the reference; brightness within "
-            f"{max(abs(b - 1) for b in done.drift.brightness):.1%} (taken out of the PSFs), place within "
+            f"{max(abs(b - 1) for b in done.drift.brightness):.1%} ({taken}), place within "
             f"{max(done.drift.shift_px):.2f} pixels."
+        )
+    if done.scatter.averages and not done.scatter.findings():
+        lines.append(
+            f"Frames: brightness steady within {done.scatter.flicker:.1%}, place within "
+            f"{done.scatter.motion_px:.2f} pixels from frame to frame, noise taken off."
+        )
+    if done.late_hot:
+        lines.append(
+            f"Sensor: {count(done.late_hot, 'pixel')} turned hot during the sweep (replaced by the "
+            "neighbours' median, like the others): let the camera warm up."
         )
     return lines
 
 
 def _verdict(done: SweepCalibration) -> str:
     quality = done.quality
-    count = len(quality)
+    number = len(quality)
     words = [f"signal at least {min(q.snr for q in quality):.0f} times the noise"]
     planes = [q for q in quality if q.similarity is None]
     if len(planes) >= 4:  # fewer planes give no line to hold a centroid against
@@ -140,8 +154,8 @@ def _verdict(done: SweepCalibration) -> str:
         words.append(f"similar to the central PSF by at least {min(across):.2f}")
         cut = sum(q.clipped > 0 for q in quality)
         words += [f"{cut} patterns reach the sensor's edge"] if cut else []
-    plural = "s" if count > 1 else ""
-    return f"{'all ' if count > 1 else ''}{count} PSF{plural} good. No saturated pixel; {'; '.join(words)}."
+    plural = "s" if number > 1 else ""
+    return f"{'all ' if number > 1 else ''}{number} PSF{plural} good. No saturated pixel; {'; '.join(words)}."
 
 
 def _depths(bench: Bench) -> dict[str, float]:

@@ -34,14 +34,13 @@ from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.stage_fit import (
     MAX_GAIN_ERROR,
     MAX_ROTATION_MRAD,
-    compare_visit,
     find_pattern,
     judge_visit,
     nominal_px_per_um,
-    reduction,
 )
 from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import DARK, REFERENCE
+from calibration_routines.scatter import NO_CHANGE, Change, Steadied, compare, reduction
 from instrument.bench.photograph import Snapshot
 from instrument.plan import Step
 from recon.base.blocks import block_mean
@@ -119,6 +118,7 @@ class SweepWatch:
         self._planes: list[PsfQuality] = []  # good central PSFs, one a depth
         self._first_visit: tuple[Position, Float] | None = None
         self._visits: list[SourceVisit] = []
+        self._change: Change = NO_CHANGE  # of the newest visit against the first
         self._points_done = 0
 
     def see(self, step: Step, snapshot: Snapshot) -> bool:
@@ -144,8 +144,9 @@ class SweepWatch:
         take = 1
         while True:
             plane = self._plane(point, taken)
-            image = self._image(plane)
-            quality = self._judged(plane, image)
+            steady = plane_light(plane, self._dark_model(plane.full_scale))
+            image = _reduced(steady)
+            quality = self._judged(plane, steady, image)
             again = quality.retake and self.take_again is not None and take <= self._sweep.retakes
             number, total = self._numbers[point], len(self._numbers)
             self._report(PointTaken(number, total, take, quality, plane.exposure_ms, again, image))
@@ -168,17 +169,11 @@ class SweepWatch:
             off_axis=point not in self._central,
         )
 
-    def _image(self, plane: PlaneFrames) -> Float:
-        """Return a point's light, (height, width), binned as for registration."""
-        light = channels_first(plane_light(plane, self._dark_model(plane.full_scale)))
-        grey: Float = light.mean(axis=0)
-        return block_mean(grey, reduction(grey))
-
-    def _judged(self, plane: PlaneFrames, image: Float) -> PsfQuality:
+    def _judged(self, plane: PlaneFrames, steady: Steadied, image: Float) -> PsfQuality:
         frame_shape = plane.frames.shape[1:3]
         factor = max(1, frame_shape[0] // image.shape[0])
         binning = max(1, self._sweep.binning)
-        found = measure_point(plane, image[np.newaxis], self._dark_model(plane.full_scale), binning)
+        found = measure_point(plane, image[np.newaxis], steady, self._dark_model(plane.full_scale), binning)
         found = replace(
             found,
             centroid_px=(found.centroid_px[0] * factor / binning, found.centroid_px[1] * factor / binning),
@@ -219,23 +214,24 @@ class SweepWatch:
     def _visit(self, taken: list[Snapshot]) -> None:
         assert self._reference is not None
         plane = self._plane(self._reference, taken)
-        image = self._image(plane)
+        steady = plane_light(plane, self._dark_model(plane.full_scale))
+        image = _reduced(steady)
         if self._first_visit is None:
-            seen = self._judged(plane, image)
+            seen = self._judged(plane, steady, image)
             self._planes += [] if seen.retake else [seen]
             self._first_visit = self._reference, image
-            visit = SourceVisit(1, self._points_done, 1.0, 0.0, ())
+            self._change, visit = NO_CHANGE, SourceVisit(1, self._points_done, 1.0, 0.0, ())
         else:
             before = self._visits[-1]
-            brightness, shift_px = compare_visit(image, self._first_visit[1])
-            frame = taken[0].image
-            shift_px *= max(1, frame.shape[0] // image.shape[0])
-            findings = judge_visit(
-                (before.brightness, brightness),
-                (before.shift_px, shift_px),
-                (before.before_point, self._points_done),
+            found = compare(image, self._first_visit[1])
+            factor = max(1, taken[0].image.shape[0] // image.shape[0])
+            change = replace(found, rows=factor * found.rows, columns=factor * found.columns)
+            points = before.before_point, self._points_done
+            findings = judge_visit((self._change, change), points, steady.scatter)
+            self._change = change
+            visit = SourceVisit(
+                before.number + 1, self._points_done, change.brightness, change.shift_px, findings
             )
-            visit = SourceVisit(before.number + 1, self._points_done, brightness, shift_px, findings)
         self._visits.append(visit)
         self._report(visit)
 
@@ -254,6 +250,12 @@ class SweepWatch:
 def retake_dimming(quality: PsfQuality) -> float:
     """Return which part of its exposure a PSF that is taken again gets: less where it saturated."""
     return _SATURATED_DIMMING if quality.saturated_pixels else 1.0
+
+
+def _reduced(steady: Steadied) -> Float:
+    """Return a point's light, (height, width), binned as for registration."""
+    grey: Float = channels_first(steady.mean).mean(axis=0)
+    return block_mean(grey, reduction(grey))
 
 
 def _counts(snapshot: Snapshot) -> Counts:

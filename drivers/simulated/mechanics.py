@@ -34,6 +34,11 @@ class AxisSpec:
     repeatability: float
     hard_margin: float
     """How far the limit switches lie beyond the soft limits."""
+    scale: float = 1.0
+    """True way over the way that the screw reports, about where homing ends."""
+    slip: float = 0.0
+    slip_at_move: int = 0
+    """Steps that are lost when the axis begins so manieth move (from 1; 0: never)."""
 
 
 @dataclass(slots=True)
@@ -47,6 +52,7 @@ class _AxisState:
     slip: float = 0.0
     """True screw position minus the one reported (lost steps)."""
     jammed: bool = False
+    moves: int = 0
 
 
 def trapezoid_path(elapsed: float, distance: float, speed: float, acceleration: float) -> float:
@@ -94,8 +100,13 @@ class Carriage:
                 axis, state = self.axes[name], self._states[name]
                 state.target = round(position / axis.resolution) * axis.resolution
                 state.error_after = float(self._rng.normal(0.0, axis.repeatability))
+                state.moves += state.target != state.start
+                if state.moves == axis.slip_at_move and state.target != state.start:
+                    state.slip += axis.slip
             self._started = time.monotonic()
-            return max((self._duration(name) for name in target), default=0.0)
+            duration_s = max((self._duration(name) for name in target), default=0.0)
+            self._clock.skip(duration_s)
+            return duration_s
 
     def halt(self) -> None:
         """Stop where the axes are now."""
@@ -144,8 +155,10 @@ class Carriage:
         """Set every axis to its reference position; lost steps are forgotten."""
         with self._lock:
             for name, axis in self.axes.items():
-                jammed = self._states[name].jammed
-                self._states[name] = _AxisState(axis.home, axis.home, axis.home, jammed=jammed)
+                before = self._states[name]
+                self._states[name] = _AxisState(
+                    axis.home, axis.home, axis.home, jammed=before.jammed, moves=before.moves
+                )
 
     def set_jammed(self, name: str, jammed: bool) -> None:
         """Make an axis stick, or free it."""
@@ -190,7 +203,8 @@ class Carriage:
     def _true(self, name: str, screw: float) -> float:
         state = self._states[name]
         error = state.error_before + (state.error_after - state.error_before) * self._fraction(state, screw)
-        return self._trailing(name, screw) + state.slip + error
+        axis = self.axes[name]
+        return axis.home + axis.scale * (self._trailing(name, screw) - axis.home) + state.slip + error
 
     @staticmethod
     def _fraction(state: _AxisState, screw: float) -> float:

@@ -39,6 +39,9 @@ class AxisOptions(BaseModel):
     repeatability: NotNegative | None = Field(
         default=None, description="Standard deviation of where a move to one place ends."
     )
+    scale: Positive = Field(default=1.0, description="True way over the way that it reports.")
+    slip: float = Field(default=0.0, description="Steps lost, once: how far it is off from then on.")
+    slip_at_move: int = Field(default=0, ge=0, description="At which of its moves, from 1; 0: never.")
 
 
 class StageOptions(DriverOptions):
@@ -53,6 +56,9 @@ class StageOptions(DriverOptions):
     )
     mount_offset_um: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="True source position minus stage reading, x, y, z."
+    )
+    mount_tilt_mrad: tuple[float, float] = Field(
+        (0.0, 0.0), description="How far the stage's z axis leans towards x and y."
     )
 
     @model_validator(mode="after")
@@ -172,7 +178,8 @@ class SimulatedStage(CarriageStage):
             true.get(name, resting[name]) + offset
             for name, offset in zip(AXIS_NAMES[:3], self.options.mount_offset_um, strict=True)
         )
-        return x, y, z
+        lean_x, lean_y = self.options.mount_tilt_mrad
+        return x + 1e-3 * lean_x * z, y + 1e-3 * lean_y * z, z
 
     def _axis_spec(self, name: str, options: AxisOptions) -> AxisSpec:
         """Fill in what the options leave out: a stepper stage that suits the preset's size."""
@@ -207,4 +214,7 @@ def axis_spec(name: str, options: AxisOptions, low: float, high: float, home: fl
         backlash=given(options.backlash, min(3.0, travel * 2e-5) if linear else 0.05),
         repeatability=given(options.repeatability, min(0.5, travel * 4e-6) if linear else 0.01),
         hard_margin=travel * 0.01,
+        scale=options.scale,
+        slip=options.slip,
+        slip_at_move=options.slip_at_move,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from abc import abstractmethod
+from datetime import UTC, datetime, timedelta
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +14,8 @@ from pydantic import Field
 
 from drivers.device import Device, DeviceIdentity, DriverOptions, SharedPart
 from drivers.errors import DeviceError, DeviceNotOpenError
+from drivers.simulated.faults import FaultOptions, with_late_hot
+from drivers.simulated.wire import WireFaults, Wires
 from recon.optics.sensor import FixedPattern, SensorSpec, fixed_pattern
 
 
@@ -22,9 +25,30 @@ class Clock:
     def __init__(self, time_scale: float) -> None:
         self.time_scale = time_scale
 
+        self._began, self._began_utc = time.monotonic(), datetime.now(UTC)
+        self._skipped_s = 0.0
+
+    @property
+    def now_s(self) -> float:
+        """Simulated seconds since the world began, those that nobody waited for included."""
+        if self.time_scale == 0:
+            return self._skipped_s
+        return (time.monotonic() - self._began) / self.time_scale
+
+    @property
+    def utc(self) -> datetime:
+        """The time of day; where nothing is waited for, as if it had been."""
+        return datetime.now(UTC) if self.time_scale else self._began_utc + timedelta(seconds=self._skipped_s)
+
     def wait(self, seconds: float, cancelled: threading.Event) -> bool:
         """Wait; returns False as soon as ``cancelled`` is set."""
+        self.skip(seconds)
         return not cancelled.wait(max(seconds, 0.0) * self.time_scale)
+
+    def skip(self, seconds: float) -> None:
+        """Let time pass that is not waited for where nothing is."""
+        if self.time_scale == 0:
+            self._skipped_s += max(seconds, 0.0)
 
     def elapsed_since(self, start: float) -> float:
         """Return the simulated seconds since ``start``, a reading of ``time.monotonic()``.
@@ -36,7 +60,7 @@ class Clock:
         return (time.monotonic() - start) / self.time_scale
 
 
-class CommonOptions(DriverOptions):
+class CommonOptions(FaultOptions):
     """What the options of every simulated world have."""
 
     seed: int = Field(0, ge=0, description="The same seed gives the same optics, sensor and noise.")
@@ -48,6 +72,13 @@ class CommonOptions(DriverOptions):
     noise: float = Field(1.0, ge=0, description="Scale of all temporal noise: 1 is physical, 0 is none.")
     fixed_pattern: bool = Field(
         True, description="Whether camera pixels differ (response, offset, hot, dead)."
+    )
+    pulse_jitter_us: float = Field(
+        0.0, ge=0, description="Standard deviation by which trigger pulses come late; they never come early."
+    )
+    missed_pulses: float = Field(0.0, ge=0, le=1, description="Share of trigger pulses that are lost.")
+    extra_pulses: float = Field(
+        0.0, ge=0, le=1, description="Trigger pulses that nobody sent, per pulse that was sent."
     )
 
 
@@ -65,6 +96,9 @@ class Surroundings(SharedPart):
         self.scene_lit = False
         """Whether the scene glows."""
         self._lock = threading.RLock()
+        faults = WireFaults(1e-6 * options.pulse_jitter_us, options.missed_pulses, options.extra_pulses)
+        self.wires = Wires(options.time_scale, faults, options.seed)
+        """From LED array and SLM to the camera."""
 
     @abstractmethod
     def photons_per_s(
@@ -82,8 +116,13 @@ class Surroundings(SharedPart):
     def light_key(self) -> tuple[Any, ...]:
         """Something that changes whenever :meth:`photons_per_s` does."""
 
-    def fixed_pattern(self) -> FixedPattern:
-        """Return the sensor's pixels: response, dark current, offset."""
+    @property
+    def late_hot(self) -> bool:
+        """Whether those pixels that turn hot late are hot now."""
+        return self.options.late_hot_pixels > 0 and self.clock.now_s >= self.options.late_hot_after_s
+
+    def fixed_pattern(self, *, late: bool = False) -> FixedPattern:
+        """Return the sensor's pixels: response, dark current, offset; ``late``: those that turn hot are."""
         if self._pattern is None:
             if self.options.fixed_pattern:
                 self._pattern = fixed_pattern(self.sensor, self.options.seed + 1)
@@ -91,7 +130,7 @@ class Surroundings(SharedPart):
                 ones = np.ones(self.sensor.shape, np.float32)
                 dark = np.float32(self.sensor.dark_current_e_per_s) * ones
                 self._pattern = FixedPattern(ones, dark, np.zeros_like(ones))
-        return self._pattern
+        return with_late_hot(self._pattern, self.options, self.options.seed) if late else self._pattern
 
     # Faults, for tests ---
     def unplug(self, kind: str) -> None:

@@ -342,6 +342,7 @@ def _facts(computed: Computed) -> list[tuple[str, str]]:
     rows, columns = display.slm_shape
     return [
         *facts,
+        ("Light", f"{result.efficiency:.1%} of what falls on the SLM reaches the field"),
         ("Stopped", f"{stopped}: {result.hologram.stop_reason}"),
         ("Expansion", f"{display.expansion}x on {columns} x {rows} pixels, {display.wavelength_nm:g} nm"),
         *(("Pattern", str(path)) for path in computed.patterns),

@@ -14,8 +14,8 @@ from PySide6.QtWidgets import QGraphicsItem, QWidget
 from gui.theme import NAMES, colours
 from gui.widgets.building import button, choice, fill, narrow
 from gui.widgets.entry import NumberEdit
+from instrument.files.seen import levels_of
 from instrument.live.frame_view import grouped
-from instrument.reconstruction.result_file import white_level
 
 # Images are (row, column) here as everywhere else in the project.
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
@@ -159,7 +159,7 @@ class LevelsBar(QWidget):
         step = max(1, round((image.size / _MOST_PIXELS) ** 0.5))
         sample = np.asarray(image[::step, ::step], np.float32)
         lowest, highest = float(sample.min()), float(sample.max())
-        self._automatic = (min(0.0, highest - 1.0) if highest <= 0 else 0.0, white_level(sample))
+        self._automatic = (min(0.0, highest - 1.0) if highest <= 0 else 0.0, max(levels_of(sample).white))
         counts, bins = np.histogram(sample, _BINS, (lowest, highest if highest > lowest else lowest + 1.0))
         edges = bins.astype(float)  # pyqtgraph's limits overflow in float32
         self._curve.setData(edges, np.log1p(counts))

@@ -21,7 +21,7 @@ from instrument.plan.model import load_plan
 from instrument.runs.export import export as export_run
 from instrument.runs.inspection import run_paths, summary
 from instrument.runs.inspection import verify as verify_run
-from instrument.runs.run import Run, RunCondition
+from instrument.runs.run import Run
 from instrument.runs.run_files import BENCH_TOML
 from instrument.runs.writer import RunWriter
 from recon.base.declare import option
@@ -222,33 +222,26 @@ def resume(
     be taken. A sweep of calibrate becomes its calibration when its last frame is there, a run of calibrate
     angular or dpc its response or surface.
     """
-    from calibration_routines.plan_procedures import ResumeProcedure, finished, mended_recording
+    from calibration_routines.plan_procedures import ResumeProcedure, settled
     from instrument.cli.calibrate import TerminalListener, carry_out_run, print_outcome
+    from instrument.runs.acquire import look
     from instrument.runs.run_control import RunControl
 
-    found = Run.open(run)
     with TerminalListener() as listener:
-        if found.plan is None:
-            outcome = mended_recording(run, listener)
-            for words in outcome.verdict:
-                typer.echo(f"{run}: {words}")
-            return
-        whole = found.condition is RunCondition.COMPLETED and verify_run(found, listener.share).is_sound
-    if whole:
-        typer.echo(f"{run}: complete already, {found.n_frames} frames read back, all as they were written.")
-        with TerminalListener() as listener:
-            result = finished(found, None, RunControl(), listener)
-        if result is not None:
-            print_outcome(Console(), result)
-        return
-    with open_and_say(bench or _bench_of(found)) as opened:
-        carry_out_run(ResumeProcedure(run), opened, run)
-
-
-def _bench_of(run: Run) -> Path:
-    """Return the run's bench file, made again first where it is damaged."""
-    if any(problem.name == BENCH_TOML for problem in run.files.problems()):
-        with RunWriter.reopen(run.path) as writer:
-            for words in writer.mended or ():
-                typer.echo(words)
-    return run.path / BENCH_TOML
+        listener.step("verifying the frames")
+        found = look(run, listener.share)
+        if not found.todo:
+            outcome = settled(run, found, None, RunControl(), listener)
+    if found.todo:
+        if bench is None and any(problem.name == BENCH_TOML for problem in found.files):
+            with RunWriter.reopen(run, log_bytes=found.log_bytes) as writer:
+                for words in writer.mended or ():
+                    typer.echo(words)
+            found = look(run)
+        with open_and_say(bench or run / BENCH_TOML) as opened:
+            carry_out_run(ResumeProcedure(run, found), opened, run)
+    elif isinstance(outcome.result, Run):
+        for words in outcome.verdict:
+            typer.echo(f"{run}: {words}")
+    else:
+        print_outcome(Console(), outcome)

@@ -31,7 +31,7 @@ from recon.holography import (
     compute_hologram,
     random_mask,
 )
-from recon.holography.display import greatest_defocus_mm
+from recon.holography.display import greatest_defocus_mm, no_mask
 from recon.holography.judge import compare
 from recon.holography.options import Fit
 from recon.holography.pose import NODES, Pose
@@ -73,6 +73,8 @@ class HologramResult:
     """Target and image through the eye's low-pass, and the image before; in units of the target's white."""
     scores: tuple[Scores, ...]
     """Alias-free, with the envelope that was asked for and all frames."""
+    efficiency: float
+    """Part of the light on the SLM that reaches the field, DC term and envelope included."""
 
     def facts(self, options: HologramOptions) -> dict[str, Any]:
         """Return metrics and options, JSON-compatible."""
@@ -80,6 +82,7 @@ class HologramResult:
         return {
             "computed": True,
             "metrics": [asdict(score) for score in self.scores],
+            "efficiency": round(self.efficiency, 6),
             "metrics_computed_for": {
                 "grid": "alias-free",
                 "envelope": options.envelope,
@@ -112,7 +115,7 @@ def compute_and_judge(
     seen = tuple(np.asarray(model.seen(hologram.slm, p), float) / model.peaks[p] for p in planes)
     raw = tuple(np.asarray(model.intensity(hologram.slm, p), float) / model.peaks[p] for p in planes)
     scores = tuple(compare(s, w, 1.0) for s, w in zip(seen, wanted, strict=True))
-    return HologramResult(hologram, wanted, seen, raw, scores)
+    return HologramResult(hologram, wanted, seen, raw, scores, model.efficiency(hologram.slm))
 
 
 def prepare_target(
@@ -208,7 +211,7 @@ def bench_display(
     """Return the display that ``[display]`` describes.
 
     ``size`` is the SLM's shape and pitch, of :func:`slm_size`. Another ``expansion`` than the bench's has a
-    random mask of its own; with another wavelength the mask keeps its height.
+    random mask of its own, 1 none; with another wavelength the mask keeps its height.
 
     Raises BenchError or FileError when SLM, binning, expansion and mask do not fit together.
     """
@@ -220,7 +223,9 @@ def bench_display(
     if height % binning or width % binning:
         raise BenchError(f"An SLM of {height} x {width} pixels cannot be binned by slm_binning = {binning}.")
     shape = (height // binning, width // binning)
-    if table.mask_file is not None and q == table.expansion:
+    if q == 1 and (table.mask_file is None or table.expansion != 1):
+        mask = no_mask(shape)
+    elif table.mask_file is not None and q == table.expansion:
         base = config.path.parent if config.path else Path()
         mask = _mask_from(base / table.mask_file, (shape[0] * k, shape[1] * k), table.wavelength_nm)
     else:

@@ -7,6 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -66,22 +67,13 @@ class HologramFiles:
         for number in range(max(self.video, 1)):
             for channel in range(len(self.displays)):
                 patterns = self.patterns(number, channel)
-                files += [*patterns, *map(side_car, patterns), self._preview(number, channel)]
+                files += [*patterns, *map(side_car, patterns), self.preview(number, channel)]
         return files
 
     def write(self, number: int, channel: int, result: HologramResult) -> None:
         """Write one hologram's patterns and its preview."""
         display = self.displays[channel]
-        facts = {
-            **result.facts(self.options),
-            "binning": self.binning,
-            "expansion": display.expansion,
-            "slm_shape": list(display.slm_shape),
-            "slm_pitch_um": display.slm_pitch_um,
-            "wavelength_nm": display.wavelength_nm,
-            "dc_power": display.dc.power,
-            "mask_fill": display.mask_fill,
-        }
+        facts = {**result.facts(self.options), **self.display_facts(channel)}
         patterns = self.patterns(number, channel)
         for frame, path in enumerate(patterns):
             about = {**facts, "frame": frame + 1, "of_frames": len(patterns)}
@@ -94,15 +86,29 @@ class HologramFiles:
             ("loss, method", f"{loss_of(self.options.loss).name}, {self.options.method}"),
             ("judged", f"alias-free grid, envelope {self.options.envelope}, {self.options.frames} frame(s)"),
             ("crop", f"{result.scores[0].crop_psnr_db:.1f} dB in the middle quarter"),
+            ("light", f"{result.efficiency:.2%} of what falls on the SLM reaches the field"),
             ("stopped", str(result.hologram.stop_reason)),
             ("iterations", f"{result.hologram.history[-1].iteration}"),
         ]
         write_hologram_figure(
-            self._preview(number, channel),
+            self.preview(number, channel),
             result,
             title=f"Hologram {patterns[0].stem}",
             facts=lines,
         )
+
+    def display_facts(self, channel: int) -> dict[str, Any]:
+        """Return what a pattern was computed for, JSON-compatible."""
+        display = self.displays[channel]
+        return {
+            "binning": self.binning,
+            "expansion": display.expansion,
+            "slm_shape": list(display.slm_shape),
+            "slm_pitch_um": display.slm_pitch_um,
+            "wavelength_nm": display.wavelength_nm,
+            "dc_power": display.dc.power,
+            "mask_fill": display.mask_fill,
+        }
 
     def _stem(self, number: int, channel: int) -> str:
         stem = self.out.stem
@@ -122,7 +128,8 @@ class HologramFiles:
             for frame in range(self.options.frames)
         ]
 
-    def _preview(self, number: int, channel: int) -> Path:
+    def preview(self, number: int, channel: int) -> Path:
+        """Return the preview's file."""
         return self.out.with_name(f"{self._stem(number, channel)}-preview.png")
 
 

@@ -32,6 +32,7 @@ from recon.types import Calibration, Geometry
 _JSON = "calibration.json"
 _PSFS = "psfs.ome.zarr"
 _BACKGROUND = "background.ome.zarr"
+CALIBRATION_FILES = (_JSON, _PSFS, _BACKGROUND)
 _RESTORE = "Take the calibration again or restore it from a copy."
 _FIELDS = ("shape", "source_positions_um", "geometry", "quality", "provenance", "sha256")
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import whole_file, write_json, write_text
 from instrument.files.errors import BenchError, FileError
-from instrument.files.images import write_mp4
+from instrument.files.films import write_mp4
 from instrument.files.record import plain
 from instrument.reconstruction.video_files import (
     DEFAULT_FPS,

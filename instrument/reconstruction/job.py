@@ -21,6 +21,7 @@ from instrument.reconstruction.mosaic import (
     on_every_pixel,
     pattern_of,
     reduce_mosaic,
+    suspected_mosaic,
 )
 from instrument.reconstruction.options import InputOptions, NoiseChoice
 from instrument.reconstruction.preparation import (
@@ -42,6 +43,7 @@ from instrument.reconstruction.preparation import (
 )
 from recon.base.noise import NoiseModel, averaged_noise
 from recon.camera.factors import Pattern
+from recon.reconstruction.measurement import Measurement
 from recon.types import Calibration
 
 
@@ -98,12 +100,13 @@ class Job:
             factor /= 2  # red and blue have a quarter of the pixels
         return averaged_noise(noise, factor**2)
 
+    def as_measurement(self, noise: NoiseChoice) -> Measurement:
+        """Return the photograph with what is known of it."""
+        erasures = None if self.valid is None else ~self.valid
+        return Measurement(self.measurement, self.binned_noise(noise), erasures=erasures)
 
-def job_from_files(
-    psf_path: Path,
-    image_path: Path,
-    inputs: InputOptions,
-) -> Job:
+
+def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inputs: InputOptions) -> Job:
     """Prepare a PSF and an image from anywhere.
 
     Where a grey image is the raw frame of a colour mosaic, its PSF, when grey as well, is taken to be one
@@ -112,7 +115,7 @@ def job_from_files(
     Raises FileError or BenchError when a file cannot be used, the two do not belong together, or the window
     or binning does not fit.
     """
-    psf, image = read_image(psf_path), read_image(image_path)
+    psf, image = read_image(psf_file), read_image(image_file, holes=True)
     crop, binning = inputs.crop, inputs.binning
     _refuse_constant(image)
     warnings = check_psf(psf, allow_saturated=inputs.allow_saturated)
@@ -152,7 +155,7 @@ def job_from_files(
             **noise_note(noise_of(image)),
         },
         valid,
-        (*warnings, *_saturation(image, erased)),
+        (*warnings, *_converted(psf, image), *_saturation(image, erased), *_suspicion(inputs, image)),
         {
             "psf": source_record(psf),
             "image": source_record(image),
@@ -168,28 +171,21 @@ def job_from_files(
     )
 
 
-def job_from_calibration(
-    folder: Path,
-    image_path: Path,
-    inputs: InputOptions,
-) -> Job:
+def job_from_calibration(folder: Path, image: Path | ImageFile, inputs: InputOptions) -> Job:
     """Prepare an image for a calibration folder, or a run folder with one calibration inside.
 
     An image with a whole multiple of the calibration's pixels is binned to them first; window and
     binning then act on the pixels of both. Errors as ``job_from_files``.
     """
     folder = find_calibration(folder)
-    return job_with(load_calibration(folder), folder, image_path, inputs)
+    return job_with(load_calibration(folder), folder, image, inputs)
 
 
 def job_with(
-    calibration: Calibration,
-    folder: Path,
-    image_path: Path,
-    inputs: InputOptions,
+    calibration: Calibration, folder: Path, image_file: Path | ImageFile, inputs: InputOptions
 ) -> Job:
     """Prepare an image for a calibration that came from ``folder``; as :func:`job_from_calibration`."""
-    image = read_image(image_path)
+    image = read_image(image_file, holes=True)
     crop = inputs.crop
     _refuse_constant(image)
     shape = calibration.psfs.shape[-2:]
@@ -225,7 +221,7 @@ def job_with(
             **noise_note(noise_of(image)),
         },
         valid,
-        _saturation(image, erased),
+        (*_saturation(image, erased), *_suspicion(inputs, image)),
         {
             "calibration": str(folder.resolve()),
             "image": source_record(image),
@@ -242,6 +238,12 @@ def job_with(
     )
 
 
+_PLAIN_PSFS = (
+    "PSF images by themselves tell no places: reconstruct takes one by --psf FILE, one a depth by "
+    "--volume FOLDER."
+)
+
+
 def find_calibration(folder: Path) -> Path:
     """Return the calibration folder that ``folder`` is, or the one that it holds.
 
@@ -249,7 +251,11 @@ def find_calibration(folder: Path) -> Path:
     """
     if not folder.is_dir():
         found = "is no folder" if folder.exists() else "does not exist"
-        raise FileError(folder, f"{found}; a calibration or a run folder is expected.")
+        raise FileError(
+            folder,
+            f"{found}; a calibration or a run folder is expected.",
+            "" if folder.is_dir() or not folder.exists() else _PLAIN_PSFS,
+        )
     if is_calibration(folder):
         return folder
     # In the folder, in a run in it, or in that run's calibration folder (a demo's).
@@ -261,7 +267,10 @@ def find_calibration(folder: Path) -> Path:
             if inside
             else "no calibration"
         )
-        raise FileError(folder, f"holds {found}; exactly one is expected.")
+        plain = not inside and any(
+            f.suffix.lower() in (".tif", ".tiff", ".png", ".npy") for f in folder.iterdir()
+        )
+        raise FileError(folder, f"holds {found}; exactly one is expected.", _PLAIN_PSFS if plain else "")
     return inside[0]
 
 
@@ -326,12 +335,28 @@ def _refuse_constant(image: ImageFile) -> None:
         )
 
 
+def _converted(psf: ImageFile, image: ImageFile) -> tuple[str, ...]:
+    """Doubt a photograph that was made into fractions while its PSF is raw."""
+    kinds = psf.pixels.dtype.kind, image.pixels.dtype.kind
+    if kinds != ("u", "f"):
+        return ()
+    return (
+        f"The photograph is {image.pixels.dtype} and its PSF {psf.pixels.dtype}: it was converted, and its "
+        "dark level is estimated by itself. Take the raw file, or give --dark.",
+    )
+
+
 def _saturation(image: ImageFile, erased: Erased) -> tuple[str, ...]:
     count = saturated_pixels(image.pixels)
     if not count or erased.valid is not None:
         return ()
     share = f"{count / image.pixels.size:.2%}"
     return (f"{count} pixels of the image ({share}) are saturated and used: expect halos there.",)
+
+
+def _suspicion(inputs: InputOptions, image: ImageFile) -> tuple[str, ...]:
+    asked = suspected_mosaic(image) if inputs.mosaic == "auto" else ""
+    return (asked,) if asked else ()
 
 
 # As it is shown, and kept beside the result -------------------------------------------------------------

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import BenchError
-from instrument.files.images import read_stack
+from instrument.files.images import ImageFile, read_stack
 from instrument.reconstruction.job import (
     Job,
     job_from_calibration,
@@ -96,8 +96,7 @@ class _Request:
 
     def _measurement(self, job: Job) -> Measurement:
         """Return a job's photograph with what is known of it."""
-        erasures = None if job.valid is None else ~job.valid
-        return Measurement(job.measurement, job.binned_noise(self.inputs.noise), erasures=erasures)
+        return job.as_measurement(self.inputs.noise)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,31 +183,35 @@ def _require_known(inputs: InputOptions, options: ReconstructionOptions) -> None
         _require_choice("--choose", options.model)
 
 
-def volume_job(
-    psfs: Path,
-    image: Path,
-    inputs: InputOptions,
-) -> Job:
+def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOptions) -> Job:
     """Prepare a photograph and PSFs at several depths.
 
-    ``psfs``: a calibration folder or the run it lies in, a multi-page TIFF or array, or a folder with one
-    image file a depth, in the order of their names (the photograph itself may lie there too). Integer PSFs
-    lose their darkest level; float ones are taken to be free of any offset. ``image`` and ``inputs``: as
-    :func:`~instrument.reconstruction.job.job_from_calibration`.
+    ``psfs``: a calibration folder or the run it lies in, or a stack as
+    :func:`~instrument.files.images.read_stack` takes it (the photograph may lie there too), whose order the
+    job's notes and record tell. Integer PSFs lose their darkest level; float ones are taken to be free of any
+    offset. ``image`` and ``inputs``: as :func:`~instrument.reconstruction.job.job_from_calibration`.
 
     Raises FileError or BenchError.
     """
-    if psfs.is_dir() and (is_calibration(psfs) or (psfs / STATE).is_file()):  # or the run it was made in
-        return job_from_calibration(psfs, image, inputs)
-    stack = read_stack(psfs, leave_out=image).pixels
+    if not isinstance(psfs, ImageFile):
+        if psfs.is_dir() and (is_calibration(psfs) or (psfs / STATE).is_file()):  # or the run it was made in
+            return job_from_calibration(psfs, image, inputs)
+        own = image.path if isinstance(image, ImageFile) else image
+        psfs = read_stack(psfs, leave_out=own)
+    stack = psfs.pixels
     pixels = stack.astype(np.float32)
     if stack.dtype.kind == "u":
         pixels = np.maximum(pixels - min(darkest_block(p) for p in pixels), 0)
     channels = pixels[:, None] if pixels.ndim == 3 else np.moveaxis(pixels, -1, 1)
     calibration = Calibration(
-        np.ascontiguousarray(channels), np.full((len(pixels), 3), np.nan), provenance={"psfs": str(psfs)}
+        np.ascontiguousarray(channels), np.full((len(pixels), 3), np.nan), provenance={"psfs": str(psfs.path)}
     )
-    return job_with(calibration, psfs, image, inputs)
+    job = job_with(calibration, psfs.path, image, inputs)
+    return replace(
+        job,
+        notes={**job.notes, **({"PSFs": "; ".join(psfs.notes)} if psfs.notes else {})},
+        provenance={**job.provenance, "psf_stack": dict(psfs.metadata)},
+    )
 
 
 def require_distance(z_um: float) -> None:

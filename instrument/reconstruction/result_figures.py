@@ -77,6 +77,16 @@ def in_colour_of_depth(
     return shown
 
 
+def volume_seen(volume: Grey) -> npt.NDArray[np.uint8]:
+    """Return a volume (n_z, height, width[, n_channels]) for a screen: brightest over depth, depth as hue."""
+    from instrument.files.seen import srgb
+
+    grey_volume = volume if volume.ndim == 3 else volume.mean(axis=-1)
+    front = grey_volume.max(axis=0)
+    coloured = in_colour_of_depth(front, grey_volume.argmax(axis=0), len(volume), _white(front))
+    return np.asarray(np.round(255 * srgb(coloured)), np.uint8)
+
+
 _SLICES = 4
 _WHITE_PERCENTILE = 99.8
 
@@ -135,7 +145,12 @@ def write_figure(path: Path, result: Reconstruction, job: Job, *, rotate_deg: in
 
     Raises FileError or OSError when it cannot be written.
     """
-    save_figure(summary_figure(_summary(result, job, rotate_deg)), path)
+    save_figure(picture_figure(result, job, rotate_deg=rotate_deg), path)
+
+
+def picture_figure(result: Reconstruction, job: Job, *, rotate_deg: int = 0) -> Figure:
+    """Draw PSF, photograph and picture, how the solver converged, and facts."""
+    return summary_figure(_summary(result, job, rotate_deg))
 
 
 def _summary(result: Reconstruction, job: Job, rotate_deg: int) -> Summary:

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.files.atomic import check_writable, write_json, write_text
 from instrument.files.errors import FileError
 from instrument.files.figures import save_figure
 from instrument.files.images import write_image
 from instrument.files.record import plain
+from instrument.files.seen import as_seen, levels_of
 from instrument.files.volumes import (
     is_zarr_name,
     known,
@@ -28,9 +28,6 @@ from instrument.reconstruction.job import Job
 from recon.reconstruction.point_errors import PointErrors
 from recon.reconstruction.result import Grid, Reconstruction
 from recon.reconstruction.uncertainty import Uncertainty
-
-WHITE_PERCENTILE = 99.9
-"""The preview's white; brighter pixels are shown white too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +121,8 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
     """
     image = np.rot90(result.image, rotate_deg // 90)
     write_image(outputs.image, image, {"simulated": job.simulated, "record": outputs.record.name})
-    pixels, white = preview(image)
-    write_image(outputs.preview, pixels)
+    levels = levels_of(image)
+    write_image(outputs.preview, as_seen(image, levels))
     if outputs.deviation is not None and result.uncertainty is not None:
         deviation = np.rot90(result.uncertainty.deviation[0], rotate_deg // 90)
         write_image(outputs.deviation, deviation, {"simulated": job.simulated, "record": outputs.record.name})
@@ -136,7 +133,7 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
         "uncertainty": _of_uncertainty(result.uncertainty, outputs),
         "residual": None if result.residual is None else outputs.written(result)[-1].name,
         "rotated_deg": rotate_deg,
-        "preview": {"white": white, "white_percentile": WHITE_PERCENTILE, "black": 0.0},
+        "preview": levels.to_json(),
     }
     write_json(outputs.record, record)
 
@@ -161,20 +158,6 @@ def picture_grid(grid: Grid) -> dict[str, Any]:
         "object_pitch_um": known(grid.pitch_um[0]),
         "z_um": known(grid.z_um[0]),
     }
-
-
-def preview(image: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.uint8], float]:
-    """Return 8-bit pixels, linear from zero to the white level, and that level in the image's units."""
-    white = white_level(image)
-    return np.clip(image * (255.0 / white) + 0.5, 0, 255).astype(np.uint8), white
-
-
-def white_level(image: npt.NDArray[np.floating]) -> float:
-    """Return the value that a preview shows as white: nearly the brightest, and above zero."""
-    white = float(np.percentile(image, WHITE_PERCENTILE))
-    if white <= 0:
-        white = float(image.max()) if image.max() > 0 else 1.0
-    return white
 
 
 def reconstruction_record(result: Reconstruction, job: Job, *, volume: bool) -> dict[str, Any]:

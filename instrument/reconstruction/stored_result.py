@@ -15,6 +15,7 @@ from instrument.files.atomic import refuse_input, whole_file
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, write_image
 from instrument.files.reading import parse_json, read_bytes, require_file
+from instrument.files.seen import as_seen
 from instrument.files.volumes import (
     VolumeSource,
     is_zarr_name,
@@ -23,7 +24,6 @@ from instrument.files.volumes import (
     write_volume_tiff,
     write_volume_zarr,
 )
-from instrument.reconstruction.result_file import preview
 from recon.reconstruction.result import Grid
 from recon.solvers.base import IterationRecord
 from recon.verdict.judge import Region
@@ -363,7 +363,7 @@ def export_result(
     if result.volume is None:
         assert result.image is not None
         image = np.ascontiguousarray(np.rot90(result.image, rotate_deg // 90))
-        write_image(target, preview(image)[0] if target.suffix.lower() == ".png" else image)
+        write_image(target, as_seen(image) if target.suffix.lower() == ".png" else image)
     elif is_zarr_name(target):
         _to_zarr(result, result.volume, target, advance)
     elif target.suffix.lower() == ".npy":

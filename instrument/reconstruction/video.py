@@ -16,7 +16,7 @@ import numpy as np
 
 from instrument.files.atomic import write_json
 from instrument.files.errors import BenchError, FileError
-from instrument.files.images import as_shown, write_mp4
+from instrument.files.films import as_shown, write_mp4
 from instrument.files.record import plain
 from instrument.files.volumes import is_zarr_name, stem_of
 from instrument.reconstruction.job import Job, Reduction

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from instrument.bench.bench import Bench
 from instrument.bench.camera_settings import camera_settings, restore_camera
+from instrument.bench.photograph import Progress
 from instrument.files.errors import FileError
 from instrument.plan import BenchAbilities, Plan, check
 from instrument.runs.inspection import Verification, verify
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_control import RunControl
-from instrument.runs.run_files import SLM_IMAGES, RunError, log_size
+from instrument.runs.run_files import SLM_IMAGES, RunError
 from instrument.runs.runner import Runner, RunProgress
 from instrument.runs.writer import BenchRecord, RunWriter
 
@@ -79,12 +80,16 @@ def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
         stage_position=stage.position() if stage is not None else {},
         stage_homed=stage is None or stage.is_homed,
         stage_target=(lambda source: bench.source_mount.target(*source)) if stage is not None else None,
+        play=bench.play,
         can_switch_source=bench.can_switch_source,
         can_switch_scene=bench.can_switch_scene,
         n_leds=len(bench.led_array.led_positions_mm) if bench.led_array is not None else 0,
         led_array=bench.led_array,
         slm_shape=slm.shape if slm is not None else None,
         slm_settle_ms=slm.settle_ms if slm is not None else 0.0,
+        has_trigger_wire=bench.trigger_source is not None,
+        trigger_lines=camera.trigger_lines,
+        trigger_edges=camera.trigger_edges,
         free_bytes=free_bytes(folder) if folder is not None else None,
     )
 
@@ -128,44 +133,51 @@ def there_now(folder: Path) -> Path:
     raise FileError(folder, "nothing of this path is there, not even its disk. Is the drive connected?")
 
 
+def look(path: Path | str, on_verify: Progress | None = None) -> Verification:
+    """Verify a run that is to be resumed; ``on_verify`` gets frames read and frames to read.
+
+    Raises RunError when some program writes to it: what is found could be gone the next moment.
+    """
+    run = Run.open(path)
+    if run.is_being_written:
+        raise RunError(run.path, "another program is writing to this run.", "Wait until it ends.")
+    return verify(run, on_verify)
+
+
 def prepare_resume(
     bench: Bench,
     path: Path | str,
+    found: Verification | None = None,
     *,
-    on_verify: Callable[[int, int], None] | None = None,
     on_progress: RunProgress | None = None,
-) -> tuple[Runner, Verification]:
-    """Mend a run's files, read its frames, and return the runner of the steps that are left.
+) -> Runner:
+    """Mend a run's files, and return the runner of the steps that are left.
 
-    With it comes what was found before anything was mended.
-
-    The camera gets the settings that it had when the run began. Settings that the plan left as they were are
-    brought back as the steps before had them. The bench is as a rule opened from the run's own
-    ``bench.toml``. ``on_verify`` is called with frames verified and frames to verify, ``on_progress`` as in
+    ``found`` is what :func:`look` found; None: it is looked now. The camera gets the settings that it had
+    when the run began. Settings that the plan left as they were are brought back as the steps before had
+    them. The bench is as a rule opened from the run's own ``bench.toml``. ``on_progress`` as in
     :func:`acquire`.
 
-    Raises RunError when the folder is no run of a plan, or some program writes to it; PlanError when the
-    bench cannot do what is left; DeviceError or BenchError when the camera does not take the settings of the
-    run.
+    Raises RunError when the folder is no run of a plan, or some program writes to it or did since it was
+    looked at; PlanError when the bench cannot do what is left; DeviceError or BenchError when the camera does
+    not take the settings of the run.
     """
-    size = log_size(path)
-    findings = verify(_at_rest(path), on_verify)  # before this program's own lock answers "running"
-    if findings.is_recording:
+    found = found or look(path)
+    if found.is_recording:
         raise RunError(Path(path), "is a recording; only runs of a plan can be continued.")
-    writer = RunWriter.reopen(path, log_bytes=size)
+    writer = RunWriter.reopen(path, log_bytes=found.log_bytes)
     try:
         run = Run.open(path)
         plan = run.plan
         assert plan is not None
-        _require_slm_images(findings, plan)
+        _require_slm_images(found, plan)
         restore_camera(bench.camera, run.provenance["camera"])
-        check(plan, abilities_of(bench, run.path), todo=findings.todo, start=run.start)
-        writer.note("found", text="\n  ".join([str(findings), *(writer.mended or ())]))
+        check(plan, abilities_of(bench, run.path), todo=found.todo, start=run.start)
+        writer.note("found", text="\n  ".join([str(found), *(writer.mended or ())]))
     except BaseException:
         writer.close()
         raise
-    runner = Runner(bench, plan, writer, start=run.start, todo=findings.todo, on_progress=on_progress)
-    return runner, findings
+    return Runner(bench, plan, writer, start=run.start, todo=found.todo, on_progress=on_progress)
 
 
 def _require_slm_images(findings: Verification, plan: Plan) -> None:
@@ -176,33 +188,36 @@ def _require_slm_images(findings: Verification, plan: Plan) -> None:
             raise RunError(image, "is not the image that the run began with.", "Put it back from a backup.")
 
 
-def _at_rest(path: Path | str) -> Run:
-    """Return a run that no program writes to; raises RunError where one does."""
-    run = Run.open(path)
-    if run.is_being_written:
-        raise RunError(run.path, "another program is writing to this run.", "Wait until it ends.")
-    return run
+def settle(path: Path | str, found: Verification | None = None) -> list[str]:
+    """Mend and close a run that needs no frame taken; returns what was done, in words. No bench is needed.
 
+    Of a recording, frames that are missing or damaged are marked as lost, and images without a line in the
+    log are listed there and stay. ``found`` as in :func:`prepare_resume`.
 
-def settle_recording(path: Path | str, on_verify: Callable[[int, int], None] | None = None) -> list[str]:
-    """Mend a recording's files, and mark frames that are missing or damaged as lost; returns it in words.
-
-    A recording that was cut off is closed. Images without a line in the log are listed there and stay.
-
-    Raises RunError when some program writes to it, or its log is another run's.
+    Raises RunError when frames of a plan are still to be taken, when some program writes to the run or did
+    since it was looked at, or when its log is another run's.
     """
-    size = log_size(path)
-    found = verify(_at_rest(path), on_verify)
-    if found.is_sound and found.condition is not RunCondition.CRASHED:
+    found = found or look(path)
+    if found.todo:
+        raise RunError(Path(path), f"{len(found.todo)} frames of its plan are still to be taken.")
+    ended = found.condition in (_ANY_END if found.is_recording else (RunCondition.COMPLETED,))
+    if found.is_sound and ended:
         return []
-    with RunWriter.reopen(path, log_bytes=size) as writer:
+    with RunWriter.reopen(path, log_bytes=found.log_bytes) as writer:
         words = [*(writer.mended or ()), *writer.settle({f.index: f.problem for f in found.damaged})]
-        reason, error = FinishReason.ABORTED, "its program ended without finishing it"
-        if found.condition is RunCondition.CRASHED:
-            words.append("the recording was cut off; it is closed now")
-        else:
+        reason, error = FinishReason.COMPLETED, ""
+        if found.is_recording and ended:
             run = Run.open(path)
             reason, error = FinishReason(found.condition), run.error
+        elif found.is_recording:
+            reason, error = FinishReason.ABORTED, "its program ended without finishing it"
+        if not ended:
+            kind = "recording" if found.is_recording else "run"
+            how = "cut off" if found.condition is RunCondition.CRASHED else found.condition
+            words.append(f"the {kind} was {how}; it is closed now")
         writer.note("found", text="\n  ".join([str(found), *words]))
         writer.finish(reason, error)
     return words
+
+
+_ANY_END = tuple(RunCondition(reason) for reason in FinishReason)

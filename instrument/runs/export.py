@@ -15,7 +15,8 @@ import tifffile
 from instrument.bench.photograph import Progress
 from instrument.files.atomic import check_writable, require_new, whole_file
 from instrument.files.errors import BenchError, FileError
-from instrument.files.images import as_shown, write_image, write_mp4
+from instrument.files.films import as_shown, write_mp4
+from instrument.files.images import write_image
 from instrument.runs.run import Run
 from instrument.runs.run_files import RunError
 

@@ -20,6 +20,8 @@ from instrument.runs.run_files import LOG, FileProblem, RunError
 class Verification:
     """What looking at a whole run found, and what ``resume`` would do about it."""
 
+    log_bytes: int
+    """The log's size when it was read: what was found holds as long as it has not grown."""
     condition: RunCondition
     """How the run was left."""
     is_recording: bool
@@ -49,17 +51,23 @@ class Verification:
         return [*found, *map(str, self.files), *self.problems]
 
     def remedy(self) -> str:
-        """Return what ``resume`` would do; empty where there is nothing to do."""
-        done = ["makes its files again"] if any(file.text is not None for file in self.files) else []
+        """Return what ``resume`` would do, or what must be done before it can; empty where nothing is."""
+        beyond_help = [file.name for file in self.files if not file.remedy]
+        if LOG in beyond_help:
+            return "Put the run's own log back, or move this one away: resume changes nothing before."
+        if beyond_help and self.todo:
+            return f"Put {', '.join(beyond_help)} back from a backup: resume takes no frame before."
+        done = list(dict.fromkeys(file.remedy for file in self.files if file.remedy))
         if self.is_recording:
             if self.damaged:
                 done.append(f"marks frames {ranges([f.index for f in self.damaged], 8)} as lost")
             if self.without_a_line:
                 done.append("keeps the images without a line")
-        elif self.todo:
-            done.append(f"takes frames {ranges(self.todo, 8)}")
-        if any(file.name == LOG for file in self.files):
-            done.append("cuts out of the log what cannot be read")
+        else:
+            if set(self.without_a_line) - set(self.todo):
+                done.append("moves the images beyond the plan's away")
+            if self.todo:
+                done.append(f"takes frames {ranges(self.todo, 8)}")
         return f"diffuserbench resume {', '.join(done)}; what it replaces is kept beside." if done else ""
 
     def __str__(self) -> str:
@@ -80,6 +88,7 @@ def verify(run: Run, on_progress: Progress | None = None, *, read: bool = True) 
     steps = range(len(plan)) if plan is not None else ()
     running = run.is_being_written
     return Verification(
+        log_bytes=run.log_bytes,
         condition=run.condition,
         is_recording=plan is None,
         frames=len(run.records) + len(run.unlisted) - len(damaged),

@@ -22,13 +22,17 @@ from instrument.runs.run_files import (
     FRAMES,
     KEPT,
     LOG,
+    MADE_AGAIN,
     PROVENANCE,
     RUN_STATE,
     STATE,
     UNCHANGING,
     FileProblem,
     RunError,
+    copies_of,
 )
+
+_CUT = "cuts out of the log what cannot be read"
 
 
 def file_problems(run: Run) -> list[FileProblem]:
@@ -37,12 +41,14 @@ def file_problems(run: Run) -> list[FileProblem]:
         return [FileProblem(LOG, "is another run's, and was not used")]
     found: list[FileProblem] = []
     if not (run.path / LOG).is_file():
-        found.append(FileProblem(LOG, "is gone", ""))
+        found.append(FileProblem(LOG, "is gone", remedy="begins a new log"))
     for bad in run.bad_lines:
         if not bad.is_torn:
-            found.append(FileProblem(LOG, f"line {bad.number} cannot be read ({len(bad.data)} bytes)"))
+            found.append(
+                FileProblem(LOG, f"line {bad.number} cannot be read ({len(bad.data)} bytes)", remedy=_CUT)
+            )
         elif not run.is_being_written:
-            found.append(FileProblem(LOG, f"it ends in a half line of {len(bad.data)} bytes"))
+            found.append(FileProblem(LOG, f"it ends in a half line of {len(bad.data)} bytes", remedy=_CUT))
     found += run.files.problems()
     if (problem := _state_problem(run)) is not None:
         found.append(problem)
@@ -52,7 +58,7 @@ def file_problems(run: Run) -> list[FileProblem]:
 def _state_problem(run: Run) -> FileProblem | None:
     """Hold ``state.json`` against the log."""
     if run.state_problem:
-        return FileProblem(STATE, run.state_problem, RUN_STATE.text(run.state))
+        return FileProblem(STATE, run.state_problem, RUN_STATE.text(run.state), MADE_AGAIN)
     if PROVENANCE not in run.files.copies:
         return None
     by_log = run.state_by_log()
@@ -62,7 +68,7 @@ def _state_problem(run: Run) -> FileProblem | None:
     if not wrong:
         return None
     words = "; ".join(f"{name} is {run.state.get(name)!r:.60}, not {by_log[name]!r:.60}" for name in wrong)
-    return FileProblem(STATE, f"says what the log does not: {words}", RUN_STATE.text(by_log))
+    return FileProblem(STATE, f"says what the log does not: {words}", RUN_STATE.text(by_log), MADE_AGAIN)
 
 
 def _array_problems(run: Run) -> list[FileProblem]:
@@ -87,7 +93,7 @@ def _array_problems(run: Run) -> list[FileProblem]:
         except (FileError, LookupError, TypeError, ValueError, AttributeError):
             problem = "is damaged"
         if problem:
-            found.append(FileProblem(f"{FRAMES}/{name}", problem, json_text(expected)))
+            found.append(FileProblem(f"{FRAMES}/{name}", problem, json_text(expected), MADE_AGAIN))
     return found
 
 
@@ -132,6 +138,11 @@ def mend_files(path: Path) -> list[str]:
         done.append(words)
     if FrameArray.is_there(path / FRAMES):
         run.array.remove_half_written()
+    beyond = [index for index in run.without_a_line() if run.plan is not None and index >= len(run.plan)]
+    for index in beyond:
+        keep_beside(path, str(run.array.chunk_path(index).relative_to(path)))
+    if beyond:
+        done.append(f"images {ranges(beyond, 8)}, beyond the plan's, are kept in {KEPT}")
     _renew_copies(path)
     return done
 
@@ -140,12 +151,12 @@ def _renew_copies(path: Path) -> None:
     """Give a log that lacks them (an older run's, or a new one) copies of the small files."""
     run = Run.open(path)
     absent = [name for name in UNCHANGING if name not in run.files.copies and (path / name).is_file()]
-    texts = {name: run.files.text(name) for name in absent}
+    texts = {name: text for name in absent if (text := run.files.text(name)) is not None}
     if not texts:
         return
     log = AppendOnlyLog(path / LOG)
     try:
-        log.append({"kind": "file", "name": name, "text": text} for name, text in texts.items())
+        log.append(copies_of(texts))
     finally:
         log.close()
 
@@ -179,8 +190,9 @@ def settle_recording(run: Run, log: AppendOnlyLog, damaged: Mapping[int, str]) -
     lines: list[Unlisted | Lost] = [Lost(index, why) for index, why in damaged.items()]
     for index in found:
         assert array is not None
-        chunk = array.checksum(index)
-        if chunk is not None and chunk.n_bytes == array.frame_bytes:
+        whole = array.n_bytes(index) == array.frame_bytes
+        chunk = array.checksum(index) if whole else None
+        if chunk is not None:
             lines.append(Unlisted(index, chunk.n_bytes, f"{chunk.crc32:08x}"))
         else:
             lines.append(Lost(index, "neither its line in the log nor a whole image is left"))

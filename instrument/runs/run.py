@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
 from drivers.registry.claim import is_locked
+from instrument.files.calibration_file import CALIBRATION_FILES, is_calibration
 from instrument.files.errors import FileError
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import value_of
@@ -37,6 +38,7 @@ from instrument.runs.run_files import (
     UNCHANGING,
     RunError,
     RunFiles,
+    log_size,
 )
 
 if TYPE_CHECKING:
@@ -107,12 +109,15 @@ class Run:
         The small files.
     state_problem : str
         What is wrong with ``state.json``, whose ``state`` is then the log's; otherwise empty.
+    log_bytes : int
+        The log's size when it was read.
     log_is_foreign : bool
         Whether ``log.jsonl`` is another run's; nothing is taken from it then.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.log_bytes = log_size(path)
         try:
             lines, self.bad_lines = read_lines(path / LOG)
         except FileNotFoundError:
@@ -430,18 +435,21 @@ def is_run(path: Path) -> bool:
     return (path / STATE).is_file() or ((path / LOG).is_file() and (path / PROVENANCE).is_file())
 
 
-def refuse_own_files(path: Path) -> None:
-    """Refuse to have something else written to a file that a run consists of; results beside them may be.
+_RUN_FILES = (*UNCHANGING, STATE, LOG, LOCK, FRAMES, SLM_IMAGES, KEPT)
 
-    Raises RunError naming the run.
+
+def refuse_own_files(path: Path) -> None:
+    """Refuse to have something else written to what a run or a calibration consists of; beside it may be.
+
+    Raises FileError naming the run or calibration.
     """
     for folder in path.resolve().parents:
-        if is_run(folder):
-            own = path.resolve().relative_to(folder).parts[0]
-            if own in (*UNCHANGING, STATE, LOG, LOCK, FRAMES, SLM_IMAGES, KEPT):
-                raise RunError(
+        own = path.resolve().relative_to(folder).parts[0]
+        for kind, names in (("run", _RUN_FILES), ("calibration", CALIBRATION_FILES)):
+            if own in names and (is_run(folder) if kind == "run" else is_calibration(folder)):
+                raise FileError(
                     folder,
-                    f"is a run, and {own} is part of it; no output replaces it.",
+                    f"is a {kind}, and {own} is part of it; no output replaces it.",
                     "Choose another name.",
                 )
 

@@ -20,6 +20,11 @@ UNCHANGING = (PLAN, BENCH, BENCH_TOML, PROVENANCE)
 """Files that are as they were written; a routine's own record may be put right by hand."""
 
 
+MADE_AGAIN = "makes its files again"
+_LONGEST_COPY = 30 << 20
+"""Bytes of a text that the log takes a copy of: escaped as JSON, it stays below a line's limit."""
+
+
 class RunError(FileError):
     """A run folder that cannot be used as asked."""
 
@@ -36,9 +41,17 @@ class FileProblem:
     problem: str
     text: str | None = None
     """What it should hold; None where that is not known."""
+    remedy: str = ""
+    """What ``resume`` does about it; empty where it can do nothing."""
 
     def __str__(self) -> str:
         return f"{self.name}: {self.problem}"
+
+
+def copies_of(texts: Mapping[str, str]) -> list[dict[str, str]]:
+    """Return the lines of the log that keep these files' texts, by name; a text too long gets none."""
+    short = {name: text for name, text in texts.items() if len(text.encode()) <= _LONGEST_COPY}
+    return [{"kind": "file", "name": name, "text": text} for name, text in short.items()]
 
 
 def slm_image_name(data: bytes, suffix: str) -> str:
@@ -97,14 +110,19 @@ class RunFiles:
     def problems(self) -> list[FileProblem]:
         """Return what differs from the copies, and SLM images that are not what their names say."""
         found = [
-            FileProblem(name, problem, text)
+            FileProblem(name, problem, text, MADE_AGAIN)
             for name, text in self.copies.items()
             if (problem := self._problem(name, text)) is not None
         ]
         folder = self.path / SLM_IMAGES
         for image in sorted(folder.iterdir()) if folder.is_dir() else ():
-            if image.name != slm_image_name(image.read_bytes(), image.suffix):
-                found.append(FileProblem(f"{SLM_IMAGES}/{image.name}", "is not as it was written"))
+            try:
+                same = image.name == slm_image_name(read_bytes(image), image.suffix)
+                problem = "" if same else "is not as it was written"
+            except (OSError, FileError):
+                problem = "cannot be read"
+            if problem:
+                found.append(FileProblem(f"{SLM_IMAGES}/{image.name}", problem))
         return found
 
     def _problem(self, name: str, text: str) -> str | None:

@@ -43,6 +43,7 @@ from instrument.runs.run_files import (
     SLM_IMAGES,
     STATE,
     RunError,
+    copies_of,
     log_size,
     slm_image_name,
 )
@@ -208,8 +209,7 @@ class RunWriter:
                     "pid": os.getpid(),
                 }
                 write_json(draft / STATE, RUN_STATE.stamped(state))
-                copies = (log_line({"kind": "file", "name": n, "text": text}) for n, text in texts.items())
-                write_bytes(draft / LOG, b"".join(copies))
+                write_bytes(draft / LOG, b"".join(map(log_line, copies_of(texts))))
                 write_bytes(draft / LOCK, b"")
                 held = lock_run(draft)
                 draft.rename(path)
@@ -286,7 +286,8 @@ class RunWriter:
         """Write one more small file of the run, with its copy in the log."""
         with _disk(self.path, f"{name} could not be written"):
             write_bytes(self.path / name, text.encode())
-        self._append({"kind": "file", "name": name, "text": text})
+        for copy in copies_of({name: text}):
+            self._append(copy)
 
     def settle(self, damaged: Mapping[int, str]) -> list[str]:
         """Say in a recording's log what became of damaged frames (why, by frame) and of unlisted images."""
@@ -309,14 +310,20 @@ class RunWriter:
         self._array.resize(run.n_frames, frame_period_s=run.frame_period_s)
 
     def finish(self, reason: FinishReason, error: str = "") -> Run:
-        """Say how the run ended, close its files, and return it for reading."""
+        """Say how the run ended, close its files, and return it for reading.
+
+        A run that ended before, and was only mended, keeps the time of its end.
+        """
+        utc = datetime.now(UTC).isoformat()
+        if self._state["state"] == "finished":
+            utc = self._state.get("finished_utc", utc)
         ended = {"reason": reason.value, "error": error}
         try:
             with _disk(self.path, "its array could not be trimmed"):
                 self._trim()
             sums = self._array.description_sums() if self._array is not None else {}
-            self.note("finished", **ended, descriptions=sums)
-            self._set_state(state="finished", **ended, finished_utc=datetime.now(UTC).isoformat())
+            self.note("finished", **ended, descriptions=sums, utc=utc)
+            self._set_state(state="finished", **ended, finished_utc=utc)
         finally:
             self.close()
         return Run.open(self.path)

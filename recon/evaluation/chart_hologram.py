@@ -28,6 +28,9 @@ from recon.holography.target import Target, foveal_weights
 
 Array = npt.NDArray[Any]
 
+LIGHTS = (0.7, 0.4, 0.2, 0.1, 0.03, 0.01)
+"""What a complex SLM is charted at."""
+
 COUNTS = (1, 3, 5, 10, 20, 40, 80, 160)
 """Iterations at which a run is scored."""
 
@@ -45,6 +48,8 @@ class HologramSetting:
     that."""
     frames: int = 1
     """Shown one after the other."""
+    light: float | None = None
+    """Part of the light that a complex SLM sends into the field; None for a phase SLM."""
 
     @property
     def family(self) -> str:
@@ -52,18 +57,21 @@ class HologramSetting:
         if self.method == "one-step":
             return "one-step"
         loss = LOSSES.named(self.loss).title
+        if self.light is not None:
+            return f"{loss}, complex SLM"
         return f"{loss}, Nesterov" if self.method == "nesterov" else loss
 
     @property
     def name(self) -> str:
         """Say it briefly."""
         frames = "" if self.frames == 1 else f", {self.frames} frames"
-        return f"{self.expansion}x {self.family}{frames}"
+        light = "" if self.light is None else f", {self.light:.0%} of the light"
+        return f"{self.expansion}x {self.family}{frames}{light}"
 
     @property
     def group(self) -> str:
-        """Settings of one expansion compete."""
-        return f"{self.expansion}x"
+        """Settings of one expansion and kind of SLM compete; a complex one's trade light for quality."""
+        return f"{self.expansion}x" if self.light is None else f"{self.expansion}x, complex SLM"
 
 
 @dataclass(frozen=True)
@@ -101,6 +109,7 @@ class HologramProblem(Subject[HologramSetting]):
                 found.append(HologramSetting(q, "one-step", "frequency", frames))
                 found += [HologramSetting(q, "lbfgs", loss, frames) for loss in LOSSES]
             found += [HologramSetting(q, "nesterov", loss) for loss in LOSSES]
+            found += [HologramSetting(q, light=light) for light in LIGHTS]
         return tuple(sorted(found, key=_cost))
 
     def _curve(
@@ -118,6 +127,8 @@ class HologramProblem(Subject[HologramSetting]):
             time_s=limit_s,
             tolerance=0.0,
             seed=self.seed,
+            complex_slm=setting.light is not None,
+            light=setting.light,
         )
         model = HologramModel(display, targets, options)
         points: list[Point] = []

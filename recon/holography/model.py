@@ -67,7 +67,7 @@ class HologramModel:
     targets : sequence of Target
         One per plane; planes share the loss.
     options : HologramOptions
-        Loss, weights, grid and frames make the model; the search takes the rest.
+        Loss, weights, grid, frames and the kind of SLM make the model; the search takes the rest.
     dtype : complex64 or complex128
     **overrides
         Single options.
@@ -170,6 +170,11 @@ class HologramModel:
         total *= self._ey[:, None] * self._ex
         return np.fft.fftshift(total)
 
+    def efficiency(self, slm: ComplexArray, plane: int = 0) -> float:
+        """Return the part of the light on the SLM that reaches the field, DC term and envelope included."""
+        self._intensity_spectrum(self._check(slm), plane)
+        return float(self._spectrum[0, 0].real) * self._mean_power()
+
     def back_propagate(self, amplitude: ComplexArray, plane: int = 0) -> ComplexArray:
         """Return ``U^H m^* h^* F^-1 amplitude``: a field in the image plane integrated over the SLM pixels.
 
@@ -195,7 +200,9 @@ class HologramModel:
     # Steps -------------------------------------------------------------------------------------
     def _spectrum_of(self, target: Target) -> tuple[ComplexArray, float]:
         spectrum, peak = target.spectrum(self.display, self.band)
-        return spectrum.astype(self.dtype), peak
+        share = self.options.share
+        spectrum *= share
+        return spectrum.astype(self.dtype), peak * share
 
     def _mean_power(self) -> float:
         """Return the mean light that passes from an SLM of random phases, relative to a mask in place."""

@@ -1,7 +1,7 @@
 """Find the SLM pattern: L-BFGS on the phase, projected gradient, one-step back-propagation.
 
 All start from a seed or a given pattern and give the same result for the same seed, whatever the number of
-threads. A complex SLM (any amplitude) is the same problem without the constraint on the amplitude.
+threads. The amplitude of a complex SLM lies between 0 and 1 all the way.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from recon.holography.options import HologramOptions
 
 Array = npt.NDArray[Any]
 
-_OF_THE_MODEL = ("loss", "centre", "radius", "periphery", "weights", "grid", "frames")
+_OF_THE_MODEL = ("loss", "centre", "radius", "periphery", "weights", "grid", "frames", "complex_slm", "light")
 
 
 class HologramStop(enum.StrEnum):
@@ -36,6 +36,7 @@ class HologramStop(enum.StrEnum):
     ITERATIONS = "the number of iterations is reached"
     CANCELLED = "cancelled"
     ONE_STEP = "one-step method"
+    EVEN = "the spots are as bright as asked for"
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,21 +121,22 @@ def compute_hologram(
         return _on_levels(phase, phase.pack(_start(initial, model, options)), options.phase_levels, watch)
     search: _Lbfgs | _Nesterov
     if method == "lbfgs":
-        variable = _Complex(model) if complex_slm else _Phase(model)
+        variable = _Bounded(model) if complex_slm else _Phase(model)
         search = _Lbfgs(variable, variable.pack(_start(initial, model, options)))
     else:
         search = _Nesterov(model, _start(initial, model, options), complex_slm)
     history, reason = watch.run(search, options.iterations, options.psnr_db)
-    slm = search.slm / max(float(np.abs(search.slm).max()), 1.0) if complex_slm else search.slm
-    return Hologram(slm.astype(np.complex64), history, reason, history[-1].seconds)
+    return Hologram(search.slm.astype(np.complex64), history, reason, history[-1].seconds)
 
 
 def _start(initial: Array | None, model: HologramModel, options: HologramOptions) -> Array:
     if initial is not None:
-        return initial if options.complex_slm else _unit(initial)
+        return _within(initial) if options.complex_slm else _unit(initial)
     shape = (model.frames, *model.display.slm_shape)
     phases = np.random.default_rng(options.seed).uniform(0, 2 * np.pi, shape).astype(np.float32)
-    return np.asarray(np.exp(1j * phases))
+    start: Array = np.exp(1j * phases)
+    start *= np.float32(np.sqrt(options.share))
+    return start
 
 
 def one_step(model: HologramModel, *, seed: int = 0) -> Hologram:
@@ -156,6 +158,11 @@ def one_step(model: HologramModel, *, seed: int = 0) -> Hologram:
 
 def _unit(slm: Array) -> Array:
     return np.exp(1j * np.angle(slm)).astype(slm.dtype)
+
+
+def _within(slm: Array) -> Array:
+    """Return the nearest field whose amplitude is at most 1."""
+    return np.asarray(slm / np.maximum(np.abs(slm), 1), slm.dtype)
 
 
 def _sample(image: Array, shape: tuple[int, int]) -> Array:
@@ -180,6 +187,8 @@ class _Phase:
 
     def __init__(self, model: HologramModel) -> None:
         self.model = model
+        self.first_step = 0.5
+        """Root mean square of the first step, radians."""
 
     def pack(self, slm: Array) -> Array:
         phases: Array = np.angle(slm).astype(self.model.dtype.type(0).real.dtype)
@@ -205,24 +214,46 @@ class _Phase:
         return _Point(found.loss, found.seen_psnr_db), gradient
 
 
-class _Complex:
-    """Real and imaginary parts of the SLM's field as a flat real vector."""
+class _Bounded:
+    """The field of a complex SLM, amplitude at most 1, as a flat real vector.
+
+    ``s = z (1 + |z|^4)^(-1/4)`` takes any ``z`` into the disc, nearly unchanged where it is small: without a
+    constraint to watch, L-BFGS walks as on the phases. (With ``(1 + |z|^2)^(-1/2)`` or the mean of two phases
+    0.3 to 2.8 dB less after 100 iterations at 4x, 10 % of the light.)
+    """
 
     def __init__(self, model: HologramModel) -> None:
         self.model = model
+        self.first_step = 0.5 * float(np.sqrt(model.options.share))
 
     def pack(self, slm: Array) -> Array:
-        parts: Array = slm.astype(self.model.dtype).view(self.model.dtype.type(0).real.dtype)
-        return parts.ravel()
+        start = slm.astype(self.model.dtype)
+        start *= np.minimum(1, 0.95 / np.maximum(np.abs(start), 1e-12))  # the disc's edge is infinitely far
+        start *= (1 - np.abs(start) ** 4) ** -0.25
+        return start.view(self._real).ravel()
 
     def field(self, x: Array) -> Array:
-        slm: Array = x.view(self.model.dtype).reshape(self.model.frames, *self.model.display.slm_shape)
-        return slm
+        z = self._inside(x)
+        return np.asarray(z * (1 + np.abs(z) ** 4) ** -0.25, self.model.dtype)
 
     def evaluate(self, x: Array) -> tuple[_Point, Array]:
-        found = self.model.evaluate(self.field(x))
-        gradient: Array = 2 * found.gradient.ravel()
-        return _Point(found.loss, found.seen_psnr_db), gradient.view(gradient.real.dtype)
+        z = self._inside(x)
+        power = np.abs(z) ** 2
+        shrink = (1 + power**2) ** -0.25
+        found = self.model.evaluate(z * shrink)
+        gradient = found.gradient
+        # ds = shrink dz - shrink^5 |z|^2 z Re(conj(z) dz)
+        radial = (np.conj(z) * gradient).real
+        gradient = 2 * (shrink * gradient - (shrink**5 * power * radial) * z).astype(self.model.dtype)
+        return _Point(found.loss, found.seen_psnr_db), gradient.view(self._real).ravel()
+
+    @property
+    def _real(self) -> np.dtype[Any]:
+        return np.empty(0, self.model.dtype).real.dtype
+
+    def _inside(self, x: Array) -> Array:
+        z: Array = x.view(self.model.dtype).reshape(self.model.frames, *self.model.display.slm_shape)
+        return z
 
 
 # Searches -----------------------------------------------------------------------------------------
@@ -230,15 +261,14 @@ class _Complex:
 class _Lbfgs:
     """L-BFGS with a back-tracking line search (Nocedal and Wright, Alg. 7.4).
 
-    The first step turns the phases by a typical 0.5 rad; from then on the step 1 is nearly always taken, so
-    an iteration costs one evaluation. Three pairs: eight gain less than 0.15 dB after 100 iterations and need
-    10 more SLM-sized arrays.
+    The first step turns the phases by a typical 0.5 rad (a complex SLM's field by as much); from then on the
+    step 1 is nearly always taken, so an iteration costs one evaluation. Three pairs: eight gain less than
+    0.15 dB after 100 iterations and need 10 more SLM-sized arrays.
     """
 
     MEMORY = 3
-    FIRST_STEP_RAD = 0.5
 
-    def __init__(self, variable: _Phase | _Complex, x: Array) -> None:
+    def __init__(self, variable: _Phase | _Bounded, x: Array) -> None:
         self.variable = variable
         self.x = x
         self.point, self.gradient = variable.evaluate(self.x)
@@ -262,7 +292,9 @@ class _Lbfgs:
         direction = -self.gradient
         if not self.pairs:
             size = float(np.sqrt(np.mean(self.gradient.astype(np.float64) ** 2)))
-            return direction * direction.dtype.type(self.FIRST_STEP_RAD / size) if size > 0 else direction
+            return (
+                direction * direction.dtype.type(self.variable.first_step / size) if size > 0 else direction
+            )
         weights = []
         for s, y, rho in reversed(self.pairs):
             weight = rho * float(s @ direction)
@@ -309,7 +341,7 @@ class _Nesterov:
 
     def __init__(self, model: HologramModel, start: Array, complex_slm: bool) -> None:
         self.model = model
-        self.project: Callable[[Array], Array] = (lambda s: s) if complex_slm else _unit
+        self.project: Callable[[Array], Array] = _within if complex_slm else _unit
         self.base = self.ahead = start.astype(model.dtype)
         self.t = 1.0
         found = model.evaluate(self.ahead)

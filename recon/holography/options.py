@@ -18,6 +18,10 @@ Method = Literal["lbfgs", "nesterov", "one-step"]
 Fit = Literal["cover", "contain", "stretch"]
 Envelope = Literal["shade", "correct", "ignore"]
 
+LIGHT = 0.1
+"""Of the light on a complex SLM: at 16x a tenth is 2.5 to 7 dB better than a phase SLM, and a hundredth
+0.4 dB more (benchmarks/hologram_limits.py)."""
+
 _PICTURE, _COUNTS, _STOP, _SLM, _RARE = "Picture", "What counts", "When to stop", "Display", "Rarely needed"
 
 
@@ -90,7 +94,7 @@ class HologramOptions:
     )
     expansion: int | None = option(
         None,
-        help="Étendue expansion: 4, 16, 36 ..., a square.",
+        help="Étendue expansion: 4, 16, 36 ..., a square; 1: without a mask.",
         default_words="the bench's",
         least=1,
         flags=("--expansion", "-q"),
@@ -102,9 +106,20 @@ class HologramOptions:
     )
     complex_slm: bool = option(
         False,
-        help="For an SLM that sets amplitude and phase.",
+        help="For an SLM that sets amplitude, at most 1, and phase.",
         flags=("--complex",),
         label="Complex SLM",
+        group=_SLM,
+    )
+    light: float | None = option(
+        None,
+        help="Of a complex SLM, how much of the light that falls on it goes into the field: the less, the "
+        "better the picture. A phase SLM always sends all of it.",
+        default_words="0.1 with a complex SLM",
+        above=0,
+        most=1,
+        metavar="SHARE",
+        label="Light",
         group=_SLM,
     )
     phase_levels: int | None = option(
@@ -170,6 +185,8 @@ class HologramOptions:
         require(self)
         if not all(0 <= at <= 1 for at in self.centre):
             raise InputError(f"centre must lie in 0 to 1 of the field, not {self.centre}.")
+        if self.light is not None and not self.complex_slm:
+            raise InputError("light is of a complex SLM: a phase SLM sends all of the light into the field.")
         if self.weights is None:
             return
         if not loss_of(self.loss).takes_weights:
@@ -178,6 +195,13 @@ class HologramOptions:
         weights = self.weights
         if weights.ndim != 2 or not np.isfinite(weights).all() or weights.min() < 0 or weights.max() <= 0:
             raise InputError("Weights must be a (height, width) image, finite, not negative, not all zero.")
+
+    @property
+    def share(self) -> float:
+        """How much of the light on the SLM the target asks for."""
+        if not self.complex_slm:
+            return 1.0
+        return LIGHT if self.light is None else self.light
 
     def field_weights(self) -> npt.NDArray[Any] | None:
         """Return the weights over the field, (height, width); None where the loss takes none."""

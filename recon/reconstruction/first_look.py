@@ -29,7 +29,8 @@ share, and at most this."""
 WEIGHT = 0.25
 """Of total variation in the look, in units of the noise."""
 STEEPEST = 2.5
-"""Steepness up to which the laws were fitted: beyond, smaller weights would take ever more iterations."""
+"""Steepness up to which the laws were fitted, in units of what is left where that is more than the noise:
+beyond, smaller weights would take ever more iterations."""
 LIT = 0.1
 """A pixel is lit from this share of the brightest (99.9th percentile)."""
 
@@ -98,9 +99,10 @@ class FirstLook:
     def weight(self, prior: str) -> float:
         """Return the weight of a prior by name, in units of the noise."""
         law = LAWS[kind_of(prior)]
-        misfit = min(max(self.misfit, 1.0), law.most_misfit) ** law.misfit
-        steepness = float(np.clip(self.steepness, 1e-6, STEEPEST))
-        weight = law.factor * steepness**law.steepness * 2 ** (law.lit * self.lit) * misfit
+        misfit = min(max(self.misfit, 1.0), law.most_misfit)
+        steepness = float(np.clip(self.steepness, 1e-6, STEEPEST * misfit))
+        factor = law.factor * 2 ** (law.lit * self.lit)
+        weight = factor * steepness**law.steepness * misfit**law.misfit
         return float(min(weight, law.most)) * self.passed_on
 
     def in_words(self, prior: str) -> str:

@@ -122,12 +122,18 @@ class Problem:
         extent = extent or Extent()
         _require(options)
         measurement = measurement if isinstance(measurement, Measurement) else Measurement(measurement)
+        measurement, holes = measurement.with_holes_erased()
         counts = measurement.counts()
         if not isinstance(calibration, Calibration):
             if options.model not in ("auto", "convolution"):
                 raise InputError(
                     f"The {options.model} model needs a calibration with PSFs from several places of the "
                     "field."
+                )
+            if options.z_um is not None:
+                raise InputError(
+                    f"z_um = {options.z_um:g} asks for the picture at a depth; a bare PSF image has none: "
+                    "leave z_um out, or give a Calibration with the depths of its PSFs."
                 )
             psfs = as_channels(calibration, "PSF")
             calibration = Calibration(psfs[None], np.full((1, 3), np.nan))
@@ -161,7 +167,7 @@ class Problem:
             (not one and measurement.background is None) if asked is None else asked,
             "float32" if options.precision == "auto" else options.precision,
             extent,
-            tuple(dict.fromkeys((*doubts, *depths.warnings, *counts.warnings))),
+            tuple(dict.fromkeys((*filter(None, (holes,)), *doubts, *depths.warnings, *counts.warnings))),
         )
         if options.axis_weights is not None:
             problem._require_axis_weights(options.axis_weights)

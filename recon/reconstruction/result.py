@@ -84,7 +84,7 @@ def window_of(
     return window, (row - top, column - left)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Reconstruction:
     """A reconstructed picture or volume with all that is needed to judge it: a picture is one plane.
 
@@ -165,6 +165,16 @@ class Reconstruction:
     state: npt.NDArray[Any] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     basis: tuple[Problem, Reconstruction] | None = field(default=None, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        """Say in a line what it is, how it was made, and whether to trust it."""
+        planes, height, width = self.volume.shape[:3]
+        size = f"Picture {height} x {width}" if planes == 1 else f"Volume {planes} x {height} x {width}"
+        size += f" x {self.volume.shape[3]} channels" if self.volume.ndim == 4 else ""
+        count = len(self.history)
+        ended = f"{count} iterations, {self.seconds:.1f} s, {self.stop_reason}" if count else "one step"
+        verdict = "" if self.verdict is None else "; " + self.verdict.sentences[0].partition(":")[0]
+        return f"<{size} by {self.solver}, prior {self.prior}: {ended}{verdict}>"
 
     @property
     def is_picture(self) -> bool:

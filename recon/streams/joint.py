@@ -214,7 +214,8 @@ def solve_together(
     over_time : "tv" or "lowrank"
         Total variation along time, or low rank plus sparse (background and activity).
     weight : float, optional
-        Of the prior over time relative to the frames' own; default 1.
+        Of the prior over time, in units of the noise that the adjoint passes on; default 1. What changes in
+        time says nothing of the steps in space that the frames' own weight follows.
     ended : callable
         Asked before each iteration; True gives the block up.
 
@@ -236,7 +237,7 @@ def solve_together(
     if not problem.valid.all():
         valid = np.repeat(problem.valid, len(frames), axis=0)
         operator = Erasures(valid, data.shape, part.dtype) @ operator
-    scale = part.weight * (1.0 if weight is None else weight)
+    scale = (1.0 if weight is None else weight) * float(np.sqrt(problem.valid.mean()))
     prior_over_time: OverTime = (
         TemporalTotalVariation(scale)
         if over_time == "tv"

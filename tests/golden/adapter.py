@@ -270,6 +270,7 @@ def hologram(  # noqa: PLR0913 - what the cases vary
         displacement=displacement,
     )
     shown = [Target(image, z_mm) for image, z_mm in targets]
+    complex_slm = bool(options.pop("complex_slm", False))
     weights = foveal_weights((64, 64), radius=0.3, periphery=0.05) if loss == "spatial" else None
     model = HologramModel(
         display,
@@ -278,6 +279,7 @@ def hologram(  # noqa: PLR0913 - what the cases vary
         weights=weights,
         grid=grid,
         frames=frames,
+        complex_slm=complex_slm,
         dtype=np.complex128 if precise else np.complex64,
     )
     found = compute_hologram(model, iterations=iterations, tolerance=0, **options)

@@ -279,6 +279,10 @@ def test_no_output_is_written_to_a_runs_own_files(here: Path, capsys: pytest.Cap
         assert "is part of it; no output replaces it" in capsys.readouterr().err
     assert verify(Run.open(run.path)).is_sound
     assert main(["snap", "--dark", "--out", str(run.path / "beside.tif")]) == 0
+    (calibration := here / "calibration").mkdir()
+    (calibration / "calibration.json").write_text("{}")
+    assert main(["snap", "--dark", "--force", "--out", str(calibration / "psfs.ome.zarr")]) == 2
+    assert "is a calibration, and psfs.ome.zarr is part of it" in capsys.readouterr().err
 
 
 def test_list_says_what_cannot_be_read(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -34,7 +34,7 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError
-from instrument.runs.acquire import prepare_resume
+from instrument.runs.acquire import look, prepare_resume
 from instrument.runs.run import FinishReason, RunCondition
 from instrument.runs.runner import RunStatus
 from recon import reconstruct
@@ -285,7 +285,7 @@ def test_a_sweep_that_was_cut_off_is_resumed_and_becomes_a_calibration(bench: Be
         pass
 
     def cut(status: RunStatus) -> None:
-        if status.done == 9:
+        if status.done == 7:
             raise Cut
 
     with pytest.raises(Cut):
@@ -293,8 +293,9 @@ def test_a_sweep_that_was_cut_off_is_resumed_and_becomes_a_calibration(bench: Be
     (run,) = tmp_path.iterdir()
     with pytest.raises(CalibrationError, match="ended early"):
         finish_sweep(run)
-    runner, findings = prepare_resume(bench, run)
-    assert findings.frames >= 9
+    findings = look(run)
+    runner = prepare_resume(bench, run, findings)
+    assert findings.frames >= 7
     events: list[SweepEvent] = []
     watch_sweep(bench, runner, Following(on_event=events.append))
     assert runner.execute().condition is RunCondition.COMPLETED

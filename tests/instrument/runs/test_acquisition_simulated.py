@@ -106,7 +106,7 @@ def test_a_device_unplugged_mid_run_loses_nothing_and_the_run_goes_on(tmp_path: 
     kept = {i: run.frame(i) for i in run.records}
     assert len(kept) >= 3
     with open_tiny() as bench:
-        run = prepare_resume(bench, runner.path)[0].execute()
+        run = prepare_resume(bench, runner.path).execute()
     assert run.condition is RunCondition.COMPLETED
     assert verify(run).is_sound
     assert all(np.array_equal(run.frame(i), frame) for i, frame in kept.items())

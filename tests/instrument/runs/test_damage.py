@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from instrument.plan import Part, Plan
-from instrument.runs.acquire import prepare, prepare_resume, settle_recording
+from instrument.runs.acquire import look, prepare, prepare_resume, settle
 from instrument.runs.inspection import verify
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_files import RunError
@@ -168,6 +168,41 @@ def test_an_older_runs_log_without_sums_and_copies_gets_them(tmp_path: Path, run
     assert Run.open(path).plan == Run.open(runs[0]).plan
 
 
+def test_what_verify_says_that_resume_does_is_what_it_does(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    shutil.copytree(runs[0], path)
+    assert look(path).remedy() == ""
+    ended = Run.open(path).state["finished_utc"]
+    (path / "provenance.json").write_text("{")
+    chunk = Run.open(path).array.chunk_path(len(Run.open(path).records))  # beyond the plan
+    chunk.parent.mkdir(parents=True)
+    chunk.write_bytes(b"an image of nothing")
+    found = look(path)
+    assert not found.todo
+    assert found.remedy() == (
+        "diffuserbench resume makes its files again, moves the images beyond the plan's away; "
+        "what it replaces is kept beside."
+    )
+    said = "\n".join(settle(path, found))  # no bench is opened
+    assert "provenance.json was made again" in said
+    assert "beyond the plan's, are kept" in said
+    assert look(path).is_sound
+    assert {p.read_bytes() for p in (path / "kept").iterdir()} == {b"{", b"an image of nothing"}
+    assert Run.open(path).state["finished_utc"] == Run.open(path).state_by_log()["finished_utc"] == ended
+    shutil.copy(runs[1] / "log.jsonl", path)
+    foreign = look(path)
+    assert foreign.remedy().startswith("Put the run's own log back")
+    with pytest.raises(RunError, match="another run's; nothing was changed"):
+        RunWriter.reopen(path)
+    (path / "log.jsonl").unlink()
+    assert "begins a new log, takes frames" in look(path).remedy()
+    with pytest.raises(RunError, match="still to be taken"):
+        settle(path)
+    (path / "slm").mkdir(exist_ok=True)
+    (path / "slm" / "no-image").mkdir()
+    assert look(path).remedy().startswith("Put slm/no-image back from a backup")
+
+
 def test_a_recording_keeps_images_without_a_line_and_marks_the_rest_as_lost(tmp_path: Path) -> None:
     with new_run(tmp_path, plan=None) as writer:
         writer.start()
@@ -183,7 +218,7 @@ def test_a_recording_keeps_images_without_a_line_and_marks_the_rest_as_lost(tmp_
     assert [f.index for f in found.damaged] == [5, 6]
     assert found.without_a_line == (3,)
     assert "marks frames 5-6 as lost" in found.remedy()
-    said = "\n".join(settle_recording(path))
+    said = "\n".join(settle(path))
     assert "marked as lost: frames 5-6" in said
     assert "images of frames 3" in said
     run = Run.open(path)
@@ -195,7 +230,7 @@ def test_a_recording_keeps_images_without_a_line_and_marks_the_rest_as_lost(tmp_
     assert (chunks / "5/0/0").read_bytes() == b"short"
     with pytest.raises(RunError, match="frame 6 is lost: its file is gone"):
         run.frame(6)
-    assert settle_recording(path) == []
+    assert settle(path) == []
     (chunks / "3/0/0").write_bytes(bytes(96))
     assert [f.index for f in verify(Run.open(path)).damaged] == [3]
 
@@ -210,7 +245,8 @@ def test_a_completed_run_takes_damaged_frames_again_and_keeps_the_old(tmp_path: 
     chunk = Run.open(path).array.chunk_path(2)
     chunk.write_bytes(spoilt := bytes(chunk.stat().st_size))
     with open_mock_bench() as bench:
-        runner, findings = prepare_resume(bench, path)
+        findings = look(path)
+        runner = prepare_resume(bench, path, findings)
         assert findings.todo == (2,)
         run = runner.execute()
     assert verify(run).is_sound

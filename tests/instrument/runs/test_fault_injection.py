@@ -120,7 +120,7 @@ def test_a_fault_at_any_device_call_leaves_the_bench_safe_and_a_run_that_goes_on
         assert verify(run).is_sound
         with open_mock_bench() as bench:
             taken = len(run.records)
-            run = prepare_resume(bench, run.path)[0].execute()
+            run = prepare_resume(bench, run.path).execute()
             exposures = calls(bench).count("camera.snap")
         assert run.condition is RunCondition.COMPLETED
         assert sorted(run.records) == list(range(len(PLAN)))
@@ -167,7 +167,7 @@ def test_a_disk_that_fails_at_any_write_loses_nothing_that_was_written(tmp_path:
         if run.condition is RunCondition.COMPLETED:
             continue
         with open_mock_bench() as bench:
-            run = prepare_resume(bench, run.path)[0].execute()
+            run = prepare_resume(bench, run.path).execute()
         assert run.missing() == []
         assert all(run.array.chunk_path(i).read_bytes() == data for i, data in frames.items())
         assert verify(run).is_sound

@@ -14,7 +14,7 @@ from drivers.registry import claim
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.plan import Part, Plan, PlanError, SourcePoints, StagePoints
-from instrument.runs.acquire import prepare, prepare_resume
+from instrument.runs.acquire import look, prepare, prepare_resume
 from instrument.runs.inspection import verify
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_files import RunError
@@ -76,7 +76,8 @@ def test_resume_does_what_is_left_and_nothing_twice(tmp_path: Path, after: int) 
         assert sorted(kept.records) == list(range(n_kept))
     before = image_bytes(path, range(n_kept))
     with open_mock_bench() as bench:
-        runner, findings = prepare_resume(bench, path)
+        findings = look(path)
+        runner = prepare_resume(bench, path, findings)
         assert findings.todo == tuple(range(n_kept, 6))
         run = runner.execute()
         assert calls(bench).count("camera.snap") == 6 - n_kept
@@ -103,7 +104,7 @@ def test_the_camera_and_the_stage_are_as_they_were_when_the_run_began(tmp_path: 
         runner = prepare(bench, plan, tmp_path, on_progress=abort)
         path = runner.execute().path
     with open_mock_bench() as bench:
-        run = prepare_resume(bench, path)[0].execute()
+        run = prepare_resume(bench, path).execute()
     last = run.metadata(2)
     assert (last.exposure_ms, last.gain, last.stage_position["z_um"]) == (33, 4, 77)
 
@@ -116,7 +117,8 @@ def test_damaged_and_missing_images_are_taken_again_and_named(tmp_path: Path) ->
     array.chunk_path(1).write_bytes(data)
     array.chunk_path(3).unlink()
     with open_mock_bench() as bench:
-        runner, findings = prepare_resume(bench, path)
+        findings = look(path)
+        runner = prepare_resume(bench, path, findings)
         assert findings.todo == (1, 3, 5)
         assert [frame.index for frame in findings.damaged] == [1, 3]
         assert "frame 1: its file" in str(findings)
@@ -136,7 +138,8 @@ def test_what_a_crash_leaves_behind_is_found_and_done_again(tmp_path: Path) -> N
     (path / ".state.12ab34cd.json").write_text("{")
     assert Run.open(path).condition is RunCondition.CRASHED
     with open_mock_bench() as bench:
-        runner, findings = prepare_resume(bench, path)
+        findings = look(path)
+        runner = prepare_resume(bench, path, findings)
         assert findings.condition is RunCondition.CRASHED
         assert (findings.without_a_line, findings.todo) == ((3,), (3, 4, 5))
         run = runner.execute()
@@ -212,7 +215,7 @@ def test_slm_images_are_the_ones_that_the_run_began_with(tmp_path: Path) -> None
         image.unlink()
     moved = path.rename(tmp_path / "elsewhere")
     with open_mock_bench() as bench:
-        run = prepare_resume(bench, moved)[0].execute()
+        run = prepare_resume(bench, moved).execute()
     hashes = [run.metadata(i).slm_image_hash for i in range(4)]
     assert hashes == [whole.metadata(i).slm_image_hash for i in range(4)]
     assert hashes[0] == hashes[2] == hashes[3] != hashes[1]
@@ -230,7 +233,7 @@ def test_positions_by_stage_axes_go_on_as_well(tmp_path: Path) -> None:
     whole = Run.open(aborted_run(tmp_path / "whole", plan, after=99))
     path = aborted_run(tmp_path / "cut", plan, after=3)
     with open_mock_bench() as bench:
-        run = prepare_resume(bench, path)[0].execute()
+        run = prepare_resume(bench, path).execute()
     for i in range(4):
         assert run.metadata(i).stage_position == whole.metadata(i).stage_position
         assert np.array_equal(run.frame(i).shape, whole.frame(i).shape)

@@ -22,7 +22,7 @@ from ome_zarr_models.v05 import Image
 
 from instrument.cli import main
 from instrument.files.errors import BenchError, FileError
-from instrument.files.images import as_shown
+from instrument.files.films import as_shown
 from instrument.plan import Part, Plan
 from instrument.reconstruction import video_work as block_module
 from instrument.reconstruction.options import InputOptions, VideoOptions

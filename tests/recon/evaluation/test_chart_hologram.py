@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon.errors import InputError
-from recon.evaluation.chart_hologram import HologramProblem, HologramSetting
+from recon.evaluation.chart_hologram import LIGHTS, HologramProblem, HologramSetting
 from recon.evaluation.scored import KINDS, fronts
 from recon.holography import Display, HologramModel, Target, compute_hologram, judge, random_mask
 
@@ -36,7 +36,7 @@ def problem() -> HologramProblem:
 
 def test_every_loss_method_expansion_and_number_of_frames_takes_part(problem):
     settings = problem.settings()
-    assert len({s.name for s in settings}) == len(settings) == 2 * (2 * 4 + 3)
+    assert len({s.name for s in settings}) == len(settings) == 2 * (2 * 4 + 3 + len(LIGHTS))
     assert {s.expansion for s in settings} == {4, 16}
     assert {s.loss for s in settings if s.method == "lbfgs"} == {"none", "frequency", "spatial"}
     assert settings[0].method == "one-step"
@@ -47,6 +47,12 @@ def test_every_loss_method_expansion_and_number_of_frames_takes_part(problem):
     ):
         with pytest.raises(InputError, match="does not apply"):
             problem.run(outside)
+
+
+def test_a_complex_slm_trades_light_for_quality_and_competes_with_itself(problem):
+    bright, dim = (problem.run(HologramSetting(16, light=light), counts=(40,)) for light in (LIGHTS[0], 0.1))
+    assert dim.points[-1].psnr_db > bright.points[-1].psnr_db + 1
+    assert bright.points[-1].group == "16x, complex SLM"
 
 
 def test_a_score_is_that_of_the_plain_judge(problem):

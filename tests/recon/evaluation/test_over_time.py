@@ -28,7 +28,7 @@ def test_points_are_cast_where_the_truth_has_them_and_move_as_asked() -> None:
 def test_total_variation_over_time_helps_what_stands_and_harms_what_runs() -> None:
     trial = map_named("over-time-motion").trial
     stands, runs = (trial("temporal tv", v, 30.0, 0, "quick") for v in (0.0, 3.0))
-    # -22 % and +5 % on 2026-11-22 (-15 % and +44 % before frames' own weight came from a first look, 0071).
-    assert -30 < stands.error < -7
+    # -31 % and +41 % on 2026-11-23.
+    assert -45 < stands.error < -15
     assert stands.severities[Failure.ALONE] == pytest.approx(1 + stands.error / 100)
-    assert 2 < runs.error < 80
+    assert 20 < runs.error < 80

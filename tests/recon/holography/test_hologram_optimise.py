@@ -12,6 +12,7 @@ from recon.holography import (
     DcTerm,
     Display,
     HologramModel,
+    HologramOptions,
     HologramStop,
     Target,
     compute_hologram,
@@ -19,6 +20,7 @@ from recon.holography import (
     judge,
     random_mask,
 )
+from recon.holography.optimise import _Bounded
 
 SHAPE, K = (48, 64), 2
 
@@ -108,13 +110,37 @@ def test_a_modelled_dc_term_costs_little_and_an_ignored_one_much():
     assert modelled.history[-1].psnr_db > ignored + 3
 
 
-def test_a_complex_slm_beats_a_phase_slm():
-    display = Display(SHAPE, random_mask((SHAPE[0] * K, SHAPE[1] * K), seed=1))
-    phase = compute_hologram(make_model(), iterations=60)
-    free = compute_hologram(make_model(), iterations=60, complex_slm=True)
-    assert np.abs(free.slm).max() <= 1 + 1e-6
+def test_a_complex_slm_beats_a_phase_slm_beside_a_dc_term_at_the_light_that_was_asked_for():
+    display = Display(SHAPE, random_mask((SHAPE[0] * K, SHAPE[1] * K), seed=1), dc=DcTerm(0.1, 0.6))
     target = Target(picture())
-    assert judge(free.slm, display, target).psnr_db > judge(phase.slm, display, target).psnr_db + 1
+    phase = compute_hologram(make_model(display=display), iterations=60)
+    for light in (0.3, 0.05):
+        model = make_model({"complex_slm": True, "light": light}, display=display)
+        free = compute_hologram(model, iterations=60)
+        assert np.abs(free.slm).max() <= 1 + 1e-6
+        gain = judge(free.slm, display, target).psnr_db - judge(phase.slm, display, target).psnr_db
+        assert gain > 4
+        behind = np.mean(np.abs(display.dc.modulated * free.slm + display.dc.amplitude) ** 2)
+        assert model.efficiency(free.slm) == pytest.approx(behind, rel=1e-3)
+        assert behind == pytest.approx(light, rel=0.05)
+    plain = compute_hologram(model, iterations=30, method="nesterov")
+    assert np.abs(plain.slm).max() <= 1 + 1e-6
+    assert plain.history[-1].loss < 0.1 * plain.history[0].loss
+
+
+def test_the_gradient_of_a_bounded_amplitude_is_its_finite_difference():
+    model = HologramModel(
+        Display((8, 8), random_mask((16, 16)), dc=DcTerm(0.1, 0.6)),
+        [Target(np.random.default_rng(1).random((16, 16)))],
+        complex_slm=True,
+        light=0.6,
+        dtype=np.complex128,
+    )
+    variable = _Bounded(model)
+    x, step = np.random.default_rng(2).normal(0, 1.2, (2, 128))
+    sides = [variable.evaluate(x + h * step)[0].loss for h in (1e-5, -1e-5)]
+    assert (sides[0] - sides[1]) / 2e-5 == pytest.approx(float(variable.evaluate(x)[1] @ step), rel=1e-6)
+    assert variable.field(variable.pack(variable.field(x) * 0.9)) == pytest.approx(variable.field(x) * 0.9)
 
 
 def test_planes_share_the_hologram():
@@ -160,7 +186,9 @@ def test_bad_requests_are_refused_in_words():
     with pytest.raises(InputError, match="method must be one of"):
         compute_hologram(model, method="adam")
     with pytest.raises(InputError, match="takes no start"):
-        compute_hologram(model, method="one-step", complex_slm=True)
+        compute_hologram(make_model({"complex_slm": True}), method="one-step")
+    with pytest.raises(InputError, match="light is of a complex SLM"):
+        HologramOptions(light=0.5)
 
 
 @pytest.mark.parametrize("levels", [2, 4, 64])
@@ -181,12 +209,13 @@ def test_phases_on_levels_do_better_than_rounded_ones(levels):
 
 def test_levels_need_the_phase_and_lbfgs():
     for options, words in (
-        ({"complex_slm": True}, "Phase levels are of a phase SLM"),
         ({"method": "nesterov"}, "need the method 'lbfgs'"),
         ({"phase_levels": 1}, "phase_levels must be a whole number, 2 or more"),
     ):
         with pytest.raises(InputError, match=words):
             compute_hologram(make_model(), **{"phase_levels": 4, **options})
+    with pytest.raises(InputError, match="Phase levels are of a phase SLM"):
+        compute_hologram(make_model({"complex_slm": True}), phase_levels=4)
 
 
 def test_what_made_the_model_is_not_overridden_by_the_search():
@@ -196,5 +225,6 @@ def test_what_made_the_model_is_not_overridden_by_the_search():
 
 def test_what_a_callback_keeps_stays_as_it_was():
     kept = []
-    compute_hologram(make_model(), iterations=3, complex_slm=True, callback=lambda _, s: kept.append(s))
+    model = make_model({"complex_slm": True})
+    compute_hologram(model, iterations=3, callback=lambda _, s: kept.append(s))
     assert np.abs(kept[0] - kept[1]).max() > 1e-3

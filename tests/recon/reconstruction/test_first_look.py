@@ -54,6 +54,7 @@ def test_a_misfit_far_above_the_noise_asks_for_more_and_all_stays_within_limits(
 
     assert weight(1, 0.3, 3.0) > 3 * weight(1, 0.3, 1.0)
     assert weight(1, 0.3, 90.0) == weight(1, 0.3, LAWS["tv"].most_misfit)
+    assert weight(10, 0.3, 4.0) < weight(2.5, 0.3, 4.0) / 2  # steps count beside what is left
     assert weight(0, 1.0, 2.0) == LAWS["tv"].most
     assert weight(1e9, 0.0, 0.0) == weight(STEEPEST, 0.0, 1.0) > 0
 

@@ -1,0 +1,274 @@
+"""Frames of the same thing differ: by noise, and on a real bench by a flickering lamp, a shaking table.
+
+Whatever averages frames looks at how they scatter first. Each frame is held against their mean by one linear
+fit: ``frame = brightness * mean - (rows, columns) . grad(mean) + ambient``, so that light that changes, a
+picture that moves and other light that comes in are told apart, each with its own uncertainty. What a fit to
+the noise would give is taken off; what is left is the bench's.
+
+* Brightness: frames of one place share it, so an average of ``n`` is known to ``flicker / sqrt(n)``. Nothing
+  in the frames tells the rest; the result says so, or is refused.
+* Place: frames are put onto one another before they are averaged, which takes out the blur.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from recon.base.blocks import block_mean
+from recon.camera.registration import moved, register
+
+Float = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float64]
+
+TOLERATED = 0.02
+"""Part of a result that a fault of the bench may change without being named."""
+LARGEST_PX = 500_000
+"""Larger images are binned before they are compared: a twentieth of a pixel is told still."""
+_LINEAR_PX = 0.4  # a picture moves so far as its gradient tells; beyond, it is registered
+_SLOPE = np.array([-1, 9, -45, 0, 45, -9, 1], np.float32) / 60
+"""A derivative of sixth order: the usual one of second order takes fine structure for flatter than it is."""
+_UNLIKE = 0.3  # part of an image's contrast that a fit leaves: beyond, it is looked for elsewhere
+_FLAT = 0.3  # contrast, relative to the mean, below which other light cannot be told from brightness
+_SHAKEN_PX = 0.05  # frames that scatter less are averaged as they are
+_SURE = 3.0  # standard deviations of its own uncertainty, beyond which a scatter is the bench's
+_SHARP_PX = 2.0
+"""Width of a pattern's finest structure: blurred by ``s`` pixels it changes by about ``(s / this)^2``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """How an image differs from another one of the same thing."""
+
+    brightness: float
+    """Relative to the other's; nan where there is no light."""
+    rows: float
+    columns: float
+    """Displacement, pixels; infinite where the pattern is not found again."""
+    ambient: float
+    """Light that came in evenly, in units of the other's mean."""
+    brightness_noise: float = 0.0
+    place_noise: float = 0.0
+    """Standard deviations by the images' noise alone: of brightness, and of the displacement, pixels."""
+
+    @property
+    def shift_px(self) -> float:
+        """Length of the displacement."""
+        return float(np.hypot(self.rows, self.columns))
+
+
+NO_CHANGE = Change(1.0, 0.0, 0.0, 0.0)
+"""Of an image against itself."""
+
+
+def reduction(image: npt.NDArray[np.floating]) -> int:
+    """Return by how much an image (..., height, width) is binned before it is compared."""
+    return max(1, int(np.ceil(np.sqrt(np.prod(image.shape[-2:]) / LARGEST_PX))))
+
+
+def compare(image: Float, reference: Float) -> Change:
+    """Return how an image differs from a reference, (height, width) each, dark frames taken off."""
+    factor = reduction(reference)
+    seen, other = block_mean(image, factor), block_mean(reference, factor)
+    if not other.mean() > 0 or not np.ptp(seen) > 0 or not np.ptp(other) > 0:
+        return Change(float("nan"), float("nan"), float("nan"), float("nan"))
+    found, left = _fitted(seen, other)
+    if left > _UNLIKE or found.shift_px > _LINEAR_PX:
+        far = register(seen, other)
+        if far.reliable:
+            found, left = _fitted(moved(seen, -far.rows, -far.columns), other)
+            found = _with_place(found, found.rows + far.rows, found.columns + far.columns)
+        elif left > _UNLIKE:
+            brightness = float(image.sum(dtype=np.float64) / reference.sum(dtype=np.float64))
+            return Change(brightness, float("inf"), float("inf"), 0.0)
+    return _with_place(found, factor * found.rows, factor * found.columns, factor * found.place_noise)
+
+
+def _with_place(found: Change, rows: float, columns: float, noise: float | None = None) -> Change:
+    noise = found.place_noise if noise is None else noise
+    return Change(found.brightness, rows, columns, found.ambient, found.brightness_noise, noise)
+
+
+def _fitted(seen: Float, other: Float) -> tuple[Change, float]:
+    """Fit brightness, place and other light; returns the part of the contrast that is left, too."""
+    mean = float(other.mean(dtype=np.float64))
+    down, right = (ndimage.correlate1d(other, _SLOPE, axis=axis) for axis in (0, 1))
+    columns = [other, -down, -right]
+    if float(other.std(dtype=np.float64)) > _FLAT * mean:
+        columns.append(np.full_like(other, mean))
+    design = np.stack([column.ravel() for column in columns]).astype(np.float64)
+    target = seen.ravel().astype(np.float64)
+    inverse = np.linalg.pinv(design @ design.T)
+    solution = inverse @ (design @ target)
+    rest = target - solution @ design
+    spread = inverse @ ((design * rest**2) @ design.T) @ inverse  # White's estimate: noise grows with light
+    noise = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    level = float(solution[0])
+    safe = level if abs(level) > 1e-6 else 1e-6
+    change = Change(
+        level,
+        float(solution[1] / safe),
+        float(solution[2] / safe),
+        float(solution[3]) if len(solution) > 3 else 0.0,
+        float(noise[0]),
+        float(np.hypot(noise[1], noise[2]) / abs(safe)),
+    )
+    return change, float(rest.std() / max(target.std(), 1e-12))
+
+
+@dataclass(frozen=True, slots=True)
+class Scatter:
+    """How the frames of an average scatter, beyond what their noise explains; of several averages: pooled."""
+
+    frames: int
+    """Of one average."""
+    flicker: float = 0.0
+    """Standard deviation of the brightness, relative."""
+    motion_px: float = 0.0
+    """Standard deviation of the place, both axes together, pixels of the camera."""
+    ambient: float = 0.0
+    """Standard deviation of light that came in evenly, in units of the mean light."""
+    averages: int = 1
+    """Averages whose frames were looked at."""
+
+    @property
+    def brightness_error(self) -> float:
+        """Of an average: standard deviation, relative."""
+        return self.flicker / float(np.sqrt(self.frames))
+
+    @property
+    def place_error_px(self) -> float:
+        """Of an average: standard deviation, pixels."""
+        return self.motion_px / float(np.sqrt(self.frames))
+
+    @property
+    def blur(self) -> float:
+        """About how much a plain average differs from one of steady frames, relative."""
+        return (self.motion_px / _SHARP_PX) ** 2 * (1 - 1 / self.frames) / 2
+
+    @property
+    def frames_needed(self) -> int:
+        """Frames of an average whose brightness is known well enough."""
+        return int(np.ceil((self.flicker / TOLERATED) ** 2))
+
+    def findings(self, what: str = "PSF") -> tuple[str, ...]:
+        """Return what is wrong with the light and the place of what was averaged, with the remedy."""
+        found = []
+        if self.brightness_error > TOLERATED:
+            many = "one frame" if self.frames == 1 else f"{self.frames} frames"
+            found.append(
+                f"the light flickers by {self.flicker:.1%} from frame to frame, so that the brightness of a "
+                f"{what} of {many} is known to {self.brightness_error:.1%} only (wanted: {TOLERATED:.0%}): "
+                "give the lamp a steady supply, lengthen the exposure over its flicker, or average "
+                f"{self.frames_needed} frames."
+            )
+        if self.ambient > TOLERATED:
+            found.append(
+                f"other light came and went between frames, by {self.ambient:.1%} of the {what}'s mean: keep "
+                "daylight, lamps and screens out."
+            )
+        if self.blur > TOLERATED:
+            found.append(
+                f"the picture shakes by {self.motion_px:.2f} pixels from frame to frame (frames were put "
+                f"onto one another; the place of a {what} is known to {self.place_error_px:.2f} pixels): "
+                "clamp source, stage and camera, wait after moves, take the table off what vibrates."
+            )
+        return tuple(found)
+
+
+STEADY = Scatter(1, averages=0)
+"""Nothing is known of a scatter: single frames."""
+
+
+def scatter_of(frames: Float) -> tuple[Scatter, list[Change]]:
+    """Return how frames of the same thing scatter, and how each differs from their mean.
+
+    Parameters
+    ----------
+    frames : ndarray, float32, (n_frames, height, width)
+        Dark frames taken off, hot pixels replaced.
+    """
+    if len(frames) < 2:
+        return Scatter(len(frames), averages=0), []
+    changes = _against(frames, frames.mean(axis=0, dtype=np.float32))
+    if not max(change.shift_px for change in changes) <= _LINEAR_PX:  # their mean is blurred: once more
+        changes = _against(frames, frames[0])
+        if all(np.isfinite(change.shift_px) for change in changes):
+            back = [_put_back(frame, change) for frame, change in zip(frames, changes, strict=True)]
+            changes = _against(frames, np.mean(back, axis=0).astype(np.float32))
+    if not all(np.isfinite(change.shift_px) for change in changes):
+        return Scatter(len(frames), averages=0), []
+    levels = np.array([change.brightness for change in changes])
+    places = np.array([(change.rows, change.columns) for change in changes])
+    ambient = np.array([change.ambient for change in changes])
+    flicker = _beyond(levels.var(ddof=1), [c.brightness_noise for c in changes]) / abs(levels.mean())
+    motion = _beyond(places.var(axis=0, ddof=1).sum(), [c.place_noise for c in changes])
+    came = _beyond(ambient.var(ddof=1), [c.brightness_noise for c in changes])
+    return Scatter(len(frames), float(flicker), motion, came), changes
+
+
+def _against(frames: Float, reference: Float) -> list[Change]:
+    return [compare(frame, reference) for frame in frames]
+
+
+def _beyond(variance: float, noises: Sequence[float]) -> float:
+    """Return the standard deviation that is left when the noise's share is taken off; 0 for what is its."""
+    expected = float(np.mean(np.square(noises)))
+    return float(np.sqrt(variance - expected)) if variance > _SURE**2 * expected else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Steadied:
+    """Frames of the same thing with what flickered and shook taken out, as far as they tell."""
+
+    frames: Float
+    """(n_frames, height, width) or (n_frames, height, width, 3): as bright as their mean, and put onto one
+    another."""
+    scatter: Scatter
+
+    @property
+    def mean(self) -> Float:
+        """Their mean."""
+        mean: Float = self.frames.mean(axis=0, dtype=np.float32)
+        return mean
+
+
+def steadied(frames: Float) -> Steadied:
+    """Look at how frames scatter, and take out what they tell.
+
+    Parameters
+    ----------
+    frames : ndarray, float32, (n_frames, height, width) or (n_frames, height, width, 3)
+        Of the same thing, dark frames taken off, hot pixels replaced.
+    """
+    scatter, changes = scatter_of(frames if frames.ndim == 3 else frames.mean(axis=-1))
+    if scatter.flicker > 0:
+        levels = np.array([change.brightness for change in changes], np.float32)
+        frames = frames * (levels.mean() / levels).reshape(-1, *(1,) * (frames.ndim - 1))
+    if scatter.motion_px > _SHAKEN_PX:
+        frames = np.stack([_put_back(frame, change) for frame, change in zip(frames, changes, strict=True)])
+    return Steadied(frames, scatter)
+
+
+def _put_back(frame: Float, change: Change) -> Float:
+    """Return a frame, (height, width) or (height, width, 3), moved back onto the mean."""
+    if frame.ndim == 2:
+        return np.asarray(moved(frame, -change.rows, -change.columns), np.float32)
+    first = np.moveaxis(frame, -1, 0)
+    return np.asarray(np.moveaxis(moved(first, -change.rows, -change.columns), 0, -1), np.float32)
+
+
+def pooled(scatters: Sequence[Scatter]) -> Scatter:
+    """Return the scatter of several averages together: the root of the mean square."""
+    known = [one for one in scatters if one.averages]
+    if not known:
+        return scatters[0] if scatters else STEADY
+    means = {
+        name: float(np.sqrt(np.mean([getattr(one, name) ** 2 for one in known])))
+        for name in ("flicker", "motion_px", "ambient")
+    }
+    return Scatter(min(one.frames for one in known), averages=len(known), **means)

@@ -1,0 +1,1 @@
+"""Devices that another computer's ``diffuserbench serve`` offers, over HTTP and WebSocket."""

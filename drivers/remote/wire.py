@@ -1,0 +1,260 @@
+"""What goes over the network: which calls a kind of device has, and their values as JSON; frames as bytes.
+
+Both ends read the calls off the interfaces (:mod:`drivers.camera` and its neighbours), so what an interface
+declares is served and called without being declared again. A call is one HTTP request:
+
+===========================================  ====================================================
+``GET /api/devices/KIND/NAME``               a property, or what only looks
+``POST /api/devices/KIND/NAME``              a command; its arguments by name, a JSON object
+``PUT /api/devices/KIND/NAME``               what overtakes: ``stop``, ``off``, ``stop_sequence``
+``GET /api/devices/KIND/hold`` (WebSocket)   opens the device and keeps it for one operator, until it ends
+``GET /api/devices/camera/frames``           (WebSocket) a running sequence
+===========================================  ====================================================
+
+A reply is a JSON object with ``value`` or ``error``, or the bytes of one frame (:func:`pack_frame`).
+"""
+
+from __future__ import annotations
+
+import base64
+import functools
+import inspect
+import io
+import json
+import struct
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from types import FunctionType
+from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from drivers import errors
+from drivers.camera import Camera
+from drivers.device import Device
+from drivers.frame import Frame, FrameMetadata
+from drivers.led_array import LedArray
+from drivers.registry.claim import DeviceBusyError
+from drivers.slm import Slm
+from drivers.stage import Stage
+
+Kind = Literal["camera", "stage", "led_array", "slm"]
+INTERFACES: Mapping[Kind, Any] = {
+    "camera": Camera,
+    "stage": Stage,
+    "led_array": LedArray,
+    "slm": Slm,
+}
+PORT = 8470
+OPERATOR_HEADER = "Diffuserbench-Operator"
+"""Whose call it is: a word that its program drew when it began."""
+NUMBER_HEADER = "Diffuserbench-Number"
+"""Calls of one opening are numbered: one that a later stop has overtaken on its way is not carried out."""
+PROTOCOL = "diffuserbench"
+"""WebSocket subprotocol; a browser, which can send no header, gives the token as a second one."""
+
+_AT_HOME = {"open", "close", "is_open", "name", "stream", "start_sequence", "next_frame", "next_frame_into"}
+_AT_HOME |= {"is_streaming", "frame_dtype", "single"}
+"""What the computer that asks answers itself."""
+_OVERTAKING = frozenset(("stop", "off", "stop_sequence"))
+
+
+class Values:
+    """A type's values as JSON has them, arrays and frames included."""
+
+    def __init__(self, hint: Any) -> None:
+        self.is_array = get_origin(hint) is np.ndarray or any(
+            get_origin(part) is np.ndarray for part in get_args(hint)
+        )
+        self.is_frame = hint is Frame
+        self._adapter: TypeAdapter[Any] = TypeAdapter(Any if self.is_array or self.is_frame else hint)
+
+    def dump(self, value: Any) -> Any:
+        """Return a value as ``json.dumps`` takes it, with :func:`plain`."""
+        if self.is_array:
+            file = io.BytesIO()
+            np.save(file, np.ascontiguousarray(value), allow_pickle=False)
+            return base64.b64encode(file.getvalue()).decode()
+        return self._adapter.dump_python(value, mode="json", warnings=False)
+
+    def load(self, value: Any) -> Any:
+        """Return a value from what ``json.loads`` gave.
+
+        Raises ValueError when it is none of this type.
+        """
+        if not self.is_array:
+            return self._adapter.validate_python(value)
+        array = np.load(io.BytesIO(base64.b64decode(value, validate=True)), allow_pickle=False)
+        array.flags.writeable = False
+        return array
+
+
+def plain(value: Any) -> Any:
+    """Return what JSON has for a value that it does not know: numbers of NumPy's."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} cannot be sent.")
+
+
+@dataclass(frozen=True)
+class Call:
+    """One call that a kind of device takes.
+
+    Attributes
+    ----------
+    verb : str
+        ``"GET"``, ``"POST"`` or ``"PUT"``, as this module's beginning has it.
+    signature : inspect.Signature or None
+        Of the method; None of a property.
+    takes : mapping
+        Its arguments' types.
+    gives : Values
+        Its result's type.
+    function : function
+        The interface's own.
+    """
+
+    name: str
+    verb: Literal["GET", "POST", "PUT"]
+    signature: inspect.Signature | None
+    takes: Mapping[str, Values]
+    gives: Values
+    function: FunctionType
+
+    def named(self, device: Device, args: tuple[Any, ...], named: Mapping[str, Any]) -> dict[str, Any]:
+        """Return arguments by name, as JSON has them."""
+        if self.signature is None:
+            return {}
+        bound = self.signature.bind(device, *args, **named).arguments
+        return {name: self.takes[name].dump(value) for name, value in bound.items() if name in self.takes}
+
+    def make(self, device: Device, arguments: Mapping[str, Any]) -> Any:
+        """Call a device, with arguments from JSON.
+
+        Raises ValueError when they do not fit the call; what the device raises.
+        """
+        if self.signature is None:
+            return getattr(device, self.name)
+        unknown = [name for name in arguments if name not in self.takes]
+        if unknown:
+            raise ValueError(f"{self.name} takes no {', '.join(unknown)}")
+        given = {name: self.takes[name].load(value) for name, value in arguments.items()}
+        try:
+            self.signature.bind(device, **given)
+        except TypeError as error:
+            raise ValueError(f"{self.name}: {error}") from None
+        return getattr(device, self.name)(**given)
+
+
+@functools.cache
+def calls(kind: Kind) -> Mapping[str, Call]:
+    """Return what a kind of device is asked for from afar, by name."""
+    found: dict[str, Call] = {}
+    for name in dir(INTERFACES[kind]):
+        member = inspect.getattr_static(INTERFACES[kind], name)
+        function = member.fget if isinstance(member, property) else member
+        if name.startswith("_") or name in _AT_HOME or not isinstance(function, FunctionType):
+            continue
+        hints = get_type_hints(function)
+        gives = Values(hints.pop("return"))
+        is_read = isinstance(member, property)
+        verb: Literal["GET", "POST", "PUT"] = "GET" if is_read else "POST"
+        found[name] = Call(
+            name,
+            "PUT" if name in _OVERTAKING else verb,
+            None if is_read else inspect.signature(function),
+            {name: Values(hint) for name, hint in hints.items()},
+            gives,
+            function,
+        )
+    return found
+
+
+@functools.cache
+def facts(kind: Kind) -> Mapping[str, Values]:
+    """Return what a kind of device declares of itself beside calls: a camera's trigger modes, its silence."""
+    hints = get_type_hints(INTERFACES[kind])
+    return {
+        name: Values(get_args(hint)[0] if get_origin(hint) is ClassVar else hint)
+        for name, hint in hints.items()
+        if name not in ("Options", "Shared") and not name.startswith("_")
+    }
+
+
+# Errors ---
+_ERRORS: Mapping[str, type[errors.DeviceError]] = {
+    kind.__name__: kind
+    for kind in (
+        errors.DeviceError,
+        errors.DeviceNotOpenError,
+        errors.DeviceLostError,
+        errors.DeviceTimeoutError,
+        errors.LimitError,
+        errors.StoppedError,
+        DeviceBusyError,
+    )
+}
+
+
+def dump_error(error: errors.DeviceError) -> dict[str, str]:
+    """Return an error as JSON has it."""
+    return {"type": type(error).__name__, "problem": error.problem, "remedy": error.remedy}
+
+
+def load_error(device: str, said: Mapping[str, str]) -> errors.DeviceError:
+    """Return the error that the other end had, under this end's name of the device."""
+    kind = _ERRORS.get(said["type"], errors.DeviceError)
+    made = errors.DeviceError(device, said["problem"], said["remedy"])
+    if kind is not errors.DeviceNotOpenError:
+        made = kind(device, said["problem"], said["remedy"])
+    return made
+
+
+# Frames ---
+_LENGTH = struct.Struct("<I")
+_ALIGNED = 8
+
+
+@functools.cache
+def _metadata() -> TypeAdapter[FrameMetadata]:
+    return TypeAdapter(FrameMetadata)
+
+
+def pack_frame(frame: Frame, number: int = 0) -> list[bytes | memoryview]:
+    """Return a frame as parts of one message: the length of a JSON object, the object, the pixels.
+
+    ``number`` is the frame's place among those sent, from 0.
+    """
+    said = json.dumps(
+        {
+            "number": number,
+            "shape": frame.image.shape,
+            "bits": 8 * frame.image.dtype.itemsize,
+            "metadata": _metadata().dump_python(frame.metadata, mode="json", warnings=False),
+        },
+        default=plain,
+    ).encode()
+    said += b" " * (-(len(said) + _LENGTH.size) % _ALIGNED)
+    pixels = np.ascontiguousarray(frame.image, dtype=frame.image.dtype.newbyteorder("<"))
+    return [_LENGTH.pack(len(said)), said, pixels.data.cast("B")]
+
+
+def unpack_frame(message: bytes) -> tuple[Frame, int]:
+    """Return a frame, whose image looks at the message, and its number; it reached this computer now.
+
+    Raises ValueError when the message is no frame.
+    """
+    try:
+        (length,) = _LENGTH.unpack_from(message)
+        begin = _LENGTH.size + length
+        said = json.loads(message[_LENGTH.size : begin])
+        metadata = _metadata().validate_python(said["metadata"])
+        pixels = np.frombuffer(message, "<u1" if said["bits"] == 8 else "<u2", offset=begin)
+        image = pixels.reshape(said["shape"])
+        number = int(said["number"])
+    except (struct.error, KeyError, TypeError) as error:
+        raise ValueError(f"no frame: {error!r}") from None
+    return Frame(image, replace(metadata, host_time_ns=time.monotonic_ns(), utc=datetime.now(UTC))), number

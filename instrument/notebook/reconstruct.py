@@ -1,0 +1,225 @@
+"""From images, arrays or files to a result, in one call: what is prepared is what the terminal prepares."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config import BenchConfig
+from instrument.bench.config_file import TEMPLATES, parse_config, template
+from instrument.bench.source_and_scene import Ask
+from instrument.files.calibration_file import load_calibration
+from instrument.files.errors import BenchError
+from instrument.files.images import ImageFile, read
+from instrument.notebook.result import Result
+from instrument.reconstruction.job import Job, find_calibration, job_from_files, job_with
+from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.request import refocused, volume_job
+from instrument.runs.run import Run
+from recon.base.checks import as_channels
+from recon.base.declare import options_of, require, with_overrides
+from recon.reconstruction import reconstruct as one_door
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.problem import Stage
+from recon.reconstruction.result import Reconstruction
+from recon.reconstruction.solve import Progress
+from recon.types import Calibration
+
+Image = Path | str | ImageFile | Measurement | npt.ArrayLike
+Psf = Path | str | ImageFile | Calibration | npt.ArrayLike
+
+_INPUTS = {f.name for f in fields(InputOptions)}
+_FILES_ONLY = _INPUTS - set(one_door.FACTS)
+
+
+def calibration(folder: Path | str) -> Calibration:
+    """Read a calibration: its folder, or the run that it was made in.
+
+    Raises FileError when there is none, more than one, or it is damaged.
+    """
+    return load_calibration(find_calibration(Path(folder)))
+
+
+def run(folder: Path | str) -> Run:
+    """Open a run for reading; raises RunError where there is none."""
+    return Run.open(folder)
+
+
+def bench(config: BenchConfig | Path | str | None = None, *, ask: Ask | None = None) -> Bench:
+    """Open a bench, to be used as a context manager.
+
+    Parameters
+    ----------
+    config : path or str, optional
+        A ``bench.toml``; or ``"display"``, ``"led_microscope"``, ``"screen"`` or ``"default"`` for one of the
+        simulated benches. None: ``bench.toml`` in the working folder, else the simulated bench.
+    ask : callable, optional
+        Asks whoever stands at the bench to do something by hand.
+
+    Raises ConfigError, FileError or DeviceError as :func:`~instrument.bench.bench.open_bench`.
+    """
+    if isinstance(config, str) and config in TEMPLATES and not Path(config).exists():
+        config = parse_config(template(config), None)
+    return open_bench(config, ask=ask)
+
+
+def reconstruct(
+    image: Image,
+    psf: Psf,
+    options: ReconstructionOptions | None = None,
+    *,
+    warm: Reconstruction | None = None,
+    on_progress: Progress | None = None,
+    cancel: threading.Event | None = None,
+    on_stage: Stage | None = None,
+    **overrides: Any,
+) -> Result:
+    """Reconstruct a picture, or a volume where PSFs of several depths are given.
+
+    Files, and images that were read from them, are prepared as the terminal does it: dark level, saturated
+    pixels, raw colours, binning to half a megapixel; ``result.job.notes`` says what was done. Arrays are
+    taken as they are, the PSF without background.
+
+    Parameters
+    ----------
+    image : path, image, Measurement or array, (height, width) or (height, width, n_channels)
+        The photograph.
+    psf : path, image, Calibration or array
+        A PSF image; a calibration's folder or a run with one; for a volume a folder or stack of PSFs, one a
+        depth.
+    options : ReconstructionOptions, optional
+        How to reconstruct.
+    warm, on_progress, cancel, on_stage
+        As :func:`recon.reconstruct`. Without ``on_stage`` what takes over two seconds is told in a line.
+    **overrides
+        Single options by name: of the reconstruction (``prior="l1"``, ``iterations=50``, ``z_um=30e3``), and
+        of how files are read (``dark``, ``crop``, ``binning``, ``erasures``, ``mosaic``, ``noise``), as
+        values or in the words of the terminal (``dark="dark.tif"``).
+
+    Raises InputError, BenchError or FileError: what was found, what was expected, what to do.
+    """
+    image, psf = getattr(image, "measurement", image), getattr(psf, "calibration", psf)
+    told = on_stage or _Told()
+    further: dict[str, Any] = {"warm": warm, "on_progress": on_progress, "cancel": cancel, "on_stage": told}
+    try:
+        if _is_file(image) or _is_file(psf):
+            inputs = _inputs({name: overrides.pop(name) for name in _INPUTS & set(overrides)})
+            options = with_overrides(options or ReconstructionOptions(), overrides)
+            job = _job(_opened(image, "photograph"), psf, inputs, options.z_um)
+            measurement = job.as_measurement(inputs.noise)
+            return Result.of(one_door.reconstruct(measurement, job.calibration, options, **further), job)
+        if about := sorted(_FILES_ONLY & set(overrides)):
+            raise BenchError(
+                f"{' and '.join(about)}: of files, and of images by db.read; arrays are taken as they are. "
+                "Leave it out, or do it to the arrays."
+            )
+        found = one_door.reconstruct(image, psf, options, **further, **overrides)  # type: ignore[arg-type]
+        return Result.of(found, _job_of_arrays(image, psf))
+    finally:
+        if isinstance(told, _Told):
+            told.end()
+
+
+def _is_file(given: object) -> bool:
+    return isinstance(given, Path | str | ImageFile)
+
+
+def _opened(given: Any, name: str) -> ImageFile:
+    """Return an image of a file; an array as one, under a name for messages."""
+    if isinstance(given, ImageFile):
+        return given
+    if isinstance(given, Path | str):
+        return read(given)
+    if isinstance(given, Measurement):
+        raise BenchError(
+            "A Measurement goes with a Calibration or an array, not with a file: db.read(...).pixels is one."
+        )
+    pixels = np.asarray(given)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        pixels = pixels.astype(np.float32)
+    return ImageFile(Path(f"the {name}, an array"), pixels)
+
+
+def _inputs(given: Mapping[str, Any]) -> InputOptions:
+    """Return options of files; words are read as the terminal reads them."""
+    parsers = {o.name: o.declaration.parse for o in options_of(InputOptions)}
+    read = {
+        name: parse(value) if isinstance(value, str) and (parse := parsers[name]) is not None else value
+        for name, value in given.items()
+    }
+    inputs = InputOptions(**read)
+    require(inputs)
+    return inputs
+
+
+def _job(image: ImageFile, psf: Any, inputs: InputOptions, z_um: float | None) -> Job:
+    """Bring a photograph and PSFs together."""
+    if isinstance(psf, Calibration):
+        job = job_with(psf, Path("the calibration"), image, inputs)
+    elif isinstance(psf, Path | str) and Path(psf).is_dir():
+        job = volume_job(Path(psf), image, inputs)
+    else:
+        file = _opened(psf, "PSF")
+        job = volume_job(file, image, inputs) if file.is_stack else job_from_files(file, image, inputs)
+    return job if z_um is None else refocused(job, z_um)
+
+
+def _job_of_arrays(image: Any, psf: Any) -> Job:
+    """Return what arrays were reconstructed from."""
+    pixels = np.asarray(image.image if isinstance(image, Measurement) else image, np.float32)
+    if not isinstance(psf, Calibration):
+        psf = Calibration(as_channels(psf, "PSF")[None], np.full((1, 3), np.nan))
+    simulated = bool(psf.provenance.get("simulated"))
+    return Job(pixels, psf, {}, provenance={"image": "an array"}, simulated=simulated)
+
+
+class _Told:
+    """Tells on one line of a terminal or notebook how far a job is, from its second second on."""
+
+    PATIENCE_S, EVERY_S = 2.0, 0.5
+
+    def __init__(self) -> None:
+        self._began_s = self._said_s = time.monotonic()
+        self._is_watched = sys.stderr.isatty() or "ipykernel" in sys.modules
+        self._has_spoken = False
+
+    def __call__(self, share: float, what: str) -> None:
+        now_s = time.monotonic()
+        took_s = now_s - self._began_s
+        if not self._is_watched or took_s < self.PATIENCE_S or now_s - self._said_s < self.EVERY_S:
+            return
+        self._said_s, self._has_spoken = now_s, True
+        left = f", {took_s * (1 - share) / share:.0f} s left" if share > 0 else ""
+        sys.stderr.write(f"\r{share:4.0%} {what}{left}".ljust(79))
+
+    def end(self) -> None:
+        """Clear the line."""
+        if self._has_spoken:
+            sys.stderr.write("\r" + " " * 79 + "\r")
+
+
+def _signature() -> inspect.Signature:
+    """Return the signature with every option by name: what a notebook completes."""
+    own = [p for p in inspect.signature(reconstruct).parameters.values() if p.kind is not p.VAR_KEYWORD]
+    known = {p.name for p in own}
+    declared = {o.name: o for o in (*options_of(ReconstructionOptions), *options_of(InputOptions))}
+    named = [
+        inspect.Parameter(o.name, inspect.Parameter.KEYWORD_ONLY, default=o.default, annotation=o.type)
+        for o in declared.values()
+        if o.name not in known
+    ]
+    return inspect.Signature([*own, *named], return_annotation=Result)
+
+
+reconstruct.__signature__ = _signature()  # type: ignore[attr-defined]

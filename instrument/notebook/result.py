@@ -1,0 +1,237 @@
+"""A reconstruction with what it was made of: it shows itself, draws itself, is saved in one line."""
+
+from __future__ import annotations
+
+import html
+import sys
+import warnings
+from base64 import b64encode
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.atomic import require_new
+from instrument.files.errors import BenchError
+from instrument.files.images import ImageFile, write_image
+from instrument.files.seen import as_seen, png_bytes
+from instrument.reconstruction.job import Job
+from instrument.reconstruction.result_file import (
+    Outputs,
+    reconstruction_record,
+    write_reconstruction,
+    write_volume,
+)
+from recon.reconstruction.result import Reconstruction
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Shown = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, repr=False, eq=False)
+class Result(Reconstruction):
+    """A :class:`~recon.Reconstruction` that shows and saves itself.
+
+    Attributes
+    ----------
+    job : Job
+        Photograph, calibration, and what was done to them; in ``job.notes`` in words.
+    """
+
+    job: Job = field(kw_only=True)
+
+    @classmethod
+    def of(cls, found: Reconstruction, job: Job) -> Result:
+        """Return a reconstruction with what it was made of."""
+        return cls(**{f.name: getattr(found, f.name) for f in fields(Reconstruction)}, job=job)
+
+    def facts(self) -> Mapping[str, str]:
+        """Return what is known of it, in words: what was read, chosen, and how far it can be trusted."""
+        from instrument.reconstruction.stored_result import StoredResult
+
+        record = reconstruction_record(self, self.job, volume=not self.is_picture)
+        pixels = self.image if self.is_picture else self.volume
+        said = StoredResult(Path(), pixels, None, record).facts()
+        return {**dict(self.job.notes), **{name: text for name, text in said if name != "Made"}}
+
+    def seen(self, *, rotate_deg: int = 0) -> Shown:
+        """Return the picture for a screen, 8 bit; of a volume the brightest over depth, coloured by depth."""
+        if self.is_picture:
+            return as_seen(np.rot90(self.image, rotate_deg // 90))
+        from instrument.reconstruction.result_figures import volume_seen
+
+        return np.rot90(volume_seen(self.volume), rotate_deg // 90)
+
+    def plot(self, axes: Axes | None = None, *, rotate_deg: int = 0) -> Axes:
+        """Draw the picture into Matplotlib axes, its own or given ones, and return them."""
+        if axes is None:
+            from matplotlib import pyplot
+
+            axes = pyplot.subplots()[1]
+        axes.imshow(self.seen(rotate_deg=rotate_deg), cmap="gray", vmin=0, vmax=255)
+        axes.set_axis_off()
+        axes.set_title(_title(self), fontsize=9)
+        return axes
+
+    def figure(self, *, rotate_deg: int = 0) -> Figure:
+        """Return a page: PSF, photograph, reconstruction, how it converged, facts; of a volume its views."""
+        from instrument.reconstruction import result_figures
+
+        if self.is_picture:
+            return result_figures.picture_figure(self, self.job, rotate_deg=rotate_deg)
+        return result_figures.volume_figure(self, simulated=self.job.simulated)
+
+    def show(self, *, rotate_deg: int = 0) -> None:
+        """Show the page: below the cell of a notebook, else in a window."""
+        _show(self.figure(rotate_deg=rotate_deg))
+
+    def save(
+        self,
+        out: Path | str,
+        *,
+        overwrite: bool = False,
+        rotate_deg: int = 0,
+        figure: Path | str | None = None,
+    ) -> tuple[Path, ...]:
+        """Write it, and return the files.
+
+        Parameters
+        ----------
+        out : path
+            ``.tif`` (volumes also ``.ome.zarr``): the numbers, float32, with a preview and a record of how
+            they were made beside them, as the terminal writes them. ``.npy``: the numbers alone. ``.png``:
+            the picture as it is seen.
+        overwrite : bool
+            Whether files that exist may be replaced.
+        rotate_deg : int
+            A multiple of 90: turns a picture counter-clockwise.
+        figure : path, optional
+            Also the page (.png, .pdf, .svg).
+
+        Raises FileError when a file exists or cannot be written, naming it.
+        """
+        out, page = Path(out), None if figure is None else Path(figure)
+        if out.suffix.lower() in (".png", ".npy"):
+            require_new(out, overwrite=overwrite)
+            pixels: npt.NDArray[Any] = self.seen(rotate_deg=rotate_deg)
+            if out.suffix.lower() == ".npy":
+                pixels = np.rot90(self.image, rotate_deg // 90) if self.is_picture else self.volume
+            write_image(out, pixels)
+            written: tuple[Path, ...] = (out,)
+        else:
+            volume = not self.is_picture
+            outputs = Outputs.named(
+                out, volume=volume, uncertainty=self.uncertainty is not None and not volume
+            )
+            outputs.check(self.volume.size, overwrite=overwrite)
+            if volume:
+                write_volume(outputs, self, self.job)
+            else:
+                write_reconstruction(outputs, self, self.job, rotate_deg=rotate_deg)
+            written = outputs.written(self)
+        if page is not None:
+            from instrument.files.figures import save_figure
+
+            require_new(page, overwrite=overwrite)
+            written = (*written, save_figure(self.figure(rotate_deg=rotate_deg), page))
+        return written
+
+    def _repr_html_(self) -> str:
+        picture = b64encode(png_bytes(self.seen())).decode()
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
+            f"<td style='text-align:left'>{html.escape(text)}</td></tr>"
+            for name, text in self.facts().items()
+        )
+        doubts = "".join(f"<p>{html.escape(said)}</p>" for said in (*self.job.warnings, *self.warnings))
+        mark = "<b>SIMULATED</b> " if self.job.simulated else ""
+        return (
+            f"<p>{mark}{html.escape(repr(self)[1:-1])}</p>"
+            f"<img style='max-width:100%;min-width:256px' src='data:image/png;base64,{picture}'/>"
+            f"<details><summary>How it was made</summary><table>{rows}</table></details>{doubts}"
+        )
+
+
+def _title(shown: object) -> str:
+    """Say in a line what a picture is."""
+    if isinstance(shown, Reconstruction):
+        verdict = "" if shown.verdict is None else "; " + shown.verdict.sentences[0].partition(":")[0]
+        return f"{shown.prior} by {shown.solver}, {shown.seconds:.1f} s{verdict}"
+    return shown.path.name if isinstance(shown, ImageFile) else ""
+
+
+def show(*pictures: Any, **titled: Any) -> None:
+    """Show pictures beside one another: results, images, arrays; those with a name under it.
+
+    Below the cell of a notebook, else in a window: ``db.show(photo, tv=first, l1=second)``.
+
+    Raises BenchError when one of them is no picture.
+    """
+    _show(figure_of(*pictures, **titled))
+
+
+def figure_of(*pictures: Any, **titled: Any) -> Figure:
+    """Return the figure that :func:`show` shows."""
+    from matplotlib.figure import Figure
+
+    panels = [*(("", picture) for picture in pictures), *titled.items()]
+    if not panels:
+        raise BenchError("There is nothing to show: give results, images or arrays.")
+    figure = Figure(figsize=(4.5 * len(panels), 4.2), layout="constrained")
+    for axes, (name, picture) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        axes.imshow(_pixels(picture), cmap="gray", vmin=0, vmax=255)
+        axes.set_axis_off()
+        axes.set_title(": ".join(filter(None, (name, _title(picture)))), fontsize=9)
+    return figure
+
+
+def _pixels(picture: Any) -> Shown:
+    if isinstance(picture, Result):
+        return picture.seen()
+    if isinstance(picture, Reconstruction):
+        picture = picture.image
+    array = np.asarray(picture)
+    if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
+        raise BenchError(
+            f"A picture is (height, width) or (height, width, channels) of real numbers; this is "
+            f"{array.dtype} {array.shape}."
+        )
+    return as_seen(array, raw=array.dtype.kind == "u")
+
+
+def _show(figure: Figure) -> None:
+    """Show a figure where there is a place for it; say where there is none."""
+    ipython = sys.modules.get("IPython")
+    if ipython is not None and ipython.get_ipython() is not None:
+        from io import BytesIO
+
+        from IPython.display import Image, display
+
+        png = BytesIO()
+        figure.savefig(png, format="png")
+        display(Image(png.getvalue()))
+        return
+    import matplotlib
+    from matplotlib.backends.registry import BackendFilter, backend_registry
+
+    interactive: list[str] = backend_registry.list_builtin(BackendFilter.INTERACTIVE)  # type: ignore[no-untyped-call]
+    if matplotlib.get_backend().lower() not in interactive:
+        warnings.warn(
+            "There is no screen for a window here: .save('scene.png') writes the picture, "
+            ".figure().savefig('page.png') the page.",
+            stacklevel=3,
+        )
+        return
+    from matplotlib import pyplot
+
+    window = pyplot.figure().canvas.manager
+    assert window is not None
+    window.canvas.figure = figure
+    figure.set_canvas(window.canvas)
+    pyplot.show()

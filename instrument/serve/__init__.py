@@ -1,0 +1,1 @@
+"""A bench's devices for other computers: ``diffuserbench serve``, and its page in the browser."""

@@ -1,0 +1,73 @@
+"""Frames that scatter: noise, flicker, motion and other light are told apart and taken out where possible."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy import ndimage
+
+from calibration_routines.psf.stage_fit import judge_drift
+from calibration_routines.scatter import Scatter, compare, pooled, scatter_of, steadied
+
+RNG = np.random.default_rng(4)
+PATTERN = ndimage.gaussian_filter(np.maximum(RNG.normal(size=(80, 100)), 0), 0.9)
+PATTERN[:20] = PATTERN[:, :20] = 0
+PATTERN *= 200 / PATTERN.max()
+
+
+Frames = npt.NDArray[np.float32]
+
+
+def frames(flicker: float = 0.0, motion_px: float = 0.0, ambient: float = 0.0, n: int = 4) -> Frames:
+    """Return frames of the pattern with noise as of photons."""
+    taken = []
+    for _ in range(n):
+        light = ndimage.shift(PATTERN, RNG.normal(0, motion_px, 2)) * (1 + flicker * RNG.normal())
+        light = np.maximum(light, 0) + abs(RNG.normal(0, ambient))
+        taken.append(light + RNG.normal(size=light.shape) * np.sqrt(0.2 * light + 2))
+    return np.array(taken, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("faults", "named"),
+    [
+        ({}, []),
+        ({"flicker": 0.2}, ["the light flickers"]),
+        ({"motion_px": 0.6}, ["the picture shakes"]),
+        ({"ambient": 8.0}, ["other light came"]),
+        ({"flicker": 0.1, "motion_px": 2.0}, ["the light flickers", "the picture shakes"]),
+    ],
+)
+def test_each_fault_is_named_alone_with_its_size(faults: dict[str, float], named: list[str]) -> None:
+    found = pooled([scatter_of(frames(**faults))[0] for _ in range(6)])
+    assert [" ".join(words.split()[:3]) for words in found.findings()] == named
+    assert found.flicker == pytest.approx(faults.get("flicker", 0.0), rel=0.5, abs=0.01)
+    assert found.motion_px == pytest.approx(2**0.5 * faults.get("motion_px", 0.0), rel=0.5, abs=0.03)
+
+
+def test_shaken_frames_are_put_onto_one_another_and_flickering_ones_made_alike() -> None:
+    steady = steadied(frames(flicker=0.1, motion_px=0.8, n=6))
+    plain = frames(motion_px=0.8, n=6).mean(axis=0)
+    assert _unlike(steady.mean) < 0.5 * _unlike(plain)
+    levels = steady.frames.mean(axis=(1, 2))
+    assert levels.std() < 0.01 * levels.mean()
+
+
+def _unlike(image: Frames) -> float:
+    """Relative difference to the pattern, once this is brought to the image's place and brightness."""
+    change = compare(image.astype(np.float32), PATTERN.astype(np.float32))
+    there = change.brightness * ndimage.shift(PATTERN, (change.rows, change.columns))
+    return float(np.linalg.norm(image - there) / np.linalg.norm(there))
+
+
+def test_a_lamp_that_flickers_is_not_said_to_drift_nor_is_its_flicker_taken_out_of_the_psfs() -> None:
+    levels = 1 + 0.1 * np.array([0.0, 1.2, -0.4, 0.9, -1.0])
+    visits = [(level * PATTERN).astype(np.float32) for level in levels]
+    how = visits, range(5), 4, [0.0, 1.0, 2.0, 3.0, 4.0]
+    shaky, plain = judge_drift(*how, Scatter(4, flicker=0.2)), judge_drift(*how)
+    assert plain.findings
+    assert not shaky.findings
+    at = [shaky.brightness_at(t) for t in how[3]]
+    assert np.diff(at, 2) == pytest.approx(np.zeros(3), abs=1e-9)
+    assert np.ptp(at) < 0.15 < np.ptp(levels)

@@ -1,0 +1,137 @@
+"""``import diffuserbench as db``: light, complete, and its results show and save themselves."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import diffuserbench as db
+from recon.base.declare import options_of
+from recon.evaluation.scene import make_scene
+from recon.reconstruction.options import ReconstructionOptions
+from tests.test_tutorials import code_of
+
+ROOT = Path(__file__).parents[1]
+OFFSET = 30
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[np.ndarray, np.ndarray]:
+    """A photograph and its PSF, raw: 16 bit with a camera's offset."""
+    made = make_scene("sparse-picture", size=48)
+    photo, psf = np.asarray(made.measurement), made.calibration.psfs[0, 0]
+    return tuple((OFFSET + 40_000 * image / image.max()).astype(np.uint16) for image in (photo, psf))
+
+
+def plain(scene: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    return tuple(image.astype(np.float32) - OFFSET for image in scene)
+
+
+def test_the_import_is_light_and_every_name_exists() -> None:
+    light = "import sys, diffuserbench; assert 'numpy' not in sys.modules and 'recon' not in sys.modules"
+    subprocess.run([sys.executable, "-c", light], check=True, cwd=ROOT)
+    for name in dir(db):
+        assert getattr(db, name) is not None, name
+    with pytest.raises(AttributeError, match="Did you mean 'reconstruct'"):
+        db.reconstuct  # noqa: B018
+
+
+def test_the_ten_lines_of_the_readme_run(
+    scene: tuple[np.ndarray, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, image in zip(("photo.tif", "psf.tif"), scene, strict=True):
+        db.write_image(name, image)
+    with pytest.warns(UserWarning, match="no screen"):
+        exec(compile(code_of(ROOT / "README.md"), "README.md", "exec"), names := {})
+    assert (tmp_path / "scene.png").exists()
+    assert "counts from both" in names["tv"].job.notes["Dark"]
+    assert names["tv"].image.shape == (48, 48)
+    assert names["l1"].prior == "l1"
+
+
+def test_a_result_shows_draws_and_saves_itself(scene: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    found = db.reconstruct(*plain(scene), iterations=5)
+    assert repr(found).startswith("<Picture 48 x 48 by admm, prior tv: 5 iterations")
+    page = found._repr_html_()
+    assert "data:image/png;base64" in page
+    assert "Verdict" in page
+    axes = found.plot(rotate_deg=180)
+    assert axes.images[0].get_array().shape == (48, 48)
+    for name in ("a.npy", "a.png", "b.tif"):
+        assert all(path.exists() for path in found.save(tmp_path / name))
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), found.image)
+    with pytest.raises(db.FileError, match="exists already"):
+        found.save(tmp_path / "a.npy")
+    assert db.open_result(tmp_path / "b.tif").facts()
+
+
+def test_options_are_completed_and_nothing_is_ignored(scene: tuple[np.ndarray, np.ndarray]) -> None:
+    named = inspect.signature(db.reconstruct).parameters
+    assert {o.name for o in options_of(ReconstructionOptions)} | {"dark", "crop"} <= set(named)
+    photo, psf = plain(scene)
+    for given, said in (
+        ({"z_um": 100.0}, "a bare PSF image has none"),
+        ({"dark": 30}, "arrays are taken as they are"),
+        ({"iteration": 3}, "Did you mean 'iterations'"),
+    ):
+        with pytest.raises((ValueError, db.BenchError), match=said):
+            db.reconstruct(photo, psf, **given)
+
+
+def test_nan_pixels_are_erased_and_said(scene: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    photo, psf = plain(scene)
+    photo[3:6, 4] = np.nan
+    erased = np.isnan(photo)
+    given = {"iterations": 5, "judged": False}
+    found = db.reconstruct(photo, psf, **given)
+    assert "3 pixels of the measurement are NaN: they are erased." in found.warnings
+    np.testing.assert_array_equal(
+        found.image, db.reconstruct(np.where(erased, 0, photo), psf, erasures=erased, **given).image
+    )
+    for name, image in (("photo.tif", photo), ("psf.tif", psf)):
+        db.write_image(tmp_path / name, image)
+    assert "3 pixels" in db.reconstruct(tmp_path / "photo.tif", tmp_path / "psf.tif", **given).warnings[0]
+    with pytest.raises(db.FileError, match="no finite numbers"):
+        db.reconstruct(tmp_path / "psf.tif", tmp_path / "photo.tif", **given)
+
+
+def test_a_stack_of_psfs_gives_a_volume_in_colours_of_depth(
+    scene: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    photo, psf = plain(scene)
+    np.save(tmp_path / "psfs.npy", np.stack([psf, np.roll(psf, 3, 0)]))
+    found = db.reconstruct(photo, tmp_path / "psfs.npy", iterations=3, judged=False)
+    assert repr(found).startswith("<Volume 2 x 48 x 48")
+    assert found.seen().shape == (48, 48, 3)
+    assert db.read(tmp_path / "psfs.npy").is_stack
+
+
+def own_prior() -> type[db.Prior]:
+    class Ridge(db.Prior):
+        """Squares."""
+
+        def __init__(self, weight: float) -> None:
+            self.weight = weight
+
+        def value(self, x: np.ndarray) -> float:
+            return float(self.weight * np.vdot(x, x) / 2)
+
+        def prox(self, x: np.ndarray, step: float) -> np.ndarray:
+            return np.asarray(x / (1 + self.weight * step), x.dtype)
+
+    return Ridge
+
+
+def test_a_prior_of_ones_own_is_taken_by_every_solver(scene: tuple[np.ndarray, np.ndarray]) -> None:
+    given = {"prior": own_prior()(1.0), "iterations": 150, "tolerance": 0.0, "judged": False}
+    fista, *others = (
+        db.reconstruct(*plain(scene), solver=solver, **given).image
+        for solver in ("fista", "admm", "admm-sensor")
+    )
+    assert max(db.metrics.nrmse(other, fista) for other in others) < 0.02
