@@ -367,6 +367,7 @@ class OfFiles(Procedure):
 
 _MODULES = (
     "psf.sweep_procedure",
+    "optics.stage_play",
     "optics.photograph",
     "optics.angular",
     "optics.dpc",
