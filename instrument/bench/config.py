@@ -157,7 +157,8 @@ class DisplayTable(Table):
     expansion: int = Field(
         16,
         ge=1,
-        description="Étendue expansion: mask pixels in the area of one (binned) SLM pixel; a square.",
+        description="Étendue expansion: mask pixels in the area of one (binned) SLM pixel; a square. "
+        "1: without a mask.",
     )
     mask_file: str | None = Field(
         None,
