@@ -64,6 +64,14 @@ class CameraTable(Table):
 class StageTable(Table):
     """Settings that every stage has."""
 
+    play: dict[str, Annotated[float, Field(gt=0)]] = Field(
+        default_factory=dict,
+        description=(
+            "Play of the axes' screws by name, as calibrate stage measures it: the source comes to every "
+            "place from one side."
+        ),
+    )
+
 
 class LedArrayTable(Table):
     """Settings that every LED array has."""

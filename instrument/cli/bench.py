@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
-import click
 import typer
 
 from instrument.cli.app import App, BenchOption, examples, load_and_say
@@ -89,8 +88,10 @@ def _asked_for(templates: Mapping[str, tuple[str, str]]) -> str:
     names = list(templates)
     for number, (what, _) in enumerate(templates.values(), 1):
         typer.echo(f"  {number}  {what}", err=True)
-    number = typer.prompt("Which bench", type=click.IntRange(1, len(names)), default=1, err=True)
-    return names[int(number) - 1]
+    answer = str(typer.prompt("Which bench", default="1", err=True)).strip()
+    if not answer.isdecimal() or not 1 <= int(answer) <= len(names):
+        raise BenchError(f"There is no bench {answer!r}: a number from 1 to {len(names)} is expected.")
+    return names[int(answer) - 1]
 
 
 def _found_lines() -> str:

@@ -170,6 +170,18 @@ def field_picture(
     return image
 
 
+def crop_words(pixels: npt.NDArray[Any], fit: Fit) -> str:
+    """Say what of a picture is not shown; empty where all of it is."""
+    height, width = pixels.shape[:2]
+    if fit != "cover" or height == width:
+        return ""
+    side = min(height, width)
+    return (
+        f"The field is square: the middle {side} x {side} of the picture's {height} x {width} pixels are "
+        "shown (--fit contain shows all of it, --fit stretch stretches it)."
+    )
+
+
 def _white(pixels: npt.NDArray[Any]) -> float:
     if pixels.dtype == np.uint8:
         return 255.0
