@@ -16,6 +16,7 @@ from drivers.errors import DeviceError, LimitError
 from drivers.frame import Frame, FrameMetadata
 
 TriggerMode = Literal["free_run", "software", "hardware"]
+TriggerEdge = Literal["rising", "falling"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +35,13 @@ class Roi:
             self.top <= other.top < other.top + other.height <= bottom
             and self.left <= other.left < other.left + other.width <= right
         )
+
+    def inside(self, step: int) -> Roi:
+        """Return the largest region inside this one with all borders on multiples of ``step``."""
+        top, left = (-(-start // step) * step for start in (self.top, self.left))
+        bottom = (self.top + self.height) // step * step
+        right = (self.left + self.width) // step * step
+        return Roi(top, left, max(0, bottom - top), max(0, right - left))
 
     def as_tuple(self) -> tuple[int, int, int, int]:
         """Return ``(top, left, height, width)``."""
@@ -166,13 +174,56 @@ class Camera(Device):
     def set_trigger_mode(self, mode: TriggerMode) -> TriggerMode:
         """Choose what starts an exposure; returns what the device made of it."""
 
+    @property
+    def trigger_lines(self) -> tuple[str, ...]:
+        """Inputs that a hardware trigger may come in on, by the camera's names; empty: there is no choice."""
+        return ()
+
+    @property
+    def trigger_line(self) -> str:
+        """The input that a hardware trigger comes in on; empty where there is no choice."""
+        return ""
+
+    def set_trigger_line(self, line: str) -> str:
+        """Choose the input of the hardware trigger; returns what the device made of it."""
+        self._require_offered("trigger line", line, self.trigger_lines)
+        return line
+
+    @property
+    def trigger_edges(self) -> tuple[TriggerEdge, ...]:
+        """Edges of a pulse that can start an exposure; empty: there is no choice."""
+        return ()
+
+    @property
+    def trigger_edge(self) -> TriggerEdge:
+        """The edge of a pulse that starts an exposure."""
+        return "rising"
+
+    def set_trigger_edge(self, edge: TriggerEdge) -> TriggerEdge:
+        """Choose the edge that starts an exposure; returns what the device made of it."""
+        self._require_offered("trigger edge", edge, self.trigger_edges)
+        return edge
+
+    @property
+    def readout_ms(self) -> float:
+        """From the end of a triggered exposure to the next trigger that is not lost, milliseconds.
+
+        Drivers that cannot know it leave it long.
+        """
+        return 50.0
+
     def _common_settings(self) -> dict[str, Setting]:
         """Return what every camera's settings say, for drivers."""
         names = (
             "exposure_ms gain black_level pixel_format significant_bits roi binning trigger_mode "
-            "sensor_shape pixel_pitch_um"
+            "trigger_line trigger_edge sensor_shape pixel_pitch_um"
         )
-        return {name: getattr(self, name) for name in names.split()} | {"roi": self.roi.as_tuple()}
+        made = {name: getattr(self, name) for name in names.split()} | {"roi": self.roi.as_tuple()}
+        if not self.trigger_lines:
+            del made["trigger_line"]
+        if not self.trigger_edges:
+            del made["trigger_edge"]
+        return made
 
     def _require_within(
         self, value: float, limits: tuple[float, float], problem: str, what: str, unit: str = ""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from drivers.device import Device
 from drivers.errors import LimitError
+from drivers.sequence import PlaysSequences
 
 Rgb = tuple[int, int, int]
 
@@ -43,7 +43,7 @@ class LedPattern:
 OFF = LedPattern("off")
 
 
-class LedArray(Device):
+class LedArray(PlaysSequences[LedPattern]):
     """An array of RGB LEDs. It is dark after ``open`` and after ``close``."""
 
     @property

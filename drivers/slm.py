@@ -7,8 +7,8 @@ from abc import abstractmethod
 import numpy as np
 import numpy.typing as npt
 
-from drivers.device import Device
 from drivers.errors import LimitError
+from drivers.sequence import PlaysSequences
 
 
 def read_only(levels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
@@ -18,7 +18,7 @@ def read_only(levels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     return view
 
 
-class Slm(Device):
+class Slm(PlaysSequences[npt.NDArray[np.uint8]]):
     """A spatial light modulator that shows 8-bit grey levels. It is blank (all zero) after ``open``."""
 
     @property

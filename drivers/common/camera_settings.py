@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from drivers.camera import Camera, Roi, TriggerMode
+from drivers.camera import Camera, Roi, TriggerEdge, TriggerMode
 from drivers.device import DeviceIdentity
 
 GainUnit = Literal["dB", "factor", "steps"]
@@ -54,7 +54,10 @@ class GainScale:
                 return self.lowest + (factor - 1) / self.per_count
 
 
-_ORDER = ("pixel_format", "binning", "roi", "black_level", "gain", "exposure_ms", "trigger_mode")
+_ORDER = (
+    *("pixel_format", "binning", "roi", "black_level", "gain", "exposure_ms"),
+    *("trigger_line", "trigger_edge", "trigger_mode"),
+)
 """The order in which settings are brought back: each may change the limits of those after it."""
 
 
@@ -69,6 +72,8 @@ class KeptSettings(Camera):
     _gain: float
     _roi: Roi
     _trigger_mode: TriggerMode = "free_run"
+    _trigger_line: str = ""
+    _trigger_edge: TriggerEdge = "rising"
 
     def __init__(self) -> None:
         self._remembered: dict[str, Callable[[], object]] = {}
@@ -100,7 +105,7 @@ class KeptSettings(Camera):
         """Set the offset, within its limits."""
 
     def _write_trigger(self, mode: TriggerMode) -> None:
-        """Choose what starts an exposure, where the device is to know."""
+        """Choose what starts an exposure, where the device is to know; line and edge are set by then."""
 
     # The settings ---------------------------------------------------------------------------------
     @property
@@ -166,6 +171,44 @@ class KeptSettings(Camera):
         self._trigger_mode = mode
         self._remember("trigger_mode", lambda: self.set_trigger_mode(mode))
         return mode
+
+    @property
+    def trigger_line(self) -> str:
+        """The input that a hardware trigger comes in on."""
+        return self._trigger_line
+
+    def set_trigger_line(self, line: str) -> str:
+        """Choose the input of the hardware trigger."""
+        self._require_idle("trigger line")
+        self._require_offered("trigger line", line, self.trigger_lines)
+        before, self._trigger_line = self._trigger_line, line
+        self._trigger_again(lambda: setattr(self, "_trigger_line", before))
+        self._remember("trigger_line", lambda: self.set_trigger_line(line))
+        return line
+
+    @property
+    def trigger_edge(self) -> TriggerEdge:
+        """The edge of a pulse that starts an exposure."""
+        return self._trigger_edge
+
+    def set_trigger_edge(self, edge: TriggerEdge) -> TriggerEdge:
+        """Choose the edge that starts an exposure."""
+        self._require_idle("trigger edge")
+        self._require_offered("trigger edge", edge, self.trigger_edges)
+        before, self._trigger_edge = self._trigger_edge, edge
+        self._trigger_again(lambda: setattr(self, "_trigger_edge", before))
+        self._remember("trigger_edge", lambda: self.set_trigger_edge(edge))
+        return edge
+
+    def _trigger_again(self, back: Callable[[], object]) -> None:
+        """Make the hardware trigger again with another line or edge, where it is in force."""
+        if self._trigger_mode != "hardware":
+            return
+        try:
+            self._write_trigger("hardware")
+        except BaseException:
+            back()
+            raise
 
     # A device that was lost -----------------------------------------------------------------------
     def _remember(self, name: str, again: Callable[[], object]) -> None:

@@ -28,7 +28,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import numpy.typing as npt
 
-from drivers.camera import Camera, Roi, TriggerMode
+from drivers.camera import Camera, Roi, TriggerEdge, TriggerMode
 from drivers.common.pixels import Pixels
 from drivers.device import Device
 from drivers.errors import DeviceError
@@ -163,6 +163,12 @@ class _CheckedCamera(Camera):
 
     def set_trigger_mode(self, mode: TriggerMode) -> TriggerMode:
         return _same(self, "a trigger mode", mode, super().set_trigger_mode(mode))  # type: ignore[safe-super]
+
+    def set_trigger_line(self, line: str) -> str:
+        return _same(self, "a trigger line", line, super().set_trigger_line(line))
+
+    def set_trigger_edge(self, edge: TriggerEdge) -> TriggerEdge:
+        return _same(self, "a trigger edge", edge, super().set_trigger_edge(edge))
 
     def set_roi(self, roi: Roi | None) -> Roi:
         said = super().set_roi(roi)  # type: ignore[safe-super]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from pydantic import Field
 
-from drivers.camera import Roi, TriggerMode
+from drivers.camera import Roi, TriggerEdge, TriggerMode
 from drivers.common.buffered_camera import BufferedCamera
 from drivers.common.camera_settings import GainScale, GainUnit
 from drivers.device import DriverOptions, Setting
@@ -20,7 +20,7 @@ from drivers.genicam.features import (
     GAIN,
     Features,
 )
-from drivers.genicam.images import Images, set_trigger
+from drivers.genicam.images import TRIGGER_EDGES, Images, set_trigger, trigger_lines
 
 GIGE_BLOCK_IDS = 1 << 16
 """Frame ids of GigE Vision 1 start again after this many, at 1."""
@@ -34,12 +34,6 @@ class GenicamOptions(DriverOptions):
     )
     frames_per_s: float | None = Field(
         None, gt=0, description="Frames a second when running free; left out: as the camera has it."
-    )
-    trigger_line: str = Field(
-        "Line1", description="Line of the hardware trigger, by the camera's TriggerSource."
-    )
-    trigger_activation: str = Field(
-        "RisingEdge", description="Edge of the hardware trigger: TriggerActivation."
     )
     gain_unit: GainUnit | None = Field(
         None,
@@ -84,6 +78,8 @@ class GenicamCamera(BufferedCamera):
         self._rate_name = features.find(*FRAME_RATE)
         self._write_trigger("free_run")
         self._trigger_mode = "free_run"
+        self._lines = trigger_lines(features)
+        self._trigger_line = next((line for line in ("Line1", *self._lines) if line in self._lines), "")
         self._images = Images(features, self._read_sensor)
         self._roi = self._images.roi
         for name, value in self.options.features.items():
@@ -272,9 +268,30 @@ class GenicamCamera(BufferedCamera):
         self._remember("binning", lambda: self.set_binning(binning))
         return self._images.binning
 
+    @property
+    def trigger_lines(self) -> tuple[str, ...]:
+        """What its TriggerSource offers, but for software."""
+        self._require()
+        return self._lines
+
+    @property
+    def trigger_edges(self) -> tuple[TriggerEdge, ...]:
+        """The edges that its TriggerActivation offers."""
+        self._require()
+        if not self._features.find("TriggerActivation"):
+            return ()
+        offered = self._features.entries("TriggerActivation")
+        return tuple(edge for edge, name in TRIGGER_EDGES.items() if name in offered)
+
+    @property
+    def readout_ms(self) -> float:
+        """Time of a frame at the highest rate of its present settings, which read-out fits into."""
+        self._require()
+        fastest = self._features.bounds(self._rate_name)[1] if self._rate_name else 0.0
+        return 1e3 / fastest if fastest > 0 else super().readout_ms
+
     def _write_trigger(self, mode: TriggerMode) -> None:
-        options = self.options
-        set_trigger(self._features, mode, options.trigger_line, options.trigger_activation)
+        set_trigger(self._features, mode, self._trigger_line, self._trigger_edge)
 
     def _fire(self) -> None:
         self._features.execute("TriggerSoftware")

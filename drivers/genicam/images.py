@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
-from drivers.camera import Roi, TriggerMode
+from drivers.camera import Roi, TriggerEdge, TriggerMode
 from drivers.common.pixels import PixelFormat, compile_kernels, genicam_format
 from drivers.errors import DeviceError, LimitError
 from drivers.genicam.features import FRAME_TRIGGERS, Features
@@ -125,8 +125,19 @@ class Images:
         self._apply_whole()
 
 
-def set_trigger(features: Features, mode: TriggerMode, line: str, activation: str) -> None:
-    """Choose what starts an exposure; ``line`` and ``activation`` are of the hardware trigger."""
+TRIGGER_EDGES: Mapping[TriggerEdge, str] = {"rising": "RisingEdge", "falling": "FallingEdge"}
+"""By their names of TriggerActivation."""
+
+
+def trigger_lines(features: Features) -> tuple[str, ...]:
+    """Return the inputs that a hardware trigger may come in on; none of a camera without triggers."""
+    if not features.find("TriggerSource"):
+        return ()
+    return tuple(name for name in features.entries("TriggerSource") if not name.startswith("Software"))
+
+
+def set_trigger(features: Features, mode: TriggerMode, line: str, edge: TriggerEdge) -> None:
+    """Choose what starts an exposure; ``line`` and ``edge`` are of the hardware trigger."""
     if not features.find("TriggerMode"):
         if mode != "free_run":
             raise LimitError(features.name, f"has no trigger mode {mode!r}.", "It has no triggers.")
@@ -144,5 +155,5 @@ def set_trigger(features: Features, mode: TriggerMode, line: str, activation: st
         source = "Software" if mode == "software" else line
         features.choose("TriggerSource", source)
         if mode == "hardware" and features.find("TriggerActivation"):
-            features.choose("TriggerActivation", activation)
+            features.choose("TriggerActivation", TRIGGER_EDGES[edge])
         features.choose("TriggerMode", "On")

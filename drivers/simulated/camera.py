@@ -7,7 +7,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,10 +18,20 @@ from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedE
 from drivers.frame import Frame, FrameMetadata
 from drivers.simulated.camera_settings import SimulatedCameraSettings
 from drivers.simulated.faults import disturbed, disturbs
+from drivers.simulated.wire import Pulse
 from drivers.simulated.world import Rgb
 from recon.optics.sensor import FixedPattern, Readout, expose
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+
+
+class _Received(NamedTuple):
+    """A pulse that starts an exposure, and what says that it was exposed."""
+
+    pulse: Pulse
+    seen: threading.Event
+
+
 _MOST_LATE_FRAMES = 4
 """So many frames a camera holds back for a host that does not fetch them; what is later than that is lost."""
 
@@ -50,6 +60,8 @@ class SimulatedCamera(SimulatedCameraSettings):
     def _reset(self) -> None:
         self._reset_settings()
         self._triggers = 0
+        self._pulse: _Received | None = None
+        self._ready_ns = 0
         self._next_id = 0
         self._lost = 0
         self._failure: DeviceError | None = None
@@ -76,6 +88,12 @@ class SimulatedCamera(SimulatedCameraSettings):
         """Take one frame whose exposure begins now, and wait for it."""
         self._require_idle("frame")
         self._abort.clear()
+        if self._trigger_mode == "hardware":
+            raise DeviceError(
+                self.name,
+                "takes no single frame in trigger mode 'hardware': nothing sends it a pulse.",
+                "Set trigger mode 'free_run', or play a sequence.",
+            )
         return self._take()
 
     def start_sequence(self, n_buffers: int = 8) -> None:
@@ -86,9 +104,12 @@ class SimulatedCamera(SimulatedCameraSettings):
         with self._arrived:
             self._ring = deque(maxlen=n_buffers)
             self._triggers = 0
+            self._pulse, self._ready_ns = None, 0
             self._lost = 0
             self._failure = None
             self._abort.clear()
+            if self._trigger_mode == "hardware":
+                self.world.wires.listen(self._trigger_line, self._trigger_edge, self._receive)
             self._producer = threading.Thread(target=self._produce, name="simulated camera", daemon=True)
             self._producer.start()
 
@@ -138,6 +159,7 @@ class SimulatedCamera(SimulatedCameraSettings):
 
     def _end(self) -> None:
         self._abort.set()
+        self.world.wires.deaf()
         with self._arrived:
             producer, self._producer = self._producer, None
             self._arrived.notify_all()
@@ -151,13 +173,22 @@ class SimulatedCamera(SimulatedCameraSettings):
             while not self._abort.is_set():
                 if self._trigger_mode == "software" and not self._await_trigger():
                     return
-                frame = self._take()
+                if self._trigger_mode == "hardware":
+                    received = self._await_pulse()
+                    if received is None:
+                        return
+                    frame = self._take(received.pulse)
+                    received.seen.set()
+                else:
+                    frame = self._take()
                 with self._arrived:
                     if len(self._ring) == self._ring.maxlen:
                         self._ring.popleft()
                         self._lost += 1
                     self._ring.append(frame)
                     self._arrived.notify_all()
+                if self._trigger_mode == "hardware":
+                    continue
                 rate = self.options.frames_per_s or self._spec.frames_per_s
                 period = max(1 / rate, self._exposure_ms * 1e-3) * self.world.clock.time_scale
                 # A camera's clock does not wait for a busy host: what was late is made up for, up to a point.
@@ -187,7 +218,36 @@ class SimulatedCamera(SimulatedCameraSettings):
             self._triggers -= 1
         return True
 
-    def _take(self) -> Frame:
+    def _await_pulse(self) -> _Received | None:
+        with self._arrived:
+            while self._pulse is None:
+                if self._abort.is_set():
+                    return None
+                self._arrived.wait(0.1)
+            received, self._pulse = self._pulse, None
+            return received
+
+    def _receive(self, pulse: Pulse) -> None:
+        """Have a pulse start an exposure, unless one is being exposed or read out; wait until it is."""
+        with self._arrived:
+            if pulse.time_ns < self._ready_ns or self._producer is None:
+                return
+            self._ready_ns = pulse.time_ns + round(1e6 * (self._exposure_ms + self.readout_ms))
+            received = self._pulse = _Received(pulse, threading.Event())
+            self._arrived.notify_all()
+        while not received.seen.wait(0.05):
+            if self._abort.is_set() or self._producer is None:
+                return
+
+    def _light_during(self, pulse: Pulse, exposure_ms: float) -> npt.NDArray[np.float32]:
+        """Return the mean light of an exposure, which what is shown may change during."""
+        total = np.zeros(self.image_shape, np.float32)
+        for share, show in pulse.during(1e-3 * exposure_ms):
+            show()
+            total += np.float32(share) * self._electrons_per_s()
+        return total
+
+    def _take(self, pulse: Pulse | None = None) -> Frame:
         """Expose, read out, and wrap one frame."""
         with self._arrived:
             exposure_ms, gain = self._exposure_ms, self._gain
@@ -196,13 +256,13 @@ class SimulatedCamera(SimulatedCameraSettings):
         if not self.world.clock.wait(half, self._abort):
             raise StoppedError(self.name, "the exposure was stopped.")
         self._require()
-        light = self._electrons_per_s()
+        light = self._electrons_per_s() if pulse is None else self._light_during(pulse, exposure_ms)
         faults = self.world.options
         if disturbs(faults):
             light = disturbed(light, faults, (faults.seed, frame_id), self.world.clock.now_s, self._binning)
         if not self.world.clock.wait(half, self._abort):
             raise StoppedError(self.name, "the exposure was stopped.")
-        ended_ns = time.monotonic_ns()
+        ended_ns = time.monotonic_ns() if pulse is None else pulse.time_ns + round(1e6 * exposure_ms)
         image, saturated_fraction = self._read_out(light, exposure_ms, gain, frame_id)
         return Frame(
             image,

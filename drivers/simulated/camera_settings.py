@@ -7,11 +7,12 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from drivers.camera import Roi
+from drivers.camera import Roi, TriggerEdge, TriggerMode
 from drivers.common.camera_settings import KeptSettings
 from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError
 from drivers.simulated.surroundings import SimulatedDevice, Surroundings
+from drivers.simulated.wire import LED_LINE, SLM_LINE
 from drivers.simulated.world import SimulatedWorld
 
 ROI_STEP = 4
@@ -52,6 +53,9 @@ class SimulatedCameraSettings(SimulatedDevice, KeptSettings):
     """
 
     kind = "camera"
+    trigger_modes: tuple[TriggerMode, ...] = ("free_run", "software", "hardware")
+    trigger_lines = (LED_LINE, SLM_LINE)
+    trigger_edges: tuple[TriggerEdge, ...] = ("rising", "falling")
     Shared: ClassVar[type[Surroundings]] = SimulatedWorld
     Options = CameraOptions
 
@@ -70,7 +74,7 @@ class SimulatedCameraSettings(SimulatedDevice, KeptSettings):
         self._binning = 1
         self._pixel_format = self.pixel_formats[0]
         self._black_fraction = self._spec.black_level
-        self._trigger_mode = "free_run"
+        self._trigger_mode, self._trigger_line, self._trigger_edge = "free_run", LED_LINE, "rising"
         self._remembered.clear()
 
     def _model(self) -> str:
@@ -187,6 +191,11 @@ class SimulatedCameraSettings(SimulatedDevice, KeptSettings):
     @property
     def _full_scale(self) -> int:
         return (1 << self.significant_bits) - 1
+
+    @property
+    def readout_ms(self) -> float:
+        """A frame's time at the highest rate: no exposure while one is read out."""
+        return 1e3 / (self.options.frames_per_s or self._spec.frames_per_s)
 
     def _require_idle(self, what: str) -> None:
         self._require()

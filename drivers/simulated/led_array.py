@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import threading
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -10,9 +12,12 @@ import numpy.typing as npt
 from pydantic import Field
 
 from drivers.device import DriverOptions, Setting, SharedPart
+from drivers.errors import DeviceError, StoppedError
 from drivers.led_array import OFF, LedArray, LedPattern
+from drivers.sequence import SequenceLimits
 from drivers.simulated.scene_light import Lamp, SceneLight
 from drivers.simulated.surroundings import SimulatedDevice, Surroundings
+from drivers.simulated.wire import LED_LINE
 from drivers.simulated.world import SimulatedWorld
 from recon.optics.grid import BANDS
 
@@ -44,6 +49,8 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
         self.options = options = LedArrayOptions.of(options)
         self._positions_mm = _round_array(options.leds, options.led_pitch_mm)
         self._pattern = OFF
+        self._armed: tuple[tuple[LedPattern, ...], float] | None = None
+        self._darkened = threading.Event()
 
     def open(self) -> None:
         """Connect; every LED is off."""
@@ -54,8 +61,9 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
     def close(self) -> None:
         """Turn every LED off and disconnect."""
         if self._is_open:
+            self._darkened.set()
             self._show(OFF)
-            self._is_open = False
+            self._is_open, self._armed = False, None
 
     def settings(self) -> Mapping[str, Setting]:
         """Read the pattern and the array's build."""
@@ -100,7 +108,42 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
     def off(self) -> None:
         """Turn every LED off."""
         self._require()
+        self._darkened.set()
         self._show(OFF)
+
+    @property
+    def sequence_limits(self) -> SequenceLimits:
+        """As an Illuminate array has them."""
+        return SequenceLimits(most=1000, shortest_ms=1.0, outputs=1)
+
+    def arm(self, patterns: Sequence[LedPattern], period_ms: float, output: int = 0) -> float:
+        """Store a sequence."""
+        self._require()
+        self._check_sequence(len(patterns), period_ms, output)
+        for pattern in patterns:
+            self.check(pattern)
+        self._armed = (tuple(patterns), period_ms)
+        return period_ms
+
+    def play(self) -> None:
+        """Show the armed sequence once, with a pulse to the camera for each pattern."""
+        self._require()
+        if self._armed is None:
+            raise DeviceError(self.name, "has no sequence to play.", "Arm one first.")
+        patterns, period_ms = self._armed
+        self._darkened.clear()
+        shown = [partial(self._show_unless_darkened, pattern) for pattern in patterns]
+        dark = partial(self._show, OFF)
+        whole = self.world.wires.play(
+            LED_LINE, shown, dark, period_s=1e-3 * period_ms, settle_s=0.0, ended=self._darkened
+        )
+        self._show(OFF)
+        self._require()
+        if not whole:
+            raise StoppedError(self.name, "the light was turned off during its sequence.")
+
+    def _show_unless_darkened(self, pattern: LedPattern) -> None:
+        self._show(OFF if self._darkened.is_set() else pattern)
 
     def _show(self, pattern: LedPattern) -> None:
         if self.world.options.led_light == "scene":

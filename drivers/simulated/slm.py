@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -11,7 +12,10 @@ import numpy.typing as npt
 from pydantic import Field
 
 from drivers.device import DriverOptions, Setting, SharedPart
+from drivers.errors import DeviceError, StoppedError
+from drivers.sequence import SequenceLimits
 from drivers.simulated.surroundings import SimulatedDevice, Surroundings
+from drivers.simulated.wire import SLM_LINE
 from drivers.simulated.world import SimulatedWorld
 from drivers.slm import Slm, read_only
 
@@ -110,6 +114,57 @@ class SimulatedSlm(SimulatedPanel):
     model = "phase SLM"
     Options = SlmOptions
     options: SlmOptions
+
+    def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
+        super().__init__(options, shared)
+        self._armed: tuple[list[npt.NDArray[np.uint8]], float] | None = None
+        self._blanked = threading.Event()
+
+    @property
+    def sequence_limits(self) -> SequenceLimits:
+        """As many images as a DLPC900 stores, each settled before its pulse."""
+        return SequenceLimits(400, max(1.0, self.settle_ms), 1, self.settle_ms)
+
+    def arm(self, patterns: Sequence[npt.NDArray[np.uint8]], period_ms: float, output: int = 0) -> float:
+        """Store a sequence."""
+        self._require()
+        self._check_sequence(len(patterns), period_ms, output)
+        for levels in patterns:
+            self._check(levels)
+        self._armed = ([levels.copy() for levels in patterns], period_ms)
+        return period_ms
+
+    def play(self) -> None:
+        """Show the armed sequence once, with a pulse to the camera for each; then what was shown before."""
+        self._require()
+        if self._armed is None:
+            raise DeviceError(self.name, "has no sequence to play.", "Arm one first.")
+        images, period_ms = self._armed
+        before = self._displayed
+        self._blanked.clear()
+        whole = self.world.wires.play(
+            SLM_LINE,
+            [partial(setattr, self, "_displayed", levels) for levels in images],
+            partial(setattr, self, "_displayed", before),
+            period_s=1e-3 * period_ms,
+            settle_s=1e-3 * self.settle_ms,
+            ended=self._blanked,
+        )
+        self._displayed = before if whole else np.zeros(self.options.shape, np.uint8)
+        self._require()
+        if not whole:
+            raise StoppedError(self.name, "was blanked or closed during its sequence.")
+
+    def blank(self) -> None:
+        """Show all zeros; ends a sequence."""
+        self._blanked.set()
+        super().blank()
+
+    def close(self) -> None:
+        """Blank and disconnect."""
+        self._blanked.set()
+        self._armed = None
+        super().close()
 
     @property
     def phase_rad(self) -> npt.NDArray[np.float32]:

@@ -15,6 +15,7 @@ from pydantic import Field
 from drivers.device import Device, DeviceIdentity, DriverOptions, SharedPart
 from drivers.errors import DeviceError, DeviceNotOpenError
 from drivers.simulated.faults import FaultOptions, with_late_hot
+from drivers.simulated.wire import WireFaults, Wires
 from recon.optics.sensor import FixedPattern, SensorSpec, fixed_pattern
 
 
@@ -72,6 +73,13 @@ class CommonOptions(FaultOptions):
     fixed_pattern: bool = Field(
         True, description="Whether camera pixels differ (response, offset, hot, dead)."
     )
+    pulse_jitter_us: float = Field(
+        0.0, ge=0, description="Standard deviation by which trigger pulses come late; they never come early."
+    )
+    missed_pulses: float = Field(0.0, ge=0, le=1, description="Share of trigger pulses that are lost.")
+    extra_pulses: float = Field(
+        0.0, ge=0, le=1, description="Trigger pulses that nobody sent, per pulse that was sent."
+    )
 
 
 class Surroundings(SharedPart):
@@ -88,6 +96,9 @@ class Surroundings(SharedPart):
         self.scene_lit = False
         """Whether the scene glows."""
         self._lock = threading.RLock()
+        faults = WireFaults(1e-6 * options.pulse_jitter_us, options.missed_pulses, options.extra_pulses)
+        self.wires = Wires(options.time_scale, faults, options.seed)
+        """From LED array and SLM to the camera."""
 
     @abstractmethod
     def photons_per_s(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,10 @@ class CameraForm(QWidget):
             {
                 "binning": Behaviour(offers=lambda: self._offered("binnings")),
                 "pixel_format": Behaviour(offers=lambda: self._offered("pixel_formats")),
+                **{
+                    f"trigger_{what}": Behaviour(offers=partial(self._offered, f"trigger_{what}s"))
+                    for what in ("mode", "line", "edge")
+                },
             },
         )
         self.widgets = self.form.widgets

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -16,12 +17,12 @@ from drivers.common.checked import checked
 from drivers.device import Device, SharedPart
 from drivers.errors import DeviceLostError, LimitError
 from drivers.frame import Frame, FrameMetadata
-from drivers.led_array import LedArray
+from drivers.led_array import LedArray, LedPattern
 from drivers.registry.claim import Claim
 from drivers.slm import Slm
-from drivers.stage import Stage
+from drivers.stage import Stage, approached
 from instrument.bench.camera_settings import apply_table
-from instrument.bench.config import BenchConfig, CameraTable, Kind, SlmTable
+from instrument.bench.config import BenchConfig, CameraTable, Kind, SlmTable, StageTable
 from instrument.bench.config_file import load_config
 from instrument.bench.photograph import Progress, Snapshot, photograph
 from instrument.bench.safety import ClosingAtExit, SafeStep, StepsFailedError, safe_steps, try_all
@@ -57,6 +58,8 @@ class Bench:
             for kind, device in config.devices.items()
         }
         switch = next((part for part in self.shared.values() if isinstance(part, SceneSwitch)), None)
+        self._seated: dict[str, float] = {}
+        """Axes that came to where they are from below, and where that is."""
         self.newest_frame: Frame | None = None
         """The last frame of a photograph, whoever took it: what a window shows while a run goes on."""
         self._lights = Lights(config.source, config.scene, self.led_array, switch, ask)
@@ -111,10 +114,36 @@ class Bench:
             except LimitError as error:
                 error.add_note(f"The value is from [camera] in {self.config.path}.")
                 raise
+        self._refuse_wire(device)
         if kind == "led_array":
             self._refuse_missing_leds(cast(LedArray, device))
         _log.info("%s opened: %s", device.name, device.identity)
         return device
+
+    @property
+    def trigger_source(self) -> LedArray | Slm | None:
+        """The open device that plays sequences with a wire to the camera, by [trigger]; None without one."""
+        sent_by = self.config.trigger.sent_by
+        device = None if sent_by is None else cast("LedArray | Slm", self.devices[sent_by])
+        return device if device is not None and device.is_open else None
+
+    def _refuse_wire(self, device: Device) -> None:
+        """Refuse a device that cannot do its part in the sequences of [trigger]."""
+        wire = self.config.trigger
+        if wire.sent_by is None:
+            return
+        problem = ""
+        if device is self.camera and "hardware" not in self.camera.trigger_modes:
+            problem = "takes no hardware trigger"
+        elif device is self.devices[wire.sent_by]:
+            limits = cast("LedArray | Slm", device).sequence_limits
+            if limits is None:
+                problem = "plays no sequences with pulses"
+            elif wire.output >= limits.outputs:
+                problem = f"has trigger outputs 0 to {limits.outputs - 1}, not {wire.output}"
+        if problem:
+            where = f"[trigger] of {self.config.path or 'the configuration'}"
+            raise LimitError(device.name, f"{problem}, which {where} needs.", "Take that table out.")
 
     def _refuse_missing_leds(self, led_array: LedArray) -> None:
         count = len(led_array.led_positions_mm)
@@ -231,8 +260,28 @@ class Bench:
             The place reached, as the stage reads.
         """
         mount = self.source_mount
-        mount.stage.move_to(mount.target(x_um, y_um, z_um))
+        stage, target = mount.stage, mount.target(x_um, y_um, z_um)
+        here, play = stage.position(), self.play
+        seated = {
+            axis.name
+            for axis in stage.axes
+            if abs(self._seated.get(axis.name, math.inf) - here[axis.name]) <= stage.settles_within(axis)
+        }
+        for place in approached(here, target, play, seated):
+            reached = stage.move_to(place)
+        self._seated |= {name: reached[name] for name in target if name in play}
         return mount.position_um
+
+    @property
+    def play(self) -> Mapping[str, float]:
+        """Play of the stage's axes, as configured; those that are left out have none."""
+        stage = self.config.devices.get("stage")
+        return {} if stage is None else cast(StageTable, stage.settings).play
+
+    @property
+    def source_pattern(self) -> LedPattern:
+        """The LED pattern that lights the point source."""
+        return self._lights.source_pattern
 
     def source_on(self) -> None:
         """Light the point source; confirmed when this returns."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from drivers.camera import Camera, Roi
+from drivers.camera import Camera, Roi, TriggerEdge, TriggerMode
 from drivers.device import Setting
 from drivers.errors import DeviceError, LimitError
 from instrument.bench.config import CameraTable
@@ -32,6 +32,11 @@ class CameraOptions:
     black_level: float = option(help="Offset that the camera adds.", unit="counts", least=0)
     binning: int = option(help="Sensor pixels summed along each axis.")
     pixel_format: str = option(help="Pixel format by its GenICam name.", label="Format")
+    trigger_mode: TriggerMode = option(help="What starts an exposure.", label="Trigger")
+    trigger_line: str = option(help="Input that a hardware trigger comes in on.", label="Trigger line")
+    trigger_edge: TriggerEdge = option(
+        help="Edge of the pulse that starts an exposure.", label="Trigger edge"
+    )
     roi: Roi = option(
         help="Region of interest in sensor pixels before binning: top, left, height, width.",
         metavar="TOP, LEFT, HEIGHT, WIDTH",
@@ -50,11 +55,17 @@ class CameraState:
     binning: int
     roi: Roi
     pixel_format: str
+    trigger_mode: TriggerMode
+    trigger_line: str
+    trigger_edge: TriggerEdge
     """As read back."""
     exposure_limits_ms: tuple[float, float]
     gain_limits: tuple[float, float]
     binnings: tuple[int, ...]
     pixel_formats: tuple[str, ...]
+    trigger_modes: tuple[TriggerMode, ...]
+    trigger_lines: tuple[str, ...]
+    trigger_edges: tuple[TriggerEdge, ...]
     sensor_shape: tuple[int, int]
     """What it offers."""
     temperature_c: float | None
@@ -78,7 +89,7 @@ def read_camera(camera: Camera) -> CameraState:
 
 
 def camera_settings(camera: Camera) -> dict[str, Any]:
-    """Return format, region, binning, black level, gain and exposure as the camera reports them."""
+    """Return format, region, binning, black level, gain, exposure and trigger as the camera reports them."""
     return {
         "pixel_format": camera.pixel_format,
         "binning": camera.binning,
@@ -86,18 +97,21 @@ def camera_settings(camera: Camera) -> dict[str, Any]:
         "black_level": camera.black_level,
         "gain": camera.gain,
         "exposure_ms": camera.exposure_ms,
+        "trigger_line": camera.trigger_line,
+        "trigger_edge": camera.trigger_edge,
+        "trigger_mode": camera.trigger_mode,
     }
 
 
 def restore_camera(camera: Camera, wanted: Mapping[str, Any]) -> None:
-    """Bring a camera back to what :func:`camera_settings` returned.
+    """Bring a camera back to what :func:`camera_settings` returned, in a version that may have known less.
 
     Raises DeviceError naming the settings that the camera did not take.
     """
     for name, set_to in _setters(camera).items():
-        if not _same(camera_settings(camera)[name], wanted[name]):
+        if name in wanted and not _same(camera_settings(camera)[name], wanted[name]):
             set_to(wanted[name])
-    now = camera_settings(camera)
+    now = {name: value for name, value in camera_settings(camera).items() if name in wanted}
     different = [
         f"{name} is {now[name]}, was {wanted[name]}" for name in now if not _same(now[name], wanted[name])
     ]
@@ -139,6 +153,9 @@ def _setters(camera: Camera) -> dict[str, Callable[[Any], object]]:
         "black_level": camera.set_black_level,
         "gain": camera.set_gain,
         "exposure_ms": camera.set_exposure_ms,
+        "trigger_line": camera.set_trigger_line,
+        "trigger_edge": camera.set_trigger_edge,
+        "trigger_mode": camera.set_trigger_mode,
     }
 
 

@@ -48,10 +48,29 @@ class CameraTable(Table):
         description="Region of interest in sensor pixels before binning: [top, left, height, width].",
     )
     pixel_format: str | None = Field(None, description='GenICam name of the pixel format, e.g. "Mono12".')
+    trigger_line: str | None = Field(
+        None, min_length=1, description="Input that a hardware trigger comes in on, by the camera's name."
+    )
+    trigger_edge: Literal["rising", "falling"] | None = Field(
+        None, description="Edge of the pulse that starts an exposure."
+    )
+    trigger_mode: Literal["free_run", "software", "hardware"] | None = Field(
+        None,
+        description='What starts an exposure; "hardware" here is for pulses from outside the bench: '
+        "sequences by the wire of [trigger] set it themselves.",
+    )
 
 
 class StageTable(Table):
     """Settings that every stage has."""
+
+    play: dict[str, Annotated[float, Field(gt=0)]] = Field(
+        default_factory=dict,
+        description=(
+            "Play of the axes' screws by name, as calibrate stage measures it: the source comes to every "
+            "place from one side."
+        ),
+    )
 
 
 class LedArrayTable(Table):
@@ -115,6 +134,22 @@ class GeometryTable(Table):
         return Geometry(self.pixel_pitch_um, self.diffuser_distance_mm, self.aperture_mm, self.wavelength_nm)
 
 
+class TriggerTable(Table):
+    """A trigger wire from a device that plays sequences to the camera: frames timed by hardware."""
+
+    sent_by: Literal["led_array", "slm"] | None = Field(
+        None,
+        description="The device whose trigger output is wired to the camera's input (trigger_line of "
+        "[camera]); left out: there is no wire, and plans go step by step.",
+    )
+    output: int = Field(0, ge=0, description="Which of its outputs, counted from 0.")
+    period_ms: float | None = Field(
+        None,
+        gt=0,
+        description="From one pattern to the next; left out: as fast as exposure and read-out allow.",
+    )
+
+
 class DisplayTable(Table):
     """The holographic display: SLM, scattering mask and Fourier lens, as holograms are computed for them."""
 
@@ -122,7 +157,8 @@ class DisplayTable(Table):
     expansion: int = Field(
         16,
         ge=1,
-        description="Étendue expansion: mask pixels in the area of one (binned) SLM pixel; a square.",
+        description="Étendue expansion: mask pixels in the area of one (binned) SLM pixel; a square. "
+        "1: without a mask.",
     )
     mask_file: str | None = Field(
         None,
@@ -158,6 +194,7 @@ PLAIN_TABLES: Mapping[str, type[Table]] = {
     "scene": SceneTable,
     "geometry": GeometryTable,
     "display": DisplayTable,
+    "trigger": TriggerTable,
 }
 
 
@@ -193,6 +230,7 @@ class BenchConfig:
     scene: SceneTable
     geometry: GeometryTable
     display: DisplayTable
+    trigger: TriggerTable
     devices: Mapping[Kind, DeviceConfig]
     """Only devices that the bench has."""
     shared: Mapping[str, SharedConfig] = field(default_factory=dict)

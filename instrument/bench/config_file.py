@@ -34,13 +34,47 @@ BUILT_IN = "built-in bench.toml"
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
-TEMPLATES = ("default", "display", "led_microscope", "screen")
-"""The simulated benches."""
+TEMPLATES: Mapping[str, tuple[str, str]] = {
+    "default": ("camera behind a diffuser", ""),
+    "display": ("holographic display", "--display"),
+    "led_microscope": ("LED array microscope", "--microscope"),
+    "screen": ("camera before a monitor", "--screen"),
+}
+"""The simulated benches: what each is, and how ``diffuserbench new`` is asked for it."""
 
 
 def template(name: str = "default") -> str:
-    """Return a commented simulated bench: ``default``, ``display``, ``led_microscope`` or ``screen``."""
+    """Return a commented simulated bench, one of :data:`TEMPLATES`."""
     return resources.files("instrument.bench").joinpath(f"{name}_bench.toml").read_text("utf-8")
+
+
+def other_bench_for(config: BenchConfig, kinds: Iterable[str], name: str) -> str | None:
+    """Say that a simulated bench is not the one that something can be tried on, and how to get that one.
+
+    Parameters
+    ----------
+    config : BenchConfig
+    kinds : iterable of str
+        The devices that it takes.
+    name : str
+        The bench that it can be tried on, of :data:`TEMPLATES`.
+
+    Returns
+    -------
+    str or None
+        None where the devices are that bench's, or some of them are no simulated ones.
+    """
+    present = {kind: device.driver_name for kind, device in config.devices.items() if kind in set(kinds)}
+    tables = tomllib.loads(template(name))
+    wrong = [kind for kind, driver in present.items() if tables.get(kind, {}).get("driver") != driver]
+    if not wrong or not all(driver.startswith("simulated") for driver in present.values()):
+        return None
+    what, flag = TEMPLATES[name]
+    write = " ".join(filter(None, ("diffuserbench new", f"{name}.toml", flag)))
+    return (
+        f"This cannot be tried on {config.label}, whose {' and '.join(wrong)} would see nothing of it: it "
+        f"takes a simulated {what}. Write one with {write}, then give the same command --bench {name}.toml."
+    )
 
 
 def load_config(path: Path | str | None = None) -> BenchConfig:
@@ -77,6 +111,7 @@ def parse_config(text: str, path: Path | None) -> BenchConfig:
     reader = _Reader(tables, Mistakes(key_lines(text)))
     plain = {name: reader.plain_table(name, model) for name, model in PLAIN_TABLES.items()}
     devices = {kind: device for kind in DEVICE_TABLES if (device := reader.device(kind))}
+    reader.refuse_wire_from_nowhere(plain["trigger"])
     shared = reader.shared_parts()
     reader.refuse_unknown_tables()
     if reader.mistakes:
@@ -123,6 +158,15 @@ class _Reader:
         if settings is None or options is None:
             return None
         return DeviceConfig(kind, str(name), driver, options, settings)
+
+    def refuse_wire_from_nowhere(self, trigger: object) -> None:
+        sent_by = getattr(trigger, "sent_by", None)
+        if sent_by is not None and sent_by not in self._tables:
+            self.mistakes.add(
+                ("trigger", "sent_by"),
+                "[trigger] sent_by",
+                f"this bench has no [{sent_by}] that sends pulses.",
+            )
 
     def _driver(self, kind: Kind, name: object) -> type[Device] | None:
         """Return the driver; of a misspelt name the nearest one, so that the table's other mistakes show."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -41,6 +41,22 @@ class Snapshot:
     average: int
     """Number of frames averaged."""
 
+    @classmethod
+    def of(cls, frames: Sequence[Frame]) -> Snapshot:
+        """Return the photograph that some frames make: the frame itself, or their mean."""
+        if len(frames) == 1:
+            return cls(frames[0].image, frames[0].metadata, 1)
+        total = np.zeros((), np.float64)
+        for frame in frames:
+            total = np.add(total, frame.image)
+        return cls._mean(total, [frame.metadata for frame in frames])
+
+    @classmethod
+    def _mean(cls, total: npt.NDArray[np.float64], metadata: Sequence[FrameMetadata]) -> Snapshot:
+        mean = np.asarray(total / len(metadata), np.float32)
+        mean.flags.writeable = False
+        return cls(mean, FrameMetadata.of_mean(metadata), len(metadata))
+
     @property
     def full_scale(self) -> int:
         """The largest count that the camera can report at its present bit depth."""
@@ -76,9 +92,7 @@ def photograph(
             on_progress(taken, average)
     if average == 1:
         return Snapshot(frame.image, frame.metadata, average)
-    mean = np.asarray(total / average, np.float32)
-    mean.flags.writeable = False
-    return Snapshot(mean, FrameMetadata.of_mean(metadata), average)
+    return Snapshot._mean(total, metadata)
 
 
 class LightState(enum.StrEnum):

@@ -65,14 +65,19 @@ class Lights:
         lit = {led: rgb for led, rgb in pattern.levels if any(rgb)}
         return bool(lit) and lit == dict.fromkeys(self._source.leds, self._source.rgb)
 
+    @property
+    def source_pattern(self) -> LedPattern:
+        """The point source as it is configured."""
+        leds, rgb = self._source.leds, self._source.rgb
+        words = f"point source: LED {', '.join(map(str, leds))} rgb {rgb}"
+        return LedPattern(words, tuple((led, rgb) for led in leds))
+
     def switch_source(self, *, lit: bool) -> None:
         """Light or darken the point source; confirmed when this returns."""
         if self._led_array is None:
             self._ask_once("the point source", lit=lit)
         elif lit:
-            leds, rgb = self._source.leds, self._source.rgb
-            words = f"point source: LED {', '.join(map(str, leds))} rgb {rgb}"
-            self._led_array.set_pattern(LedPattern(words, tuple((led, rgb) for led in leds)))
+            self._led_array.set_pattern(self.source_pattern)
         else:
             self._led_array.off()
 

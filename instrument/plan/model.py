@@ -26,6 +26,7 @@ from instrument.plan.positions import PlanData, Positions, SourcePosition, Stage
 
 Label = Annotated[str, StringConstraints(min_length=1, max_length=80, pattern=r"^[^/\x00-\x1f]+$")]
 Loop = Literal["repeat", "position", "light", "slm", "exposure"]
+Timing = Literal["auto", "stepped", "hardware"]
 LOOPS: tuple[Loop, ...] = ("repeat", "position", "slm", "light", "exposure")
 
 
@@ -51,6 +52,13 @@ class Part(PlanData):
     """How often all of it is done again; ``interval_s`` is the time from start to start of a repeat (0: at
     once)."""
     interval_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    timing: Timing = "auto"
+    """What times the frames: ``"hardware"``: the LED array or SLM plays its patterns as a sequence, and a
+    trigger wire (``[trigger]`` of ``bench.toml``) has the camera expose; ``"stepped"``: one frame after the
+    other by the program; ``"auto"``: by hardware where there is a wire and the part allows it."""
+    trigger_line: str | None = None
+    trigger_edge: Literal["rising", "falling"] | None = None
+    """Of the camera's hardware trigger; None: as ``[camera]`` has them."""
     order: tuple[Loop, ...] = LOOPS
 
     @model_validator(mode="before")

@@ -80,12 +80,16 @@ def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
         stage_position=stage.position() if stage is not None else {},
         stage_homed=stage is None or stage.is_homed,
         stage_target=(lambda source: bench.source_mount.target(*source)) if stage is not None else None,
+        play=bench.play,
         can_switch_source=bench.can_switch_source,
         can_switch_scene=bench.can_switch_scene,
         n_leds=len(bench.led_array.led_positions_mm) if bench.led_array is not None else 0,
         led_array=bench.led_array,
         slm_shape=slm.shape if slm is not None else None,
         slm_settle_ms=slm.settle_ms if slm is not None else 0.0,
+        has_trigger_wire=bench.trigger_source is not None,
+        trigger_lines=camera.trigger_lines,
+        trigger_edges=camera.trigger_edges,
         free_bytes=free_bytes(folder) if folder is not None else None,
     )
 

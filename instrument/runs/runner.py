@@ -12,6 +12,7 @@ configured) and the run's files are closed, in that order, each tried even when 
 
 from __future__ import annotations
 
+import logging
 import sys
 import threading
 import time
@@ -23,16 +24,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import StoppedError
+from drivers.errors import LimitError, StoppedError
+from drivers.frame import Frame
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import Snapshot
 from instrument.bench.safety import stop_until
+from instrument.bench.sequence import Wire
 from instrument.files.errors import BenchError
 from instrument.files.slm_image import read_slm_levels
 from instrument.plan import Light, Plan, Step
 from instrument.runs.finish import end_run
 from instrument.runs.run import FinishReason, Run
+from instrument.runs.timed import TimedSteps, left_to, take_steps
 from instrument.runs.writer import FrameToStore, RunWriter
+
+_log = logging.getLogger(__name__)
 
 
 class RunState(StrEnum):
@@ -92,8 +98,8 @@ class StepSettings:
         self._now: dict[str, Any] = {}
         """What is set, by the names of a step's fields; not there where it is not known."""
 
-    def actions(self, step: Step) -> list[Callable[[], None]]:
-        """Return what to do, in order: camera, motion, SLM, light."""
+    def actions(self, step: Step, but: str = "") -> list[Callable[[], None]]:
+        """Return what to do, in order: camera, motion, SLM, light; one field may be left alone."""
         bench = self._bench
         setters: dict[str, Callable[[Any], object]] = {
             "exposure_ms": bench.camera.set_exposure_ms,
@@ -108,8 +114,12 @@ class StepSettings:
         return [
             partial(self._set, name, value, setters[name])
             for name, value in wanted.items()
-            if value not in (None, {}) and value != self._now.get(name)
+            if name != but and value not in (None, {}) and value != self._now.get(name)
         ]
+
+    def unknown(self, name: str) -> None:
+        """Take note that a field is as something else left it."""
+        self._now.pop(name, None)
 
     def darken(self) -> None:
         """Turn off the light for a pause; the next step turns it on again."""
@@ -189,6 +199,7 @@ class Runner:
         self.on_progress = on_progress
         self.on_frame = on_frame
         self._settings = StepSettings(bench)
+        self._timed = TimedSteps(bench, plan)
         self._condition = threading.Condition()
         self._pausing = False
         self._aborting = False
@@ -301,21 +312,57 @@ class Runner:
 
     def _do_steps(self) -> None:
         part, part_started_s = -1, 0.0
-        for step in self._plan.whole_steps(self._start):
-            if step.index not in self._todo:
-                continue
+        todo = (step for step in self._plan.whole_steps(self._start) if step.index in self._todo)
+        for wire, steps in self._timed.groups(todo):
+            step = steps[0]
             self._between_steps()
             if step.part != part:
-                part, part_started_s = step.part, time.monotonic() - step.start_after_s
+                part_started_s = time.monotonic() - step.start_after_s
+            part = steps[-1].part
             self._wait_until(part_started_s + step.start_after_s)
             self._report(step=step)
-            snapshot = self._take(step)
-            self._writer.write(
-                [FrameToStore(step.index, snapshot.image, snapshot.metadata, snapshot.average)]
-            )
-            self._report_stored(snapshot)
+            if wire is not None and (taken := self._take_sequence(wire, steps)) is not None:
+                self._store(steps, taken)
+                continue
+            for number, step in enumerate(steps):
+                if number:
+                    self._between_steps()
+                    self._report(step=step)
+                self._store([step], [self._take(step)])
+
+    def _store(self, steps: Sequence[Step], taken: Sequence[Snapshot]) -> None:
+        pairs = list(zip(steps, taken, strict=True))
+        self._writer.write([FrameToStore(step.index, s.image, s.metadata, s.average) for step, s in pairs])
+        for step, snapshot in pairs:
+            self._report_stored(step, snapshot)
             if self.on_frame is not None and self.on_frame(step, snapshot):
                 self._settings = StepSettings(self._bench)
+
+    def _take_sequence(self, wire: Wire, steps: Sequence[Step]) -> list[Snapshot] | None:
+        """Take steps by one sequence; None where its source refuses it and the plan leaves the choice."""
+        shown_by_itself = left_to(wire)
+        for setting in self._settings.actions(steps[0], but=shown_by_itself):
+            self._raise_if_stopping()
+            setting()
+        self._raise_if_stopping()
+        try:
+            taken, troubles = take_steps(wire, steps, self._see)
+        except LimitError as refusal:
+            if not self._timed.may_step(steps):
+                raise
+            self._writer.note("stepped", text=str(refusal), first=steps[0].index, steps=len(steps))
+            _log.warning("Taken step by step, not timed by hardware: %s", refusal)
+            return None
+        finally:
+            self._settings.unknown(shown_by_itself)
+        self._raise_if_stopping()  # the light may have gone out during the exposures
+        for words in troubles:
+            self._writer.note("sequence taken again", text=words, first=steps[0].index, steps=len(steps))
+            _log.warning("%s: a sequence of %d steps was taken again: %s", steps[0], len(steps), words)
+        return taken
+
+    def _see(self, frame: Frame) -> None:
+        self._bench.newest_frame = frame
 
     def _take(self, step: Step) -> Snapshot:
         for setting in self._settings.actions(step):
@@ -385,11 +432,12 @@ class Runner:
         return None
 
     # Status --------------------------------------------------------------------------------------
-    def _report_stored(self, snapshot: Snapshot) -> None:
+    def _report_stored(self, step: Step, snapshot: Snapshot) -> None:
         now = self.status
         done_here = now.done_here + 1
         seconds = time.monotonic() - self._started_s
         self._report(
+            step=step,
             done=now.done + 1,
             done_here=done_here,
             seconds=seconds,

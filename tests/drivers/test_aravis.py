@@ -156,9 +156,10 @@ def test_features_of_the_configuration_are_set_and_listed() -> None:
 
 
 def test_a_hardware_trigger_sets_line_and_edge(fake: AravisCamera) -> None:
-    with pytest.raises(LimitError, match=r"no TriggerSource 'Line1'\. It offers Line0, Software"):
-        fake.set_trigger_mode("hardware")
-    with camera_of("Fake_1", trigger_line="Line0", features={}) as camera:
+    with pytest.raises(LimitError, match=r"no trigger line 'Line1'\. It offers Line0"):
+        fake.set_trigger_line("Line1")
+    with camera_of("Fake_1", features={}) as camera:
+        assert camera.trigger_line == "Line0"
         assert camera.set_trigger_mode("hardware") == "hardware"
         device = camera._camera.get_device()
         assert device.get_string_feature_value("TriggerMode") == "On"

@@ -85,11 +85,15 @@ def test_a_hardware_trigger_sets_line_and_edge(camera: BaslerCamera) -> None:
     assert camera.set_trigger_mode("hardware") == "hardware"
     assert camera._features.text("TriggerMode") == "On"
     assert camera._features.text("TriggerSource") == "Line1"
-    with (
-        camera_of(serial_number="0815-0001", trigger_line="Line7") as other,
-        pytest.raises(LimitError, match=r"no TriggerSource 'Line7'\. It offers .*Line3"),
-    ):
-        other.set_trigger_mode("hardware")
+    assert camera.trigger_edges == ("rising", "falling")
+    camera.set_trigger_mode("free_run")
+    assert camera.set_trigger_line("Line3") == "Line3"
+    assert camera.set_trigger_edge("falling") == "falling"
+    camera.set_trigger_mode("hardware")
+    assert camera._features.text("TriggerSource") == "Line3"
+    assert camera._features.text("TriggerActivation") == "FallingEdge"
+    with pytest.raises(LimitError, match=r"no trigger line 'Line7'\. It offers .*Line3"):
+        camera.set_trigger_line("Line7")
 
 
 def test_a_camera_that_is_unplugged_is_lost_and_comes_back(

@@ -1,0 +1,170 @@
+"""Frames timed by hardware: frame k is pattern k's, or the fault is named; never one in another's place."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.errors import DeviceError, LimitError
+from drivers.led_array import LedPattern
+from drivers.simulated.wire import Wires
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import parse_config
+from instrument.bench.sequence import Wire, _placed, take_sequence
+from instrument.files.errors import ConfigError
+from instrument.plan import Light, Part, Plan, PlanError
+from instrument.runs.acquire import acquire
+from instrument.runs.run import FinishReason, Run
+from instrument.runs.run_control import RunControl
+
+LEVELS = (40, 80, 120, 160, 200, 240)
+
+
+def open_bench(simulated: str = "", camera: str = "", wire: str = 'sent_by = "led_array"') -> Bench:
+    return Bench(
+        parse_config(
+            f"""
+            [camera]
+            driver = "simulated_led_microscope"
+            exposure_ms = 5.0
+            {camera}
+            [led_array]
+            driver = "simulated_led_microscope"
+            [trigger]
+            {wire}
+            [scene]
+            control = "simulated"
+            [simulated_led_microscope]
+            pixels = 64
+            time_scale = 0.0
+            {simulated}
+            """,
+            None,
+        )
+    ).open()
+
+
+def steps_of_light(**more: Any) -> Plan:
+    lights = tuple(Light(kind="pattern", description=f"level {n}", leds=((0, n, n, n),)) for n in LEVELS)
+    part = {"label": "lit", "light": lights, **more}
+    return Plan(label="p", parts=(Part(label="dark", repeats=2), Part.model_validate(part)))
+
+
+def brightness(run: Run) -> np.ndarray[Any, np.dtype[np.float64]]:
+    dark = run.images("dark").mean()
+    return np.asarray(run.images("lit").mean(axis=(1, 2)) - dark)
+
+
+def notes(run: Run, kind: str) -> list[str]:
+    return [str(event["text"]) for event in run.events if event["kind"] == kind]
+
+
+@pytest.mark.parametrize(
+    "simulated",
+    ["", "pulse_jitter_us = 20", "missed_pulses = 0.02", "extra_pulses = 0.02"],
+    ids=["clean", "jitter", "missed", "extra"],
+)
+def test_frame_k_is_of_pattern_k(tmp_path: Path, simulated: str) -> None:
+    with open_bench(simulated) as bench:
+        run = acquire(bench, steps_of_light(average=2), tmp_path)
+        assert bench.camera.trigger_mode == "free_run"
+        assert bench.led_array is not None
+        assert bench.led_array.pattern.is_dark
+    assert run.reason is FinishReason.COMPLETED
+    assert brightness(run) / brightness(run)[-1] == pytest.approx(np.array(LEVELS) / 240, abs=0.02)
+    assert [run.metadata(n).led_pattern for n in range(8)] == ["off"] * 2 + [f"level {n}" for n in LEVELS]
+    assert run.records[5].average == 2
+
+
+def test_faults_are_named_and_the_sequence_is_taken_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent = Wires._pulses
+    attempts: list[int] = []
+
+    def third_lost(self: Wires, count: int, period_s: float, settle_s: float) -> Any:
+        attempts.append(count)
+        pulses = sent(self, count, period_s, settle_s)
+        return np.delete(pulses, 2 + 2 + 2) if len(attempts) == 1 else pulses
+
+    monkeypatch.setattr(Wires, "_pulses", third_lost)
+    with open_bench() as bench:
+        run = acquire(bench, steps_of_light(), tmp_path)
+    assert notes(run, "sequence taken again") == ["no frame came of pattern 5"]
+    assert attempts == [2 + 2 + 6] * 2
+    assert brightness(run)[2] / brightness(run)[-1] == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("pulses", "words"),
+    [
+        (lambda at, period: np.append(at[1:], at[-1] + 0.99 * period), "as if they were shifted"),
+        (lambda at, period: at[:-1], "1 of 10 frames are missing at the beginning or the end"),
+        (lambda at, period: at + 0.6 * period * (np.arange(10) == 5), r"late: pattern 4 by \d"),
+        (lambda at, period: at[:0], "no frame came on Line1"),
+    ],
+    ids=["shifted", "last", "late", "none"],
+)
+def test_a_sequence_that_is_never_whole_is_refused(
+    monkeypatch: pytest.MonkeyPatch, pulses: Any, words: str
+) -> None:
+    monkeypatch.setattr(
+        Wires, "_pulses", lambda _, count, period, settle: pulses(np.arange(count) * period + settle, period)
+    )
+    patterns = [LedPattern(f"{n}", ((0, (n, n, n)),)) for n in (*LEVELS, 20, 60)]
+    with open_bench() as bench, pytest.raises(DeviceError, match=words):
+        take_sequence(Wire(bench), patterns)
+
+
+def test_times_are_put_to_places() -> None:
+    rng = np.random.default_rng(1)
+    times = 5.003 * np.arange(400.0) + rng.normal(0, 0.05, 400)  # clocks that differ: two periods in all
+    on_time, late, extra = _placed(np.sort(np.append(np.delete(times, [7, 300]), times[50] + 2.4)), 5.0, 0.25)
+    assert set(range(400)) - {n - min(on_time) for n in on_time} == {7, 300}
+    assert not late
+    assert extra == pytest.approx([times[50] + 2.4 - times[0]])
+
+
+def test_stop_ends_a_sequence(tmp_path: Path) -> None:
+    control = RunControl()
+    with open_bench() as bench:
+        plan = steps_of_light(repeats=20)
+        original = Wires.play
+
+        def stopping(self: Wires, *args: Any, **named: Any) -> bool:
+            threading.Thread(target=control.stop).start()
+            return original(self, *args, **named)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Wires, "play", stopping)
+            run = acquire(bench, plan, tmp_path, control=control)
+        assert bench.led_array is not None
+        assert bench.led_array.pattern.is_dark
+    assert run.reason is FinishReason.STOPPED
+    assert run.records == {}
+
+
+def test_what_a_sequence_needs_is_asked_for_beforehand(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"\[trigger\] sent_by.*no \[slm\]"):
+        open_bench(wire='sent_by = "slm"')
+    with pytest.raises(LimitError, match="has trigger outputs 0 to 0, not 1, which"):
+        open_bench(wire='sent_by = "led_array"\noutput = 1')
+    with open_bench(wire="") as bench, pytest.raises(PlanError, match="the bench has no trigger wire"):
+        acquire(bench, steps_of_light(timing="hardware"), tmp_path)
+    with (
+        open_bench() as bench,
+        pytest.raises(PlanError, match="trigger_line 'Line9', but the camera's are Line1"),
+    ):
+        acquire(bench, steps_of_light(trigger_line="Line9"), tmp_path)
+
+
+def test_a_falling_edge_and_another_line(tmp_path: Path) -> None:
+    with open_bench(camera='trigger_edge = "falling"') as bench:
+        run = acquire(bench, steps_of_light(), tmp_path)
+        assert run.reason is FinishReason.COMPLETED
+        with pytest.raises(DeviceError, match="no frame came on Line2"):
+            acquire(bench, steps_of_light(trigger_line="Line2"), tmp_path)
