@@ -61,12 +61,9 @@ def measure_look_up_table(io: DisplayBench, *, n_levels: int = 33, seed: int = 0
     chosen = np.random.default_rng(seed).random((height // io.binning, width // io.binning)) < 0.5
     varied = np.repeat(np.repeat(chosen, io.binning, axis=0), io.binning, axis=1)
     exposure_ms = _exposure_ms(io)
-    frames = []
-    for level in levels:
-        io.show_levels(np.where(varied, level, 0).astype(np.uint8))
-        picture = io.photograph(exposure_ms)
-        # Every fourth pixel has more than enough light.
-        frames.append(picture[::2, ::2])
+    shown = [np.where(varied, level, 0).astype(np.uint8) for level in levels]
+    # Every fourth pixel has more than enough light.
+    frames = [picture[::2, ::2] for picture in io.photographs(shown, exposure_ms)]
     phases = phases_from_frames(np.array(frames))
     from scipy.interpolate import PchipInterpolator
 

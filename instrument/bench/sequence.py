@@ -39,6 +39,8 @@ _LATE = 0.25
 """Share of the period by which a frame may be late, where its exposure leaves so much time."""
 _CLOCKS = 0.01
 """Share of the period that the clocks themselves are allowed."""
+_OTHER_CLOCK = 0.05
+"""Share by which a source's period may be another than it said: some count their own work beside it."""
 _HEAD, _FOLLOW = 9, 0.1
 """Frames that tell where the grid of times is, and how quickly it follows the frames."""
 _NAMED = 5
@@ -278,6 +280,9 @@ def _placed(
     The grid is the one that most of the first frames are on; it follows the slow drift of one clock against
     the other.
     """
+    measured_ms = float(np.median(np.diff(times_ms))) if len(times_ms) > _HEAD else period_ms
+    if abs(measured_ms / period_ms - 1) < _OTHER_CLOCK:
+        period_ms = measured_ms
     head = times_ms[:_HEAD]
     off_grid = (head - head[:, None]) / period_ms
     reference_ms = head[np.argmax((abs(off_grid - np.round(off_grid)) <= slack).sum(axis=1))]
