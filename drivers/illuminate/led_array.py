@@ -305,7 +305,8 @@ class IlluminateLedArray(LedArray):
     def arm(self, patterns: Sequence[LedPattern], period_ms: float, output: int = 0) -> float:
         """Store a sequence, of one colour; its period is whole milliseconds."""
         self._check_sequence(len(patterns), period_ms, output)
-        self.sequencer.load(patterns)
+        if not self.sequencer.holds(patterns):
+            self.sequencer.load(patterns)
         self._armed = (ceil(period_ms), output)
         return float(self._armed[0])
 

@@ -79,6 +79,10 @@ class Sequencer:
             self._rgb = next(iter(colors), (0, 0, 0))
             array.remember("sequence", lambda: self.load(patterns))
 
+    def holds(self, patterns: Sequence[LedPattern]) -> bool:
+        """Whether the array has these patterns stored."""
+        return self._stored == tuple(patterns)
+
     def forget(self) -> None:
         """Take it that the array holds no sequence."""
         self._stored = ()
