@@ -52,6 +52,9 @@ FAMILIES: tuple[Family, ...] = (
     *("microscope", "gradient", "lights", "dense-volume", "sparse-picture"),
 )
 """Of these scenes, in the order of their numbers, two of each."""
+BRIGHT = range(4000, 5000)
+BRIGHT_FAMILIES: tuple[Family, ...] = ("beads", "microscope", "beads", "dense-volume")
+"""Numbers of bright volumes alone, as among the others few are good, and of what."""
 MOST = 10**9
 """Voxels up to which every scene is taken."""
 DIGITS = 4
@@ -66,7 +69,8 @@ def scene(index: int) -> tuple[SceneSpec, Options]:
     """Return an unseen scene and how its data is handled; odd ones are seen through measured PSFs."""
     rng = np.random.default_rng([FIRST_SEED, index])
     measured = index % 2 == 1
-    family = FAMILIES[index // 2 % len(FAMILIES)]
+    families = BRIGHT_FAMILIES if index in BRIGHT else FAMILIES
+    family = families[index // 2 % len(families)]
     is_picture = family in PICTURES
     larger = float(rng.choice([1.0, 1.0, 1.5, 2.0]))
     numbers: dict[str, object] = {
@@ -75,12 +79,14 @@ def scene(index: int) -> tuple[SceneSpec, Options]:
         "seed": FIRST_SEED + index,
         "density": float(10 ** rng.uniform(-0.5, 0.5)),
     }
+    if index in BRIGHT:
+        numbers["photons"] = float(10 ** rng.uniform(3, 5))
     if measured:
         optics = "usaf" if not is_picture else str(rng.choice(["hand", "usaf"]))
         height, width = (45, 60) if optics == "hand" else (45, 53)
         numbers |= {"optics": optics, "field": 0.65}
         numbers["calibration_photons"] = float(10 ** rng.uniform(3, 4.5))
-        if index % 4 == 3:  # as bright, and some as large, as those that were taken
+        if index % 4 == 3 and index not in BRIGHT:  # as bright, and some as large, as those that were taken
             numbers["photons"] = float(numbers["photons"]) * 20  # type: ignore[arg-type]
             larger = 5.0 if index % 8 == 7 else larger
         if rng.random() < 0.3:

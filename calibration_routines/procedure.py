@@ -296,6 +296,8 @@ class Routine:
     """More about it, for the command's help."""
     needs: tuple[str, ...] = ()
     """Devices that it needs besides the camera."""
+    tried_on: str = "default"
+    """The simulated bench that it can be tried on, one of ``instrument.bench.config_file.TEMPLATES``."""
     examples: tuple[str, ...] = ()
     """Command lines."""
     start: Callable[[Bench], Mapping[str, Any]] | None = None
@@ -365,6 +367,7 @@ class OfFiles(Procedure):
 
 _MODULES = (
     "psf.sweep_procedure",
+    "optics.stage_play",
     "optics.photograph",
     "optics.angular",
     "optics.dpc",

@@ -36,6 +36,13 @@ class Roi:
             and self.left <= other.left < other.left + other.width <= right
         )
 
+    def inside(self, step: int) -> Roi:
+        """Return the largest region inside this one with all borders on multiples of ``step``."""
+        top, left = (-(-start // step) * step for start in (self.top, self.left))
+        bottom = (self.top + self.height) // step * step
+        right = (self.left + self.width) // step * step
+        return Roi(top, left, max(0, bottom - top), max(0, right - left))
+
     def as_tuple(self) -> tuple[int, int, int, int]:
         """Return ``(top, left, height, width)``."""
         return (self.top, self.left, self.height, self.width)

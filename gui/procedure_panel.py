@@ -18,6 +18,7 @@ from gui.procedure_run import Ended, ProcedureRun, RunBar, Situation, script
 from gui.session import BenchSession
 from gui.session_news import name_of
 from gui.widgets.building import after_rest, button, choice, fill, label, mark, scrolled, split, text_view
+from instrument.bench.config_file import other_bench_for
 from instrument.files.errors import BenchError, SettingsError, count, duration, size
 
 _CHECK_MS = 250
@@ -151,6 +152,10 @@ class ProcedurePanel(Panel):
             names = " and ".join(map(name_of, missing))
             self._say(f"The bench has no {names} that is open.", wrong=True)
             self.run_bar.set_startable("Not all devices are open.")
+            return
+        if needed and (wrong := other_bench_for(self.session.config, needed, self.routine.tried_on)):
+            self._say(wrong, wrong=True)
+            self.run_bar.set_startable("It takes another bench.")
             return
         bench, routine = self.session.bench, self.routine
         first = routine.start if routine.name not in self._started else None

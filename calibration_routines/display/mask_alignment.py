@@ -347,6 +347,7 @@ ROUTINES = (
         options=AlignmentSettings,
         procedure=AlignmentProcedure,
         needs=("slm",),
+        tried_on="display",
         examples=(
             "diffuserbench align mask --bench display.toml",
             "diffuserbench align mask --reach 30 --depth-um 300 --moves 0",

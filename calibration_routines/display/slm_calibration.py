@@ -224,6 +224,7 @@ ROUTINES = (
         options=SlmProcedure,
         procedure=lambda options: options,
         needs=("slm",),
+        tried_on="display",
         examples=(
             "diffuserbench calibrate slm --bench display.toml",
             "diffuserbench calibrate slm --bench display.toml --alignment alignment.json",

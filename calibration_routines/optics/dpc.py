@@ -341,10 +341,11 @@ ROUTINES = (
         options=DpcSetup,
         procedure=DpcProcedure,
         needs=("led_array",),
+        tried_on="led_microscope",
         purpose=DPC,
         finish=_finish,
         examples=(
-            "diffuserbench new microscope.toml --led-microscope",
+            "diffuserbench new microscope.toml --microscope",
             "diffuserbench calibrate dpc --bench microscope.toml --na 0.1 --magnification 4",
         ),
         start=lambda _: {"objective_na": 0.1, "magnification": 4.0},

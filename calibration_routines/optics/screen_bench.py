@@ -117,10 +117,7 @@ class ScreenProcedure(Procedure):
         screen, asked = require_slm(bench), self.asked
         height, width = screen.shape
         if screen.identity.simulated and screen.identity.model != "screen":
-            raise BenchError(
-                f"The SLM of {bench.label} is no screen: it does not glow. To try it, write a bench that has "
-                "one: diffuserbench new screen.toml --screen"
-            )
+            raise BenchError(f"The SLM of {bench.label} is no screen: it does not glow.")
         frames = asked.dark_frames + asked.average * (len(TONES) + asked.pictures + asked.judged + 1)
         return Outlook(
             (
@@ -161,6 +158,7 @@ ROUTINES = (
         options=ScreenOptions,
         procedure=ScreenProcedure,
         needs=("slm",),
+        tried_on="screen",
         purpose=SCREEN,
         finish=finish_screen,
         files=FromFiles(

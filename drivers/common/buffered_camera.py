@@ -358,7 +358,7 @@ class BufferedCamera(KeptSettings):
         frame_id = self._next_id + lost
         self._next_id = frame_id + 1
         full_scale = (1 << run.significant_bits) - 1
-        return FrameMetadata(
+        metadata = FrameMetadata(
             frame_id=frame_id,
             device_time_ns=raw.device_time_ns,
             host_time_ns=host_time_ns,
@@ -372,8 +372,8 @@ class BufferedCamera(KeptSettings):
             binning=run.binning,
             dropped_before=lost,
             saturated_fraction=float(np.count_nonzero(image >= full_scale) / image.size),
-            **raw.facts,
         )
+        return replace(metadata, **raw.facts)
 
     def _count_from(self, number: int, run: _Run) -> None:
         """Count from an incomplete frame on, which the first whole one comes after."""

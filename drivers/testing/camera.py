@@ -73,8 +73,12 @@ class CameraContract(DeviceContract):
         assert camera.gain == pytest.approx(high, rel=0.01)
 
     def test_black_level_is_read_back(self, camera: Camera) -> None:
-        level = camera.set_black_level(0)
-        assert level == camera.black_level == pytest.approx(0, abs=1)
+        try:
+            level = camera.set_black_level(0)
+        except LimitError:  # of a sensor that has one offset and keeps it
+            assert camera.set_black_level(camera.black_level) == camera.black_level > 0
+        else:
+            assert level == camera.black_level == pytest.approx(0, abs=1)
         with pytest.raises(LimitError, match="black level"):
             camera.set_black_level(-1)
 

@@ -34,13 +34,47 @@ BUILT_IN = "built-in bench.toml"
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
-TEMPLATES = ("default", "display", "led_microscope", "screen")
-"""The simulated benches."""
+TEMPLATES: Mapping[str, tuple[str, str]] = {
+    "default": ("camera behind a diffuser", ""),
+    "display": ("holographic display", "--display"),
+    "led_microscope": ("LED array microscope", "--microscope"),
+    "screen": ("camera before a monitor", "--screen"),
+}
+"""The simulated benches: what each is, and how ``diffuserbench new`` is asked for it."""
 
 
 def template(name: str = "default") -> str:
-    """Return a commented simulated bench: ``default``, ``display``, ``led_microscope`` or ``screen``."""
+    """Return a commented simulated bench, one of :data:`TEMPLATES`."""
     return resources.files("instrument.bench").joinpath(f"{name}_bench.toml").read_text("utf-8")
+
+
+def other_bench_for(config: BenchConfig, kinds: Iterable[str], name: str) -> str | None:
+    """Say that a simulated bench is not the one that something can be tried on, and how to get that one.
+
+    Parameters
+    ----------
+    config : BenchConfig
+    kinds : iterable of str
+        The devices that it takes.
+    name : str
+        The bench that it can be tried on, of :data:`TEMPLATES`.
+
+    Returns
+    -------
+    str or None
+        None where the devices are that bench's, or some of them are no simulated ones.
+    """
+    present = {kind: device.driver_name for kind, device in config.devices.items() if kind in set(kinds)}
+    tables = tomllib.loads(template(name))
+    wrong = [kind for kind, driver in present.items() if tables.get(kind, {}).get("driver") != driver]
+    if not wrong or not all(driver.startswith("simulated") for driver in present.values()):
+        return None
+    what, flag = TEMPLATES[name]
+    write = " ".join(filter(None, ("diffuserbench new", f"{name}.toml", flag)))
+    return (
+        f"This cannot be tried on {config.label}, whose {' and '.join(wrong)} would see nothing of it: it "
+        f"takes a simulated {what}. Write one with {write}, then give the same command --bench {name}.toml."
+    )
 
 
 def load_config(path: Path | str | None = None) -> BenchConfig:

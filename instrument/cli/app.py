@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drivers.errors import DeviceError, LimitError
-from instrument.cli.options import GroupedCommand, flat
+from instrument.cli.options import USAGE_ERROR, GroupedCommand, flat
 from instrument.files.errors import BenchError, OperatorNeededError, in_words
 from recon.base.declare import option
 
@@ -94,14 +94,15 @@ def load_and_say(bench: Path | None) -> BenchConfig:
     return config
 
 
-def open_and_say(bench: Path | None, *, as_is: bool = False) -> Bench:
+def open_and_say(bench: BenchConfig | Path | None, *, as_is: bool = False) -> Bench:
     """Open the bench, ready to ask the operator in a terminal; say on stderr what it is.
 
     With ``as_is`` nobody is asked: what the operator would have to do is said, and taken for done.
     """
     from instrument.bench.bench import open_bench
 
-    opened = open_bench(load_and_say(bench), ask=_taken_for_done if as_is else operator())
+    config = load_and_say(bench) if bench is None or isinstance(bench, Path) else bench
+    opened = open_bench(config, ask=_taken_for_done if as_is else operator())
     typer.echo(f"Bench: {opened.label}", err=True)
     return opened
 
@@ -152,8 +153,6 @@ def _changed_ns(file: Path) -> int | None:
 
 DEBUG_VARIABLE = "DIFFUSERBENCH_DEBUG"
 INTERRUPTED = 130
-# What typer raises for wrong options; its public subclass is the stable way to name it.
-_UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 class Terminated(SystemExit):
@@ -175,7 +174,7 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt | Terminated):
             _be_silent_about_half_made_objects()
-        if debug and not isinstance(error, _UsageError | typer.Abort | typer.Exit | SystemExit):
+        if debug and not isinstance(error, USAGE_ERROR | typer.Abort | typer.Exit | SystemExit):
             raise
         return report(error)
     return 0
@@ -201,7 +200,7 @@ def report(error: BaseException) -> int:
     """Say on stderr what went wrong and return the exit status; what is no known mistake is raised again."""
     if isinstance(error, typer.Exit):
         return error.exit_code
-    if isinstance(error, _UsageError):
+    if isinstance(error, USAGE_ERROR):
         error.show()  # type: ignore[attr-defined]
         return 2
     if isinstance(error, SystemExit):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -30,40 +31,78 @@ _OF_THE_WINDOW = ("PySide6", "shiboken6", "pyqtgraph")
         "diffuserbench new benches/microscope.toml",
         "diffuserbench new --force          overwrite an existing bench.toml",
         "diffuserbench new display.toml --display",
-        "diffuserbench new microscope.toml --led-microscope",
+        "diffuserbench new microscope.toml --microscope",
         "diffuserbench new screen.toml --screen",
     )
 )
 def new(
     out: Annotated[Path, typer.Argument(help="The file to write.", metavar="FILE")] = Path("bench.toml"),
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
+    camera: Annotated[
+        bool, typer.Option("--camera", help="A camera behind a diffuser (the default where nobody is asked).")
+    ] = False,
     display: Annotated[bool, typer.Option("--display", help="A holographic display instead.")] = False,
     led_microscope: Annotated[
-        bool, typer.Option("--led-microscope", help="An LED array microscope instead, for calibrate dpc.")
+        bool,
+        typer.Option(
+            "--microscope", "--led-microscope", help="An LED array microscope instead, for calibrate dpc."
+        ),
     ] = False,
     screen: Annotated[
         bool, typer.Option("--screen", help="A camera before a monitor instead, for calibrate screen.")
     ] = False,
+    look: Annotated[
+        bool, typer.Option("--look/--no-look", help="Add what is connected here, as comments to be used.")
+    ] = True,
 ) -> None:
-    """Write a commented bench.toml in which every key is explained: the simulated bench to start from."""
-    from instrument.bench.config_file import DEFAULT_NAME, template
+    """Write a commented bench.toml in which every key is explained: the simulated bench to start from.
+
+    In a terminal you are asked which bench it is to be. The lines of real devices that are connected, as
+    diffuserbench devices prints them, stand at the file's end, ready to be put in.
+    """
+    from instrument.bench.config_file import DEFAULT_NAME, TEMPLATES, template
     from instrument.files.atomic import require_new, write_text
 
     if out.is_dir():
         raise FileError(out, "is a folder.", f"Name a file in it, e.g. {out / DEFAULT_NAME}")
     require_new(out, overwrite=force)
-    if display + led_microscope + screen > 1:
-        raise BenchError("Give one of --display, --led-microscope and --screen.")
-    name, what = "default", "bench, with every key explained"
-    if display:
-        name, what = "display", "holographic display"
-    if led_microscope:
-        name, what = "led_microscope", "LED array microscope"
-    if screen:
-        name, what = "screen", "camera before a monitor"
-    write_text(out, template(name))
-    typer.echo(f"Wrote {out}: a SIMULATED {what}.")
+    given = dict(zip(TEMPLATES, (camera, display, led_microscope, screen), strict=True))
+    chosen = [name for name, is_set in given.items() if is_set]
+    if len(chosen) > 1:
+        raise BenchError("Give one of --camera, --display, --microscope and --screen.")
+    name = chosen[0] if chosen else _asked_for(TEMPLATES)
+    found = _found_lines() if look else ""
+    write_text(out, template(name) + found)
+    typer.echo(f"Wrote {out}: a SIMULATED {TEMPLATES[name][0]}.")
+    if found:
+        typer.echo(
+            "What is connected here stands at its end: put those lines in the place of simulated ones."
+        )
     typer.echo(f"Next: diffuserbench check{'' if out == Path(DEFAULT_NAME) else f' --bench {out}'}")
+
+
+def _asked_for(templates: Mapping[str, tuple[str, str]]) -> str:
+    """Ask which bench it is to be; the first where nobody can answer."""
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        return next(iter(templates))
+    names = list(templates)
+    for number, (what, _) in enumerate(templates.values(), 1):
+        typer.echo(f"  {number}  {what}", err=True)
+    answer = str(typer.prompt("Which bench", default="1", err=True)).strip()
+    if not answer.isdecimal() or not 1 <= int(answer) <= len(names):
+        raise BenchError(f"There is no bench {answer!r}: a number from 1 to {len(names)} is expected.")
+    return names[int(answer) - 1]
+
+
+def _found_lines() -> str:
+    """Return the lines of bench.toml for what is connected, as comments; empty where nothing is."""
+    from drivers.registry.registry import list_devices
+
+    rows: list[str] = []
+    for device in list_devices(probe=False, say=lambda _: None).found:
+        if lines := device.bench_lines():
+            rows += ["#", f"# {_device_line(device)}", *(f"# {line}" for line in lines.splitlines())]
+    return "\n".join(["", "# Connected here (diffuserbench devices):", *rows, ""]) if rows else ""
 
 
 @check_app.command(

@@ -40,8 +40,9 @@ from calibration_routines.psf.sweep_plan import SweepExposures
 from calibration_routines.psf.sweep_procedure import event_lines, event_note, exposure_lines
 from calibration_routines.psf.sweep_watch import SweepEvent
 from instrument.bench.bench import Bench
+from instrument.bench.config_file import other_bench_for
 from instrument.bench.safety import StepsFailedError
-from instrument.cli.app import App, BenchOption, examples, open_and_say
+from instrument.cli.app import App, BenchOption, examples, load_and_say, open_and_say
 from instrument.cli.options import Given
 from instrument.cli.progress import keys, progress_bar
 from instrument.files.errors import BenchError, duration, size
@@ -168,7 +169,10 @@ def carry_out(
     """Say what a routine will do and why, then do it and say how good it is; a dry run ends before that."""
     console = Console()
     procedure = routine.procedure(options)
-    with open_and_say(bench) as opened:
+    config = load_and_say(bench)
+    if wrong := other_bench_for(config, ("camera", *routine.needs), routine.tried_on):
+        raise BenchError(wrong)
+    with open_and_say(config) as opened:
         outlook = procedure.outlook(opened, folder)
         print_lines(console, outlook.reasons)
         if dry_run:

@@ -88,6 +88,13 @@ class CaptureOptions:
 class SnapOptions(CaptureOptions):
     """A photograph."""
 
+    exposure_ms: float | None = option(
+        None,
+        help="Exposure time, e.g. 12.5.",
+        unit="ms",
+        default_words="as bench.toml has it, else found, so that nothing saturates",
+        group=_CAMERA,
+    )
     average: int = option(
         1,
         help="Frames to average; the mean is float32.",
@@ -117,6 +124,7 @@ class SnapOptions(CaptureOptions):
 def snap(options: SnapOptions, bench: BenchOption = None) -> None:
     """Take a photograph and write it with its metadata (exposure, gain, stage position, light ...).
 
+    The exposure is found where neither --exposure-ms nor bench.toml gives one; a dark frame needs it given.
     The bench is opened for it and made safe again: light off, motion stopped.
     """
     light = options.light()
@@ -125,10 +133,28 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
     with saying_what_is_left(target), naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
         options.set_camera(opened)
         switch_light(opened, light)
+        if options.exposure_ms is None and light is not LightState.DARK:
+            _expose(opened, light)
         with one_task("Frames") as advance:
             taken = opened.snap(options.average, on_progress=advance)
         write_snapshot(opened, target, taken, light, operator_asked=not options.as_is)
     _report(target, taken, light)
+
+
+def _expose(bench: Bench, light: LightState) -> None:
+    """Find the exposure where bench.toml has none, and say how; the light is as it is to be."""
+    from calibration_routines.psf.exposure import auto_expose, hot_pixels
+
+    if getattr(bench.config.devices["camera"].settings, "exposure_ms", None) is not None:
+        return
+    hot = None
+    can_switch = {LightState.SCENE: bench.can_switch_scene, LightState.SOURCE: bench.can_switch_source}
+    if can_switch.get(light, False):
+        switch_light(bench, LightState.DARK)
+        dark = bench.camera.snap()
+        hot = hot_pixels(dark.image, dark.full_scale)
+        switch_light(bench, light)
+    typer.echo(auto_expose(bench.camera, hot=hot).message)
 
 
 def _report(target: Path, taken: Snapshot, light: LightState) -> None:

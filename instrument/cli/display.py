@@ -13,18 +13,21 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from instrument.bench.config import BenchConfig
 from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
 from instrument.cli.progress import first_interrupt_cancels, one_task, progress_bar
 from instrument.display.hologram import (
     HologramResult,
     bench_display,
     compute_and_judge,
+    crop_words,
     load_alignment,
     prepare_target,
     read_weights,
     slm_size,
 )
 from instrument.display.hologram_files import HologramFiles, rows, write_chart, write_csv
+from instrument.display.spots import SpotFiles, spots_of
 from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image, read_stack
@@ -38,9 +41,11 @@ from recon.holography import (
     HologramRecord,
     HologramStop,
     Target,
+    compute_spots,
     eyebox_for_field_of_view,
     field_of_view_for_eyebox,
     pixels_for,
+    pixels_per_degree,
 )
 from recon.holography.judge import GRIDS, METHODS, Cell, run_table
 
@@ -145,7 +150,7 @@ def etendue(options: EtendueOptions) -> None:
             f"{x.mask_pitch_um:.2f} um",
             f"{x.field_of_view_deg:.1f} deg square",
             f"{x.eyebox_mm:.2f} x {y.eyebox_mm:.2f} mm",
-            f"{x.pixels_per_degree:.0f} x {y.pixels_per_degree:.0f} px/deg",
+            f"{pixels_per_degree(x, y):.0f} px/deg",
             f"{x.etendue_mm:.3f} mm",
         )
     console.print(table)
@@ -225,6 +230,13 @@ def _print_table(cells: list[Cell], note: str) -> None:
 class HologramInputs:
     """What is shown, for which display, and where the pattern goes."""
 
+    spots: str | None = option(
+        None,
+        help="Spots instead of a picture: an even array, 10x10, or a CSV file with columns y, x (fractions "
+        "of the field from the top left), and where wanted intensity, z_mm.",
+        metavar="ROWSxCOLUMNS|FILE",
+        group="Files",
+    )
     z_mm: tuple[float, ...] = option(
         (),
         help="Depth of each target behind the focal plane; once a target.",
@@ -265,24 +277,38 @@ class HologramInputs:
         "diffuserbench hologram picture.png --frames 2 --psnr 30 --out slm.png",
         "diffuserbench hologram frames/ --video --iterations 10 --out video.png",
         "diffuserbench hologram colour.png --color --out slm.png",
+        "diffuserbench hologram --spots 10x10 --expansion 1 --out spots.png",
     )
 )
 def hologram(
-    target: Annotated[list[Path], typer.Argument(metavar="TARGET...", help="The picture, or one per plane.")],
     inputs: HologramInputs,
     options: HologramOptions,
+    target: Annotated[
+        list[Path] | None, typer.Argument(metavar="[TARGET...]", help="The picture, or one per plane.")
+    ] = None,
     bench: BenchOption = None,
 ) -> None:
-    """Compute the SLM phase that shows a picture through the bench's scattering mask.
+    """Compute the SLM phase that shows a picture through the bench's scattering mask, or without one.
+
+    --expansion 1 is an ordinary hologram, without a mask. --spots takes the place of a picture: weighted
+    Gerchberg-Saxton makes spots as bright as asked for, at any places and depths.
 
     Writes the pattern, a JSON file with settings and metrics, and a preview of what will be seen with and
     without the eye's low-pass (computed, not photographed). Ctrl-C keeps the pattern so far.
     """
+    if (inputs.spots is None) == (not target):
+        raise BenchError("Give a TARGET picture, or --spots.")
     config = load_and_say(bench)
     size = slm_size(config)
+    if inputs.spots is not None:
+        _spots(inputs, options, config, size)
+        return
+    assert target is not None
     if inputs.weights is not None:
         options = replace(options, weights=read_weights(inputs.weights))
     pictures = _frames(target, video=inputs.video)
+    if said := next(filter(None, (crop_words(p, options.fit) for planes in pictures for p in planes)), ""):
+        typer.echo(said, err=True)
     depths = inputs.depths(1 if inputs.video else len(target))
     lasers = inputs.wavelengths if inputs.color else (None,)
     displays = [
@@ -313,6 +339,47 @@ def hologram(
                 if result.hologram.stop_reason is HologramStop.CANCELLED:
                     typer.echo("Interrupted: this is the pattern so far.", err=True)
                     raise typer.Exit(130)
+
+
+def _spots(
+    inputs: HologramInputs,
+    options: HologramOptions,
+    config: BenchConfig,
+    size: tuple[tuple[int, int], float],
+) -> None:
+    """Compute a hologram of spots, say how even they are, write."""
+    given = [
+        flag
+        for flag, value in (("--video", inputs.video), ("--color", inputs.color), ("--z-mm", inputs.z_mm))
+        if value
+    ]
+    if given or inputs.weights is not None:
+        raise BenchError(f"{given[0] if given else '--weights'} does not apply to --spots.")
+    spots = spots_of(inputs.spots or "")
+    display = options.display_of(bench_display(config, size, expansion=options.expansion))
+    if inputs.alignment is not None:
+        display = load_alignment(inputs.alignment).of(display)
+    writer = HologramFiles(inputs.out, config.display.slm_binning, options, [display])
+    writer.check(overwrite=inputs.force)
+    with saying_what_is_left(*writer.files()), first_interrupt_cancels() as cancel:
+        with one_task("spots", options.iterations) as advance:
+
+            def show(record: HologramRecord, _slm: object) -> None:
+                advance(float(record.iteration), note=f"deviation {record.loss:.2%}")
+
+            found, scores = compute_spots(display, spots, options, callback=show, cancel=cancel)
+        SpotFiles(writer).write(spots, found, scores)
+    last = found.history[-1]
+    typer.echo(f"spots: {last.iteration} iterations, {found.seconds:.1f} s: {found.stop_reason}")
+    least, greatest = scores.relative.min(), scores.relative.max()
+    typer.echo(
+        f"  {len(spots)} spots: {least:.3f} to {greatest:.3f} of the brightness asked for, "
+        f"deviation {scores.deviation:.2%} (computed)"
+    )
+    typer.echo(f"  light: {scores.efficiency:.1%} of what falls on the SLM is in the spots")
+    if found.stop_reason is HologramStop.CANCELLED:
+        typer.echo("Interrupted: this is the pattern so far.", err=True)
+        raise typer.Exit(130)
 
 
 def _compute(

@@ -236,7 +236,7 @@ def _darkest_corner(pixels: npt.NDArray[Any]) -> tuple[float, str]:
 def darkest_block(pixels: npt.NDArray[Any]) -> float:
     """Return the mean of an image's darkest block of 10 x 10 pixels (smaller in a smaller image)."""
     grey = pixels.mean(axis=-1, dtype=np.float32) if pixels.ndim == 3 else pixels
-    return float(bin_image(grey, max(1, min(_PATCH, *grey.shape))).min())
+    return float(np.nanmin(bin_image(grey, max(1, min(_PATCH, *grey.shape)))))
 
 
 def dark_level(choice: DarkChoice, psf: ImageFile, image: ImageFile) -> Dark:

@@ -33,6 +33,10 @@ class Operator:
     since: datetime = field(default_factory=lambda: datetime.now(UTC))
 
 
+WATCHER = Operator("the page", "the page in the browser")
+"""Who looks while nobody operates, and gives way to whoever wants to."""
+
+
 @dataclass
 class _Hold:
     """A device that the operator has open."""
@@ -59,8 +63,11 @@ class Operation:
     def __init__(self, config: BenchConfig, say: Callable[[str], None]) -> None:
         self.config = config
         self._say = say
-        self._taking = threading.RLock()
+        self._taking, self._dropping = threading.RLock(), threading.Lock()
         self._bench: Bench | None = None
+        self._dropped: Bench | None = None
+        """One whose operation is being ended: once is enough, however many connections break."""
+        self._ended: DeviceError | None = None
         self._holds: dict[Kind, _Hold] = {}
         self.operator: Operator | None = None
         self.newest_frame: Frame | None = None
@@ -76,6 +83,10 @@ class Operation:
         cannot be opened.
         """
         with self._taking:
+            if self._ended is not None:
+                raise self._ended
+            if self.operator == WATCHER and operator != WATCHER:
+                self.let_go("camera", WATCHER)
             present = self.operator
             if present is not None and present.key != operator.key:
                 raise DeviceBusyError(
@@ -96,7 +107,7 @@ class Operation:
                 if self._bench is None:
                     self._close(bench)
                 raise
-            if self.operator is None:
+            if self.operator is None and operator != WATCHER:
                 self._say(f"Operated by {operator.words}.")
             self._bench, self.operator = bench, present or operator
             self._holds[kind] = _Hold(device, on_end)
@@ -123,9 +134,13 @@ class Operation:
 
         Raises StepsFailedError naming what could not be made safe; all was tried.
         """
-        bench = self._bench
-        if bench is None or self.operator is None or self.operator.key != operator.key:
-            return
+        with self._dropping:
+            bench = self._bench
+            if bench is None or self.operator is None or self.operator.key != operator.key:
+                return
+            if self._dropped is bench:
+                return
+            self._dropped = bench
         for hold in self._holds.values():
             hold.stopped_at = 1 << 62  # nothing that is still on its way is carried out
         failure: StepsFailedError | None = None
@@ -154,12 +169,19 @@ class Operation:
             reason = StoppedError("bench", f"STOP was pressed by {who}.", "Open it again to go on.")
             self.drop(operator, reason)
 
+    def end(self, reason: DeviceError) -> None:
+        """Make the bench safe and close it for good; errors as ``stop``."""
+        self._ended = reason
+        if self.operator is not None:
+            self.drop(self.operator, reason)
+
     def _end(self, bench: Bench) -> None:
-        words = self.operator.words if self.operator else "nobody"
+        operator = self.operator
         self._holds.clear()
-        self._bench, self.operator = None, None
         self._close(bench)
-        self._say(f"No longer operated by {words}.")
+        self._bench, self.operator = None, None
+        if operator is not None and operator != WATCHER:
+            self._say(f"No longer operated by {operator.words}.")
 
     def _close(self, bench: Bench) -> None:
         try:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import hmac
 import json
 import logging
 import threading
+import weakref
 from collections.abc import Awaitable, Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -34,13 +36,21 @@ from drivers.remote.wire import (
 )
 from instrument.bench.config import BenchConfig
 from instrument.files.errors import BenchError
-from instrument.serve.operation import Operation, Operator
+from instrument.serve.operation import WATCHER, Operation, Operator
+from instrument.serve.watching import Watcher, picture
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 _LONGEST_REQUEST = 256 << 20
-_FRAME_WAIT_S = 0.2
+_FRAME_WAIT_S, _CLOSING_S = 0.2, 1.0
+_STATE_S, _PICTURE_S = 1.0, 0.1
+"""How often a page hears of the state, and sees a picture, at most."""
+_PAGE_HEADERS = {
+    "Content-Security-Policy": "default-src 'self' 'unsafe-inline'; img-src blob:; frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",
+}
 _dumps = functools.partial(json.dumps, default=plain)
 
 
@@ -73,7 +83,9 @@ class BenchServer:
         self._thread = threading.Thread(target=self._loop.run_forever, name="server", daemon=True)
         self._pool = ThreadPoolExecutor(64, "call")
         self._overtaking = ThreadPoolExecutor(16, "stop")
+        self._watcher = Watcher(self.operation)
         self._runner: web.AppRunner | None = None
+        self._links: weakref.WeakSet[web.WebSocketResponse] = weakref.WeakSet()
         self._frames: asyncio.Task[Any] | None = None
 
     # Starting and ending -------------------------------------------------------------------------
@@ -100,6 +112,7 @@ class BenchServer:
                 web.get("/", self._page),
                 web.get("/api/state", self._state),
                 web.post("/api/stop", self._stop),
+                web.get("/api/live", self._live),
                 web.get("/api/devices/{kind}/hold", self._hold),
                 web.get("/api/devices/camera/frames", self._sequence),
                 *(
@@ -109,8 +122,20 @@ class BenchServer:
             ]
         )
         self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0)
+        app.on_shutdown.append(self._part_all)
         await self._runner.setup()
         await web.TCPSite(self._runner, self._serving.host, self._serving.port).start()
+
+    async def _part_all(self, _app: web.Application) -> None:
+        for link in set(self._links):
+            await link.close(code=WSCloseCode.GOING_AWAY)
+
+    async def _linked(self, request: web.Request, heartbeat_s: float | None = None) -> web.WebSocketResponse:
+        """Return a WebSocket that is closed with the server."""
+        link = web.WebSocketResponse(heartbeat=heartbeat_s, protocols=(PROTOCOL,), timeout=_CLOSING_S)
+        await link.prepare(request)
+        self._links.add(link)
+        return link
 
     @property
     def url(self) -> str:
@@ -127,10 +152,8 @@ class BenchServer:
         if not self._thread.is_alive():
             return
         try:
-            operator = self.operation.operator
-            if operator is not None:
-                lost = DeviceLostError("bench", "its server was ended.", "Start diffuserbench serve again.")
-                self.operation.drop(operator, lost)
+            lost = DeviceLostError("bench", "its server was ended.", "Start diffuserbench serve again.")
+            self.operation.end(lost)
         finally:
             if self._runner is not None:
                 self._run(self._runner.cleanup())
@@ -192,6 +215,8 @@ class BenchServer:
             problem = f"takes no {request.method} {name}."
             return _error(404, DeviceError(kind, problem, "Both ends need the same version of the program."))
         arguments = await request.json() if request.can_read_body else {}
+        if not isinstance(arguments, dict):
+            raise ValueError("arguments come by name, in a JSON object")
         number = int(request.headers.get(NUMBER_HEADER, "0"))
         pool = self._overtaking if call.verb == "PUT" else self._pool
         key = self._operator(request).key
@@ -211,22 +236,21 @@ class BenchServer:
     def state(self) -> dict[str, Any]:
         """Return what the bench is and does, as its page shows it."""
         operation = self.operation
-        operator = operation.operator
+        operator = None if operation.operator == WATCHER else operation.operator
         return {
             "bench": operation.config.label,
             "devices": {kind: device.driver_name for kind, device in operation.config.devices.items()},
             "operator": operator and operator.words,
             "since": operator and operator.since.isoformat(timespec="seconds"),
             "readings": operation.readings(),
-            "trouble": operation.trouble,
+            "trouble": operation.trouble or self._watcher.trouble,
         }
 
     # Holds ---------------------------------------------------------------------------------------
     async def _hold(self, request: web.Request) -> web.StreamResponse:
         """Keep a device open for an operator as long as his connection lasts."""
         kind, operator = _kind(request), self._operator(request)
-        link = web.WebSocketResponse(heartbeat=self._serving.lost_after_s * 2 / 3, protocols=(PROTOCOL,))
-        await link.prepare(request)
+        link = await self._linked(request, self._serving.lost_after_s * 2 / 3)
 
         def on_end(reason: DeviceError) -> None:
             self._loop.call_soon_threadsafe(lambda: self._loop.create_task(_part(link, reason)))
@@ -278,8 +302,7 @@ class BenchServer:
         """Start a sequence and send its frames, ``window`` of them ahead of what the operator has fetched."""
         key = self._operator(request).key
         n_buffers, window = int(request.query["n_buffers"]), int(request.query["window"])
-        link = web.WebSocketResponse(protocols=(PROTOCOL,))
-        await link.prepare(request)
+        link = await self._linked(request)
         try:
             camera = cast(Camera, self.operation.device("camera", key))
             await self._in_thread(camera.start_sequence, n_buffers)
@@ -318,7 +341,43 @@ class BenchServer:
     # The page ------------------------------------------------------------------------------------
     async def _page(self, request: web.Request) -> web.StreamResponse:
         text = resources.files("instrument.serve").joinpath("page.html").read_text("utf-8")
-        return web.Response(text=text, content_type="text/html")
+        return web.Response(text=text, content_type="text/html", headers=_PAGE_HEADERS)
+
+    async def _live(self, request: web.Request) -> web.StreamResponse:
+        """Tell a page what the bench does every second, and show it each new frame that it is ready for."""
+        link = await self._linked(request, self._serving.lost_after_s * 2 / 3)
+        ready = asyncio.Event()
+        telling = asyncio.create_task(self._tell(link))
+        showing = asyncio.create_task(self._show(link, ready))
+        self._watcher.join()
+        try:
+            async for _ in link:
+                ready.set()
+        finally:
+            self._watcher.leave()
+            telling.cancel()
+            showing.cancel()
+        return link
+
+    async def _tell(self, link: web.WebSocketResponse) -> None:
+        with contextlib.suppress(ConnectionError):
+            while True:
+                await link.send_json({"state": await self._in_thread(self.state)}, dumps=_dumps)
+                await asyncio.sleep(_STATE_S)
+
+    async def _show(self, link: web.WebSocketResponse, ready: asyncio.Event) -> None:
+        shown: Frame | None = None
+        with contextlib.suppress(ConnectionError):
+            while True:
+                await ready.wait()
+                frame = self.operation.newest_frame
+                if frame is not None and frame is not shown:
+                    said, pixels = await self._in_thread(picture, frame)
+                    ready.clear()
+                    await link.send_json({"picture": said})
+                    await link.send_bytes(pixels)
+                    shown = frame
+                await asyncio.sleep(_PICTURE_S)
 
 
 def _kind(request: web.Request) -> Kind:

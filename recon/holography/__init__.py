@@ -16,6 +16,7 @@ from recon.holography.display import (
     eyebox_for_field_of_view,
     field_of_view_for_eyebox,
     pixels_for,
+    pixels_per_degree,
     random_mask,
 )
 from recon.holography.judge import Scores, judge
@@ -29,6 +30,7 @@ from recon.holography.optimise import (
     one_step,
 )
 from recon.holography.options import HologramOptions
+from recon.holography.spot_list import SpotList, SpotScores, compute_spots, spot_array
 from recon.holography.target import Grid, Target, foveal_weights, painted_weights
 
 __all__ = [
@@ -46,8 +48,11 @@ __all__ = [
     "Loss",
     "ScatteringMask",
     "Scores",
+    "SpotList",
+    "SpotScores",
     "Target",
     "compute_hologram",
+    "compute_spots",
     "eyebox_for_field_of_view",
     "field_of_view_for_eyebox",
     "foveal_weights",
@@ -55,5 +60,7 @@ __all__ = [
     "one_step",
     "painted_weights",
     "pixels_for",
+    "pixels_per_degree",
     "random_mask",
+    "spot_array",
 ]

@@ -36,6 +36,7 @@ class HologramStop(enum.StrEnum):
     ITERATIONS = "the number of iterations is reached"
     CANCELLED = "cancelled"
     ONE_STEP = "one-step method"
+    EVEN = "the spots are as bright as asked for"
 
 
 @dataclass(frozen=True, slots=True)

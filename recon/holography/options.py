@@ -94,7 +94,7 @@ class HologramOptions:
     )
     expansion: int | None = option(
         None,
-        help="Étendue expansion: 4, 16, 36 ..., a square.",
+        help="Étendue expansion: 4, 16, 36 ..., a square; 1: without a mask.",
         default_words="the bench's",
         least=1,
         flags=("--expansion", "-q"),

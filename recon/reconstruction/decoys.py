@@ -27,7 +27,6 @@ from recon.verdict.calibration_check import (
     Fit,
     Score,
     check_of,
-    is_told,
     near_decoys,
 )
 
@@ -57,44 +56,30 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
     """Let a problem's calibration compete with its decoys on the channel that has most signal.
 
     One convolution a depth by the central PSFs, on as few pixels as still tell one per cent of size; of PSFs
-    that vary over the field only whether they are the photograph's at all, and by all of them where they vary
-    much. None where the light is patterned, the camera model comes from outside, or one PSF was chosen of a
-    field that varies much: nothing is known of such.
+    that vary over the field only whether they are the photograph's at all, and where they vary much by all of
+    them, turned too. None where the light is patterned, the camera model comes from outside, or one PSF was
+    chosen of a field that varies much: nothing is known of such.
     """
     if problem.patterned or problem.model in CAMERAS:
         return None
     done = count(1)
 
-    def scored(small: _Small, iterations: int, *, lit: bool, how: Transformation) -> Score:
-        if on_stage is not None:  # how many there will be depends on what they say
-            on_stage(1 - DECOYS / (DECOYS + next(done)), "judging: the calibration among its decoys")
-        return small.score(how, iterations=iterations, background=lit)
+    def compete(small: _Small, iterations: int) -> CalibrationCheck:
+        def scored(how: Transformation) -> Score:
+            if on_stage is not None:  # how many there will be depends on what they say
+                on_stage(1 - DECOYS / (DECOYS + next(done)), "judging: the calibration among its decoys")
+            return small.score(how, iterations=iterations, background=lit)
 
-    def compete(small: _Small, iterations: int, *, lit: bool) -> CalibrationCheck:
-        return _competition(small, lambda how: scored(small, iterations, lit=lit, how=how))
+        return _competition(small, scored)
 
     (few_px, quick), (more_px, thorough) = QUICK, THOROUGH
     few, lit = _small(problem, few_px), problem.smooth or problem.n_planes > 1
-    check = compete(few, quick, lit=lit)
+    check = compete(few, quick)
     if check.sure:
         return check
-    dark = None
-    if not lit:
-        more = _small(problem, more_px)
-        dark = check = compete(more, thorough, lit=False)
-        # Stray light, or light from beyond the field, which any PSF but the right one may explain better?
-        winner = check.better or GIVEN
-        lit = check.fit is not Fit.FITS and is_told(
-            scored(more, thorough, lit=True, how=winner), check.scores[winner], more.pixels
-        )
-        check = compete(few, quick, lit=True) if lit else check
-    if lit and not check.sure:
-        check = compete(few, thorough, lit=True)
-    if dark is not None and dark.fit is Fit.OFF and check.fit is Fit.UNTOLD:
-        # A background explains much; where odds still are for a decoy, what was certain without one stands.
-        best = min(check.scores, key=lambda how: check.scores[how].objective)
-        if best not in (GIVEN, BETWEEN) and is_told(check.scores[best], check.scores[GIVEN], check.pixels):
-            check = replace(check, fit=Fit.OFF, better=best)
+    again = compete(few if lit else _small(problem, more_px), thorough)
+    # A faint photograph's large pixels may tell what small ones do not.
+    check = again if again.fit is not Fit.UNTOLD else check
     given = _given(problem).depths
     one = given.varies and not problem.depths.varies and given.field_error > VARIED
     return None if one and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
@@ -107,7 +92,7 @@ class _Small:
     photograph: Measurement
     calibration: Calibration
     varies: bool
-    """Whether there are other PSFs over the field; near decoys of one convolution then tell nothing."""
+    """Whether there are other PSFs over the field; near decoys of one of them then tell nothing."""
     model: ModelName
 
     @property
@@ -117,12 +102,14 @@ class _Small:
         return int(np.size(self.photograph.image) - (0 if erasures is None else np.count_nonzero(erasures)))
 
     def decoys(self) -> tuple[Transformation, ...]:
-        """Return those that differ from the PSFs: near ones where one PSF serves the field, then far ones."""
+        """Return those that differ from the PSFs: near ones unless one of many serves, then far ones."""
         psfs = self.calibration.psfs
         middle = psfs[len(psfs) // 2, 0]
         far = [how for how in FAR if likeness(transformed(middle, how), middle) < ALIKE]
-        near = () if self.varies else near_decoys(psfs.shape[2:], volume=len(psfs) > 1)
-        return (*near, *far)
+        field = self.model == "local"
+        if self.varies and not field:
+            return tuple(far)
+        return (*near_decoys(psfs.shape[2:], sizes=len(psfs) == 1 and not field), *far)
 
     def score(self, how: Transformation, *, iterations: int, background: bool) -> Score:
         """Reconstruct through transformed PSFs in few iterations."""
@@ -203,4 +190,5 @@ def _score(problem: Problem, iterations: int) -> Score:
     left = found.left[0].astype(np.float64)
     misfit = float(np.mean(left[valid] ** 2))
     fine = tile_means(fine_structure(left, valid) ** 2, valid)
-    return Score(misfit, misfit + 2 * prior / np.count_nonzero(valid), tuple(fine.tolist()))
+    objective = float(np.mean(fine)) + 2 * prior / np.count_nonzero(valid)
+    return Score(misfit, objective, tuple(fine.tolist()))

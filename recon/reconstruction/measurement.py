@@ -54,6 +54,20 @@ class Measurement:
         """Whether the image has no axis of channels."""
         return np.ndim(self.image) == 2 or self.patterns is not None
 
+    def with_holes_erased(self) -> tuple[Measurement, str]:
+        """Return it with its NaN pixels erased, and that in words; itself and no words without any."""
+        image = np.asarray(self.image)
+        if self.patterns is not None or image.dtype.kind != "f" or not (holes := np.isnan(image)).any():
+            return self, ""
+        erased = np.asarray(self.erasures if self.erasures is not None else False)
+        if erased.ndim == 2 and image.ndim == 3:
+            erased = erased[..., None]
+        if holes.all() or erased.ndim not in (0, image.ndim):
+            return self, ""  # which is refused in words of its own
+        filled = np.where(holes, np.median(image[~holes]), image)
+        said = f"{np.count_nonzero(holes)} pixels of the measurement are NaN: they are erased."
+        return replace(self, image=filled, erasures=np.maximum(erased, holes)), said
+
     def channels(self) -> Floats:
         """Return the image as it came, channels (or frames under patterns) first."""
         if self.patterns is None:

@@ -240,8 +240,8 @@ def _verdict(
         # One plane is a picture: it fails as pictures do, by a wrong depth for one.
         evidence = evidence_of(
             observations(problem.measurement.image, problem.data, problem.valid, problem.noise),
-            result.volume,
-            problem.depths.central,
+            result.volume[: problem.n_depths],
+            problem.depths.central[: problem.n_depths],
             list(result.residuals),
             max(
                 unsettled_by(h, r, problem.stop_tolerance, started=started)

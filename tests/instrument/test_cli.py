@@ -219,11 +219,54 @@ def test_snap_keeps_counts_and_metadata(here: Path, capsys: pytest.CaptureFixtur
     assert json.loads((here / "mean.json").read_text())["led_pattern"].startswith("point source")
 
 
+TINY = """
+[camera]
+driver = "simulated"
+[stage]
+driver = "simulated"
+[led_array]
+driver = "simulated"
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+time_scale = 0
+"""
+
+
+def test_snap_exposes_by_itself_unless_it_is_told_how(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (here / "bench.toml").write_text(TINY)
+    assert main(["snap", "--out", "found.tif"]) == 0
+    assert "Auto-exposure" in capsys.readouterr().out
+    (here / "bench.toml").write_text(TINY.replace("[stage]", "exposure_ms = 2\n[stage]", 1))
+    assert main(["snap", "--out", "told.tif"]) == 0
+    said = capsys.readouterr().out
+    assert "Auto-exposure" not in said
+    assert ", 2 ms," in said
+
+
+@pytest.mark.parametrize(
+    ("words", "bench"),
+    [
+        (["calibrate", "slm"], "display"),
+        (["align", "mask"], "display"),
+        (["calibrate", "dpc", "--na", "0.1", "--magnification", "4"], "microscope"),
+        (["calibrate", "screen"], "screen"),
+    ],
+)
+def test_a_command_that_takes_another_bench_says_which(
+    words: list[str], bench: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == 2
+    written = capsys.readouterr().err.replace("\n", " ").partition("Write one with diffuserbench ")[2]
+    assert f"--{bench}," in written
+    new, file, flag = written.split(",")[0].split()
+    assert main([new, file, flag, "--no-look"]) == 0
+    assert (here / file).exists()
+
+
 def test_snap_says_when_a_lit_photograph_is_dim(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    devices = "".join(f'[{kind}]\ndriver = "simulated"\n' for kind in ("camera", "stage", "led_array"))
-    (here / "bench.toml").write_text(
-        f'{devices}[scene]\ncontrol = "simulated"\n[simulated]\npreset = "tiny"\n'
-    )
+    (here / "bench.toml").write_text(TINY)
     assert main(["snap", "--out", "dim.tif", "--exposure-ms", "1"]) == 0
     assert "below 10% of full scale" in capsys.readouterr().err
     assert main(["snap", "--dark", "--out", "dark.tif", "--exposure-ms", "1"]) == 0

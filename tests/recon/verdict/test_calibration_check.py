@@ -19,6 +19,7 @@ from recon.optics.scene import bar_target, picture
 from recon.optics.wave import WavePropagator
 from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.options import ReconstructionOptions as Options
+from recon.reconstruction.pilot import pilot
 from recon.reconstruction.problem import Problem
 from recon.verdict.calibration_check import BETWEEN, FAR, GIVEN, Fit, Score, check_of, near_decoys
 from recon.verdict.judge import Region, Verdict
@@ -87,6 +88,19 @@ def test_where_nothing_is_lit_nothing_is_told(seen: tuple[Image, Image]) -> None
     assert fit(noise, seen[1])[0] is Fit.UNTOLD
 
 
+def test_of_a_picture_with_a_background(seen: tuple[Image, Image]) -> None:
+    stray = np.random.default_rng(4).poisson(2 * seen[0].mean() * np.linspace(0.7, 1.3, 96), (96, 96))
+    problem = Problem.of(seen[0] + stray.astype(np.float32), seen[1], Options(estimate_background=True))
+    found = pilot(problem, 10)
+    assert found.background is not None
+    assert np.linalg.norm(found.left) == pytest.approx(found.outcome.history[-1].data_residual, rel=0.1)
+    turned = Problem.of(
+        problem.measurement, transformed(seen[1], Transformation(rotation_deg=1)), problem.options
+    )
+    right, wrong = check_calibration(problem), check_calibration(turned)
+    assert [right and right.fit, wrong and str(wrong.better)] == [Fit.FITS, "turned by -1 degrees"]
+
+
 def test_volumes_are_told_by_turns(seen: tuple[Image, Image]) -> None:
     psfs = np.stack([seen[1], transformed(seen[1], Transformation(scale=1.1))])[:, None]
     depths = Calibration(psfs, np.array([[0.0, 0.0, Z_UM], [0.0, 0.0, 0.6 * Z_UM]]))
@@ -102,14 +116,14 @@ def test_psfs_that_vary_much_over_the_field_are_told_by_all_of_them(stretch: flo
     own = Calibration(grid["psfs"], grid["positions_um"], geometry=Geometry(10.0, 5.0))
     mirrored = replace(own, psfs=np.ascontiguousarray(own.psfs[..., ::-1]))
     photograph = inputs.beads(1, stretch=stretch)
-    found = [
+    right, wrong = (
         check_calibration(Problem.of(photograph, psfs, Options(estimate_background=True)))
         for psfs in (own, mirrored)
-    ]
-    assert [check and check.wrong for check in found] == [False, True]
+    )
+    assert [right and right.fit is Fit.FITS, wrong and wrong.wrong] == [True, True]
 
 
-NEAR = near_decoys((160, 160), volume=False)
+NEAR = near_decoys((160, 160), sizes=True)
 TILES = 1 + 0.01 * np.random.default_rng(0).normal(size=16)
 
 

@@ -1,0 +1,276 @@
+"""Devices on another computer over a network that breaks, and with those who may not use them."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+pytest.importorskip("aiohttp", reason='pip install "diffuserbench[remote]"')
+
+import aiohttp
+
+from drivers.errors import DeviceError, DeviceLostError, StoppedError
+from drivers.led_array import LedPattern
+from drivers.registry.claim import DeviceBusyError
+from drivers.remote import link
+from drivers.remote.camera import RemoteCamera
+from drivers.remote.light_and_motion import RemoteLedArray, RemoteSlm, RemoteStage
+from drivers.remote.options import RemoteOptions
+from drivers.remote.wire import OPERATOR_HEADER
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import parse_config
+from instrument.serve.server import BenchServer, Serving
+from tests.drivers.test_remote import BENCH, TOKEN
+from tests.mocks.bad_network import BadNetwork
+
+PATIENCE_S = 20.0
+# In real time: a move is still under way when the network breaks.
+CONFIG = parse_config(BENCH.replace("time_scale = 0.05", "time_scale = 0.2").partition("[slm]")[0], None)
+LIT = LedPattern("LED 0", ((0, (255, 255, 255)),))
+
+
+@pytest.fixture
+def said() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def server(said: list[str]) -> Iterator[BenchServer]:
+    with BenchServer(CONFIG, Serving(token=TOKEN, port=0, lost_after_s=1.0), said.append) as server:
+        yield server
+
+
+@pytest.fixture
+def network(server: BenchServer) -> Iterator[BadNetwork]:
+    with BadNetwork(int(server.url.rpartition(":")[2])) as network:
+        yield network
+
+
+@pytest.fixture
+def options(network: BadNetwork, tmp_path: Any) -> RemoteOptions:
+    (tmp_path / "token").write_text(f"{TOKEN}\n")
+    url = f"http://127.0.0.1:{network.port}"
+    return RemoteOptions(url=url, token_file=str(tmp_path / "token"), lost_after_s=1.0)
+
+
+def until(true: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not true():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+def served_bench(server: BenchServer) -> Bench:
+    bench = server.operation._bench
+    assert bench is not None
+    return bench
+
+
+def in_thread(call: Callable[[], Any]) -> tuple[threading.Thread, list[BaseException]]:
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            call()
+        except BaseException as error:  # noqa: BLE001 - looked at by the test
+            errors.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread, errors
+
+
+@pytest.mark.parametrize("how", ["cut", "silent", "server ends"])
+def test_a_lost_operator_leaves_no_light_and_no_motion(
+    how: str, server: BenchServer, network: BadNetwork, options: RemoteOptions, said: list[str]
+) -> None:
+    camera, stage, leds = RemoteCamera(options), RemoteStage(options), RemoteLedArray(options)
+    for device in (camera, stage, leds):
+        device.open()
+    stage.home()
+    leds.set_pattern(LIT)
+    camera.start_sequence()
+    camera.next_frame(PATIENCE_S)
+    bench = served_bench(server)
+    carriage, light = bench.stage.carriage, []  # type: ignore[union-attr]
+    low, high = stage.limits["x_um"]
+    off = bench.led_array.off  # type: ignore[union-attr]
+    bench.led_array.off = lambda: (off(), light.append(bench.led_array.pattern.is_dark))  # type: ignore
+    moving, errors = in_thread(lambda: stage.move_to({"x_um": high if stage.position()["x_um"] < 0 else low}))
+    until(lambda: carriage.is_moving)
+    if how == "cut":
+        network.cut()
+    elif how == "silent":
+        network.silent = True
+    else:
+        server.close()
+    moving.join(PATIENCE_S)
+    until(lambda: server.operation.operator is None)
+    assert light[0]
+    assert not carriage.is_moving
+    assert not any(device.is_open for device in bench.devices.values())
+    assert isinstance(errors[0], StoppedError if how == "server ends" else DeviceLostError)
+    with pytest.raises(DeviceLostError):
+        leds.set_pattern(LIT)
+    with pytest.raises(DeviceLostError):  # after those that had come
+        [camera.next_frame(1.0) for _ in range(9)]
+    assert not any(device.is_open for device in (camera, stage, leds))
+    assert not camera.is_streaming
+    if how == "cut":
+        assert any("was lost: light off, motion stopped" in sentence for sentence in said)
+        leds.open()
+        assert leds.pattern.is_dark
+        leds.close()
+    for device in (camera, stage, leds):
+        device.close()
+
+
+def test_a_command_that_a_stop_has_overtaken_is_not_carried_out(
+    network: BadNetwork, options: RemoteOptions
+) -> None:
+    with RemoteLedArray(options) as leds:
+        network.held = b"POST /api/devices/led_array/set_pattern"
+        late, errors = in_thread(lambda: leds.set_pattern(LIT))
+        assert network.is_holding.wait(PATIENCE_S)
+        leds.off()
+        network.let_pass()
+        late.join(PATIENCE_S)
+        assert isinstance(errors[0], StoppedError)
+        assert "overtaken by a stop" in str(errors[0])
+        assert leds.pattern.is_dark
+        leds.set_pattern(LIT)
+        assert not leds.pattern.is_dark
+
+
+def test_a_slow_network_loses_frames_and_counts_them_and_a_stop_does_not_wait(
+    network: BadNetwork, options: RemoteOptions
+) -> None:
+    with RemoteCamera(options) as camera, RemoteStage(options) as stage:
+        stage.home()
+        camera.set_exposure_ms(1.0)
+        camera.start_sequence(4)
+        camera.next_frame(PATIENCE_S)
+        network.bytes_per_s = 20 * camera.image_shape[0] * camera.image_shape[1]
+        frames = [camera.next_frame(PATIENCE_S).metadata for _ in range(8)]
+        assert sum(metadata.dropped_before for metadata in frames) > 0
+        for before, metadata in pairwise(frames):
+            assert metadata.frame_id == before.frame_id + 1 + metadata.dropped_before
+        network.bytes_per_s = 1000.0  # the frame under way now takes longer than the test
+        moving, errors = in_thread(lambda: stage.move_to({"x_um": stage.limits["x_um"][0]}))
+        until(lambda: stage.is_moving)
+        stage.stop()
+        moving.join(PATIENCE_S)
+        assert isinstance(errors[0], StoppedError)
+        network.bytes_per_s = float("inf")
+
+
+def test_frames_are_handed_out_in_their_order() -> None:
+    """Whatever stands between: proxies may hand messages on in another order than they came."""
+    from types import SimpleNamespace
+
+    from drivers.remote.wire import pack_frame
+    from tests.mocks.devices import MockCamera, MockOptions, MockWorld, MockWorldOptions
+
+    class Stream:
+        def __init__(self, messages: list[Any]) -> None:
+            self._messages = iter(messages)
+
+        def __aiter__(self) -> Stream:
+            return self
+
+        async def __anext__(self) -> Any:
+            for message in self._messages:
+                return message
+            raise StopAsyncIteration
+
+    with MockCamera(MockOptions(), MockWorld(MockWorldOptions())) as taken:
+        frames = [taken.snap() for _ in range(4)]
+    packed = [b"".join(pack_frame(frame, number)) for number, frame in enumerate(frames)]
+    messages = [SimpleNamespace(type=aiohttp.WSMsgType.BINARY, data=packed[n]) for n in (1, 0, 3, 2)]
+    camera = RemoteCamera(RemoteOptions())
+    camera._link.require = lambda: None  # type: ignore[method-assign]
+    camera._link.begin = lambda work: work.close()  # type: ignore[method-assign]
+    camera._stream = stream = Stream(messages)  # type: ignore[assignment]
+    asyncio.run(camera._receive(stream))  # type: ignore[arg-type]
+    ids = [camera._ring.popleft().metadata.frame_id for _ in range(4)]
+    assert ids == [frame.metadata.frame_id for frame in frames]
+
+
+# Who may, and who may not ---
+def test_there_is_one_operator_at_a_time_until_somebody_presses_stop(
+    server: BenchServer, options: RemoteOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leds, other = RemoteLedArray(options), RemoteStage(options)
+    leds.open()
+    with pytest.raises(DeviceBusyError, match="is open in this program already"):
+        RemoteLedArray(options).open()
+    with pytest.raises(DeviceError, match=r"there is none on .* That bench has camera, stage, led_array"):
+        RemoteSlm(options).open()
+    monkeypatch.setattr(link, "_OPERATOR", "another")
+    with pytest.raises(
+        DeviceBusyError, match=r"is operated by .*process \d+\) since .* one operator at a time"
+    ):
+        other.open()
+    leds.set_pattern(LIT)
+    server.operation.stop("somebody at the page")
+    with pytest.raises(StoppedError, match="STOP was pressed by somebody at the page"):
+        until(lambda: leds.pattern is None)
+    other.open()
+    other.close()
+    leds.close()
+
+
+def test_without_the_token_nothing_is_answered(
+    server: BenchServer, options: RemoteOptions, tmp_path: Any
+) -> None:
+    async def ask(verb: str, path: str, **named: Any) -> tuple[int, str]:
+        async with (
+            aiohttp.ClientSession(server.url) as session,
+            session.request(verb, path, **named) as reply,
+        ):
+            return reply.status, await reply.text()
+
+    with_token = {"Authorization": f"Bearer {TOKEN}", OPERATOR_HEADER: "me"}
+    for verb, path in (
+        ("GET", "/api/state"),
+        ("POST", "/api/stop"),
+        ("PUT", "/api/devices/led_array/off"),
+        ("GET", "/api/devices/camera/hold"),
+        ("GET", "/api/devices/camera/frames"),
+    ):
+        for headers in ({}, {"Authorization": "Bearer wrong"}, {"Sec-WebSocket-Protocol": "diffuserbench"}):
+            status, text = asyncio.run(ask(verb, path, headers=headers))
+            assert status == 401, path
+            assert "needs its token" in text
+    for verb, path, status, words in (
+        ("GET", "/api/devices/laser/fire", 400, "is none of camera"),
+        ("GET", "/api/devices/stage/move_to", 404, "takes no GET move_to"),
+        ("POST", "/api/devices/stage/__init__", 404, "takes no POST __init__"),
+        ("POST", "/api/devices/stage/close", 404, "takes no POST close"),
+        ("GET", "/api/devices/stage/position", 404, "takes no GET position"),
+        ("POST", "/api/devices/stage/position", 409, "is not open for this program"),
+        ("GET", "/api/state", 200, "simulated"),
+    ):
+        assert asyncio.run(ask(verb, path, headers=with_token))[0] == status, path
+        assert words in asyncio.run(ask(verb, path, headers=with_token))[1]
+    with RemoteLedArray(options):
+        headers = with_token | {OPERATOR_HEADER: link._OPERATOR}
+        for data in (b"{", b'{"pattern": 3}', b'{"colour": 1}', b"{}", b"[]"):
+            status, text = asyncio.run(
+                ask("POST", "/api/devices/led_array/set_pattern", headers=headers, data=data)
+            )
+            assert (status, "does not understand" in text) == (400, True), text
+    (tmp_path / "token").write_text("another-word-than-its")
+    with pytest.raises(DeviceError, match=r"does not take the token in .*token"):
+        RemoteLedArray(options).open()
+    with pytest.raises(DeviceError, match=r"its token cannot be read from .*nowhere: No such file"):
+        RemoteLedArray(RemoteOptions(token_file=str(tmp_path / "nowhere"))).open()
+    server.close()
+    with pytest.raises(DeviceError, match="no server answers at http"):
+        RemoteLedArray(options).open()
