@@ -82,13 +82,12 @@ def check_sequences(device: PlaysSequences[Any], patterns: Sequence[Any]) -> Non
         return
     with pytest.raises(DeviceError, match="no sequence"):
         device.play()
-    for wrong in (
-        {"patterns": [], "period_ms": 100.0},
-        {"patterns": patterns, "period_ms": limits.shortest_ms / 2},
-        {"patterns": patterns, "period_ms": 100.0, "output": limits.outputs},
-    ):
-        with pytest.raises(LimitError):
-            device.arm(**wrong)
+    with pytest.raises(LimitError):
+        device.arm([], 100.0)
+    with pytest.raises(LimitError):
+        device.arm(patterns, limits.shortest_ms / 2)
+    with pytest.raises(LimitError):
+        device.arm(patterns, 100.0, limits.outputs)
     period_ms = max(5.0, limits.shortest_ms)
     assert device.arm(patterns, period_ms) >= period_ms
     device.play()
