@@ -207,7 +207,7 @@ def _played(
                     if failed or len(frames) >= count or time.monotonic() - ended_s > _MISSING_S:
                         break
                     continue
-                if time.monotonic() - silent_since_s > camera.longest_silence_s + 1e-3 * (count * period_ms):
+                if time.monotonic() - silent_since_s > camera.longest_wait_s + 1e-3 * (count * period_ms):
                     raise
                 continue
             silent_since_s = time.monotonic()
