@@ -230,9 +230,13 @@ class Purpose(Generic[T]):
         """Whether a run's frames are for this."""
         return (Path(run) / self.file).is_file()
 
+    def place(self, run: Path, *, doubted: bool) -> Path:
+        """Return where the result of a run goes; one that is wrong as a whole not under a good one's name."""
+        return run / (f"doubtful_{self.result}" if doubted else self.result)
+
     def lacks_result(self, run: Path) -> bool:
         """Whether they are, and the result is not there yet."""
-        return self.is_of(run) and not (run / self.result).exists()
+        return self.is_of(run) and not any(self.place(run, doubted=one).exists() for one in (False, True))
 
     def read(self, run: Path) -> T:
         """Read the record of a run; CalibrationError when there is none, or it is damaged."""
