@@ -90,6 +90,7 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
         )
         self._woken = threading.Event()
         self._streaming = False
+        self._binning = 1
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
