@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,9 @@ from instrument.files.slm_image import phase_levels, write_slm_image
 from recon.holography import Display, HologramOptions
 from recon.holography.judge import DISSERTATION, GRIDS, METHODS, Cell, average
 from recon.holography.losses import loss_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CHANNELS = ("red", "green", "blue")
 
@@ -90,12 +93,8 @@ class HologramFiles:
             ("stopped", str(result.hologram.stop_reason)),
             ("iterations", f"{result.hologram.history[-1].iteration}"),
         ]
-        write_hologram_figure(
-            self.preview(number, channel),
-            result,
-            title=f"Hologram {patterns[0].stem}",
-            facts=lines,
-        )
+        figure = hologram_figure(result, title=f"Hologram {patterns[0].stem}", facts=lines)
+        save_figure(figure, self.preview(number, channel))
 
     def display_facts(self, channel: int) -> dict[str, Any]:
         """Return what a pattern was computed for, JSON-compatible."""
@@ -136,10 +135,8 @@ class HologramFiles:
 _DETAIL = "middle sixteenth of the field, raw intensity, half as bright"
 
 
-def write_hologram_figure(
-    path: Path, result: HologramResult, *, title: str, facts: list[tuple[str, str]]
-) -> None:
-    """Draw wanted, seen and unfiltered image, the SLM's phase and the convergence; errors as ``whole_file``.
+def hologram_figure(result: HologramResult, *, title: str, facts: list[tuple[str, str]]) -> Figure:
+    """Draw wanted, seen and unfiltered image, the SLM's phase and the convergence.
 
     The first plane is drawn large; further planes as a strip below.
     """
@@ -168,8 +165,7 @@ def write_hologram_figure(
         f"{history[-1].psnr_db:.1f} dB",
         "seconds of optimisation",
     )
-    summary = Summary(title, panels, convergence, sweep=strip, lines=facts, simulated=True)
-    save_figure(summary_figure(summary), path)
+    return summary_figure(Summary(title, panels, convergence, sweep=strip, lines=facts, simulated=True))
 
 
 def _detail(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -7,7 +7,7 @@ import pytest
 import zarr
 from ome_zarr_models.v05 import Image
 
-from instrument.files.volumes import write_volume_zarr
+from instrument.files.volumes import write_volume_tiff, write_volume_zarr
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.result_file import Outputs, write_reconstruction
 from recon import Calibration, Options, Problem, solve
@@ -32,12 +32,24 @@ def test_levels_scales_and_every_planes_own_size(tmp_path, volume):
     first, second, third = model.ome_attributes.multiscales[0].datasets
     assert first.coordinateTransformations[0].scale == [1500.0, 20.0, 20.0]
     assert second.coordinateTransformations[0].scale == [1500.0, 40.0, 40.0]
-    assert second.coordinateTransformations[1].translation == [0.0, 10.0, 10.0]
+    assert first.coordinateTransformations[1].translation == [9000.0, -3000.0, -2000.0]
+    assert second.coordinateTransformations[1].translation == [9000.0, -2990.0, -1990.0]
     assert third.path == "2"
     np.testing.assert_allclose(group["1"][1, 7, 9], volume[1, 14:16, 18:20].mean(), rtol=1e-6)
     assert group["0"].chunks == (1, 300, 200)
     assert group.attrs["diffuserbench"]["z_um"] == Z_UM.tolist()
     assert group.attrs["diffuserbench"]["simulated"] is True
+
+
+def test_an_ome_tiff_says_where_its_planes_lie(tmp_path, volume):
+    ome_types = pytest.importorskip("ome_types")
+    colour = np.stack([volume, 2 * volume, 3 * volume], -1)
+    write_volume_tiff(tmp_path / "v.ome.tif", iter(colour), colour.shape, GRID)
+    pixels = ome_types.from_tiff(tmp_path / "v.ome.tif").images[0].pixels
+    assert [(p.the_z, p.the_c, p.position_z) for p in pixels.planes] == [
+        (z, c, Z_UM[z]) for z in range(3) for c in range(3)
+    ]
+    assert (pixels.planes[0].position_x, pixels.planes[0].position_y) == (-2000.0, -3000.0)
 
 
 def test_colour_goes_first_and_unknown_sizes_have_no_unit(tmp_path, volume):
