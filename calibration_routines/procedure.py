@@ -22,6 +22,7 @@ from instrument.runs.acquire import abilities_of, prepare
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Runner, RunStatus, discarded
+from instrument.runs.timed import TimedSteps
 from instrument.runs.writer import dated_name, free_name
 from recon.base.declare import options_of
 from recon.base.option_text import size
@@ -405,6 +406,8 @@ def outlook_of(
     words = list(reasons)
     if path and bench.stage is not None and (homes or not bench.stage.is_homed):
         words.append("The stage is homed first, every axis to its reference: its way must be free.")
+    if bench.trigger_source is not None:
+        words.append(TimedSteps(bench, plan).words())
     return Outlook(tuple(words), plan, estimate(plan, abilities), abilities.free_bytes, path=path)
 
 

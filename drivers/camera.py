@@ -312,6 +312,11 @@ class Camera(Device):
     longest_silence_s: ClassVar[float] = 2.0
     """A free-running camera that sends nothing for this long beyond three exposures has failed."""
 
+    @property
+    def longest_wait_s(self) -> float:
+        """What a snap, or a free-running sequence's next frame, may take before the camera has failed."""
+        return self.longest_silence_s + 3e-3 * self.exposure_ms
+
     frames_in_flight: ClassVar[int] = 2
     """Frames that can be between the sensor and the host while the next one is exposed, at most."""
 

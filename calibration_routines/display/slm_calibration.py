@@ -81,17 +81,22 @@ def measure_look_up_table(io: DisplayBench, *, n_levels: int = 33, seed: int = 0
     chosen = np.random.default_rng(seed).random((height // io.binning, width // io.binning)) < 0.5
     varied = np.repeat(np.repeat(chosen, io.binning, axis=0), io.binning, axis=1)
     exposure_ms = _exposure_ms(io)
-    frames, references, before = [], [], []
+    order: list[int] = []
+    reference: list[bool] = []
+    before = []
     for number, level in enumerate([*levels, 0]):
         if number % _REFERENCE_EVERY == 0 or number == len(levels):
-            io.show_levels(np.zeros(io.slm.shape, np.uint8))
-            references.append(io.photograph(exposure_ms)[::2, ::2].astype(np.float32))
+            order.append(0)
+            reference.append(True)
             before.append(number - 0.5)
         if number < len(levels):
-            io.show_levels(np.where(varied, level, 0).astype(np.uint8))
-            # Every fourth pixel has more than enough light.
-            frames.append(io.photograph(exposure_ms)[::2, ::2])
-    phases, error, scatter = _phases(np.array(frames), np.array(references), np.array(before))
+            order.append(int(level))
+            reference.append(False)
+    images = [np.where(varied, level, 0).astype(np.uint8) for level in order]
+    # Every fourth pixel has more than enough light.
+    pictures = np.array([picture[::2, ::2] for picture in io.photographs(images, exposure_ms)])
+    references = pictures[reference].astype(np.float32)
+    phases, error, scatter = _phases(pictures[~np.array(reference)], references, np.array(before))
     if error > MAX_PHASE_ERROR_RAD:
         words = scatter.findings("picture") or (
             "light, mask or camera are not steady, or the SLM flickers: look for saturation, loose mounts.",

@@ -222,15 +222,20 @@ class BufferedCamera(KeptSettings):
         """Frames since the last opening that arrived damaged or in part; they count as lost, too."""
         return self._incomplete
 
+    @property
+    def longest_wait_s(self) -> float:
+        """What powering up and frames that are skipped may take, at the rate and exposure that are set."""
+        frames = 3 + self.frames_to_skip
+        frame_s = max(self._period_s, self.exposure_ms / 1e3)
+        return max(_START_S, self.longest_silence_s) + frames * frame_s
+
     def snap(self) -> Frame:
         """Take one frame whose exposure begins after this call, and wait for it."""
         self._require_idle("frame")
         skip = self.frames_to_skip if self.trigger_mode == "free_run" else 0
         run = self._start(_SNAP_BUFFERS, snapping=True)
         try:
-            deadline_s = (
-                time.monotonic() + _START_S + (3 + skip) * max(self._period_s, self.exposure_ms / 1e3)
-            )
+            deadline_s = time.monotonic() + self.longest_wait_s
             if self.trigger_mode == "software":
                 self._fire()
             image = np.empty(run.shape, run.dtype)

@@ -196,6 +196,18 @@ class CameraContract(DeviceContract):
                 camera.set_trigger_mode(mode)  # type: ignore[arg-type]
             assert camera.trigger_mode == "free_run"
 
+    def test_a_trigger_line_and_edge_are_kept_and_others_refused(self, camera: Camera) -> None:
+        for line in camera.trigger_lines:
+            assert camera.set_trigger_line(line) == camera.trigger_line == line
+        for edge in camera.trigger_edges:
+            assert camera.set_trigger_edge(edge) == camera.trigger_edge == edge
+        with pytest.raises(LimitError, match="trigger line"):
+            camera.set_trigger_line("none such")
+        if "rising" not in camera.trigger_edges:
+            with pytest.raises(LimitError, match="trigger edge"):
+                camera.set_trigger_edge("rising")
+        assert camera.readout_ms >= 0
+
     def test_a_software_trigger_gives_one_frame(self, camera: Camera) -> None:
         if "software" not in camera.trigger_modes:
             pytest.skip("a camera without software trigger")

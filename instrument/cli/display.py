@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -44,10 +45,13 @@ from recon.holography import (
     compute_spots,
     eyebox_for_field_of_view,
     field_of_view_for_eyebox,
+    hologram_limit,
     pixels_for,
     pixels_per_degree,
 )
 from recon.holography.judge import GRIDS, METHODS, Cell, run_table
+from recon.holography.limit import BANDS
+from recon.holography.target import make_band
 
 hologram_app, etendue_app, table_app = App(), App(), App()
 
@@ -237,6 +241,11 @@ class HologramInputs:
         metavar="ROWSxCOLUMNS|FILE",
         group="Files",
     )
+    limit: bool = option(
+        False,
+        help="Compute no pattern: say what any number of frames could reach for this picture, mask and SLM.",
+        group="What counts",
+    )
     z_mm: tuple[float, ...] = option(
         (),
         help="Depth of each target behind the focal plane; once a target.",
@@ -277,6 +286,7 @@ class HologramInputs:
         "diffuserbench hologram picture.png --frames 2 --psnr 30 --out slm.png",
         "diffuserbench hologram frames/ --video --iterations 10 --out video.png",
         "diffuserbench hologram colour.png --color --out slm.png",
+        "diffuserbench hologram picture.png --limit",
         "diffuserbench hologram --spots 10x10 --expansion 1 --out spots.png",
     )
 )
@@ -318,6 +328,11 @@ def hologram(
     if inputs.alignment is not None:
         found = load_alignment(inputs.alignment)
         displays = [found.of(display) for display in displays]
+    if inputs.limit:
+        if inputs.color or inputs.video or len(target) > 1:
+            raise BenchError("--limit is for one picture in one plane and colour.")
+        _limit(pictures[0][0], displays[0], options, depths[0])
+        return
     frames = len(pictures) if inputs.video else 0
     writer = HologramFiles(inputs.out, config.display.slm_binning, options, displays, video=frames)
     writer.check(overwrite=inputs.force)
@@ -339,6 +354,58 @@ def hologram(
                 if result.hologram.stop_reason is HologramStop.CANCELLED:
                     typer.echo("Interrupted: this is the pattern so far.", err=True)
                     raise typer.Exit(130)
+
+
+LIFTS = (0.1, 0.3)
+"""How far black is lifted where the limit says what would help."""
+
+
+def _limit(picture: Pixels, display: Display, options: HologramOptions, z_mm: float) -> None:
+    """Say what could be reached, which frequencies fall short, and what would help."""
+    lifts = [options.lift, *(lift for lift in LIFTS if lift > options.lift)]
+    found = []
+    with first_interrupt_cancels() as cancel:
+        for lift in lifts:
+            target = prepare_target(picture, display, replace(options, lift=lift), z_mm=z_mm)
+            with one_task("limit" if lift == options.lift else f"black at {lift:g}", LIMIT_STEPS) as advance:
+
+                def show(record: HologramRecord, _slm: object, advance: Any = advance) -> None:
+                    advance(float(record.iteration), note=f"{record.psnr_db:.2f} dB")
+
+                steps = replace(options, iterations=min(options.iterations, LIMIT_STEPS))
+                found.append(hologram_limit(display, target, steps, callback=show, cancel=cancel))
+            if found[-1].stop_reason is HologramStop.CANCELLED:
+                typer.echo(
+                    "Interrupted: this is a bound all the same, less sharp than it could be.", err=True
+                )
+                break
+    here = found[0]
+    typer.echo(
+        f"limit: no number of frames shows this picture better than {_decibels(here.bound_db)} through this "
+        f"mask (a bound; {here.reached_db:.2f} dB is reached by what need not be frames of phases)"
+    )
+    least = display.factor / make_band(display.slm_shape, display.factor, "alias-free").cutoff
+    for (low, high), wanted, reached in zip(pairwise(BANDS), here.wanted, here.reached, strict=True):
+        why = ""
+        if reached < 0.7 and low < least:
+            why = "   set by the mask within an SLM pixel, not by the SLM"
+        elif reached < 0.7:
+            why = "   more contrast than so many SLM pixels can make"
+        typer.echo(
+            f"  {low:.2f} to {high:.2f} of the finest the eye resolves: contrast {wanted:.2f}, "
+            f"{reached:.0%} reached{why}"
+        )
+    for lift, better in zip(lifts[1:], found[1:], strict=False):
+        best = _decibels(better.bound_db)
+        typer.echo(f"  black at {lift:g} of white (--lift {lift:g}): at most {best} of it")
+
+
+def _decibels(bound_db: float) -> str:
+    return f"{bound_db:.2f} dB" if bound_db < 60 else "60 dB (no limit in sight)"
+
+
+LIMIT_STEPS = 60
+"""Iterations of the limit: bound and solution are then 0.3 dB apart at 16x."""
 
 
 def _spots(

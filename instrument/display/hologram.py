@@ -132,10 +132,10 @@ def prepare_target(
     pixels : ndarray, (height, width), or (height, width, 3), of which the mean of the channels is taken
         Intensity; 0 is black, an integer type's greatest value (float: the maximum) is white.
     options : HologramOptions
-        Its ``fit``, ``srgb`` and ``envelope``.
+        Its ``fit``, ``srgb``, ``lift`` and ``envelope``.
     """
     options = options or HologramOptions()
-    image = field_picture(pixels, fit=options.fit, srgb=options.srgb)
+    image = options.lift + (1 - options.lift) * field_picture(pixels, fit=options.fit, srgb=options.srgb)
     small = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
     if image.shape[0] < small[0] or image.shape[1] < small[1]:
         wide, high = max(small[1], image.shape[1]), max(small[0], image.shape[0])

@@ -20,6 +20,7 @@ from recon.holography.display import (
     random_mask,
 )
 from recon.holography.judge import Scores, judge
+from recon.holography.limit import Limit, hologram_limit
 from recon.holography.losses import LOSSES, Loss
 from recon.holography.model import Evaluation, HologramModel
 from recon.holography.optimise import (
@@ -45,6 +46,7 @@ __all__ = [
     "HologramOptions",
     "HologramRecord",
     "HologramStop",
+    "Limit",
     "Loss",
     "ScatteringMask",
     "Scores",
@@ -56,6 +58,7 @@ __all__ = [
     "eyebox_for_field_of_view",
     "field_of_view_for_eyebox",
     "foveal_weights",
+    "hologram_limit",
     "judge",
     "one_step",
     "painted_weights",

@@ -175,6 +175,19 @@ def test_spots_without_a_mask_come_from_an_array_or_a_list(capsys):
 
 
 @pytest.mark.usefixtures("here")
+def test_the_limit_is_said_before_anything_is_computed(capsys):
+    assert main(["hologram", "picture.png", "--limit", "--iterations", "10", "--lift", "0.2"]) == 0
+    said = capsys.readouterr().out
+    assert "no number of frames shows this picture better than" in said
+    assert "black at 0.3 of white" in said
+    assert "black at 0.1 of white" not in said
+    assert not Path("slm.png").exists()
+    assert main(["hologram", "picture.png", "--limit", "--color"]) == 2
+    lifted = HologramOptions(lift=0.2, envelope="correct")
+    assert prepare_target(read_image("picture.png").pixels, bench(), lifted).image.min() >= 0.2
+
+
+@pytest.mark.usefixtures("here")
 def test_an_existing_file_is_spared_and_quality_ends_the_work(capsys):
     assert main(["hologram", "picture.png", "--psnr", "15"]) == 0
     assert "the requested PSNR is reached" in capsys.readouterr().out
