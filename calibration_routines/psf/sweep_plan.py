@@ -278,7 +278,7 @@ def size_findings(size_um: float | None, geometry: Geometry, z_um: float) -> tup
         return ()
     return (
         f"the source is too large: its {size_um:g} um ([source] size_um) are {image_px:.1f} pixels wide on "
-        f"the sensor at z = {z_um / 1e3:.4g} mm, and the PSF is blurred by that (at most {FEATURE_PX:g}): take "
+        f"the sensor at z = {z_um / 1e3:.4g} mm, and the PSF is blurred (at most {FEATURE_PX:g}): take "
         f"a pinhole of {FEATURE_PX * pitch_um * z_um / (1e3 * d_mm):.2g} um or less, or go farther away.",
     )
 
