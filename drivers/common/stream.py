@@ -146,15 +146,17 @@ class FrameStream:
         Raises Exception: what a callback given to ``subscribe`` raised.
         """
         self._end()
-        if self._thread is not None:
-            name = self.camera.name
-            within(STOP_ANSWER_S, name, "ending its sequence", self.camera.stop_sequence)
-            if self._thread is not threading.current_thread():
-                within(STOP_ANSWER_S, name, "handing out a frame", self._thread.join)
-        subscriptions, self._subscriptions = self._subscriptions, []
-        errors = [error for error in (s.join() for s in subscriptions) if error is not None]
-        with self.changed:
-            self.ring.clear()
+        try:
+            if self._thread is not None:
+                name = self.camera.name
+                within(STOP_ANSWER_S, name, "ending its sequence", self.camera.stop_sequence)
+                if self._thread is not threading.current_thread():
+                    within(STOP_ANSWER_S, name, "handing out a frame", self._thread.join)
+        finally:  # a camera that hangs is given up, not its frames' readers
+            subscriptions, self._subscriptions = self._subscriptions, []
+            errors = [error for error in (s.join() for s in subscriptions) if error is not None]
+            with self.changed:
+                self.ring.clear()
         if errors:
             raise errors[0]
 

@@ -54,11 +54,13 @@ class Outputs:
 
         With ``uncertainty`` a picture's standard deviations and points are among them. Raises FileError.
         """
+        if figure is not None and figure.suffix.lower() not in (".png", ".pdf", ".svg"):
+            raise FileError(figure, "a figure is written as .png, .pdf or .svg.")
         if volume and is_zarr_name(out):
             if not (stem := stem_of(out)):
                 raise FileError(out, "has no name before its suffix.", "Call it volume.ome.zarr, say.")
             record, residual = out.with_name(f"{stem}.json"), out.with_name(f"{stem}-residual.tif")
-            return cls(out, out.with_name(f"{stem}.png"), record, residual=residual)
+            return cls(out, out.with_name(f"{stem}.png"), record, figure, residual=residual)
         if out.suffix.lower() not in (".tif", ".tiff"):
             raise FileError(
                 out,
@@ -67,8 +69,6 @@ class Outputs:
                 else "a reconstruction is written as float32 TIFF: the name must end in .tif.",
                 "A preview .png and a .json with the settings are written beside it.",
             )
-        if figure is not None and figure.suffix.lower() not in (".png", ".pdf", ".svg"):
-            raise FileError(figure, "a figure is written as .png, .pdf or .svg.")
         deviation = out.with_name(f"{out.stem}-deviation{out.suffix}") if uncertainty else None
         points = out.with_name(f"{out.stem}-points.csv") if uncertainty else None
         residual = out.with_name(f"{out.stem}-residual{out.suffix}")
@@ -112,6 +112,14 @@ class Outputs:
                 raise FileError(path, "exists already and was left as it is.", "Use --force to overwrite it.")
 
 
+def _take_away_others(outputs: Outputs, result: Reconstruction) -> None:
+    """Remove files of an older result that was overwritten, where this one has no such file."""
+    written = outputs.written(result)
+    for path in outputs.files():
+        if path not in written and path != outputs.figure:
+            path.unlink(missing_ok=True)
+
+
 def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, rotate_deg: int = 0) -> None:
     """Write image, preview and record, each whole or not at all.
 
@@ -136,6 +144,7 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
         "preview": levels.to_json(),
     }
     write_json(outputs.record, record)
+    _take_away_others(outputs, result)
 
 
 def _write_residual(outputs: Outputs, result: Reconstruction, job: Job, rotate_deg: int = 0) -> None:
@@ -259,6 +268,9 @@ def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
         write_volume_zarr(outputs.image, result.volume, result.grid, about)
     else:
         write_volume_tiff(outputs.image, result.volume, result.volume.shape, result.grid)
-    save_figure(volume_figure(result, simulated=job.simulated), outputs.preview)
+    page = volume_figure(result, simulated=job.simulated)
+    for path in filter(None, (outputs.preview, outputs.figure)):
+        save_figure(page, path)
     _write_residual(outputs, result, job)
     write_json(outputs.record, reconstruction_record(result, job, volume=True))
+    _take_away_others(outputs, result)

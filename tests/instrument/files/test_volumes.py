@@ -1,12 +1,16 @@
 """Volumes as OME-Zarr, read back by zarr-python and held against the OME-Zarr model library."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import zarr
 from ome_zarr_models.v05 import Image
 
 from instrument.files.volumes import write_volume_tiff, write_volume_zarr
-from instrument.reconstruction.result_file import Outputs
+from instrument.reconstruction.job import Job
+from instrument.reconstruction.result_file import Outputs, write_reconstruction
+from recon import Calibration, Options, Problem, solve
 from recon.reconstruction.result import Grid
 
 Z_UM = np.array([9000.0, 10000.0, 11500.0])
@@ -85,3 +89,17 @@ def test_a_folder_that_is_no_zarr_is_never_taken(tmp_path):
     assert outputs.preview.name == "v.png"
     with pytest.raises(Exception, match="is no Zarr folder"):
         outputs.check(0, overwrite=True)
+
+
+def test_what_an_older_result_left_beside_goes_with_it(tmp_path):
+    """An older residual beside a new picture would be taken for the new one's."""
+    calibration = Calibration(np.eye(16, dtype=np.float32)[None, None] + 0.1, np.full((1, 3), np.nan))
+    image = np.random.default_rng(0).random((16, 16)).astype(np.float32)
+    result = solve(Problem.of(image, calibration, Options(model="convolution", iterations=2, judged=False)))
+    outputs, job = Outputs.named(tmp_path / "a.tif"), Job(image, calibration, {})
+    write_reconstruction(outputs, replace(result, residual=image), job)
+    assert outputs.residual.exists()
+    write_reconstruction(outputs, replace(result, residual=None), job)
+    assert not outputs.residual.exists()
+    assert outputs.image.exists()
+    assert outputs.record.exists()
