@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help demo charts test lint format types clean
+.PHONY: help demo charts docs test lint format types clean
 
 help: ## what one can make
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -24,6 +24,10 @@ demo: $(STAMP) ## the main job on the simulated bench: calibrate, photograph, re
 
 charts: $(STAMP) ## draw the charts of README and docs/benchmarks/charts.md anew (most of an hour; goes on where it stopped)
 	$(BIN)/python benchmarks/charts.py
+
+docs: $(STAMP) ## the site of all documentation, with search, gallery and reference: build/docs/README.html
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[docs]"
+	$(BIN)/python -m sphinx -q -b html docs build/docs
 
 test: $(STAMP) lint types ## every check and every test
 	$(BIN)/python -m pytest -n 2

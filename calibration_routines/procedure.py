@@ -22,6 +22,7 @@ from instrument.runs.acquire import abilities_of, prepare
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Runner, RunStatus, discarded
+from instrument.runs.timed import TimedSteps
 from instrument.runs.writer import dated_name, free_name
 from recon.base.declare import options_of
 from recon.base.option_text import size
@@ -229,9 +230,13 @@ class Purpose(Generic[T]):
         """Whether a run's frames are for this."""
         return (Path(run) / self.file).is_file()
 
+    def place(self, run: Path, *, doubted: bool) -> Path:
+        """Return where the result of a run goes; one that is wrong as a whole not under a good one's name."""
+        return run / (f"doubtful_{self.result}" if doubted else self.result)
+
     def lacks_result(self, run: Path) -> bool:
         """Whether they are, and the result is not there yet."""
-        return self.is_of(run) and not (run / self.result).exists()
+        return self.is_of(run) and not any(self.place(run, doubted=one).exists() for one in (False, True))
 
     def read(self, run: Path) -> T:
         """Read the record of a run; CalibrationError when there is none, or it is damaged."""
@@ -367,6 +372,7 @@ class OfFiles(Procedure):
 
 _MODULES = (
     "psf.sweep_procedure",
+    "optics.stage_play",
     "optics.photograph",
     "optics.angular",
     "optics.dpc",
@@ -400,6 +406,8 @@ def outlook_of(
     words = list(reasons)
     if path and bench.stage is not None and (homes or not bench.stage.is_homed):
         words.append("The stage is homed first, every axis to its reference: its way must be free.")
+    if bench.trigger_source is not None:
+        words.append(TimedSteps(bench, plan).words())
     return Outlook(tuple(words), plan, estimate(plan, abilities), abilities.free_bytes, path=path)
 
 

@@ -13,7 +13,7 @@ the noise would give is taken off; what is left is the bench's.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,7 @@ _LINEAR_PX = 0.4  # a picture moves so far as its gradient tells; beyond, it is 
 _SLOPE = np.array([-1, 9, -45, 0, 45, -9, 1], np.float32) / 60
 """A derivative of sixth order: the usual one of second order takes fine structure for flatter than it is."""
 _UNLIKE = 0.3  # part of an image's contrast that a fit leaves: beyond, it is looked for elsewhere
+_POOR = 0.1  # part of its contrast that is left of a moved image
 _FLAT = 0.3  # contrast, relative to the mean, below which other light cannot be told from brightness
 _SHAKEN_PX = 0.05  # frames that scatter less are averaged as they are
 _SURE = 3.0  # standard deviations of its own uncertainty, beyond which a scatter is the bench's
@@ -82,6 +83,9 @@ def compare(image: Float, reference: Float) -> Change:
         if far.reliable:
             found, left = _fitted(moved(seen, -far.rows, -far.columns), other)
             found = _with_place(found, found.rows + far.rows, found.columns + far.columns)
+            if left > _POOR:  # too fine to be moved by fractions of a pixel: all light together tells more
+                level = float(seen.sum(dtype=np.float64) / other.sum(dtype=np.float64))
+                found = replace(found, brightness=level, ambient=0.0)
         elif left > _UNLIKE:
             brightness = float(image.sum(dtype=np.float64) / reference.sum(dtype=np.float64))
             return Change(brightness, float("inf"), float("inf"), 0.0)
@@ -90,7 +94,7 @@ def compare(image: Float, reference: Float) -> Change:
 
 def _with_place(found: Change, rows: float, columns: float, noise: float | None = None) -> Change:
     noise = found.place_noise if noise is None else noise
-    return Change(found.brightness, rows, columns, found.ambient, found.brightness_noise, noise)
+    return replace(found, rows=rows, columns=columns, place_noise=noise)
 
 
 def _fitted(seen: Float, other: Float) -> tuple[Change, float]:
@@ -147,8 +151,8 @@ class Scatter:
 
     @property
     def blur(self) -> float:
-        """About how much a plain average differs from one of steady frames, relative."""
-        return (self.motion_px / _SHARP_PX) ** 2 * (1 - 1 / self.frames) / 2
+        """About how much a plain average of many differs from one of steady frames, relative."""
+        return (self.motion_px / _SHARP_PX) ** 2 / 2
 
     @property
     def frames_needed(self) -> int:

@@ -11,6 +11,8 @@ from instrument.files.errors import BenchError as BenchError
 from instrument.files.errors import FileError as FileError
 from instrument.files.images import read as read
 from instrument.files.images import write_image as write_image
+from instrument.notebook.chart import chart as chart
+from instrument.notebook.hologram import hologram as hologram
 from instrument.notebook.reconstruct import bench as bench
 from instrument.notebook.reconstruct import calibration as calibration
 from instrument.notebook.reconstruct import reconstruct as reconstruct
@@ -26,6 +28,7 @@ from recon.camera.camera_model import OfferedCamera as OfferedCamera
 from recon.camera.convolution import Convolution as Convolution
 from recon.camera.factors import Erasures as Erasures
 from recon.errors import InputError as InputError
+from recon.holography.options import HologramOptions as HologramOptions
 from recon.priors.base import L1 as L1
 from recon.priors.base import Box as Box
 from recon.priors.base import NonNegativity as NonNegativity

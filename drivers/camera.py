@@ -36,6 +36,13 @@ class Roi:
             and self.left <= other.left < other.left + other.width <= right
         )
 
+    def inside(self, step: int) -> Roi:
+        """Return the largest region inside this one with all borders on multiples of ``step``."""
+        top, left = (-(-start // step) * step for start in (self.top, self.left))
+        bottom = (self.top + self.height) // step * step
+        right = (self.left + self.width) // step * step
+        return Roi(top, left, max(0, bottom - top), max(0, right - left))
+
     def as_tuple(self) -> tuple[int, int, int, int]:
         """Return ``(top, left, height, width)``."""
         return (self.top, self.left, self.height, self.width)
@@ -304,6 +311,11 @@ class Camera(Device):
 
     longest_silence_s: ClassVar[float] = 2.0
     """A free-running camera that sends nothing for this long beyond three exposures has failed."""
+
+    @property
+    def longest_wait_s(self) -> float:
+        """What a snap, or a free-running sequence's next frame, may take before the camera has failed."""
+        return self.longest_silence_s + 3e-3 * self.exposure_ms
 
     frames_in_flight: ClassVar[int] = 2
     """Frames that can be between the sensor and the host while the next one is exposed, at most."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from drivers.device import Device
-from drivers.errors import LimitError
+from drivers.errors import DeviceError, LimitError
 
 T = TypeVar("T")
 
@@ -71,7 +71,7 @@ class PlaysSequences(Device, Generic[T]):
 
         Raises StoppedError when ``off`` (of an SLM: ``blank``) ended it; DeviceError when nothing is armed.
         """
-        raise LimitError(self.name, "has no sequence to play.", "Arm one first.")
+        raise DeviceError(self.name, "has no sequence to play.", "Arm one first.")
 
     def _check_sequence(self, count: int, period_ms: float, output: int) -> None:
         """Refuse a sequence beyond the limits, for drivers."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from drivers.device import Device, Setting
@@ -29,6 +29,38 @@ class StageAxis:
     def unit(self) -> str:
         """The part of the name after the last underscore."""
         return self.name.rsplit("_", 1)[-1]
+
+
+OVER = 1.5
+"""So many times its play an axis goes below a place before it comes up to it."""
+
+
+def approached(
+    here: Mapping[str, float],
+    target: Mapping[str, float],
+    play: Mapping[str, float],
+    seated: Collection[str] = (),
+) -> list[dict[str, float]]:
+    """Return the moves that end at a target with every axis that has play going upwards.
+
+    A nut that trails its screw is then always on the same side of it. One move where every axis goes up far
+    enough, else one to below and one to the target.
+
+    Parameters
+    ----------
+    here, target : mapping of axis name to position
+    play : mapping of axis name to play, in the axis' unit
+        Axes that are left out have none.
+    seated : collection of axis names
+        Those that came to where they are upwards.
+    """
+    below = {}
+    for name, value in target.items():
+        way = OVER * play.get(name, 0.0)
+        least = 0.0 if name in seated else way
+        if way > 0 and value - here.get(name, value) < least:
+            below[name] = value - way
+    return [{**target, **below}, dict(target)] if below else [dict(target)]
 
 
 class Stage(Device):

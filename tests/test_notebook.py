@@ -6,6 +6,7 @@ import inspect
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -135,3 +136,27 @@ def test_a_prior_of_ones_own_is_taken_by_every_solver(scene: tuple[np.ndarray, n
         for solver in ("fista", "admm", "admm-sensor")
     )
     assert max(db.metrics.nrmse(other, fista) for other in others) < 0.02
+
+
+def test_a_hologram_shows_and_saves_itself(tmp_path: Path) -> None:
+    found = db.hologram("portrait", "display", slm=(32, 32), iterations=2)
+    assert repr(found).startswith("<Hologram 16 x 16, expansion ")
+    assert found.phase_rad.shape == (1, 16, 16)
+    assert all(path.exists() for path in found.save(tmp_path / "slm.png"))
+
+
+def test_a_chart_of_a_result_is_drawn(
+    scene: tuple[np.ndarray, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def at_once(problem: Any, setting: Any, _limit_s: float) -> Any:
+        return problem.run(setting, counts=(2,)) if setting.name.startswith("wiener") else "left out"
+
+    monkeypatch.setattr("instrument.evaluation.chart.in_own_process", at_once)
+    made = db.chart(db.reconstruct(*plain(scene), iterations=2, judged=False), budget_s=5)
+    assert repr(made).startswith("<Chart of Reconstructions, speed against accuracy: an array")
+    assert {path.name for path in made.save(tmp_path)} == {
+        "chart.json",
+        "chart.png",
+        "chart.html",
+        "chart.csv",
+    }

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from drivers.slm import Slm
 from drivers.stage import Stage
 from instrument.bench.bench import Bench
+from instrument.bench.sequence import Wire, take_sequence
 from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError
 from instrument.files.slm_image import SlmCorrection, phase_levels
@@ -87,23 +88,54 @@ class DisplayBench:
         The dark level is measured once with the laser off (or estimated with it on), at the first exposure
         asked for; its part that grows with time is small against it.
         """
+        exposure = self._expose(exposure_ms)
+        return self._signal(self._snap()) / exposure
+
+    def photographs(self, images: Sequence[npt.NDArray[np.uint8]], exposure_ms: float) -> list[Array]:
+        """Show grey levels as they are, one after the other, and return the photograph of each.
+
+        By sequences that hardware times, where a trigger wire leads from the SLM to the camera.
+        """
+        wire = Wire(self.bench)
+        most = wire.most if self.bench.trigger_source is self.slm else 0
+        if most < 2:
+            taken = []
+            for levels in images:
+                self.show_levels(levels)
+                taken.append(self.photograph(exposure_ms))
+            return taken
+        exposure = self._expose(exposure_ms)
+        frames: list[Array] = []
+        for first in range(0, len(images), most):
+            self._check()
+            for frame in take_sequence(wire, images[first : first + most]).frames:
+                frames.append(self._signal(self._counted(frame.image)) / exposure)
+        return frames
+
+    def _expose(self, exposure_ms: float) -> float:
+        """Set the exposure, know the background, light the laser; returns the exposure made, milliseconds."""
         self._check()
         camera = self.bench.camera
         low, high = camera.exposure_limits_ms
         exposure = camera.set_exposure_ms(float(np.clip(exposure_ms, low, high)))
-        key = (camera.gain, float(camera.binning), *map(float, camera.roi.as_tuple()))
-        if self.estimates_background:
-            self.bench.scene_on()
-            frame = self._snap()
-            if self._dark is None or self._dark[0] != key:
-                self._dark = key, darkest_block(frame)
-            return (frame - self._dark[1]) / exposure
-        if self._dark is None or self._dark[0] != key:
+        if not self.estimates_background and (self._dark is None or self._dark[0] != self._key):
             self.bench.scene_off()
-            self._dark = key, self._snap()
+            self._dark = self._key, self._snap()
             self._check()
         self.bench.scene_on()
-        return (self._snap() - self._dark[1]) / exposure
+        return exposure
+
+    @property
+    def _key(self) -> tuple[float, ...]:
+        """What the background depends on."""
+        camera = self.bench.camera
+        return (camera.gain, float(camera.binning), *map(float, camera.roi.as_tuple()))
+
+    def _signal(self, frame: Array) -> Array:
+        """Return a frame less the background."""
+        if self._dark is None or self._dark[0] != self._key:
+            self._dark = self._key, darkest_block(frame)
+        return np.asarray(frame - self._dark[1])
 
     @property
     def full_scale(self) -> int:
@@ -120,10 +152,12 @@ class DisplayBench:
         return display.wavelength_nm * display.focal_mm / display.mask_pitch_um / pitch_um
 
     def _snap(self) -> Array:
+        return self._counted(self.bench.snap().image)
+
+    def _counted(self, image: Array) -> Array:
         self.frames += 1
-        frame = np.asarray(self.bench.snap().image, np.float64)
         self._on_frame(self.frames)
-        return frame
+        return np.asarray(image, np.float64)
 
 
 def approach_from_below(stage: Stage, target: Mapping[str, float]) -> None:

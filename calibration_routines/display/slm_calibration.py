@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,16 @@ from calibration_routines.display.display_io import (
     require_slm,
     writable,
 )
-from calibration_routines.procedure import Checked, Listener, Outcome, Outlook, Procedure, Routine
+from calibration_routines.procedure import (
+    CalibrationError,
+    Checked,
+    Listener,
+    Outcome,
+    Outlook,
+    Procedure,
+    Routine,
+)
+from calibration_routines.scatter import NO_CHANGE, STEADY, Scatter, compare, scatter_of
 from instrument.bench.bench import Bench
 from instrument.display.hologram import bench_display, load_alignment
 from instrument.files.atomic import require_new
@@ -24,6 +33,7 @@ from instrument.files.errors import BenchError
 from instrument.files.slm_image import SlmCorrection
 from instrument.runs.run_control import RunControl
 from recon.base.declare import option
+from recon.errors import InputError
 from recon.holography import Display
 from recon.holography.pose import Pose
 from recon.holography.slm_response import MODES, flatness_jacobian, mode, phases_from_frames
@@ -31,6 +41,9 @@ from recon.holography.slm_response import MODES, flatness_jacobian, mode, phases
 Array = npt.NDArray[Any]
 SLM_FILE = "slm-calibration.json"
 """Where the command line writes it."""
+MAX_PHASE_ERROR_RAD = 0.008
+"""Standard deviation of a phase beyond which no table is made: its worst level is within 0.02 then."""
+_REFERENCE_EVERY = 8  # levels between two pictures of level 0
 _FLATNESS_FRAMES = 22
 """Of a flatness measurement, at most."""
 
@@ -47,31 +60,83 @@ class SlmCalibration:
     flatness_rms_rad: float | None
     """Of the flatness error found; None when it was not measured."""
     frames: int
+    phase_error_rad: float = 0.0
+    """Standard deviation of a phase of the table, by how far the pictures lie off interference."""
+    steadiness: Scatter = STEADY
+    """Of the picture of level 0, taken again and again in between."""
 
 
 def measure_look_up_table(io: DisplayBench, *, n_levels: int = 33, seed: int = 0) -> SlmCalibration:
     """Let half of the SLM's pixels interfere with the other half at one level after the other.
 
-    Needs no alignment and no model: see :func:`recon.holography.slm_response.phases_from_frames`.
+    Needs no alignment and no model: see :func:`recon.holography.slm_response.phases_from_frames`. Level 0 is
+    shown again after every few levels: a slow change of brightness is taken out where the pictures then lie
+    better on one ellipse.
 
-    Raises InputError when the pictures do not change as interference does.
+    Raises InputError when the pictures do not change as interference does; CalibrationError when they lie so
+    far off it that the table would be wrong, with what flickers or shakes.
     """
     levels = np.unique(np.linspace(0, 255, n_levels).round().astype(int))
     height, width = io.slm.shape
     chosen = np.random.default_rng(seed).random((height // io.binning, width // io.binning)) < 0.5
     varied = np.repeat(np.repeat(chosen, io.binning, axis=0), io.binning, axis=1)
     exposure_ms = _exposure_ms(io)
-    frames = []
-    for level in levels:
-        io.show_levels(np.where(varied, level, 0).astype(np.uint8))
-        picture = io.photograph(exposure_ms)
-        # Every fourth pixel has more than enough light.
-        frames.append(picture[::2, ::2])
-    phases = phases_from_frames(np.array(frames))
+    order: list[int] = []
+    reference: list[bool] = []
+    before = []
+    for number, level in enumerate([*levels, 0]):
+        if number % _REFERENCE_EVERY == 0 or number == len(levels):
+            order.append(0)
+            reference.append(True)
+            before.append(number - 0.5)
+        if number < len(levels):
+            order.append(int(level))
+            reference.append(False)
+    images = [np.where(varied, level, 0).astype(np.uint8) for level in order]
+    # Every fourth pixel has more than enough light.
+    pictures = np.array([picture[::2, ::2] for picture in io.photographs(images, exposure_ms)])
+    references = pictures[reference].astype(np.float32)
+    phases, error, scatter = _phases(pictures[~np.array(reference)], references, np.array(before))
+    if error > MAX_PHASE_ERROR_RAD:
+        words = scatter.findings("picture") or (
+            "light, mask or camera are not steady, or the SLM flickers: look for saturation, loose mounts.",
+        )
+        raise CalibrationError(
+            f"The SLM's table would be wrong by {error:.3f} rad (one standard deviation; at most "
+            f"{MAX_PHASE_ERROR_RAD:g} is kept): {' '.join(words)}"
+        )
     from scipy.interpolate import PchipInterpolator
 
     table = np.asarray(PchipInterpolator(levels, phases)(np.arange(256)), np.float64)
-    return SlmCalibration(SlmCorrection(table), levels, phases, None, io.frames)
+    return SlmCalibration(SlmCorrection(table), levels, phases, None, io.frames, error, scatter)
+
+
+def _phases(frames: Array, references: Array, before: Array) -> tuple[Array, float, Scatter]:
+    """Return the levels' phases, their error, and how the pictures of level 0 scatter.
+
+    The pictures as they are, and divided by the brightness between two of the references: what lies better on
+    one ellipse counts.
+    """
+    changes = [NO_CHANGE, *(compare(picture, references[0]) for picture in references[1:])]
+    levels = np.array([change.brightness for change in changes])
+    scatter, _ = scatter_of(references)
+    scatter = replace(scatter, frames=1)  # a level has one picture
+    tries = [frames]
+    if np.isfinite(levels).all() and (levels > 0).all():
+        at = np.interp(np.arange(len(frames)), before, levels)
+        tries.append(frames / at[:, None, None])
+    found = []
+    for pictures in tries:
+        try:
+            found.append(phases_from_frames(pictures))
+        except InputError:
+            if scatter.findings():
+                raise CalibrationError(
+                    f"The SLM's table cannot be measured: {' '.join(scatter.findings('picture'))}"
+                ) from None
+            raise
+    phases, error = min(found, key=lambda one: one[1])
+    return phases, error, scatter
 
 
 def measure_flatness(
@@ -122,9 +187,8 @@ def measure_flatness(
     flatness = np.tensordot(found, [mode(n, coarse) for n in range(len(MODES))], 1)
     correction = SlmCorrection(table.correction.phase_of_level_rad, flatness)
     io.correction = correction
-    return SlmCalibration(
-        correction, table.levels, table.phases_rad, float(np.sqrt((found**2).sum())), io.frames
-    )
+    rms_rad = float(np.sqrt((found**2).sum()))
+    return replace(table, correction=correction, flatness_rms_rad=rms_rad, frames=io.frames)
 
 
 def _exposure_ms(io: DisplayBench) -> float:
@@ -163,7 +227,8 @@ class SlmProcedure(Checked, Procedure):
     @property
     def frames(self) -> int:
         """Frames it takes at most."""
-        return self.levels + 2 + (_FLATNESS_FRAMES if self.alignment is not None else 0)
+        references = 1 + -(-self.levels // _REFERENCE_EVERY)
+        return self.levels + references + 2 + (_FLATNESS_FRAMES if self.alignment is not None else 0)
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse a bench without SLM, an alignment that cannot be read, a file that exists."""
@@ -209,7 +274,8 @@ def slm_lines(found: SlmCalibration, *, simulated: bool) -> list[str]:
     mark = " (SIMULATED)" if simulated else ""
     lines = [
         f"{found.frames} frames{mark}: {found.phases_rad[-1]:.3f} rad at level {found.levels[-1]},",
-        f"  up to {worst:.3f} rad from an ideal SLM's 256 levels a turn",
+        f"  up to {worst:.3f} rad from an ideal SLM's 256 levels a turn; a level is known to "
+        f"{found.phase_error_rad:.4f} rad",
     ]
     if found.flatness_rms_rad is not None:
         lines.append(f"  flatness error {found.flatness_rms_rad:.3f} rad rms")

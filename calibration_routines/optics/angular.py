@@ -36,11 +36,12 @@ from calibration_routines.procedure import (
     home_if_needed,
     outlook_of,
 )
-from calibration_routines.psf.analysis import DarkModel, dark_model, drift_of, light_of
+from calibration_routines.psf.analysis import DarkModel, ambient_findings, dark_model, drift_of, light_of
 from calibration_routines.psf.sampling import Position, known, source_limits
 from calibration_routines.psf.stage_fit import Drift
 from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import PSF, REFERENCE, check_sweep, expose_sweep, sweep_plan
+from calibration_routines.scatter import Scatter, pooled
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, SettingsError
 from instrument.files.figures import save_figure
@@ -218,21 +219,25 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     points, dark = record.sweep.points(), dark_model(run)
     pitch_um, distance_mm = _optics(record.geometry)
     drift = drift_of(run, points, dark)
+    images, scatter = _images(run, points, dark, drift)
+    ambient = dark.brightening_per_ms * run.metadata(run.steps(PSF)[0]).exposure_ms / float(images[0].mean())
+    findings = (*scatter.findings("place"), *ambient_findings(ambient))
     response = analyse_angular(
-        _images(run, points, dark, drift),
+        images,
         points.points_um,
         pitch_um=pitch_um,
         distance_um=1e3 * distance_mm,
         emission=record.sweep.emission,
-        findings=() if drift is None else drift.findings,
+        findings=findings if drift is None else (*findings, *drift.findings),
         bench=record.bench,
         simulated=record.simulated,
     )
-    file = save_response(response, run.path / ANGULAR.result)
+    file = save_response(response, ANGULAR.place(run.path, doubted=bool(response.findings)))
     picture = file.with_suffix(".png")
     save_figure(response_figure(response), picture)
+    kept = [f"Not to be relied on, hence kept as {file.name}."] if response.findings else []
     return Outcome(
-        verdict=tuple(response_lines(response)),
+        verdict=(*response_lines(response), *kept),
         good=not response.findings,
         runs=(run.path,),
         files=(file, picture),
@@ -248,15 +253,15 @@ def _optics(geometry: Geometry) -> list[float]:
 # Frames to light ---------------------------------------------------------------------------------------
 def _images(
     run: Run, points: PointSweep, dark: DarkModel, drift: Drift | None
-) -> list[npt.NDArray[np.float32]]:
-    """Return the light of every point at the first point's exposure, the source's drift taken out."""
+) -> tuple[list[npt.NDArray[np.float32]], Scatter]:
+    """Return the light of every point at the first point's exposure, drift taken out, and frames' scatter."""
     began = run.metadata(run.steps(REFERENCE)[0]).utc if drift is not None else None
     taken: dict[Position, list[int]] = {}
     for step in run.steps(PSF):
         if step.source_um is not None:
             taken.setdefault(step.source_um, []).append(step.index)
     reference_ms = run.metadata(taken[points.points_um[0]][0]).exposure_ms
-    images = []
+    images, scatters = [], []
     for point in points.points_um:
         exposure_ms = run.metadata(taken[point][0]).exposure_ms
         brightness = 1.0
@@ -264,7 +269,8 @@ def _images(
             brightness = drift.brightness_at((run.metadata(taken[point][0]).utc - began).total_seconds())
         steady = light_of(run, taken[point], dark)
         images.append(steady.mean * np.float32(reference_ms / exposure_ms / brightness))
-    return images
+        scatters.append(steady.scatter)
+    return images, pooled(scatters)
 
 
 # Procedure ---------------------------------------------------------------------------------------------

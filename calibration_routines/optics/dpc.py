@@ -7,7 +7,7 @@ slope and deflection that tell a diffuser's quality.
 
 from __future__ import annotations
 
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,6 +29,7 @@ from calibration_routines.procedure import (
 )
 from calibration_routines.psf.analysis import dark_model, full_scale, light_of
 from calibration_routines.psf.exposure import expose_light
+from calibration_routines.scatter import Scatter, pooled
 from drivers.led_array import LedArray
 from instrument.bench.bench import Bench
 from instrument.files.atomic import whole_file
@@ -174,7 +175,9 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     listener.step("analysing")
     record = DPC.read(run.path)
     optics, index = record.optics, record.setup.index
-    phase = phase_from_halves(_halves(run), optics)
+    halves, scatter = _halves(run)
+    findings = replace(scatter, flicker=0.0).findings("half")  # each half is brought to its own mean
+    phase = phase_from_halves(halves, optics)
     height = (phase * (1e-3 * optics.wavelength_nm / (2 * np.pi * (index - 1)))).astype(np.float32)
     slope = slopes_deg(height, optics.pitch_um)
     deflection = deflections_deg(slope, index)
@@ -183,19 +186,21 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     )
     with whole_file(run.path / HEIGHT_FILE) as heights:
         np.save(heights, surface.height_um)
-    file, picture = run.path / DPC.result, (run.path / DPC.result).with_suffix(".png")
+    file = DPC.place(run.path, doubted=bool(findings))
+    picture = file.with_suffix(".png")
     facts = {
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
         **plain(record),
         "height_file": HEIGHT_FILE,
         "pitch_um": surface.pitch_um,
         "figures": surface.figures,
+        "findings": list(findings),
     }
     _RESULT.write(file, facts)
     save_figure(surface_figure(surface), picture)
     return Outcome(
-        verdict=(surface_line(surface),),
-        good=True,
+        verdict=(*(f"Quality: {finding}" for finding in findings), surface_line(surface)),
+        good=not findings,
         runs=(run.path,),
         files=(file, picture),
         result=surface,
@@ -243,14 +248,16 @@ def _rgb(setup: DpcSetup) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _halves(run: Run) -> dict[str, Image]:
+def _halves(run: Run) -> tuple[dict[str, Image], Scatter]:
     dark = dark_model(run)
-    halves = {}
+    halves, scatters = {}, []
     for side in SIDES:
         if np.any((run.images(side) >= full_scale(run)).any(axis=0) & ~dark.hot):
             raise CalibrationError(f"The half {side!r} saturates; lower the light. The run is in {run.path}.")
-        halves[side] = light_of(run, [step.index for step in run.steps(side)], dark).mean
-    return halves
+        steady = light_of(run, [step.index for step in run.steps(side)], dark)
+        halves[side] = steady.mean
+        scatters.append(steady.scatter)
+    return halves, pooled(scatters)
 
 
 # Procedure -------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ camera this is a factor on the picture (Kuo 2020, Sec. 5.1), and it can be divid
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +26,18 @@ from calibration_routines.procedure import (
     completed,
     outlook_of,
 )
-from calibration_routines.psf.analysis import channels_first, dark_model, full_scale, light_of, replace_hot
+from calibration_routines.psf.analysis import (
+    ambient_findings,
+    channels_first,
+    dark_model,
+    full_scale,
+    light_frames,
+    light_of,
+)
 from calibration_routines.psf.exposure import expose_scene
 from calibration_routines.psf.psf_quality import MAX_CLIPPED, measure_psf
 from calibration_routines.psf.sweep_plan import DARK, PSF
+from calibration_routines.scatter import STEADY, Scatter, pooled
 from instrument.bench.bench import Bench
 from instrument.files.errors import SettingsError
 from instrument.files.images import write_image
@@ -57,17 +65,21 @@ class Photograph:
     saturated_pixels: int
     """Pixels at full scale in any frame, hot ones excepted."""
     run: Run
+    scatter: Scatter = STEADY
+    """Of the frames; where they shook they were put onto one another."""
+    findings: tuple[str, ...] = ()
+    """What is wrong with light and place, in words."""
 
 
 def photograph_plan(exposure_ms: float, average: int, dark_frames: int) -> Plan:
-    """Return the plan of a photograph: the lit scene, then dark frames."""
-    return Plan(
-        label="photograph",
-        parts=(
-            Part(label="scene", scene_lit=True, exposures_ms=(exposure_ms,), repeats=average),
-            Part(label="dark", light=(OFF,), exposures_ms=(exposure_ms,), repeats=dark_frames),
-        ),
+    """Return the plan of a photograph: the lit scene, and dark frames, half of them before it."""
+    late = dark_frames - dark_frames // 2
+    first, last = (
+        (Part(label=DARK, light=(OFF,), exposures_ms=(exposure_ms,), repeats=n),) if n else ()
+        for n in (dark_frames - late, late)
     )
+    lit = Part(label="scene", scene_lit=True, exposures_ms=(exposure_ms,), repeats=average)
+    return Plan(label="photograph", parts=(*first, lit, *last))
 
 
 def photograph(
@@ -109,15 +121,21 @@ def photograph(
     run = completed(acquire(bench, plan, folder, on_progress=listener.frame, control=control))
     frames = run.images("scene")
     dark = dark_model(run)
-    light = frames.mean(axis=0, dtype=np.float32) - dark.at(run.metadata(0).exposure_ms)
-    binned = block_mean(channels_first(replace_hot(light, dark.hot)), binning)
+    steady = light_frames(frames, dark.at(run.metadata(0).exposure_ms), dark.hot)
+    binned = block_mean(channels_first(steady.mean), binning)
     saturated = (frames >= full_scale(run)).any(axis=0) & ~dark.hot
+    ambient = dark.brightening_per_ms * run.metadata(0).exposure_ms / max(float(steady.mean.mean()), 1e-9)
     return Photograph(
         measurement=np.ascontiguousarray(np.moveaxis(binned, 0, -1)) if frames.ndim == 4 else binned[0],
         raw=frames[0],
         exposure_ms=run.metadata(0).exposure_ms,
         saturated_pixels=int(np.count_nonzero(saturated)),
         run=run,
+        scatter=steady.scatter,
+        findings=(
+            *replace(steady.scatter, flicker=0.0).findings("photograph"),  # its brightness is its own
+            *ambient_findings(ambient),
+        ),
     )
 
 
@@ -217,7 +235,8 @@ def measure_field_response(
         Frames a place.
 
     Raises PlanError when a place is out of reach (nothing moved); CalibrationError when the sensor's edge
-    cuts the pattern at one of the places, or the run ended early.
+    cuts the pattern at one of the places, the light flickers or the bench shakes too much for what was
+    averaged, or the run ended early.
     """
     half_y, half_x = half_field_um
     places = (
@@ -242,19 +261,23 @@ def measure_field_response(
         ),
     )
     run = completed(acquire(bench, plan, folder, on_progress=None if listener is None else listener.frame))
-    return fit_field_response(places, [_light(run, place) for place in places])
+    light, scatters = zip(*(_light(run, place) for place in places), strict=True)
+    if findings := pooled(scatters).findings("place"):
+        raise CalibrationError(f"The response over the field cannot be measured: {' '.join(findings)}")
+    return fit_field_response(places, light)
 
 
-def _light(run: Run, place: tuple[float, float, float]) -> float:
+def _light(run: Run, place: tuple[float, float, float]) -> tuple[float, Scatter]:
     indices = [step.index for step in run.steps(PSF) if step.source_um == place]
-    light = light_of(run, indices, dark_model(run)).mean
+    steady = light_of(run, indices, dark_model(run))
+    light = steady.mean
     clipped = measure_psf(light[np.newaxis], z_um=place[2], noise=0.0).clipped
     if clipped > MAX_CLIPPED:
         raise CalibrationError(
             f"With the source at x = {place[0] / 1e3:g}, y = {place[1] / 1e3:g} mm the pattern reaches over "
             f"{clipped:.0%} of the sensor's edge, so its light cannot be measured: choose a smaller field."
         )
-    return float(light.sum(dtype=np.float64))
+    return float(light.sum(dtype=np.float64)), steady.scatter
 
 
 # Procedure -------------------------------------------------------------------------------------------
@@ -301,8 +324,8 @@ class PhotographProcedure(Checked, Procedure):
         write_image(file, taken.measurement, facts | {"exposure_ms": taken.exposure_ms, "dark": "taken off"})
         words = f"Photograph: {taken.exposure_ms:.4g} ms, {taken.saturated_pixels} saturated pixels"
         return Outcome(
-            verdict=(words,),
-            good=taken.saturated_pixels == 0,
+            verdict=(*(f"Quality: {finding}" for finding in taken.findings), words),
+            good=taken.saturated_pixels == 0 and not taken.findings,
             runs=(taken.run.path,),
             files=(file,),
             result=taken,

@@ -81,15 +81,15 @@ class DarkModel:
         longest = int(np.argmax(self._exposures_ms))
         stack = frames[longest]
         first = early[longest] if early else len(stack)
-        self.hot = hot_pixels(np.min(stack[:first], axis=0), full_scale)
-        """Pixels that are bright without light at the longer exposure, in every frame of the first or of the
-        last ones."""
+        self.hot = hot_pixels(np.max(stack[:first], axis=0), full_scale)
+        """Pixels that are bright without light at the longer exposure, in any frame: some blink, some turn
+        hot meanwhile."""
         self.late_hot = 0
         """Pixels among them that were not so in the first dark frames."""
         self.brightening_per_ms = 0.0
         """Counts a millisecond by which the last dark frames are brighter than the first, in the median."""
         if first < len(stack):
-            late = hot_pixels(np.min(stack[first:], axis=0), full_scale) & ~self.hot
+            late = hot_pixels(np.max(stack[first:], axis=0), full_scale) & ~self.hot
             self.late_hot, self.hot = int(np.count_nonzero(late)), self.hot | late
             more = float(np.median(_mean(stack[first:]) - _mean(stack[:first])))
             self.brightening_per_ms = more / self._exposures_ms[longest]

@@ -80,6 +80,12 @@ class AutoExposure:
         return self.outcome in (ExposureOutcome.REACHED, ExposureOutcome.HELD_BY_BRIGHTEST_PIXEL)
 
     @property
+    def _flicker(self) -> float:
+        """Standard deviation of light a millisecond over the frames that did not saturate, relative."""
+        light = [trial.level / trial.exposure_ms for trial in self.trace if not trial.saturated_pixels]
+        return float(np.std(light) / np.mean(light)) if light else float("nan")
+
+    @property
     def message(self) -> str:
         """What happened and what to do about it, one or two sentences."""
         last = self.trace[-1]
@@ -103,8 +109,9 @@ class AutoExposure:
                 "dim the source or lower the gain."
             ),
             ExposureOutcome.UNSTEADY: (
-                " No exposure held from one frame to the next: check the source's driver (pulsed supply, "
-                "loose contact), stray light, and whether the camera's exposure steps are fine enough."
+                f" No exposure held from one frame to the next: the light flickers by {self._flicker:.0%}. "
+                "Check the source's driver (pulsed supply, loose contact), stray light, and whether the "
+                "camera's exposure steps are fine enough."
             ),
         }[self.outcome]
         return f"Auto-exposure {self.outcome.value}: {found}.{advice}"

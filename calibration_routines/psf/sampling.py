@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from drivers.stage import OVER
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, SettingsError
 from recon.analysis.resolution import SPECTRUM_LEVEL, axial_spacing_per_um, lateral_spacing_um
@@ -298,12 +299,18 @@ def _planes_by_edge(z_min_um: float, z_max_um: float, geometry: Geometry) -> int
 
 
 def source_limits(bench: Bench) -> dict[str, tuple[float, float]]:
-    """Return how far the stage takes the source along each of its axes, micrometres; empty: no stage."""
+    """Return how far the stage takes the source along each of its axes, micrometres; empty: no stage.
+
+    What an axis' play needs to come to a place from below is taken off.
+    """
     if bench.stage is None:
         return {}
     offsets = dict(zip(("x_um", "y_um", "z_um"), bench.config.source.offset_um, strict=True))
     limits = {name: ends for name, ends in bench.stage.limits.items() if name in offsets}
-    return {name: (low + offsets[name], high + offsets[name]) for name, (low, high) in limits.items()}
+    need = {name: OVER * bench.play.get(name, 0.0) for name in offsets}
+    return {
+        name: (low + need[name] + offsets[name], high + offsets[name]) for name, (low, high) in limits.items()
+    }
 
 
 def require_reach(bench: Bench, places: Mapping[str, tuple[int, float]]) -> None:

@@ -148,6 +148,12 @@ def plan_lines(bench: Bench, sweep: PointSweep, plan: Plan, folder: Path | None)
         f"= {count(cost.frames, 'frame')}, {cost.total_bytes / 1e6:.0f} MB at most, "
         f"{cost.seconds:.0f} s of exposure and motion."
     )
+    if cost.approaches:
+        axes = ", ".join(f"{name[0]} {play:g} um" for name, play in bench.play.items())
+        lines.append(
+            f"Because of the stage's play ({axes}) {count(cost.approaches, 'move')} go below the place "
+            f"first, which costs {cost.approach_seconds:.0f} s of these."
+        )
     if cost.total_bytes > _MUCH_BYTES:
         lines.append(
             f"Note: {cost.total_bytes / 1e9:.0f} GB are much. Fewer frames a PSF (--average), a larger "

@@ -222,15 +222,20 @@ class BufferedCamera(KeptSettings):
         """Frames since the last opening that arrived damaged or in part; they count as lost, too."""
         return self._incomplete
 
+    @property
+    def longest_wait_s(self) -> float:
+        """What powering up and frames that are skipped may take, at the rate and exposure that are set."""
+        frames = 3 + self.frames_to_skip
+        frame_s = max(self._period_s, self.exposure_ms / 1e3)
+        return max(_START_S, self.longest_silence_s) + frames * frame_s
+
     def snap(self) -> Frame:
         """Take one frame whose exposure begins after this call, and wait for it."""
         self._require_idle("frame")
         skip = self.frames_to_skip if self.trigger_mode == "free_run" else 0
         run = self._start(_SNAP_BUFFERS, snapping=True)
         try:
-            deadline_s = (
-                time.monotonic() + _START_S + (3 + skip) * max(self._period_s, self.exposure_ms / 1e3)
-            )
+            deadline_s = time.monotonic() + self.longest_wait_s
             if self.trigger_mode == "software":
                 self._fire()
             image = np.empty(run.shape, run.dtype)
@@ -358,7 +363,7 @@ class BufferedCamera(KeptSettings):
         frame_id = self._next_id + lost
         self._next_id = frame_id + 1
         full_scale = (1 << run.significant_bits) - 1
-        return FrameMetadata(
+        metadata = FrameMetadata(
             frame_id=frame_id,
             device_time_ns=raw.device_time_ns,
             host_time_ns=host_time_ns,
@@ -372,8 +377,8 @@ class BufferedCamera(KeptSettings):
             binning=run.binning,
             dropped_before=lost,
             saturated_fraction=float(np.count_nonzero(image >= full_scale) / image.size),
-            **raw.facts,
         )
+        return replace(metadata, **raw.facts)
 
     def _count_from(self, number: int, run: _Run) -> None:
         """Count from an incomplete frame on, which the first whole one comes after."""

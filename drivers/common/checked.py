@@ -22,7 +22,7 @@ import functools
 import inspect
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -34,6 +34,7 @@ from drivers.device import Device
 from drivers.errors import DeviceError
 from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import LedArray, LedPattern
+from drivers.sequence import PlaysSequences
 from drivers.slm import Slm
 from drivers.stage import Stage, StageAxis
 
@@ -217,7 +218,22 @@ class _CheckedStage(Stage):
         return said
 
 
+def _period(device: PlaysSequences[Any], asked_ms: float, said_ms: float) -> float:
+    """Refuse a sequence's period that is shorter than asked for, or far longer."""
+    if not asked_ms * (1 - 1e-6) <= said_ms <= 1.5 * asked_ms + 2.0:
+        raise _refuse(device, f"a sequence with a period of {asked_ms:g} ms", f"{said_ms:g} ms")
+    return said_ms
+
+
 class _CheckedLedArray(LedArray):
+    def arm(self, patterns: Sequence[LedPattern], period_ms: float, output: int = 0) -> float:
+        return _period(self, period_ms, super().arm(patterns, period_ms, output))
+
+    def play(self) -> None:
+        super().play()
+        if not self.pattern.is_dark:
+            raise _refuse(self, "darkness after a sequence", f"that it shows {self.pattern.description!r}")
+
     def set_pattern(self, pattern: LedPattern) -> LedPattern:
         said = super().set_pattern(pattern)  # type: ignore[safe-super]
         for shown in (said, self.pattern):
@@ -232,6 +248,9 @@ class _CheckedLedArray(LedArray):
 
 
 class _CheckedSlm(Slm):
+    def arm(self, patterns: Sequence[npt.NDArray[np.uint8]], period_ms: float, output: int = 0) -> float:
+        return _period(self, period_ms, super().arm(patterns, period_ms, output))
+
     def display(self, levels: npt.NDArray[np.uint8]) -> None:
         super().display(levels)  # type: ignore[safe-super]
         if not np.array_equal(self.displayed, levels):

@@ -129,9 +129,7 @@ class FrameStream:
         # Two beyond the ring: one being filled, one for a reader that has just taken the oldest.
         self._pool = BufferPool(self.n_buffers + 2, shape, dtype)
         self._scratch: Pixels = np.empty(shape, dtype)
-        self._answer_limit_s = (
-            self.camera.longest_silence_s + 3 * self.camera.exposure_ms / 1e3 + STOP_ANSWER_S
-        )
+        self._answer_limit_s = self.camera.longest_wait_s + STOP_ANSWER_S
         self.camera.start_sequence(self.n_buffers)
         self._running = True
         self._thread = threading.Thread(
@@ -148,15 +146,17 @@ class FrameStream:
         Raises Exception: what a callback given to ``subscribe`` raised.
         """
         self._end()
-        if self._thread is not None:
-            name = self.camera.name
-            within(STOP_ANSWER_S, name, "ending its sequence", self.camera.stop_sequence)
-            if self._thread is not threading.current_thread():
-                within(STOP_ANSWER_S, name, "handing out a frame", self._thread.join)
-        subscriptions, self._subscriptions = self._subscriptions, []
-        errors = [error for error in (s.join() for s in subscriptions) if error is not None]
-        with self.changed:
-            self.ring.clear()
+        try:
+            if self._thread is not None:
+                name = self.camera.name
+                within(STOP_ANSWER_S, name, "ending its sequence", self.camera.stop_sequence)
+                if self._thread is not threading.current_thread():
+                    within(STOP_ANSWER_S, name, "handing out a frame", self._thread.join)
+        finally:  # a camera that hangs is given up, not its frames' readers
+            subscriptions, self._subscriptions = self._subscriptions, []
+            errors = [error for error in (s.join() for s in subscriptions) if error is not None]
+            with self.changed:
+                self.ring.clear()
         if errors:
             raise errors[0]
 
@@ -246,7 +246,7 @@ class FrameStream:
         """
         since_ns = time.monotonic_ns() if since_ns is None else since_ns
         if timeout_s is None:
-            timeout_s = self.camera.longest_silence_s + (self.n_buffers + 4) * self.camera.exposure_ms / 1e3
+            timeout_s = self.camera.longest_wait_s + (self.n_buffers + 1) * self.camera.exposure_ms / 1e3
         deadline_s = time.monotonic() + timeout_s
         reader = self.reader()
         to_skip = self.camera.frames_in_flight + 1
@@ -297,7 +297,7 @@ class FrameStream:
                     )
                 except DeviceTimeoutError as error:
                     silent_s += time.monotonic() - began_s
-                    limit_s = self.camera.longest_silence_s + 3 * self.camera.exposure_ms / 1e3
+                    limit_s = self.camera.longest_wait_s
                     if self.camera.trigger_mode == "free_run" and silent_s > limit_s:
                         raise DeviceTimeoutError(
                             error.device, f"has sent no frame for {silent_s:.1f} s.", error.remedy

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from math import ceil
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +15,10 @@ from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, 
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.illuminate.geometry import ArrayGeometry, read_geometry
 from drivers.illuminate.link import SAFE_LINE, Link
-from drivers.illuminate.sequencer import Sequencer
+from drivers.illuminate.sequencer import MOST_PATTERNS, Sequencer
 from drivers.led_array import OFF, LedArray, LedPattern, Rgb
 from drivers.registry.buses import lasting_name
+from drivers.sequence import SequenceLimits
 
 _log = logging.getLogger(__name__)
 _OVERTAKE_S = 0.2
@@ -72,6 +74,7 @@ class IlluminateLedArray(LedArray):
         self._auto_clear: bool | None = None
         self._brightness = options.brightness
         self._restorers: dict[str, Callable[[], object]] = {}
+        self._armed: tuple[int, int] | None = None
         self.sequencer = Sequencer(self)
         """Hardware-timed sequences and the trigger lines."""
 
@@ -147,6 +150,7 @@ class IlluminateLedArray(LedArray):
             self._pattern = OFF
             self._restorers.clear()
             self.sequencer.forget()
+            self._armed = None
             self._brightness = self.options.brightness
             self.link.close()
 
@@ -289,6 +293,29 @@ class IlluminateLedArray(LedArray):
             except DeviceTimeoutError as error:
                 raise DeviceError(self.name, f"does not confirm that it is off ({error.problem})") from error
             return
+
+    # Sequences --------------------------------------------------------------------------------------
+    @property
+    def sequence_limits(self) -> SequenceLimits | None:
+        """What sequences with a pulse for each pattern it plays; None of an array without trigger output."""
+        outputs = self.geometry.outputs
+        least_ms = max(1, self.link.dialect.shortest_interval_ms)
+        return SequenceLimits(MOST_PATTERNS, least_ms, outputs) if outputs else None
+
+    def arm(self, patterns: Sequence[LedPattern], period_ms: float, output: int = 0) -> float:
+        """Store a sequence, of one colour; its period is whole milliseconds."""
+        self._check_sequence(len(patterns), period_ms, output)
+        if not self.sequencer.holds(patterns):
+            self.sequencer.load(patterns)
+        self._armed = (ceil(period_ms), output)
+        return float(self._armed[0])
+
+    def play(self) -> None:
+        """Show the armed sequence once, with a pulse for each pattern; dark when this returns."""
+        if self._armed is None:
+            raise DeviceError(self.name, "has no sequence to play.", "Arm one first.")
+        interval_ms, output = self._armed
+        self.sequencer.run(interval_ms, outputs=[*[0] * output, 1])
 
     # More than the interface ------------------------------------------------------------------------
     def set_brightness(self, brightness: int) -> int:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from drivers.illuminate.led_array import IlluminateLedArray
 
 _LONGEST_MS = _MOST_REPEATS = _LONGEST_US = 65_535  # the firmware keeps them in 16 bits
-_MOST_PATTERNS = 1000
+MOST_PATTERNS = 1000
 _MARGIN_S = 5.0
 
 
@@ -43,9 +43,9 @@ class Sequencer:
         dialect = array.link.dialect if array.is_open else None
         if dialect is None:
             raise DeviceNotOpenError(array.name)
-        if not 1 <= len(patterns) <= _MOST_PATTERNS:
+        if not 1 <= len(patterns) <= MOST_PATTERNS:
             raise LimitError(
-                array.name, f"stores 1 to {_MOST_PATTERNS} patterns, not {len(patterns)}.", "Split them."
+                array.name, f"stores 1 to {MOST_PATTERNS} patterns, not {len(patterns)}.", "Split them."
             )
         commands: list[bytes] = []
         colors: set[Rgb] = set()
@@ -78,6 +78,10 @@ class Sequencer:
             self._stored = tuple(patterns)
             self._rgb = next(iter(colors), (0, 0, 0))
             array.remember("sequence", lambda: self.load(patterns))
+
+    def holds(self, patterns: Sequence[LedPattern]) -> bool:
+        """Whether the array has these patterns stored."""
+        return self._stored == tuple(patterns)
 
     def forget(self) -> None:
         """Take it that the array holds no sequence."""
@@ -197,9 +201,9 @@ class Sequencer:
         ):
             for line, mode in enumerate(modes):
                 self._check_line(kind, line, lines)
-                if not 0 <= mode <= _MOST_PATTERNS:
+                if not 0 <= mode <= MOST_PATTERNS:
                     raise LimitError(
-                        array.name, f"trigger {kind} {line} takes no mode {mode}.", f"0 to {_MOST_PATTERNS}."
+                        array.name, f"trigger {kind} {line} takes no mode {mode}.", f"0 to {MOST_PATTERNS}."
                     )
 
     def _check_line(self, kind: str, line: int, lines: int) -> None:

@@ -90,6 +90,7 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
         )
         self._woken = threading.Event()
         self._streaming = False
+        self._binning = 1
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
@@ -129,11 +130,11 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
         self._trigger_mode = "free_run"
         self._binnings = self._read_binnings()
         self._set_raw_binning(min(self._binnings))
-        with words(self.name, "read its whole sensor", "Does its adapter support regions?"):
-            self._core.clearROI()
+        self._clear_region()
         unit = self._binning
         self._sensor = (self._core.getImageHeight() * unit, self._core.getImageWidth() * unit)
         camera.set_all(options.properties)
+        self._binning = self._binning_now()
         self._formats = self._read_formats()
         self._read_shape()
         self._exposure_ms = float(camera.call("say its exposure", "getExposure"))
@@ -236,6 +237,7 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
     def _read_shape(self) -> None:
         """Note what the camera sends as it is set now."""
         core, name = self._core, self.options.pixel_type_property
+        core.setCameraDevice(self._camera.label)  # what follows is asked of the core's camera of the moment
         self._bytes = int(core.getBytesPerPixel())
         self._components = int(core.getNumberOfComponents())
         self._bits = int(core.getImageBitDepth())
@@ -248,7 +250,7 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
         self._format = "RGB8" if self._components == 4 else f"Mono{8 * self._bytes}"
         if self._camera.has(name):
             self._format = genicam_name(self._camera.text(name)) or self._format
-        self._formats.setdefault(self._format, "")
+        self._formats.setdefault(self._format, self._camera.text(name) if self._camera.has(name) else "")
         unit = self._binning
         left, top, width, height = (edge * unit for edge in core.getROI(self._camera.label))
         self._roi = Roi(top, left, height, width)
@@ -276,7 +278,8 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
         self._require_idle("pixel format")
         self._require_offered("pixel format", pixel_format, self.pixel_formats)
         if pixel_format != self._format:
-            self._camera.set(self.options.pixel_type_property, self._formats[pixel_format])
+            value = self._formats[pixel_format]
+            self._as_told(self.options.pixel_type_property, value)
             self._read_shape()
         self._remember("pixel_format", lambda: self.set_pixel_format(pixel_format))
         return self._format
@@ -294,8 +297,7 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
             raise self._no_region(asked, f"Regions lie within {whole.as_tuple()}, in steps of {unit}.")
         before = self._roi
         if asked == whole:
-            with words(self.name, "read its whole sensor", "Does its adapter support regions?"):
-                self._core.clearROI()
+            self._clear_region()
         else:
             self._camera.call(f"read the region {asked.as_tuple()}", "setROI", left, top, width, height)
         self._read_shape()
@@ -320,8 +322,30 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
 
     def _set_raw_binning(self, binning: int) -> None:
         if self._binnings[binning]:
-            self._camera.set("Binning", self._binnings[binning])
+            self._as_told("Binning", self._binnings[binning])
         self._binning = binning
+
+    def _binning_now(self) -> int:
+        """Return the binning that the camera says it has."""
+        match = _BINNING.match(self._camera.text("Binning").strip()) if self._camera.has("Binning") else None
+        return int(match[1]) if match else 1
+
+    def _as_told(self, name: str, value: str) -> None:
+        """Set a choice and read it back.
+
+        Raises DeviceError with both values when the camera has another one.
+        """
+        made = self._camera.set(name, value)
+        if made != value:
+            raise DeviceError(
+                self.name, f"was told {name} = {value!r} and says {made!r}.", "Check its adapter."
+            )
+
+    def _clear_region(self) -> None:
+        """Read the whole sensor, of this camera, whichever the core has for its own at the moment."""
+        with words(self.name, "read its whole sensor", "Does its adapter support regions?"):
+            self._core.setCameraDevice(self._camera.label)
+            self._core.clearROI()
 
     @property
     def binning(self) -> int:
@@ -340,8 +364,7 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
         self._require_idle("binning")
         self._require_offered("binning", binning, self.binnings)
         self._set_raw_binning(binning)
-        with words(self.name, "read its whole sensor", "Does its adapter support regions?"):
-            self._core.clearROI()
+        self._clear_region()
         self._read_shape()
         self._forget("roi")
         self._remember("binning", lambda: self.set_binning(binning))

@@ -15,7 +15,7 @@ from drivers.device import DriverOptions, SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.frame import Frame
 from drivers.remote.device import RemoteDevice, filled_in
-from drivers.remote.wire import load_error, unpack_frame
+from drivers.remote.wire import Assembly, load_error
 
 if TYPE_CHECKING:
     import aiohttp
@@ -69,16 +69,12 @@ class RemoteCamera(RemoteDevice, Camera):
         """Put frames into the ring in their order, whatever the order in which they come."""
         import aiohttp
 
-        early: dict[int, Frame] = {}
-        expected = 0
+        assembly = Assembly()
         ended: DeviceError | None = None
         async for message in stream:
             if message.type is aiohttp.WSMsgType.BINARY:
-                frame, number = unpack_frame(message.data)
-                early[number] = frame
-                while expected in early:
-                    self._put(stream, early.pop(expected))
-                    expected += 1
+                for frame in assembly.add(message.data):
+                    self._put(stream, frame)
             elif message.type is aiohttp.WSMsgType.TEXT and "error" in (said := json.loads(message.data)):
                 ended = load_error(self.name, said["error"])
         if ended is None and self._stream is stream:

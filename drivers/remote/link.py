@@ -227,7 +227,7 @@ class Link:
             self.require()
         data = self._wait(self._request(call, arguments))
         if call.gives.is_frame:
-            return unpack_frame(data)[0]
+            return unpack_frame(data)
         return call.gives.load(json.loads(data)["value"])
 
     async def _request(self, call: Call, arguments: Mapping[str, Any]) -> bytes:

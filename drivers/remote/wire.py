@@ -23,7 +23,7 @@ import io
 import json
 import struct
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from types import FunctionType
@@ -216,6 +216,8 @@ def load_error(device: str, said: Mapping[str, str]) -> errors.DeviceError:
 # Frames ---
 _LENGTH = struct.Struct("<I")
 _ALIGNED = 8
+_PIECE = struct.Struct("<IQQ")
+_PIECE_BYTES = 1 << 18
 
 
 @functools.cache
@@ -223,14 +225,10 @@ def _metadata() -> TypeAdapter[FrameMetadata]:
     return TypeAdapter(FrameMetadata)
 
 
-def pack_frame(frame: Frame, number: int = 0) -> list[bytes | memoryview]:
-    """Return a frame as parts of one message: the length of a JSON object, the object, the pixels.
-
-    ``number`` is the frame's place among those sent, from 0.
-    """
+def pack_frame(frame: Frame) -> bytes:
+    """Return a frame as bytes: the length of a JSON object, the object, the pixels."""
     said = json.dumps(
         {
-            "number": number,
             "shape": frame.image.shape,
             "bits": 8 * frame.image.dtype.itemsize,
             "metadata": _metadata().dump_python(frame.metadata, mode="json", warnings=False),
@@ -239,11 +237,49 @@ def pack_frame(frame: Frame, number: int = 0) -> list[bytes | memoryview]:
     ).encode()
     said += b" " * (-(len(said) + _LENGTH.size) % _ALIGNED)
     pixels = np.ascontiguousarray(frame.image, dtype=frame.image.dtype.newbyteorder("<"))
-    return [_LENGTH.pack(len(said)), said, pixels.data.cast("B")]
+    return b"".join([_LENGTH.pack(len(said)), said, pixels.data.cast("B")])
 
 
-def unpack_frame(message: bytes) -> tuple[Frame, int]:
-    """Return a frame, whose image looks at the message, and its number; it reached this computer now.
+def pieces(frame: Frame, number: int) -> list[bytes]:
+    """Return a sequence's frame in messages of at most a quarter of a megabyte.
+
+    Each says the frame's number, from 0, the frame's size and its own place in it: a message that is whole
+    keeps a connection, and its thread, busy for long.
+    """
+    whole = pack_frame(frame)
+    return [
+        _PIECE.pack(number, len(whole), place) + whole[place : place + _PIECE_BYTES]
+        for place in range(0, len(whole), _PIECE_BYTES)
+    ]
+
+
+class Assembly:
+    """Puts frames together from their pieces, in whatever order these come, and gives them in theirs."""
+
+    def __init__(self) -> None:
+        self._parts: dict[int, tuple[bytearray, list[int]]] = {}
+        self._expected = 0
+
+    def add(self, piece: bytes) -> Iterator[Frame]:
+        """Take a piece; yields the frames that are whole by it, the oldest first.
+
+        Raises ValueError when it is none.
+        """
+        try:
+            number, size, place = _PIECE.unpack_from(piece)
+        except struct.error as error:
+            raise ValueError(f"no piece of a frame: {error}") from None
+        whole, left = self._parts.setdefault(number, (bytearray(size), [size]))
+        whole[place : place + len(piece) - _PIECE.size] = memoryview(piece)[_PIECE.size :]
+        left[0] -= len(piece) - _PIECE.size
+        while (first := self._parts.get(self._expected)) is not None and first[1] == [0]:
+            del self._parts[self._expected]
+            self._expected += 1
+            yield unpack_frame(first[0])
+
+
+def unpack_frame(message: bytes | bytearray) -> Frame:
+    """Return a frame, whose image looks at the message; it reached this computer now.
 
     Raises ValueError when the message is no frame.
     """
@@ -254,7 +290,6 @@ def unpack_frame(message: bytes) -> tuple[Frame, int]:
         metadata = _metadata().validate_python(said["metadata"])
         pixels = np.frombuffer(message, "<u1" if said["bits"] == 8 else "<u2", offset=begin)
         image = pixels.reshape(said["shape"])
-        number = int(said["number"])
     except (struct.error, KeyError, TypeError) as error:
         raise ValueError(f"no frame: {error!r}") from None
-    return Frame(image, replace(metadata, host_time_ns=time.monotonic_ns(), utc=datetime.now(UTC))), number
+    return Frame(image, replace(metadata, host_time_ns=time.monotonic_ns(), utc=datetime.now(UTC)))

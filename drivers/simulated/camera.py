@@ -94,6 +94,7 @@ class SimulatedCamera(SimulatedCameraSettings):
                 "takes no single frame in trigger mode 'hardware': nothing sends it a pulse.",
                 "Set trigger mode 'free_run', or play a sequence.",
             )
+        self.world.clock.wait(1e-3 * self.options.start_ms, self._abort)
         return self._take()
 
     def start_sequence(self, n_buffers: int = 8) -> None:
@@ -101,6 +102,8 @@ class SimulatedCamera(SimulatedCameraSettings):
         self._require_idle("second sequence")
         if n_buffers < 1:
             raise LimitError(self.name, f"cannot stream into {n_buffers} buffers.", "Ask for one or more.")
+        self._abort.clear()
+        self.world.clock.wait(1e-3 * self.options.start_ms, self._abort)
         with self._arrived:
             self._ring = deque(maxlen=n_buffers)
             self._triggers = 0
@@ -173,21 +176,21 @@ class SimulatedCamera(SimulatedCameraSettings):
             while not self._abort.is_set():
                 if self._trigger_mode == "software" and not self._await_trigger():
                     return
+                received = self._await_pulse() if self._trigger_mode == "hardware" else None
                 if self._trigger_mode == "hardware":
-                    received = self._await_pulse()
                     if received is None:
                         return
                     frame = self._take(received.pulse)
-                    received.seen.set()
                 else:
-                    frame = self._take()
+                    received, frame = None, self._take()
                 with self._arrived:
                     if len(self._ring) == self._ring.maxlen:
                         self._ring.popleft()
                         self._lost += 1
                     self._ring.append(frame)
                     self._arrived.notify_all()
-                if self._trigger_mode == "hardware":
+                if received is not None:
+                    received.seen.set()
                     continue
                 rate = self.options.frames_per_s or self._spec.frames_per_s
                 period = max(1 / rate, self._exposure_ms * 1e-3) * self.world.clock.time_scale

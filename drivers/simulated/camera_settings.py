@@ -35,6 +35,11 @@ class CameraOptions(DriverOptions):
     frames_per_s: float | None = Field(
         None, gt=0, description="Highest frame rate of a sequence; left out: the sensor's."
     )
+    start_ms: float = Field(
+        0.0,
+        ge=0,
+        description="From the start of a snap or a sequence to the first exposure: none by default.",
+    )
     replay_frames: int = Field(
         0,
         ge=0,

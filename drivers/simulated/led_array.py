@@ -28,6 +28,7 @@ class LedArrayOptions(DriverOptions):
     leds: int = Field(257, ge=1, le=10_000, description="Number of LEDs.")
     led_pitch_mm: float = Field(4.0, gt=0, description="Spacing of the LEDs.")
     distance_mm: float = Field(60.0, gt=0, description="From the array to its centre of view.")
+    command_ms: float = Field(0.0, ge=0, description="What one command takes: none by default.")
 
 
 class SimulatedLedArray(SimulatedDevice, LedArray):
@@ -102,6 +103,8 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
         """Show a pattern."""
         self._require()
         self.check(pattern)
+        self._darkened.clear()
+        self.world.clock.wait(1e-3 * self.options.command_ms, self._darkened)
         self._show(pattern)
         return self._pattern
 
@@ -122,6 +125,9 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
         self._check_sequence(len(patterns), period_ms, output)
         for pattern in patterns:
             self.check(pattern)
+        if self._armed is None or self._armed[0] != tuple(patterns):  # each is a command
+            self._darkened.clear()
+            self.world.clock.wait(1e-3 * self.options.command_ms * len(patterns), self._darkened)
         self._armed = (tuple(patterns), period_ms)
         return period_ms
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import pytest
 
 from drivers.device import Device
-from drivers.errors import DeviceNotOpenError
+from drivers.errors import DeviceError, DeviceNotOpenError, LimitError
+from drivers.sequence import PlaysSequences
 
 
 class DeviceContract:
@@ -67,3 +71,24 @@ def _fails_inside(device: Device) -> bool:
             raise RuntimeError("on purpose")
     except RuntimeError as error:
         return str(error) == "on purpose"
+
+
+def check_sequences(device: PlaysSequences[Any], patterns: Sequence[Any]) -> None:
+    """Hold a device to what it says of its sequences; one that plays none refuses them."""
+    limits = device.sequence_limits
+    if limits is None:
+        with pytest.raises(LimitError, match="plays no sequences"):
+            device.arm(patterns, 100.0)
+        return
+    with pytest.raises(DeviceError, match="no sequence"):
+        device.play()
+    with pytest.raises(LimitError):
+        device.arm([], 100.0)
+    with pytest.raises(LimitError):
+        device.arm(patterns, limits.shortest_ms / 2)
+    with pytest.raises(LimitError):
+        device.arm(patterns, 100.0, limits.outputs)
+    period_ms = max(5.0, limits.shortest_ms)
+    assert device.arm(patterns, period_ms) >= period_ms
+    device.play()
+    device.play()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from drivers.errors import LimitError
-from drivers.led_array import LedArray, LedPattern
-from drivers.testing.device import DeviceContract
+from drivers.led_array import OFF, LedArray, LedPattern
+from drivers.testing.device import DeviceContract, check_sequences
 
 
 class LedArrayContract(DeviceContract):
@@ -79,6 +79,12 @@ class LedArrayContract(DeviceContract):
             with pytest.raises(LimitError, match=f"LED {index}"):
                 leds.set_pattern(LedPattern("wrong", ((index, (1, 1, 1)),)))
         assert leds.pattern == shown
+
+    def test_a_sequence_ends_dark_and_wrong_ones_are_refused(self, leds: LedArray) -> None:
+        patterns = [leds.single(0), OFF, leds.single(0)]
+        check_sequences(leds, patterns)
+        if leds.sequence_limits is not None:
+            assert leds.pattern.is_dark
 
 
 def _inside(leds: LedArray, na: float) -> LedPattern:

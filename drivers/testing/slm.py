@@ -9,7 +9,7 @@ import pytest
 
 from drivers.errors import LimitError
 from drivers.slm import Slm
-from drivers.testing.device import DeviceContract
+from drivers.testing.device import DeviceContract, check_sequences
 
 
 class SlmContract(DeviceContract):
@@ -61,6 +61,11 @@ class SlmContract(DeviceContract):
         slm.display(np.full(slm.shape, 5, np.uint8))
         slm.blank()
         assert not slm.displayed.any()
+
+    def test_a_sequence_ends_with_what_was_shown_and_wrong_ones_are_refused(self, slm: Slm) -> None:
+        slm.display(np.full(slm.shape, 5, np.uint8))
+        check_sequences(slm, [np.full(slm.shape, level, np.uint8) for level in (0, 255)])
+        assert np.all(slm.displayed == 5)
 
     def test_pitch_and_settling_are_given(self, slm: Slm) -> None:
         assert slm.pixel_pitch_um > 0

@@ -23,7 +23,7 @@ from drivers.v4l2 import api
 from drivers.v4l2.controls import Control, Controls, Quantity
 from drivers.v4l2.device import FilledBuffer, VideoDevice
 from drivers.v4l2.formats import V4l2Format, decode
-from drivers.v4l2.images import Images, inside
+from drivers.v4l2.images import Images
 
 _SEQUENCE_MODULUS = 1 << 32
 _EXPOSURE_COUNT_MS = 0.1
@@ -338,7 +338,7 @@ class V4l2Camera(BufferedCamera):
         self._require_idle("region of interest")
         images = self._images
         whole = images.whole
-        wanted = whole if roi is None else inside(roi, 2 if images.format.pixels.bayer else 1)
+        wanted = whole if roi is None else roi.inside(2 if images.format.pixels.bayer else 1)
         if roi is not None and not (whole.contains(roi) and whole.contains(wanted)):
             raise self._no_region(roi, f"Its images have {whole.height} x {whole.width} pixels.")
         self._roi = images.cut(wanted)

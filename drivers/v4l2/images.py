@@ -202,7 +202,7 @@ class Images:
         if not self._can_crop or wanted == self.whole:
             return None
         # Drivers move regions to their steps, even out of what was asked: then once more on multiples of 8.
-        for region in (wanted, inside(wanted, 8)):
+        for region in (wanted, wanted.inside(8)):
             made = crop(self._device, region, self._origin) if region.height and region.width else None
             if made is None or not wanted.contains(made):
                 continue
@@ -215,11 +215,3 @@ class Images:
                 return made
         self.apply(self.format)
         return None
-
-
-def inside(region: Roi, step: int) -> Roi:
-    """Return the largest region inside another with all borders on multiples of ``step``."""
-    top, left = (-(-start // step) * step for start in (region.top, region.left))
-    bottom = (region.top + region.height) // step * step
-    right = (region.left + region.width) // step * step
-    return Roi(top, left, max(0, bottom - top), max(0, right - left))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -19,9 +20,9 @@ from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import LedArray, LedPattern
 from drivers.registry.claim import Claim
 from drivers.slm import Slm
-from drivers.stage import Stage
+from drivers.stage import Stage, approached
 from instrument.bench.camera_settings import apply_table
-from instrument.bench.config import BenchConfig, CameraTable, Kind, SlmTable
+from instrument.bench.config import BenchConfig, CameraTable, Kind, SlmTable, StageTable
 from instrument.bench.config_file import load_config
 from instrument.bench.photograph import Progress, Snapshot, photograph
 from instrument.bench.safety import ClosingAtExit, SafeStep, StepsFailedError, safe_steps, try_all
@@ -57,6 +58,8 @@ class Bench:
             for kind, device in config.devices.items()
         }
         switch = next((part for part in self.shared.values() if isinstance(part, SceneSwitch)), None)
+        self._seated: dict[str, float] = {}
+        """Axes that came to where they are from below, and where that is."""
         self.newest_frame: Frame | None = None
         """The last frame of a photograph, whoever took it: what a window shows while a run goes on."""
         self._lights = Lights(config.source, config.scene, self.led_array, switch, ask)
@@ -257,8 +260,23 @@ class Bench:
             The place reached, as the stage reads.
         """
         mount = self.source_mount
-        mount.stage.move_to(mount.target(x_um, y_um, z_um))
+        stage, target = mount.stage, mount.target(x_um, y_um, z_um)
+        here, play = stage.position(), self.play
+        seated = {
+            axis.name
+            for axis in stage.axes
+            if abs(self._seated.get(axis.name, math.inf) - here[axis.name]) <= stage.settles_within(axis)
+        }
+        for place in approached(here, target, play, seated):
+            reached = stage.move_to(place)
+        self._seated |= {name: reached[name] for name in target if name in play}
         return mount.position_um
+
+    @property
+    def play(self) -> Mapping[str, float]:
+        """Play of the stage's axes, as configured; those that are left out have none."""
+        stage = self.config.devices.get("stage")
+        return {} if stage is None else cast(StageTable, stage.settings).play
 
     @property
     def source_pattern(self) -> LedPattern:

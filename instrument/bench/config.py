@@ -64,6 +64,14 @@ class CameraTable(Table):
 class StageTable(Table):
     """Settings that every stage has."""
 
+    play: dict[str, Annotated[float, Field(gt=0)]] = Field(
+        default_factory=dict,
+        description=(
+            "Play of the axes' screws by name, as calibrate stage measures it: the source comes to every "
+            "place from one side."
+        ),
+    )
+
 
 class LedArrayTable(Table):
     """Settings that every LED array has."""
@@ -149,7 +157,8 @@ class DisplayTable(Table):
     expansion: int = Field(
         16,
         ge=1,
-        description="Étendue expansion: mask pixels in the area of one (binned) SLM pixel; a square.",
+        description="Étendue expansion: mask pixels in the area of one (binned) SLM pixel; a square. "
+        "1: without a mask.",
     )
     mask_file: str | None = Field(
         None,

@@ -81,8 +81,7 @@ def photograph(
     total = np.zeros((), np.float64)
     metadata: list[FrameMetadata] = []
     for taken in range(1, average + 1):
-        limit_s = camera.longest_silence_s + 3 * camera.exposure_ms / 1e3 + CALL_MARGIN_S
-        frame = within(limit_s, camera.name, "an exposure", camera.snap)
+        frame = within(camera.longest_wait_s + CALL_MARGIN_S, camera.name, "an exposure", camera.snap)
         metadata.append(frame.metadata)
         if average > 1:
             total = np.add(total, frame.image)

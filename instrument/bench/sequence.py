@@ -35,16 +35,22 @@ MOST_BYTES = 256 * 2**20
 """Memory for the frames of one sequence, which are kept until all are known to be right."""
 _MARGIN = 1.02
 """Between the shortest period and the one that is played: clocks differ."""
+_JITTER_MS = 0.5
+"""By which a pulse may be late without the next one finding the camera busy."""
 _LATE = 0.25
 """Share of the period by which a frame may be late, where its exposure leaves so much time."""
 _CLOCKS = 0.01
 """Share of the period that the clocks themselves are allowed."""
+_OTHER_CLOCK = 0.05
+"""Share by which a source's period may be another than it said: some count their own work beside it."""
 _HEAD, _FOLLOW = 9, 0.1
 """Frames that tell where the grid of times is, and how quickly it follows the frames."""
 _NAMED = 5
 """Frames of a kind of fault that are named."""
 _QUIET_S = 0.05
 """After a sequence, for a frame too many to come."""
+_MISSING_S = 0.5
+"""After a sequence, for frames that are still on their way where some have not come."""
 _DARKER = 5.0
 """Standard errors by which the dark frame before a lit one must be darker."""
 _EARLY = 0.1
@@ -93,7 +99,7 @@ class Wire:
                 f"[trigger] period_ms = {asked:g}, but an exposure of {exposure_ms:g} ms with read-out and "
                 f"settling needs {least:g} ms. Expose shorter, or leave period_ms out."
             )
-        return asked if asked is not None else _MARGIN * least
+        return asked if asked is not None else _MARGIN * least + _JITTER_MS
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,15 +196,18 @@ def _played(
     player.start()
     frames: list[Frame] = []
     quiet_s = max(_QUIET_S, 2e-3 * period_ms)
-    silent_since_s = time.monotonic()
+    silent_since_s, ended_s = time.monotonic(), math.inf
     try:
         while True:
             try:
                 frame = camera.next_frame(quiet_s)
             except DeviceTimeoutError:
                 if not player.is_alive():
-                    break
-                if time.monotonic() - silent_since_s > camera.longest_silence_s + 1e-3 * (count * period_ms):
+                    ended_s = min(ended_s, time.monotonic())
+                    if failed or len(frames) >= count or time.monotonic() - ended_s > _MISSING_S:
+                        break
+                    continue
+                if time.monotonic() - silent_since_s > camera.longest_wait_s + 1e-3 * (count * period_ms):
                     raise
                 continue
             silent_since_s = time.monotonic()
@@ -278,6 +287,9 @@ def _placed(
     The grid is the one that most of the first frames are on; it follows the slow drift of one clock against
     the other.
     """
+    measured_ms = float(np.median(np.diff(times_ms))) if len(times_ms) > _HEAD else period_ms
+    if abs(measured_ms / period_ms - 1) < _OTHER_CLOCK:
+        period_ms = measured_ms
     head = times_ms[:_HEAD]
     off_grid = (head - head[:, None]) / period_ms
     reference_ms = head[np.argmax((abs(off_grid - np.round(off_grid)) <= slack).sum(axis=1))]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drivers.errors import DeviceError, LimitError
-from instrument.cli.options import GroupedCommand, flat
+from instrument.cli.options import USAGE_ERROR, GroupedCommand, flat
 from instrument.files.errors import BenchError, OperatorNeededError, in_words
 from recon.base.declare import option
 
@@ -153,8 +153,6 @@ def _changed_ns(file: Path) -> int | None:
 
 DEBUG_VARIABLE = "DIFFUSERBENCH_DEBUG"
 INTERRUPTED = 130
-# What typer raises for wrong options; its public subclass is the stable way to name it.
-_UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 class Terminated(SystemExit):
@@ -176,7 +174,7 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt | Terminated):
             _be_silent_about_half_made_objects()
-        if debug and not isinstance(error, _UsageError | typer.Abort | typer.Exit | SystemExit):
+        if debug and not isinstance(error, USAGE_ERROR | typer.Abort | typer.Exit | SystemExit):
             raise
         return report(error)
     return 0
@@ -202,7 +200,7 @@ def report(error: BaseException) -> int:
     """Say on stderr what went wrong and return the exit status; what is no known mistake is raised again."""
     if isinstance(error, typer.Exit):
         return error.exit_code
-    if isinstance(error, _UsageError):
+    if isinstance(error, USAGE_ERROR):
         error.show()  # type: ignore[attr-defined]
         return 2
     if isinstance(error, SystemExit):

@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
-import click
 import typer
 
 from instrument.cli.app import App, BenchOption, examples, load_and_say
@@ -20,6 +19,8 @@ if TYPE_CHECKING:
 
     from drivers.device import Device, FoundDevice, Setting
     from drivers.registry.registry import Listing
+    from drivers.sequence import SequenceLimits
+    from instrument.bench.bench import Bench
 
 new_app, check_app, drivers_app, devices_app, gui_app = App(), App(), App(), App(), App()
 
@@ -89,8 +90,10 @@ def _asked_for(templates: Mapping[str, tuple[str, str]]) -> str:
     names = list(templates)
     for number, (what, _) in enumerate(templates.values(), 1):
         typer.echo(f"  {number}  {what}", err=True)
-    number = typer.prompt("Which bench", type=click.IntRange(1, len(names)), default=1, err=True)
-    return names[int(number) - 1]
+    answer = str(typer.prompt("Which bench", default="1", err=True)).strip()
+    if not answer.isdecimal() or not 1 <= int(answer) <= len(names):
+        raise BenchError(f"There is no bench {answer!r}: a number from 1 to {len(names)} is expected.")
+    return names[int(answer) - 1]
 
 
 def _found_lines() -> str:
@@ -105,23 +108,51 @@ def _found_lines() -> str:
 
 
 @check_app.command(
-    epilog=examples("diffuserbench check", "diffuserbench check --bench benches/microscope.toml")
+    epilog=examples(
+        "diffuserbench check",
+        "diffuserbench check --bench benches/microscope.toml",
+        "diffuserbench check --thorough          and write a report to send",
+    )
 )
-def check(bench: BenchOption = None) -> None:
+def check(
+    bench: BenchOption = None,
+    thorough: Annotated[
+        bool,
+        typer.Option(
+            "--thorough",
+            help="Use the devices too (light, pictures, photographs), and write a report of it.",
+        ),
+    ] = False,
+    move: Annotated[
+        bool,
+        typer.Option("--move", help="With --thorough: move axes of a homed stage by little, and back."),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="The report, by default bench-report-DATE.txt."),
+    ] = None,
+) -> None:
     """Open every device that the bench configuration names, report identity, settings and limits of each.
 
-    Ends with the light off. Nothing moves. Exit status 1 when a device fails; all failures are reported.
+    Ends with the light off. Nothing moves without --move. Exit status 1 when a device fails; all failures
+    are reported. The report has the configuration, what every device says of itself, and the measurements.
     """
     from rich.console import Console
 
     from drivers.errors import DeviceError
     from instrument.bench.bench import Bench
     from instrument.bench.safety import StepsFailedError
+    from instrument.files.atomic import require_new
 
-    console = Console()
+    if (move or out is not None) and not thorough:
+        raise BenchError("--move and --out belong to --thorough.")
+    if out is not None:
+        require_new(out)
+    console = Console(record=thorough)
     config = load_and_say(bench)
     opened = Bench(config)
     failures: list[str] = []
+    measured: list[str] = []
     try:
         for kind in opened.devices:
             try:
@@ -130,11 +161,16 @@ def check(bench: BenchOption = None) -> None:
             except DeviceError as error:
                 failures.append(str(error))
         label = opened.label
+        if thorough and not failures:
+            measured = _measured(opened, failures, moves=move)
     finally:
         try:
             opened.close()
         except StepsFailedError as error:
             failures.append(str(error))
+    if thorough:
+        file = _write_report(out, config.text, console.export_text(), measured, failures)
+        typer.echo(f"Report: {file}")
     if failures:
         for failure in failures:
             typer.echo(f"FAILED  {failure}", err=True)
@@ -142,6 +178,44 @@ def check(bench: BenchOption = None) -> None:
         raise typer.Exit(1)
     console.print(f"All {len(opened.devices)} devices answer: {label}", markup=False, soft_wrap=True)
     console.print("Light off, nothing moving, devices closed.")
+
+
+def _measured(bench: Bench, failures: list[str], *, moves: bool) -> list[str]:
+    """Measure what only hardware can tell, saying each finding; failures are added to those there are."""
+    from instrument.bench.thorough import thorough
+
+    lines = []
+    for finding in thorough(bench, moves=moves):
+        lines.append(str(finding))
+        typer.echo(lines[-1])
+        if finding.failed:
+            failures.append(f"{finding.device}: {finding.test}: {finding.words}")
+    return lines
+
+
+def _write_report(
+    out: Path | None, configuration: str, said: str, measured: list[str], failures: list[str]
+) -> Path:
+    """Write what a lab sends to whoever is to help: versions, configuration, devices, measurements."""
+    import platform
+    from importlib.metadata import version
+
+    from instrument.files.atomic import write_text
+    from instrument.runs.writer import dated_name, free_name
+
+    file = out or free_name(Path(), f"bench-report-{dated_name('check')}", ".txt")
+    head = (
+        f"diffuserbench {version('diffuserbench')}, Python {platform.python_version()}, {platform.platform()}"
+    )
+    parts = {
+        "Measured": "\n".join(measured) or "nothing: a device failed before",
+        "Failures": "\n".join(failures) or "none",
+        "Devices": said.rstrip(),
+        "bench.toml": configuration.rstrip(),
+    }
+    sections = "".join(f"\n{name}\n{'-' * len(name)}\n{text}\n" for name, text in parts.items())
+    write_text(file, f"{head}\n{sections}")
+    return file
 
 
 def _print_device(console: Console, kind: str, device: Device) -> None:
@@ -183,6 +257,9 @@ def _limits(device: Device) -> Iterator[tuple[str, str]]:
         yield "gain limits", "{:g} to {:g}".format(*device.gain_limits)
         yield "binnings", _text(device.binnings)
         yield "pixel formats", _text(device.pixel_formats)
+        yield "trigger modes", _text(device.trigger_modes)
+        if device.trigger_lines:
+            yield "trigger lines", _text(device.trigger_lines)
     elif isinstance(device, Stage):
         for axis in device.axes:
             yield (
@@ -194,10 +271,21 @@ def _limits(device: Device) -> Iterator[tuple[str, str]]:
         yield "LEDs", str(len(device.led_positions_mm))
         yield "wavelengths", f"{_text(device.wavelengths_nm)} nm"
         yield "largest NA", f"{float(cast(float, abs(device.led_na).max())):.3g}"
+        yield "sequences", _sequences(device.sequence_limits)
     elif isinstance(device, Slm):
         yield "pixels", "{} x {}".format(*device.shape)
         yield "pixel pitch", f"{device.pixel_pitch_um:g} um"
         yield "settle time", f"{device.settle_ms:g} ms"
+        yield "sequences", _sequences(device.sequence_limits)
+
+
+def _sequences(limits: SequenceLimits | None) -> str:
+    if limits is None:
+        return "none with pulses"
+    return (
+        f"up to {limits.most} patterns, {limits.shortest_ms:g} ms or more apart, "
+        f"{limits.outputs} trigger output{'' if limits.outputs == 1 else 's'}"
+    )
 
 
 def _text(value: Setting) -> str:

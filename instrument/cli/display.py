@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,18 +14,21 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from instrument.bench.config import BenchConfig
 from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
 from instrument.cli.progress import first_interrupt_cancels, one_task, progress_bar
 from instrument.display.hologram import (
     HologramResult,
     bench_display,
     compute_and_judge,
+    crop_words,
     load_alignment,
     prepare_target,
     read_weights,
     slm_size,
 )
 from instrument.display.hologram_files import HologramFiles, rows, write_chart, write_csv
+from instrument.display.spots import SpotFiles, spots_of
 from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image, read_stack
@@ -38,11 +42,16 @@ from recon.holography import (
     HologramRecord,
     HologramStop,
     Target,
+    compute_spots,
     eyebox_for_field_of_view,
     field_of_view_for_eyebox,
+    hologram_limit,
     pixels_for,
+    pixels_per_degree,
 )
 from recon.holography.judge import GRIDS, METHODS, Cell, run_table
+from recon.holography.limit import BANDS
+from recon.holography.target import make_band
 
 hologram_app, etendue_app, table_app = App(), App(), App()
 
@@ -145,7 +154,7 @@ def etendue(options: EtendueOptions) -> None:
             f"{x.mask_pitch_um:.2f} um",
             f"{x.field_of_view_deg:.1f} deg square",
             f"{x.eyebox_mm:.2f} x {y.eyebox_mm:.2f} mm",
-            f"{x.pixels_per_degree:.0f} x {y.pixels_per_degree:.0f} px/deg",
+            f"{pixels_per_degree(x, y):.0f} px/deg",
             f"{x.etendue_mm:.3f} mm",
         )
     console.print(table)
@@ -225,6 +234,18 @@ def _print_table(cells: list[Cell], note: str) -> None:
 class HologramInputs:
     """What is shown, for which display, and where the pattern goes."""
 
+    spots: str | None = option(
+        None,
+        help="Spots instead of a picture: an even array, 10x10, or a CSV file with columns y, x (fractions "
+        "of the field from the top left), and where wanted intensity, z_mm.",
+        metavar="ROWSxCOLUMNS|FILE",
+        group="Files",
+    )
+    limit: bool = option(
+        False,
+        help="Compute no pattern: say what any number of frames could reach for this picture, mask and SLM.",
+        group="What counts",
+    )
     z_mm: tuple[float, ...] = option(
         (),
         help="Depth of each target behind the focal plane; once a target.",
@@ -265,24 +286,39 @@ class HologramInputs:
         "diffuserbench hologram picture.png --frames 2 --psnr 30 --out slm.png",
         "diffuserbench hologram frames/ --video --iterations 10 --out video.png",
         "diffuserbench hologram colour.png --color --out slm.png",
+        "diffuserbench hologram picture.png --limit",
+        "diffuserbench hologram --spots 10x10 --expansion 1 --out spots.png",
     )
 )
 def hologram(
-    target: Annotated[list[Path], typer.Argument(metavar="TARGET...", help="The picture, or one per plane.")],
     inputs: HologramInputs,
     options: HologramOptions,
+    target: Annotated[
+        list[Path] | None, typer.Argument(metavar="[TARGET...]", help="The picture, or one per plane.")
+    ] = None,
     bench: BenchOption = None,
 ) -> None:
-    """Compute the SLM phase that shows a picture through the bench's scattering mask.
+    """Compute the SLM phase that shows a picture through the bench's scattering mask, or without one.
+
+    --expansion 1 is an ordinary hologram, without a mask. --spots takes the place of a picture: weighted
+    Gerchberg-Saxton makes spots as bright as asked for, at any places and depths.
 
     Writes the pattern, a JSON file with settings and metrics, and a preview of what will be seen with and
     without the eye's low-pass (computed, not photographed). Ctrl-C keeps the pattern so far.
     """
+    if (inputs.spots is None) == (not target):
+        raise BenchError("Give a TARGET picture, or --spots.")
     config = load_and_say(bench)
     size = slm_size(config)
+    if inputs.spots is not None:
+        _spots(inputs, options, config, size)
+        return
+    assert target is not None
     if inputs.weights is not None:
         options = replace(options, weights=read_weights(inputs.weights))
     pictures = _frames(target, video=inputs.video)
+    if said := next(filter(None, (crop_words(p, options.fit) for planes in pictures for p in planes)), ""):
+        typer.echo(said, err=True)
     depths = inputs.depths(1 if inputs.video else len(target))
     lasers = inputs.wavelengths if inputs.color else (None,)
     displays = [
@@ -292,6 +328,11 @@ def hologram(
     if inputs.alignment is not None:
         found = load_alignment(inputs.alignment)
         displays = [found.of(display) for display in displays]
+    if inputs.limit:
+        if inputs.color or inputs.video or len(target) > 1:
+            raise BenchError("--limit is for one picture in one plane and colour.")
+        _limit(pictures[0][0], displays[0], options, depths[0])
+        return
     frames = len(pictures) if inputs.video else 0
     writer = HologramFiles(inputs.out, config.display.slm_binning, options, displays, video=frames)
     writer.check(overwrite=inputs.force)
@@ -313,6 +354,99 @@ def hologram(
                 if result.hologram.stop_reason is HologramStop.CANCELLED:
                     typer.echo("Interrupted: this is the pattern so far.", err=True)
                     raise typer.Exit(130)
+
+
+LIFTS = (0.1, 0.3)
+"""How far black is lifted where the limit says what would help."""
+
+
+def _limit(picture: Pixels, display: Display, options: HologramOptions, z_mm: float) -> None:
+    """Say what could be reached, which frequencies fall short, and what would help."""
+    lifts = [options.lift, *(lift for lift in LIFTS if lift > options.lift)]
+    found = []
+    with first_interrupt_cancels() as cancel:
+        for lift in lifts:
+            target = prepare_target(picture, display, replace(options, lift=lift), z_mm=z_mm)
+            with one_task("limit" if lift == options.lift else f"black at {lift:g}", LIMIT_STEPS) as advance:
+
+                def show(record: HologramRecord, _slm: object, advance: Any = advance) -> None:
+                    advance(float(record.iteration), note=f"{record.psnr_db:.2f} dB")
+
+                steps = replace(options, iterations=min(options.iterations, LIMIT_STEPS))
+                found.append(hologram_limit(display, target, steps, callback=show, cancel=cancel))
+            if found[-1].stop_reason is HologramStop.CANCELLED:
+                typer.echo(
+                    "Interrupted: this is a bound all the same, less sharp than it could be.", err=True
+                )
+                break
+    here = found[0]
+    typer.echo(
+        f"limit: no number of frames shows this picture better than {_decibels(here.bound_db)} through this "
+        f"mask (a bound; {here.reached_db:.2f} dB is reached by what need not be frames of phases)"
+    )
+    least = display.factor / make_band(display.slm_shape, display.factor, "alias-free").cutoff
+    for (low, high), wanted, reached in zip(pairwise(BANDS), here.wanted, here.reached, strict=True):
+        why = ""
+        if reached < 0.7 and low < least:
+            why = "   set by the mask within an SLM pixel, not by the SLM"
+        elif reached < 0.7:
+            why = "   more contrast than so many SLM pixels can make"
+        typer.echo(
+            f"  {low:.2f} to {high:.2f} of the finest the eye resolves: contrast {wanted:.2f}, "
+            f"{reached:.0%} reached{why}"
+        )
+    for lift, better in zip(lifts[1:], found[1:], strict=False):
+        best = _decibels(better.bound_db)
+        typer.echo(f"  black at {lift:g} of white (--lift {lift:g}): at most {best} of it")
+
+
+def _decibels(bound_db: float) -> str:
+    return f"{bound_db:.2f} dB" if bound_db < 60 else "60 dB (no limit in sight)"
+
+
+LIMIT_STEPS = 60
+"""Iterations of the limit: bound and solution are then 0.3 dB apart at 16x."""
+
+
+def _spots(
+    inputs: HologramInputs,
+    options: HologramOptions,
+    config: BenchConfig,
+    size: tuple[tuple[int, int], float],
+) -> None:
+    """Compute a hologram of spots, say how even they are, write."""
+    given = [
+        flag
+        for flag, value in (("--video", inputs.video), ("--color", inputs.color), ("--z-mm", inputs.z_mm))
+        if value
+    ]
+    if given or inputs.weights is not None:
+        raise BenchError(f"{given[0] if given else '--weights'} does not apply to --spots.")
+    spots = spots_of(inputs.spots or "")
+    display = options.display_of(bench_display(config, size, expansion=options.expansion))
+    if inputs.alignment is not None:
+        display = load_alignment(inputs.alignment).of(display)
+    writer = HologramFiles(inputs.out, config.display.slm_binning, options, [display])
+    writer.check(overwrite=inputs.force)
+    with saying_what_is_left(*writer.files()), first_interrupt_cancels() as cancel:
+        with one_task("spots", options.iterations) as advance:
+
+            def show(record: HologramRecord, _slm: object) -> None:
+                advance(float(record.iteration), note=f"deviation {record.loss:.2%}")
+
+            found, scores = compute_spots(display, spots, options, callback=show, cancel=cancel)
+        SpotFiles(writer).write(spots, found, scores)
+    last = found.history[-1]
+    typer.echo(f"spots: {last.iteration} iterations, {found.seconds:.1f} s: {found.stop_reason}")
+    least, greatest = scores.relative.min(), scores.relative.max()
+    typer.echo(
+        f"  {len(spots)} spots: {least:.3f} to {greatest:.3f} of the brightness asked for, "
+        f"deviation {scores.deviation:.2%} (computed)"
+    )
+    typer.echo(f"  light: {scores.efficiency:.1%} of what falls on the SLM is in the spots")
+    if found.stop_reason is HologramStop.CANCELLED:
+        typer.echo("Interrupted: this is the pattern so far.", err=True)
+        raise typer.Exit(130)
 
 
 def _compute(

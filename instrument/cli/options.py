@@ -25,6 +25,8 @@ from recon.base.declare import RARE, Option, options_of
 from recon.base.option_text import help_text, metavar, read
 from recon.errors import InputError
 
+# What typer raises for wrong options; its public subclass is the stable way to name it.
+USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
 _MAIN = "Options"
 _WORDS = "words that were typed"
 _WIDEST_FLAG = 30
@@ -75,7 +77,39 @@ class GroupedCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Remember the flags as they were typed: of several names of an option messages say that one."""
         ctx.meta[_WORDS] = {word.partition("=")[0] for word in args}
-        return super().parse_args(ctx, args)
+        typed = list(args)
+        try:
+            return super().parse_args(ctx, args)
+        except USAGE_ERROR as error:
+            message = getattr(error, "message", "")
+            if "unexpected extra argument" in message and (meant := self._meant(ctx, typed)):
+                error.message = f"{message}. Did you mean {meant}?"  # type: ignore[attr-defined]
+            raise
+
+    def _meant(self, ctx: typer.Context, typed: list[str]) -> str:
+        """Guess the options that files without one were meant for; empty where there are none."""
+        options = [param for param in self.get_params(ctx) if param.param_type_name == "option"]
+        takes_value = {
+            f for o in options if not getattr(o, "is_flag", False) for f in (*o.opts, *o.secondary_opts)
+        }
+        flags = [flag for o in options for flag in o.opts if flag.startswith("--") and flag in takes_value]
+        files = [
+            w
+            for w, before in zip(typed, ["", *typed], strict=False)
+            if w[:1] != "-" and before not in takes_value
+        ]
+        meant: list[str] = []
+        for file in map(Path, files):
+            named = [flag for flag in flags if flag[2:] in file.name.lower() and flag != "--out"]
+            if (file / "calibration.json").exists() and "--calibration" in flags:
+                named = ["--calibration"]
+            if not file.exists():
+                named = ["--out"]
+            flag = named[0] if named else "--image"
+            if flag not in flags:
+                return ""
+            meant += [flag, str(file)]
+        return " ".join(meant)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write arguments and options, a definition list a group; close together where there are many."""

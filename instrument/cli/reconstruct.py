@@ -44,7 +44,6 @@ class _Asked:
 @app.command(
     epilog=examples(
         "diffuserbench reconstruct --psf psf.tif --image raw.tif --dark dark.tif --bin 4 --out hand.tif",
-        "diffuserbench reconstruct --psf psf.npy --image raw.npy --solver fista --prior l1 --time 30",
         "diffuserbench reconstruct --calibration demo/calibration --image photo.tif --z-mm 30 --rotate 180",
         "diffuserbench reconstruct --volume psfs/ --image raw.tif --prior l1 --checkpoint kept/ --out v.tif",
         "diffuserbench reconstruct --volume field/ --image photo.tif --explain",
@@ -75,7 +74,10 @@ def reconstruct(
     elif source.video:
         _video(asked, run)
     elif run is not None:
-        raise BenchError("RUN: for videos; give --video as well, or leave it out.")
+        raise BenchError(
+            "RUN: for videos; give --video as well, or leave it out."
+            + (f" A photograph is given by --image {run}, its PSF by --psf FILE." if run.is_file() else "")
+        )
     else:
         _photograph(asked)
 

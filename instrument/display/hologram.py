@@ -31,7 +31,7 @@ from recon.holography import (
     compute_hologram,
     random_mask,
 )
-from recon.holography.display import greatest_defocus_mm
+from recon.holography.display import greatest_defocus_mm, no_mask
 from recon.holography.judge import compare
 from recon.holography.options import Fit
 from recon.holography.pose import NODES, Pose
@@ -132,10 +132,10 @@ def prepare_target(
     pixels : ndarray, (height, width), or (height, width, 3), of which the mean of the channels is taken
         Intensity; 0 is black, an integer type's greatest value (float: the maximum) is white.
     options : HologramOptions
-        Its ``fit``, ``srgb`` and ``envelope``.
+        Its ``fit``, ``srgb``, ``lift`` and ``envelope``.
     """
     options = options or HologramOptions()
-    image = field_picture(pixels, fit=options.fit, srgb=options.srgb)
+    image = options.lift + (1 - options.lift) * field_picture(pixels, fit=options.fit, srgb=options.srgb)
     small = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
     if image.shape[0] < small[0] or image.shape[1] < small[1]:
         wide, high = max(small[1], image.shape[1]), max(small[0], image.shape[0])
@@ -168,6 +168,18 @@ def field_picture(
         top, left = (side - height) // 2, (side - width) // 2
         image = np.pad(image, ((top, side - height - top), (left, side - width - left)))
     return image
+
+
+def crop_words(pixels: npt.NDArray[Any], fit: Fit) -> str:
+    """Say what of a picture is not shown; empty where all of it is."""
+    height, width = pixels.shape[:2]
+    if fit != "cover" or height == width:
+        return ""
+    side = min(height, width)
+    return (
+        f"The field is square: the middle {side} x {side} of the picture's {height} x {width} pixels are "
+        "shown (--fit contain shows all of it, --fit stretch stretches it)."
+    )
 
 
 def _white(pixels: npt.NDArray[Any]) -> float:
@@ -211,7 +223,7 @@ def bench_display(
     """Return the display that ``[display]`` describes.
 
     ``size`` is the SLM's shape and pitch, of :func:`slm_size`. Another ``expansion`` than the bench's has a
-    random mask of its own; with another wavelength the mask keeps its height.
+    random mask of its own, 1 none; with another wavelength the mask keeps its height.
 
     Raises BenchError or FileError when SLM, binning, expansion and mask do not fit together.
     """
@@ -223,7 +235,9 @@ def bench_display(
     if height % binning or width % binning:
         raise BenchError(f"An SLM of {height} x {width} pixels cannot be binned by slm_binning = {binning}.")
     shape = (height // binning, width // binning)
-    if table.mask_file is not None and q == table.expansion:
+    if q == 1 and (table.mask_file is None or table.expansion != 1):
+        mask = no_mask(shape)
+    elif table.mask_file is not None and q == table.expansion:
         base = config.path.parent if config.path else Path()
         mask = _mask_from(base / table.mask_file, (shape[0] * k, shape[1] * k), table.wavelength_nm)
     else:

@@ -7,6 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,9 @@ from instrument.files.slm_image import phase_levels, write_slm_image
 from recon.holography import Display, HologramOptions
 from recon.holography.judge import DISSERTATION, GRIDS, METHODS, Cell, average
 from recon.holography.losses import loss_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CHANNELS = ("red", "green", "blue")
 
@@ -66,22 +70,13 @@ class HologramFiles:
         for number in range(max(self.video, 1)):
             for channel in range(len(self.displays)):
                 patterns = self.patterns(number, channel)
-                files += [*patterns, *map(side_car, patterns), self._preview(number, channel)]
+                files += [*patterns, *map(side_car, patterns), self.preview(number, channel)]
         return files
 
     def write(self, number: int, channel: int, result: HologramResult) -> None:
         """Write one hologram's patterns and its preview."""
         display = self.displays[channel]
-        facts = {
-            **result.facts(self.options),
-            "binning": self.binning,
-            "expansion": display.expansion,
-            "slm_shape": list(display.slm_shape),
-            "slm_pitch_um": display.slm_pitch_um,
-            "wavelength_nm": display.wavelength_nm,
-            "dc_power": display.dc.power,
-            "mask_fill": display.mask_fill,
-        }
+        facts = {**result.facts(self.options), **self.display_facts(channel)}
         patterns = self.patterns(number, channel)
         for frame, path in enumerate(patterns):
             about = {**facts, "frame": frame + 1, "of_frames": len(patterns)}
@@ -98,12 +93,21 @@ class HologramFiles:
             ("stopped", str(result.hologram.stop_reason)),
             ("iterations", f"{result.hologram.history[-1].iteration}"),
         ]
-        write_hologram_figure(
-            self._preview(number, channel),
-            result,
-            title=f"Hologram {patterns[0].stem}",
-            facts=lines,
-        )
+        figure = hologram_figure(result, title=f"Hologram {patterns[0].stem}", facts=lines)
+        save_figure(figure, self.preview(number, channel))
+
+    def display_facts(self, channel: int) -> dict[str, Any]:
+        """Return what a pattern was computed for, JSON-compatible."""
+        display = self.displays[channel]
+        return {
+            "binning": self.binning,
+            "expansion": display.expansion,
+            "slm_shape": list(display.slm_shape),
+            "slm_pitch_um": display.slm_pitch_um,
+            "wavelength_nm": display.wavelength_nm,
+            "dc_power": display.dc.power,
+            "mask_fill": display.mask_fill,
+        }
 
     def _stem(self, number: int, channel: int) -> str:
         stem = self.out.stem
@@ -123,17 +127,16 @@ class HologramFiles:
             for frame in range(self.options.frames)
         ]
 
-    def _preview(self, number: int, channel: int) -> Path:
+    def preview(self, number: int, channel: int) -> Path:
+        """Return the preview's file."""
         return self.out.with_name(f"{self._stem(number, channel)}-preview.png")
 
 
 _DETAIL = "middle sixteenth of the field, raw intensity, half as bright"
 
 
-def write_hologram_figure(
-    path: Path, result: HologramResult, *, title: str, facts: list[tuple[str, str]]
-) -> None:
-    """Draw wanted, seen and unfiltered image, the SLM's phase and the convergence; errors as ``whole_file``.
+def hologram_figure(result: HologramResult, *, title: str, facts: list[tuple[str, str]]) -> Figure:
+    """Draw wanted, seen and unfiltered image, the SLM's phase and the convergence.
 
     The first plane is drawn large; further planes as a strip below.
     """
@@ -162,8 +165,7 @@ def write_hologram_figure(
         f"{history[-1].psnr_db:.1f} dB",
         "seconds of optimisation",
     )
-    summary = Summary(title, panels, convergence, sweep=strip, lines=facts, simulated=True)
-    save_figure(summary_figure(summary), path)
+    return summary_figure(Summary(title, panels, convergence, sweep=strip, lines=facts, simulated=True))
 
 
 def _detail(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

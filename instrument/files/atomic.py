@@ -180,6 +180,10 @@ def check_writable(path: Path | str, n_bytes: int = 0) -> None:
     disk = os.statvfs(folder)
     if disk.f_flag & os.ST_RDONLY:
         raise FileError(path, f"{folder} is on a read-only disk.", "Choose another place.")
+    if disk.f_blocks == 0 and folder.resolve().is_relative_to("/proc"):
+        raise FileError(
+            path, f"{folder} is the system's own and holds no files of ours.", "Choose another place."
+        )
     free = disk.f_bavail * disk.f_frsize
     if free < n_bytes:
         raise FileError(

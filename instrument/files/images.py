@@ -1,4 +1,4 @@
-"""Image files: TIFF, PNG, JPEG, BMP, NumPy, 8 to 16 bit and float, grey and colour, single and stacked.
+"""Image files, 8 to 16 bit and float, grey and colour, single and stacked (formats: ``decoding``).
 
 Arrays are ``(height, width)`` or ``(height, width, 3)`` in the order red, green, blue; stacks have one more
 axis in front. The dtype is the file's own (uint8, uint16 or float32) and pixel values are never rescaled.
@@ -6,13 +6,7 @@ axis in front. The dtype is the file's own (uint8, uint16 or float32) and pixel 
 
 from __future__ import annotations
 
-import io
 import json
-import math
-import re
-import struct
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,16 +19,15 @@ import tifffile
 
 from instrument.files import reading
 from instrument.files.atomic import whole_file, write_text
+from instrument.files.decoding import READABLE, decode
 from instrument.files.errors import FileError
+from instrument.files.image_folders import images_in, in_order, order_in_words
+from instrument.files.named_arrays import is_zarr, read_zarr
 from instrument.files.seen import as_seen, png_bytes
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
 
-READABLE = "TIFF, PNG, JPEG, BMP, .npy, or .npz with one array"
 WRITABLE = (".tif", ".tiff", ".png", ".npy")
-_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-_OPENCV_MAGIC = (_PNG_MAGIC, b"\xff\xd8", b"BM")
-_TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
@@ -92,39 +85,29 @@ def read_image(path: Path | str | ImageFile, *, holes: bool = False) -> ImageFil
     if isinstance(path, ImageFile):
         _refuse_non_finite(path.path, path.pixels, holes=holes)
         return path
-    path = Path(path)
-    array, notes = _decode(path)
+    path, array, notes = _decoded(Path(path))
     array, more = _one_image(path, array)
     pixels, converted = _standard_dtype(path, array, holes=holes)
     return ImageFile(path, pixels, (*notes, *more, *converted), _metadata(path))
 
 
 def read_stack(path: Path | str, *, leave_out: Path | None = None) -> ImageFile:
-    """Read a stack of images: a multi-page TIFF, an array with one more axis, or a folder of images.
+    """Read a stack of images: a TIFF of several pages, an array of one more axis, an OME-Zarr, a folder.
 
-    The images of a folder are taken in the order of their names, all but the file ``leave_out``, and must
-    agree in shape and dtype. A single image is a stack of one. Errors as :func:`read_image`.
+    A folder's images are taken in the order of the depths that their names or Micro-Manager's metadata tell,
+    else of their names, numbers by their value; all but the file ``leave_out``. They must agree in shape and
+    dtype. The order is in the notes and the metadata (``files``, ``depths_um``). A single image is a stack of
+    one. Errors as :func:`read_image`.
     """
     path = Path(path)
     if path.is_dir():
         return _read_folder(path, leave_out)
-    array, notes = _decode(path)
-    if array.ndim == 2 or (array.ndim == 3 and array.shape[-1] in (3, 4) and not _is_npy(path)):
-        array, more = _one_image(path, array)
-        array = array[None]
-    elif array.ndim == 4:
-        array, more = _drop_alpha(array)
-    elif array.ndim == 3:
-        more = ()
-    else:
-        raise FileError(path, f"holds an array of shape {array.shape}; a stack of images is expected.")
-    pixels, converted = _standard_dtype(path, array)
-    return ImageFile(path, pixels, (*notes, *more, *converted))
+    return _as_stack(*_decoded(path))
 
 
 def read(path: Path | str) -> ImageFile:
     """Read what a file holds, or a folder: one image, or a stack. Errors as :func:`read_image`."""
-    if Path(path).is_dir():
+    if Path(path).is_dir() and not is_zarr(Path(path)):
         return read_stack(path)
     try:
         return read_image(path, holes=True)
@@ -185,170 +168,39 @@ def check_suffix(path: Path | str) -> None:
         raise FileError(path, f"{found}; choose one of {', '.join(WRITABLE)}.")
 
 
+_CFA_PATTERN, _COLOURS = 33422, "RGB"
+
+
 def _metadata(path: Path) -> dict[str, Any]:
-    """Return the metadata kept with an image; empty where there are none of ours."""
+    """Return the metadata kept with an image; of another program's TIFF its colour mosaic."""
+    said: dict[str, Any] = {}
     try:
         if path.suffix.lower() in (".tif", ".tiff"):
             with tifffile.TiffFile(path) as tiff:
-                text = tiff.pages.first.description
+                page: Any = tiff.pages.first
+                pattern = bytes(page.tags.valueof(_CFA_PATTERN, b""))
+                if len(pattern) == 4 and max(pattern) < 3:
+                    said = {"pixel_format": "Bayer" + "".join(_COLOURS[c] for c in pattern[:2])}
+                text = page.description
         else:
             text = reading.read_bytes(side_car(path)).decode()
         metadata = reading.parse_json(text)
-    except (OSError, ValueError, FileError, tifffile.TiffFileError):
-        return {}  # another program's description, or none: the pixels were read all the same
-    return metadata if isinstance(metadata, dict) else {}
+    except (OSError, ValueError, TypeError, FileError, tifffile.TiffFileError):
+        return said  # another program's description, or none: the pixels were read all the same
+    return {**said, **metadata} if isinstance(metadata, dict) else said
 
 
-# Reading -----------------------------------------------------------------------------------------
-MOST_IMAGE_BYTES = 1 << 35
-
-
-def read_bytes(path: Path) -> bytes:
-    """Return a file's content; every failure is a FileError that says what is wrong."""
-    try:
-        data = reading.read_bytes(path, MOST_IMAGE_BYTES)
-    except FileNotFoundError:
-        raise FileError(path, "there is no such file.") from None
-    if not data:
-        raise FileError(path, "is empty (0 bytes).")
-    return data
-
-
-def _decode(path: Path) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
-    """Return the file's array as it stands; its content, not its name, tells the format."""
-    data = read_bytes(path)
-    if data.startswith(b"\x93NUMPY"):
-        return _decode_npy(path, data)
-    if data.startswith(b"PK"):
-        return _decode_npz(path, data)
-    if data[:4] in _TIFF_MAGIC:
-        return _decode_tiff(path, data)
-    if not data.startswith(_OPENCV_MAGIC):
-        raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
-    return _decode_with_opencv(path, data)
-
-
-def _decode_npy(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
-    try:
-        file = io.BytesIO(data)
-        version = np.lib.format.read_magic(file)
-        read = (
-            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        )
-        shape, _, dtype = read(file)
-        if math.prod(shape) * dtype.itemsize > len(data) - file.tell():
-            raise ValueError(f"it says {dtype} {shape}, which are more bytes than it has")
-        array: npt.NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
-    except Exception as error:  # noqa: BLE001 - the header is Python text, whose parser raises nearly anything
-        raise FileError(path, f"is damaged or no plain .npy array: {error!s:.200}.") from None
-    return array, ()
-
-
-def _decode_npz(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = archive.infolist()
-            if len(members) != 1:
-                listed = ", ".join(member.filename.removesuffix(".npy") for member in members[:8]) or "none"
-                raise FileError(path, f"holds {len(members)} arrays ({listed}); one image is expected.")
-            said = members[0].file_size
-            reading.require_plausible(path, said, len(data))
-            with archive.open(members[0]) as member:
-                content = member.read(said + 1)
-            if len(content) > said:
-                raise FileError(path, "is damaged: it holds more than it says.")
-            return _decode_npy(path, content)
-    except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise FileError(path, f"is no .npz with one plain array: {error}.") from None
-    except (NotImplementedError, RuntimeError) as error:  # another compression, a password
-        raise FileError(path, f"is no .npz with one plain array: {error}.") from None
-
-
-def _decode_tiff(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
-    try:
-        with tifffile.TiffFile(io.BytesIO(data)) as tiff:
-            if not tiff.series:
-                raise FileError(path, "is a TIFF without an image.")
-            series = tiff.series[0]
-            reading.require_plausible(path, series.size * series.dtype.itemsize, len(data))
-            array = series.asarray()
-            page = series.keyframe
-            axes, notes = series.axes, []
-            if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE and array.dtype.kind == "u":
-                array = np.iinfo(array.dtype).max - array
-                notes.append("white-is-zero TIFF inverted")
-            if page.photometric == tifffile.PHOTOMETRIC.PALETTE:
-                return _decode_with_opencv(path, data)
-            if "S" in axes and not axes.endswith("S"):
-                array = np.moveaxis(array, axes.index("S"), -1)
-            if len(tiff.series) > 1:
-                notes.append(f"the first of its {len(tiff.series)} image series taken")
-            return array, tuple(notes)
-    except FileError:
-        raise
-    except Exception as error:  # noqa: BLE001 - a damaged TIFF raises nearly anything
-        if "imagecodecs" in str(error):  # a compression that only OpenCV knows here
-            return _decode_with_opencv(path, data)
-        raise FileError(path, f"is a damaged or unusual TIFF: {error}.") from None
-
-
-def _decode_with_opencv(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
-    if data.startswith(_PNG_MAGIC) and not _png_is_whole(data):
-        raise FileError(path, "is a damaged PNG: its parts are longer than the file, or out of order.")
-    shape = _shape_by_header(data)
-    if shape is not None:
-        reading.require_plausible(path, 8 * math.prod(shape), len(data))
-    # A damaged file is told of once, in our words.
-    loudness = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (cv2.error, MemoryError):
-        array = None
-    finally:
-        cv2.utils.logging.setLogLevel(loudness)
-    if array is None:
-        raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
-    if array.ndim == 3 and array.shape[-1] >= 3:
-        array = array[..., [2, 1, 0, *range(3, array.shape[-1])]]
-    lossy = ("JPEG is lossy and usually gamma-coded: prefer raw frames",) if data[:2] == b"\xff\xd8" else ()
-    return array, lossy
-
-
-def _png_is_whole(data: bytes) -> bool:
-    """Whether a PNG's parts fit into it: OpenCV takes memory for what each says it has."""
-    place = len(_PNG_MAGIC)
-    first = True
-    while place + 12 <= len(data):
-        length, kind = struct.unpack(">I4s", data[place : place + 8])
-        if first != (kind == b"IHDR") or place + 12 + length > len(data):
-            return False
-        if kind == b"IEND":
-            return True
-        first, place = False, place + 12 + length
-    return False
-
-
-def _shape_by_header(data: bytes) -> tuple[int, int] | None:
-    """Return the sides that a PNG, BMP or JPEG says it has; None where it says none."""
-    if data.startswith(_PNG_MAGIC):
-        width, height = struct.unpack(">II", data[16:24].ljust(8, b"\0"))
-        return width, height
-    if data.startswith(b"BM"):
-        width, height = struct.unpack("<ii", data[18:26].ljust(8, b"\0"))
-        return abs(width), abs(height)
-    found = re.search(rb"\xff[\xc0-\xc3\xc5-\xc7\xc9-\xcb\xcd-\xcf]...(..)(..)", data, re.DOTALL)
-    if found is None:
-        return None
-    return int.from_bytes(found[1], "big"), int.from_bytes(found[2], "big")
-
-
+# Folders -----------------------------------------------------------------------------------------
 def _read_folder(folder: Path, leave_out: Path | None) -> ImageFile:
-    suffixes = {".tif", ".tiff", ".png", ".bmp", ".npy", ".jpg", ".jpeg"}
-    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith("."))
+    if is_zarr(folder):
+        array, notes = read_zarr(folder)
+        return _as_stack(folder, array, notes)
+    paths = images_in(folder)
     if leave_out is not None:
         paths = [p for p in paths if p.resolve() != leave_out.resolve()]
     if not paths:
         raise FileError(folder, f"holds no images ({READABLE}).")
+    paths, depths_um = in_order(folder, paths)
     first = read_image(paths[0])
     images = [first.pixels]
     for path in paths[1:]:
@@ -357,9 +209,33 @@ def _read_folder(folder: Path, leave_out: Path | None) -> ImageFile:
             raise FileError(path, f"is {image.describe()}, but {first.path.name} is {first.describe()}.")
         images.append(image.pixels)
     stack: Pixels = np.stack(images)  # type: ignore[assignment]
-    return ImageFile(
-        folder, stack, (f"{len(paths)} files, {paths[0].name} to {paths[-1].name}", *first.notes)
-    )
+    metadata = {"files": [path.name for path in paths], "depths_um": list(depths_um)}
+    return ImageFile(folder, stack, (order_in_words(paths, depths_um), *first.notes), metadata)
+
+
+def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> ImageFile:
+    if array.ndim == 2 or (array.ndim == 3 and array.shape[-1] in (3, 4) and not _is_npy(path)):
+        array, more = _one_image(path, array)
+        array = array[None]
+    elif array.ndim == 4:
+        array, more = _drop_alpha(array)
+    elif array.ndim == 3:
+        more = ()
+    else:
+        raise FileError(path, f"holds an array of shape {array.shape}; a stack of images is expected.")
+    pixels, converted = _standard_dtype(path, array)
+    return ImageFile(path, pixels, (*notes, *more, *converted))
+
+
+def _decoded(path: Path) -> tuple[Path, npt.NDArray[Any], tuple[str, ...]]:
+    """Decode a file, a Zarr folder, or an array of a file (``FILE::NAME``); returns the file with it."""
+    if is_zarr(path):
+        return path, *read_zarr(path)
+    file, _, inside = str(path).partition("::")
+    if not inside or path.exists():
+        file = str(path)
+        inside = ""
+    return Path(file), *decode(Path(file), inside)
 
 
 # Shapes and dtypes ---------------------------------------------------------------------------------

@@ -102,7 +102,12 @@ def write_volume_zarr(
             )
             levels.append(step)
         group.attrs["ome"] = ome_attributes(
-            path.name, names, _voxel_um(grid), levels=levels, more={"type": "local mean"}
+            path.name,
+            names,
+            _voxel_um(grid),
+            levels=levels,
+            origin=_origin_um(grid),
+            more={"type": "local mean"},
         )
         planes = {"z_um": known(grid.z_um), "pitch_um": known(grid.pitch_um)}
         group.attrs["diffuserbench"] = attributes | planes
@@ -137,7 +142,17 @@ def write_volume_tiff(
     colour = len(shape) == 4
     pages = (page for plane in planes for page in (np.moveaxis(plane, -1, 0) if colour else plane[None]))
     sizes = {f"PhysicalSize{axis.upper()}": size for axis, size in _voxel_um(grid).items()}
-    metadata = {"axes": "ZCYX" if colour else "ZYX", **sizes, **{f"{name}Unit": "µm" for name in sizes}}
+    metadata: dict[str, Any] = {"axes": "ZCYX" if colour else "ZYX", **sizes}
+    metadata |= {f"{name}Unit": "µm" for name in sizes}
+    n_pages = shape[0] * (shape[3] if colour else 1)
+    if origin := _origin_um(grid):
+        places = {
+            "X": np.full(n_pages, origin["x"]),
+            "Y": np.full(n_pages, origin["y"]),
+            "Z": np.repeat(grid.z_um, n_pages // shape[0]),
+        }
+        metadata["Plane"] = {f"Position{axis}": list(map(float, where)) for axis, where in places.items()}
+        metadata["Plane"] |= {f"Position{axis}Unit": ["µm"] * n_pages for axis in places}
     stored = (shape[0], shape[3], *shape[1:3]) if colour else shape
     big = 4 * int(np.prod(shape)) > _BIG_TIFF_BYTES
     with whole_file(path) as temporary, tifffile.TiffWriter(temporary, ome=True, bigtiff=big) as tiff:
@@ -150,6 +165,15 @@ def _voxel_um(grid: Grid) -> dict[str, float]:
         return {}
     pitch = float(grid.pitch_um[len(grid.z_um) // 2])
     return {"z": middle_step_um(grid.z_um), "y": pitch, "x": pitch}
+
+
+def _origin_um(grid: Grid) -> dict[str, float]:
+    """Return where the first voxel's centre is: its depth, and from the axis; nothing where not known."""
+    voxel = _voxel_um(grid)
+    if not voxel or (np.diff(grid.z_um) < 0).any():  # told by a step and a place, planes go away from it
+        return {}
+    row, column = grid.centre
+    return {"z": float(grid.z_um[0]), "y": -row * voxel["y"], "x": -column * voxel["x"]}
 
 
 def known(values: npt.NDArray[np.float64]) -> list[float] | None:
@@ -167,6 +191,7 @@ def ome_attributes(
     steps: Mapping[str, float | None],
     *,
     levels: Sequence[int] = (1,),
+    origin: Mapping[str, float] | None = None,
     more: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the attribute ``ome`` of an image's group.
@@ -182,6 +207,8 @@ def ome_attributes(
         the step 1.
     levels : sequence of int
         Lateral binning of each level, the first 1; the levels are called ``0``, ``1`` ...
+    origin : mapping of axis to float, optional
+        Where the first pixel lies, in the axis' unit.
     more : mapping, optional
         Further keys of the multiscale.
     """
@@ -189,10 +216,11 @@ def ome_attributes(
     for level, binning in enumerate(levels):
         scale = [(steps.get(a) or 1.0) * (binning if a in "yx" else 1) for a in axes]
         transformations: list[dict[str, Any]] = [{"type": "scale", "scale": scale}]
-        if binning > 1:
-            # The centre of a larger pixel lies half of the difference away from that of the first small one.
-            shift = [(steps.get(a) or 1.0) * (binning - 1) / 2 if a in "yx" else 0.0 for a in axes]
-            transformations.append({"type": "translation", "translation": shift})
+        # The centre of a larger pixel lies half of the difference away from that of the first small one.
+        shift = {a: (steps.get(a) or 1.0) * (binning - 1) / 2 for a in axes if a in "yx"}
+        place = [(origin or {}).get(a, 0.0) + shift.get(a, 0.0) for a in axes]
+        if any(place):
+            transformations.append({"type": "translation", "translation": place})
         datasets.append({"path": str(level), "coordinateTransformations": transformations})
     multiscale = {
         "name": name.removesuffix(".zarr").removesuffix(".ome"),

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config import BenchConfig
-from instrument.bench.config_file import TEMPLATES, parse_config, template
+from instrument.bench.config_file import TEMPLATES, load_config, parse_config, template
 from instrument.bench.source_and_scene import Ask
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError
@@ -69,9 +69,16 @@ def bench(config: BenchConfig | Path | str | None = None, *, ask: Ask | None = N
 
     Raises ConfigError, FileError or DeviceError as :func:`~instrument.bench.bench.open_bench`.
     """
+    return open_bench(bench_config(config), ask=ask)
+
+
+def bench_config(config: BenchConfig | Path | str | None) -> BenchConfig:
+    """Return the configuration that :func:`bench` opens."""
+    if isinstance(config, BenchConfig):
+        return config
     if isinstance(config, str) and config in TEMPLATES and not Path(config).exists():
-        config = parse_config(template(config), None)
-    return open_bench(config, ask=ask)
+        return parse_config(template(config), None)
+    return load_config(config)
 
 
 def reconstruct(
@@ -181,7 +188,7 @@ def _job_of_arrays(image: Any, psf: Any) -> Job:
     if not isinstance(psf, Calibration):
         psf = Calibration(as_channels(psf, "PSF")[None], np.full((1, 3), np.nan))
     simulated = bool(psf.provenance.get("simulated"))
-    return Job(pixels, psf, {}, provenance={"image": "an array"}, simulated=simulated)
+    return Job(pixels, psf, {}, provenance={"image": {"path": "an array"}}, simulated=simulated)
 
 
 class _Told:

@@ -89,7 +89,7 @@ class Result(Reconstruction):
 
     def show(self, *, rotate_deg: int = 0) -> None:
         """Show the page: below the cell of a notebook, else in a window."""
-        _show(self.figure(rotate_deg=rotate_deg))
+        show_figure(self.figure(rotate_deg=rotate_deg))
 
     def save(
         self,
@@ -173,7 +173,7 @@ def show(*pictures: Any, **titled: Any) -> None:
 
     Raises BenchError when one of them is no picture.
     """
-    _show(figure_of(*pictures, **titled))
+    show_figure(figure_of(*pictures, **titled))
 
 
 def figure_of(*pictures: Any, **titled: Any) -> Figure:
@@ -205,7 +205,7 @@ def _pixels(picture: Any) -> Shown:
     return as_seen(array, raw=array.dtype.kind == "u")
 
 
-def _show(figure: Figure) -> None:
+def show_figure(figure: Figure) -> None:
     """Show a figure where there is a place for it; say where there is none."""
     ipython = sys.modules.get("IPython")
     if ipython is not None and ipython.get_ipython() is not None:

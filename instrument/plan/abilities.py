@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from drivers.stage import StageAxis
+from drivers.stage import OVER, StageAxis, approached
 from instrument.files.errors import FileError, ranges
 from instrument.files.slm_image import read_slm_levels
 from instrument.plan.led_shapes import LedPlaces
@@ -42,6 +42,8 @@ class BenchAbilities:
     stage_target: Callable[[SourcePosition], Mapping[str, float]] | None = None
     """The stage position that puts the point source at ``(x, y, z)`` micrometres; None without a source that
     can be placed."""
+    play: Mapping[str, float] = field(default_factory=dict)
+    """Of the stage's axes: the source comes to its places from below (:func:`drivers.stage.approached`)."""
     can_switch_source: bool = True
     can_switch_scene: bool = True
     """Whether source and scene can be lit and darkened, by a device or by asking the operator."""
@@ -75,6 +77,10 @@ class PlanEstimate:
     exposures: int
     """Frames taken, averaged ones counted singly."""
     moves: int
+    approaches: int
+    """Moves among them that go below a place first, because of an axis' play."""
+    approach_seconds: float
+    """What those cost."""
     total_bytes: int
     """Everything the run will write, metadata included."""
     seconds: float
@@ -95,6 +101,7 @@ def estimate(
     speeds = {axis.name: axis.speed_per_s for axis in abilities.stage_axes}
     position = dict(abilities.stage_position or {})
     seconds, part_start, part, moves = 0.0, 0.0, -1, 0
+    approaches, approach_seconds, seated = 0, 0.0, set[str]()
     slm_image, exposure_ms = None, abilities.exposure_ms
     for step in steps:
         if step.part != part:
@@ -102,9 +109,18 @@ def estimate(
         seconds = max(seconds, part_start + step.start_after_s)
         target = abilities.target(step)
         if any(position.get(axis) != value for axis, value in target.items()):
-            moves += 1
-            seconds += max(abs(v - position.get(a, v)) / speeds.get(a, math.inf) for a, v in target.items())
-            position.update(target)
+            direct_s = _move_s(position, target, speeds)
+            play = abilities.play if step.source_um is not None else {}
+            path = approached(position, target, play, seated)
+            way_s = 0.0
+            for place in path:
+                way_s += _move_s(position, place, speeds)
+                position.update(place)
+            moves += len(path)
+            seconds += way_s
+            approaches += len(path) - 1
+            approach_seconds += way_s - direct_s
+            seated |= target.keys()
         if step.slm_image is not None and step.slm_image != slm_image:
             slm_image = step.slm_image
             seconds += abilities.slm_settle_ms / 1e3
@@ -115,9 +131,15 @@ def estimate(
         frames=n,
         exposures=sum(step.average for step in steps),
         moves=moves,
+        approaches=approaches,
+        approach_seconds=approach_seconds,
         total_bytes=n * (frame_bytes + BYTES_A_FRAME_BESIDE_THE_IMAGE),
         seconds=seconds,
     )
+
+
+def _move_s(here: Mapping[str, float], target: Mapping[str, float], speeds: Mapping[str, float]) -> float:
+    return max((abs(v - here.get(a, v)) / speeds.get(a, math.inf) for a, v in target.items()), default=0.0)
 
 
 def _steps(plan: Plan, todo: Collection[int] | None, start: Step | None) -> list[Step]:
@@ -224,6 +246,16 @@ def _position_problems(step: Step, abilities: BenchAbilities) -> Iterable[str]:
                 f"{name} = {value:g} is outside the stage's limits "
                 f"{axes[name].lower_limit:g} to {axes[name].upper_limit:g}."
             )
+        elif step.source_um is not None and _beneath(value, name, abilities) < axes[name].lower_limit:
+            yield (
+                f"{name} = {value:g} cannot be approached from below: the stage begins at "
+                f"{axes[name].lower_limit:g}, and {OVER:g} times the axis' play of {abilities.play[name]:g} "
+                "([stage] play) are needed. Choose a place farther up."
+            )
+
+
+def _beneath(value: float, name: str, abilities: BenchAbilities) -> float:
+    return value - OVER * abilities.play.get(name, 0.0)
 
 
 def _slm_image_problems(path: Path, abilities: BenchAbilities) -> Iterable[str]:

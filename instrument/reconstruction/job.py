@@ -21,6 +21,7 @@ from instrument.reconstruction.mosaic import (
     on_every_pixel,
     pattern_of,
     reduce_mosaic,
+    suspected_mosaic,
 )
 from instrument.reconstruction.options import InputOptions, NoiseChoice
 from instrument.reconstruction.preparation import (
@@ -154,7 +155,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
             **noise_note(noise_of(image)),
         },
         valid,
-        (*warnings, *_saturation(image, erased)),
+        (*warnings, *_converted(psf, image), *_saturation(image, erased), *_suspicion(inputs, image)),
         {
             "psf": source_record(psf),
             "image": source_record(image),
@@ -220,7 +221,7 @@ def job_with(
             **noise_note(noise_of(image)),
         },
         valid,
-        _saturation(image, erased),
+        (*_saturation(image, erased), *_suspicion(inputs, image)),
         {
             "calibration": str(folder.resolve()),
             "image": source_record(image),
@@ -237,6 +238,12 @@ def job_with(
     )
 
 
+_PLAIN_PSFS = (
+    "PSF images by themselves tell no places: reconstruct takes one by --psf FILE, one a depth by "
+    "--volume FOLDER."
+)
+
+
 def find_calibration(folder: Path) -> Path:
     """Return the calibration folder that ``folder`` is, or the one that it holds.
 
@@ -244,7 +251,11 @@ def find_calibration(folder: Path) -> Path:
     """
     if not folder.is_dir():
         found = "is no folder" if folder.exists() else "does not exist"
-        raise FileError(folder, f"{found}; a calibration or a run folder is expected.")
+        raise FileError(
+            folder,
+            f"{found}; a calibration or a run folder is expected.",
+            "" if folder.is_dir() or not folder.exists() else _PLAIN_PSFS,
+        )
     if is_calibration(folder):
         return folder
     # In the folder, in a run in it, or in that run's calibration folder (a demo's).
@@ -256,7 +267,10 @@ def find_calibration(folder: Path) -> Path:
             if inside
             else "no calibration"
         )
-        raise FileError(folder, f"holds {found}; exactly one is expected.")
+        plain = not inside and any(
+            f.suffix.lower() in (".tif", ".tiff", ".png", ".npy") for f in folder.iterdir()
+        )
+        raise FileError(folder, f"holds {found}; exactly one is expected.", _PLAIN_PSFS if plain else "")
     return inside[0]
 
 
@@ -321,12 +335,28 @@ def _refuse_constant(image: ImageFile) -> None:
         )
 
 
+def _converted(psf: ImageFile, image: ImageFile) -> tuple[str, ...]:
+    """Doubt a photograph that was made into fractions while its PSF is raw."""
+    kinds = psf.pixels.dtype.kind, image.pixels.dtype.kind
+    if kinds != ("u", "f"):
+        return ()
+    return (
+        f"The photograph is {image.pixels.dtype} and its PSF {psf.pixels.dtype}: it was converted, and its "
+        "dark level is estimated by itself. Take the raw file, or give --dark.",
+    )
+
+
 def _saturation(image: ImageFile, erased: Erased) -> tuple[str, ...]:
     count = saturated_pixels(image.pixels)
     if not count or erased.valid is not None:
         return ()
     share = f"{count / image.pixels.size:.2%}"
     return (f"{count} pixels of the image ({share}) are saturated and used: expect halos there.",)
+
+
+def _suspicion(inputs: InputOptions, image: ImageFile) -> tuple[str, ...]:
+    asked = suspected_mosaic(image) if inputs.mosaic == "auto" else ""
+    return (asked,) if asked else ()
 
 
 # As it is shown, and kept beside the result -------------------------------------------------------------

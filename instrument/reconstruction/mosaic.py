@@ -50,6 +50,34 @@ def in_colours(image: npt.NDArray[np.float32], pixel_format: str) -> npt.NDArray
     return image if pattern is None else interpolate_bayer(image, pattern)
 
 
+_PHASES = 0.05
+"""Share of the light by which a mosaic's colours differ at least; white light on silicon gives far more."""
+
+
+def suspected_mosaic(image: ImageFile) -> str:
+    """Ask whether a grey image without metadata is a mosaic's raw frame; empty where it does not look so.
+
+    The four pixels of a 2 x 2 cell, averaged over the picture, agree in a grey image; in a raw frame two on a
+    diagonal (green) agree and the others do not.
+    """
+    height, width = (side - side % 2 for side in image.pixels.shape[:2])
+    if image.is_colour or "pixel_format" in image.metadata or min(height, width) < 64:
+        return ""
+    cells = image.pixels[:height, :width].astype(np.float64).reshape(height // 2, 2, width // 2, 2)
+    a, b, c, d = cells.mean(axis=(0, 2)).ravel()
+    spread = max(a, b, c, d) - min(a, b, c, d)
+    if spread <= _PHASES * (np.mean((a, b, c, d)) - np.percentile(image.pixels, 1)):
+        return ""
+    greens = {("GRBG", "GBRG"): abs(a - d), ("RGGB", "BGGR"): abs(b - c)}
+    patterns = min(greens, key=lambda one: greens[one])
+    if greens[patterns] > 0.2 * spread:
+        return ""
+    return (
+        f"{image.path} looks like the raw frame of a colour mosaic and is taken as grey: say --bayer "
+        f"{patterns[0]} or --bayer {patterns[1]} if it is one, --bayer none if not."
+    )
+
+
 def _named(pixel_format: str) -> Pattern | None:
     return _GENICAM.get(pixel_format[5:7]) if pixel_format.startswith("Bayer") else None
 

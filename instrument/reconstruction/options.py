@@ -288,7 +288,7 @@ class VideoOptions:
     )
     scheduler_owner: str | None = option(
         None,
-        help="Whose scheduler it is, if it is not yours: a user of this machine, or of another one.",
+        help="Whose scheduler it is, if not yours: a user here, or of another machine.",
         metavar="NAME",
         applies=("video",),
         group=RARE,

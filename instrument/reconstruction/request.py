@@ -186,28 +186,32 @@ def _require_known(inputs: InputOptions, options: ReconstructionOptions) -> None
 def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOptions) -> Job:
     """Prepare a photograph and PSFs at several depths.
 
-    ``psfs``: a calibration folder or the run it lies in, a multi-page TIFF or array, or a folder with one
-    image file a depth, in the order of their names (the photograph itself may lie there too). Integer PSFs
-    lose their darkest level; float ones are taken to be free of any offset. ``image`` and ``inputs``: as
-    :func:`~instrument.reconstruction.job.job_from_calibration`.
+    ``psfs``: a calibration folder or the run it lies in, or a stack as
+    :func:`~instrument.files.images.read_stack` takes it (the photograph may lie there too), whose order the
+    job's notes and record tell. Integer PSFs lose their darkest level; float ones are taken to be free of any
+    offset. ``image`` and ``inputs``: as :func:`~instrument.reconstruction.job.job_from_calibration`.
 
     Raises FileError or BenchError.
     """
-    if isinstance(psfs, ImageFile):
-        folder, stack = psfs.path, psfs.pixels
-    elif psfs.is_dir() and (is_calibration(psfs) or (psfs / STATE).is_file()):  # or the run it was made in
-        return job_from_calibration(psfs, image, inputs)
-    else:
+    if not isinstance(psfs, ImageFile):
+        if psfs.is_dir() and (is_calibration(psfs) or (psfs / STATE).is_file()):  # or the run it was made in
+            return job_from_calibration(psfs, image, inputs)
         own = image.path if isinstance(image, ImageFile) else image
-        folder, stack = psfs, read_stack(psfs, leave_out=own).pixels
+        psfs = read_stack(psfs, leave_out=own)
+    stack = psfs.pixels
     pixels = stack.astype(np.float32)
     if stack.dtype.kind == "u":
         pixels = np.maximum(pixels - min(darkest_block(p) for p in pixels), 0)
     channels = pixels[:, None] if pixels.ndim == 3 else np.moveaxis(pixels, -1, 1)
     calibration = Calibration(
-        np.ascontiguousarray(channels), np.full((len(pixels), 3), np.nan), provenance={"psfs": str(folder)}
+        np.ascontiguousarray(channels), np.full((len(pixels), 3), np.nan), provenance={"psfs": str(psfs.path)}
     )
-    return job_with(calibration, folder, image, inputs)
+    job = job_with(calibration, psfs.path, image, inputs)
+    return replace(
+        job,
+        notes={**job.notes, **({"PSFs": "; ".join(psfs.notes)} if psfs.notes else {})},
+        provenance={**job.provenance, "psf_stack": dict(psfs.metadata)},
+    )
 
 
 def require_distance(z_um: float) -> None:

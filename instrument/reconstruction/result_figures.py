@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
+from instrument.files.seen import as_seen, srgb
 from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.job import Job
 from recon.reconstruction.result import Reconstruction
@@ -79,8 +80,6 @@ def in_colour_of_depth(
 
 def volume_seen(volume: Grey) -> npt.NDArray[np.uint8]:
     """Return a volume (n_z, height, width[, n_channels]) for a screen: brightest over depth, depth as hue."""
-    from instrument.files.seen import srgb
-
     grey_volume = volume if volume.ndim == 3 else volume.mean(axis=-1)
     front = grey_volume.max(axis=0)
     coloured = in_colour_of_depth(front, grey_volume.argmax(axis=0), len(volume), _white(front))
@@ -102,9 +101,9 @@ def volume_figure(result: Reconstruction, *, simulated: bool = False) -> Figure:
     axes = figure.subplots(2, 4)
     front, side, top = (volume.max(axis=a) for a in (0, 2, 1))
     white = _white(front)
-    axes[0, 0].imshow(front, cmap="gray", vmin=0, vmax=white)
+    axes[0, 0].imshow(srgb(front / white), cmap="gray", vmin=0, vmax=1)
     axes[0, 0].set(title="brightest over depth", xlabel="x (pixels)", ylabel="y (pixels)")
-    axes[0, 1].imshow(in_colour_of_depth(front, volume.argmax(axis=0), len(volume), white))
+    axes[0, 1].imshow(srgb(in_colour_of_depth(front, volume.argmax(axis=0), len(volume), white)))
     axes[0, 1].set(title="depth as colour: blue first, red last", xlabel="x (pixels)")
     axes[0, 2].imshow(top, cmap="magma", aspect="auto", vmin=0, vmax=_white(top), interpolation="nearest")
     axes[0, 2].set(title="brightest over y", xlabel="x (pixels)", ylabel="depth plane")
@@ -116,7 +115,7 @@ def volume_figure(result: Reconstruction, *, simulated: bool = False) -> Figure:
     for axis in axes[1, :3]:
         axis.remove()
     slices = figure.add_subplot(grid[1, :3])
-    slices.imshow(strip, cmap="gray", vmin=0, vmax=white)
+    slices.imshow(srgb(strip / white), cmap="gray", vmin=0, vmax=1)
     slices.set(title="planes " + ", ".join(_depth(result, z) for z in planes[: _SLICES - 1]))
     slices.axis("off")
     for channel, history in enumerate(result.histories):
@@ -159,8 +158,8 @@ def _summary(result: Reconstruction, job: Job, rotate_deg: int) -> Summary:
     height, width = image.shape[:2]
     panels = (
         Panel("PSF", _shown(psf[..., 0] if psf.shape[-1] == 1 else psf), gamma=0.5, caption="square root"),
-        Panel("Photograph", _shown(job.measurement), caption="dark level subtracted"),
-        Panel("Reconstruction", _shown(image), caption=f"{height} x {width}"),
+        Panel("Photograph", _on_screen(job.measurement), caption="dark level subtracted", white=1.0),
+        Panel("Reconstruction", _on_screen(image), caption=f"{height} x {width}", white=1.0),
     )
     facts = [("method", result.solver), ("prior", result.prior)]
     if result.tau is not None:
@@ -174,6 +173,10 @@ def _used_psf(result: Reconstruction, job: Job) -> int:
     """Return which of the calibration's PSFs the reconstruction took."""
     z_um = result.provenance.get("psf_z_um")
     return 0 if z_um is None else int(np.argmin(np.abs(job.calibration.source_positions_um[:, 2] - z_um)))
+
+
+def _on_screen(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    return as_seen(image) / 255.0
 
 
 def _shown(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -112,6 +112,14 @@ class Outputs:
                 raise FileError(path, "exists already and was left as it is.", "Use --force to overwrite it.")
 
 
+def _take_away_others(outputs: Outputs, result: Reconstruction) -> None:
+    """Remove files of an older result that was overwritten, where this one has no such file."""
+    written = outputs.written(result)
+    for path in outputs.files():
+        if path not in written and path != outputs.figure:
+            path.unlink(missing_ok=True)
+
+
 def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, rotate_deg: int = 0) -> None:
     """Write image, preview and record, each whole or not at all.
 
@@ -136,6 +144,7 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
         "preview": levels.to_json(),
     }
     write_json(outputs.record, record)
+    _take_away_others(outputs, result)
 
 
 def _write_residual(outputs: Outputs, result: Reconstruction, job: Job, rotate_deg: int = 0) -> None:
@@ -262,3 +271,4 @@ def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
     save_figure(volume_figure(result, simulated=job.simulated), outputs.preview)
     _write_residual(outputs, result, job)
     write_json(outputs.record, reconstruction_record(result, job, volume=True))
+    _take_away_others(outputs, result)

@@ -80,6 +80,7 @@ def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
         stage_position=stage.position() if stage is not None else {},
         stage_homed=stage is None or stage.is_homed,
         stage_target=(lambda source: bench.source_mount.target(*source)) if stage is not None else None,
+        play=bench.play,
         can_switch_source=bench.can_switch_source,
         can_switch_scene=bench.can_switch_scene,
         n_leds=len(bench.led_array.led_positions_mm) if bench.led_array is not None else 0,

@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 import tifffile
 
+from drivers.frame import FrameMetadata
 from instrument.bench.photograph import Progress
 from instrument.files.atomic import check_writable, require_new, whole_file
-from instrument.files.errors import BenchError, FileError
+from instrument.files.errors import BenchError, FileError, ranges
 from instrument.files.films import as_shown, write_mp4
 from instrument.files.images import write_image
 from instrument.runs.run import Run
@@ -93,25 +94,13 @@ def _tiff(run: Run, path: Path, indices: list[int], images: Iterator[Image], *, 
     array = run.array
     shape = (len(indices), *array.frame_shape)
     pitch_um = float(run.provenance["pixel_pitch_um"])
-    metadata: dict[str, Any] = {"axes": "TYXS" if array.is_colour else "TYX"}
+    noted = [run.metadata(i) for i in indices]
+    axis = "Z" if ome and run.plan is not None and _z_steps_um(noted).size else "T"
+    metadata: dict[str, Any] = {"axes": f"{axis}YXS" if array.is_colour else f"{axis}YX"}
     if ome:
-        metadata |= {
-            "Name": run.path.name,
-            "PhysicalSizeX": pitch_um,
-            "PhysicalSizeXUnit": "µm",
-            "PhysicalSizeY": pitch_um,
-            "PhysicalSizeYUnit": "µm",
-            "Plane": {
-                "DeltaT": [
-                    (run.metadata(i).host_time_ns - run.metadata(indices[0]).host_time_ns) / 1e9
-                    for i in indices
-                ],
-                "ExposureTime": [run.metadata(i).exposure_ms / 1e3 for i in indices],
-                "TheT": list(range(len(indices))),
-            },
-        }
-        if run.frame_period_s:
-            metadata |= {"TimeIncrement": run.frame_period_s, "TimeIncrementUnit": "s"}
+        metadata |= {"Name": run.path.name, **_ome_facts(run, indices, noted, axis)}
+        for side in "XY":
+            metadata |= {f"PhysicalSize{side}": pitch_um, f"PhysicalSize{side}Unit": "µm"}
     else:
         metadata["frames"] = json.dumps(indices)
     with tifffile.TiffWriter(
@@ -126,6 +115,49 @@ def _tiff(run: Run, path: Path, indices: list[int], images: Iterator[Image], *, 
             resolutionunit="CENTIMETER",
             metadata=metadata,
         )
+
+
+def _ome_facts(run: Run, indices: list[int], noted: list[FrameMetadata], axis: str) -> dict[str, Any]:
+    """Return what OME's fields hold of frames: when and where each was taken, and the camera's settings.
+
+    ``axis`` is that of the frames, T or Z.
+    """
+    first = noted[0]
+    began_ns = first.host_time_ns
+    planes: dict[str, list[Any]] = {
+        "DeltaT": [(one.host_time_ns - began_ns) / 1e9 for one in noted],
+        "ExposureTime": [one.exposure_ms / 1e3 for one in noted],
+        f"The{axis}": list(range(len(noted))),
+    }
+    for name in "xyz":
+        if all(f"{name}_um" in one.stage_position for one in noted):
+            planes[f"Position{name.upper()}"] = [one.stage_position[f"{name}_um"] for one in noted]
+            planes[f"Position{name.upper()}Unit"] = ["µm"] * len(noted)
+    facts: dict[str, Any] = {"AcquisitionDate": f"{first.utc:%Y-%m-%dT%H:%M:%S}", "Plane": planes}
+    if run.array.dtype.kind == "u":
+        facts["SignificantBits"] = first.significant_bits
+    if axis == "Z":
+        facts |= {"PhysicalSizeZ": float(np.median(np.abs(_z_steps_um(noted)))), "PhysicalSizeZUnit": "µm"}
+    elif run.frame_period_s:
+        facts |= {"TimeIncrement": run.frame_period_s, "TimeIncrementUnit": "s"}
+    told = ("pixel_format", "black_level", "gain", "binning", "roi", "led_pattern", "slm_image_hash")
+    facts["MapAnnotation"] = {
+        "Namespace": "diffuserbench",
+        **{name: str(getattr(first, name)) for name in told},
+        "simulated": str(run.is_simulated).lower(),
+        "frames": ranges(indices),
+    }
+    return facts
+
+
+def _z_steps_um(noted: list[FrameMetadata]) -> npt.NDArray[np.float64]:
+    """Return the steps of a sweep along z alone, which goes one way; nothing for other frames."""
+    places = [one.stage_position for one in noted]
+    others = {tuple(v for name, v in place.items() if name != "z_um") for place in places}
+    if len(others) > 1 or not all("z_um" in place for place in places):
+        return np.empty(0)
+    steps = np.diff([place["z_um"] for place in places])
+    return steps if bool((steps > 0).all() or (steps < 0).all()) else np.empty(0)
 
 
 def _hdf5(run: Run, path: Path, indices: list[int], images: Iterator[Image]) -> None:

@@ -73,6 +73,17 @@ class TimedSteps:
         asks = self._plan.parts[group[0].part].timing == "hardware"
         return (None if one and not asks else wire, group)
 
+    def words(self) -> str:
+        """Return how many frames hardware would time, in a sentence."""
+        sequences = [steps for wire, steps in self.groups(self._plan.steps()) if wire is not None]
+        timed = sum(map(len, sequences))
+        line = f" on {self._bench.camera.trigger_line}" if self._bench.camera.trigger_line else ""
+        return (
+            f"{timed} of {len(self._plan)} frames are timed by hardware, in "
+            f"{len(sequences)} sequence{'' if len(sequences) == 1 else 's'}; the camera's pulses come{line}, "
+            f"{self._bench.camera.trigger_edge} edge."
+        )
+
     def may_step(self, steps: Sequence[Step]) -> bool:
         """Whether steps may be taken by the program where their sequence is refused."""
         return all(self._plan.parts[step.part].timing == "auto" for step in steps)

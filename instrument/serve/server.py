@@ -32,6 +32,7 @@ from drivers.remote.wire import (
     calls,
     dump_error,
     pack_frame,
+    pieces,
     plain,
 )
 from instrument.bench.config import BenchConfig
@@ -222,7 +223,7 @@ class BenchServer:
         key = self._operator(request).key
         made = await self._loop.run_in_executor(pool, self.operation.make, call, kind, key, number, arguments)
         if isinstance(made, Frame):
-            return web.Response(body=b"".join(pack_frame(made)))
+            return web.Response(body=await self._in_thread(pack_frame, made))
         return web.json_response({"value": call.gives.dump(made)}, dumps=_dumps)
 
     async def _stop(self, request: web.Request) -> web.StreamResponse:
@@ -331,7 +332,8 @@ class BenchServer:
                 while (frame := await self._in_thread(_next_frame, camera)) is None:
                     pass
                 self.operation.newest_frame = frame
-                await link.send_bytes(b"".join(pack_frame(frame, number)))
+                for piece in await self._in_thread(pieces, frame, number):
+                    await link.send_bytes(piece)
                 number += 1
         except DeviceError as error:
             await _part(link, error)

@@ -183,7 +183,7 @@ class Option:
         if (words := self.words) and isinstance(value, str) and value not in words:
             if instead := self.declaration.replaced().get(value):
                 return f"{name}: {instead}"
-            near = difflib.get_close_matches(value, words, 1)
+            near = difflib.get_close_matches(value.lower(), words, 1)
             meant = f"; {near[0]!r}?" if near else "."
             return f"{name} must be one of {', '.join(words)}, not {value!r}{meant}"
         if self.kinds == (bool,) and not isinstance(value, bool):

@@ -85,7 +85,7 @@ class Registry(Mapping[str, T], Generic[T]):
         known = self._all()
         if name in self._broken:
             raise InputError(f"The {self.what} {name!r} {self._broken[name]}")
-        near = difflib.get_close_matches(str(name), known, 1)
+        near = difflib.get_close_matches(str(name).lower(), known, 1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise InputError(f"The {self.what} {name!r} is not known. Choose one of {', '.join(known)}.{hint}")
 

@@ -46,11 +46,14 @@ class Extent:
         Only object pixels this near to the axis are modelled, where PSFs vary over the field; None: all.
     left_out : Calibration or None
         PSFs of depths that are not modelled: what is left of the data is searched for light from there.
+    beyond : int
+        Of the depths, so many at the end stand for light from farther away than any that was calibrated.
     """
 
     psf_window: tuple[int, int] | None = None
     acceptance_px: float | None = None
     left_out: Calibration | None = None
+    beyond: int = 0
 
 
 @dataclass(frozen=True)

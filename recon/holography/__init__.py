@@ -16,9 +16,11 @@ from recon.holography.display import (
     eyebox_for_field_of_view,
     field_of_view_for_eyebox,
     pixels_for,
+    pixels_per_degree,
     random_mask,
 )
 from recon.holography.judge import Scores, judge
+from recon.holography.limit import Limit, hologram_limit
 from recon.holography.losses import LOSSES, Loss
 from recon.holography.model import Evaluation, HologramModel
 from recon.holography.optimise import (
@@ -29,6 +31,7 @@ from recon.holography.optimise import (
     one_step,
 )
 from recon.holography.options import HologramOptions
+from recon.holography.spot_list import SpotList, SpotScores, compute_spots, spot_array
 from recon.holography.target import Grid, Target, foveal_weights, painted_weights
 
 __all__ = [
@@ -43,17 +46,24 @@ __all__ = [
     "HologramOptions",
     "HologramRecord",
     "HologramStop",
+    "Limit",
     "Loss",
     "ScatteringMask",
     "Scores",
+    "SpotList",
+    "SpotScores",
     "Target",
     "compute_hologram",
+    "compute_spots",
     "eyebox_for_field_of_view",
     "field_of_view_for_eyebox",
     "foveal_weights",
+    "hologram_limit",
     "judge",
     "one_step",
     "painted_weights",
     "pixels_for",
+    "pixels_per_degree",
     "random_mask",
+    "spot_array",
 ]

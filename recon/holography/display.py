@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import asin, atan, ceil, degrees, radians, sin, sqrt, tan
+from math import asin, atan, ceil, degrees, pi, radians, sin, sqrt, tan
 
 import numpy as np
 import numpy.typing as npt
@@ -63,6 +63,11 @@ def random_mask(
     """Return a binary mask whose pixels are 0 or pi at random: white, so its far field is flat (Sec. 7.3)."""
     levels = np.random.default_rng(seed).integers(0, 2, shape, dtype=np.uint8)
     return ScatteringMask(levels, np.array([0.0, np.pi]), design_wavelength_nm)
+
+
+def no_mask(shape: tuple[int, int]) -> ScatteringMask:
+    """Return the mask of a display without one: an SLM pixel each, phase 0."""
+    return ScatteringMask(np.zeros(shape, np.uint8), np.zeros(1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,14 +274,17 @@ class Etendue:
         return self.f2_mm / self.f1_mm * self.width_mm
 
     @property
-    def pixels_per_degree(self) -> float:
-        """Resolution that the eye's low-pass leaves: SLM pixels over the field (Eq. 7.18's cut-off)."""
-        return self.pixels / self.field_of_view_deg
-
-    @property
     def etendue_mm(self) -> float:
         """One-dimensional étendue ``lambda N`` times the expansion along one axis (Eqs. 7.3, 7.10)."""
         return self.wavelength_nm * 1e-6 * self.pixels * sqrt(self.expansion)
+
+
+def pixels_per_degree(width: Etendue, height: Etendue) -> float:
+    """Return the resolution that the eye's low-pass leaves in every direction, pixels per degree.
+
+    Its cut-off is a circle (Eq. 7.18) of ``sqrt(Nx Ny / pi)`` periods over the field, two pixels a period.
+    """
+    return 2 * sqrt(width.pixels * height.pixels / pi) / width.field_of_view_deg
 
 
 def eyebox_for_field_of_view(display: Etendue, field_of_view_deg: float, *, paraxial: bool = False) -> float:

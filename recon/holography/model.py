@@ -170,10 +170,34 @@ class HologramModel:
         total *= self._ey[:, None] * self._ex
         return np.fft.fftshift(total)
 
+    def lags(self, slm: ComplexArray | None = None, plane: int = 0) -> ComplexArray:
+        """Return Fourier coefficients at the kept lags, (rows, columns), of what is seen, or wanted."""
+        if slm is None:
+            return self._wanted[plane]
+        self._intensity_spectrum(self._check(slm), plane)
+        rows, top = self.band.kept[0], self.band.top
+        return np.concatenate([self._spectrum[:top], self._spectrum[len(self._spectrum) - rows + top :]])
+
     def efficiency(self, slm: ComplexArray, plane: int = 0) -> float:
         """Return the part of the light on the SLM that reaches the field, DC term and envelope included."""
         self._intensity_spectrum(self._check(slm), plane)
         return float(self._spectrum[0, 0].real) * self._mean_power()
+
+    def slope(self) -> ComplexArray:
+        """Return the row spectra of ``dL/dI`` of the pattern that was evaluated last, for :meth:`weighed`."""
+        return self._spectrum.copy()
+
+    def weighed(self, field: ComplexArray, slope: ComplexArray, plane: int = 0) -> ComplexArray:
+        """Take a field at the SLM, DC light included, to the image plane, weigh it there, and back.
+
+        ``slope``, from :meth:`slope`, is the weight: the result is the gradient by the field, (height,
+        width), of the light weighed so; it is linear in the field.
+        """
+        self._intensity_spectrum(np.ascontiguousarray(field, self.dtype)[None], plane)
+        self._spectrum[:] = slope
+        out = np.zeros(self.display.slm_shape, self.dtype)
+        self._backward(0, plane, out)
+        return out
 
     def back_propagate(self, amplitude: ComplexArray, plane: int = 0) -> ComplexArray:
         """Return ``U^H m^* h^* F^-1 amplitude``: a field in the image plane integrated over the SLM pixels.

@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +36,7 @@ class HologramStop(enum.StrEnum):
     ITERATIONS = "the number of iterations is reached"
     CANCELLED = "cancelled"
     ONE_STEP = "one-step method"
+    EVEN = "the spots are as bright as asked for"
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,6 +256,17 @@ class _Bounded:
         return z
 
 
+class _Variable(Protocol):
+    """What the quasi-Newton method moves: how a flat real vector becomes SLM fields, and its loss."""
+
+    @property
+    def first_step(self) -> float: ...
+
+    def field(self, x: Array) -> Array: ...
+
+    def evaluate(self, x: Array) -> tuple[_Point, Array]: ...
+
+
 # Searches -----------------------------------------------------------------------------------------
 # Each moves on by a step, and returns what is there, or None when it is stuck.
 class _Lbfgs:
@@ -267,7 +279,7 @@ class _Lbfgs:
 
     MEMORY = 3
 
-    def __init__(self, variable: _Phase | _Bounded, x: Array) -> None:
+    def __init__(self, variable: _Variable, x: Array) -> None:
         self.variable = variable
         self.x = x
         self.point, self.gradient = variable.evaluate(self.x)

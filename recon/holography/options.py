@@ -46,6 +46,15 @@ class HologramOptions:
         label="sRGB-coded",
         group=_PICTURE,
     )
+    lift: float = option(
+        0.0,
+        help="Lift the picture's black to this part of white: what the mask and a phase SLM cannot make "
+        "dark costs the rest of the picture less.",
+        least=0,
+        below=1,
+        metavar="PART",
+        group=_PICTURE,
+    )
     loss: str | Loss = option(
         "frequency",
         help="Which differences count (Kuo 2020, Eqs. 7.16, 7.17 and 7.19).",
@@ -94,7 +103,7 @@ class HologramOptions:
     )
     expansion: int | None = option(
         None,
-        help="Étendue expansion: 4, 16, 36 ..., a square.",
+        help="Étendue expansion: 4, 16, 36 ..., a square; 1: without a mask.",
         default_words="the bench's",
         least=1,
         flags=("--expansion", "-q"),

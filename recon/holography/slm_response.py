@@ -11,11 +11,14 @@ from recon.errors import InputError
 
 Array = npt.NDArray[Any]
 
+_OF_ELLIPSE = 5  # parameters
+_ROUNDS = 60
+_FLAT_CONE = 1e4  # condition beyond which pictures do not span a cone
 MODES = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 """Powers of y and x of the flatness modes; constant and linear terms move nothing but the whole picture."""
 
 
-def phases_from_frames(frames: Array) -> npt.NDArray[np.float64]:
+def phases_from_frames(frames: Array) -> tuple[npt.NDArray[np.float64], float]:
     """Return the phase steps behind a series of interference pictures.
 
     Part of the SLM's pixels shows level 0, the others one level after the other. Every camera pixel then sees
@@ -31,6 +34,8 @@ def phases_from_frames(frames: Array) -> npt.NDArray[np.float64]:
     -------
     ndarray, float64, (n_levels,)
         Unwrapped, 0 at the first level, and growing with the level (the sign cannot be told from pictures).
+    float
+        Standard deviation of a phase, radians, by how far the pictures lie off the ellipse.
 
     Raises InputError when the pictures do not lie on an ellipse: too little phase, too much noise, or
     unstable light.
@@ -57,9 +62,38 @@ def phases_from_frames(frames: Array) -> npt.NDArray[np.float64]:
     root = np.linalg.cholesky(form).T
     round_ = (np.stack([u, v], axis=1) - centre) @ root.T
     phases = np.unwrap(np.arctan2(round_[:, 1], round_[:, 0]))
-    phases -= phases[0]
-    growing: npt.NDArray[np.float64] = phases if phases[-1] >= 0 else -phases
-    return growing
+    radius = np.hypot(*round_.T)
+    error = float(np.sqrt(((radius / radius.mean() - 1) ** 2).sum() / max(len(u) - _OF_ELLIPSE, 1)))
+    level_phases, level_error = _with_levels(flat, phases)
+    if level_error < error:
+        phases, error = level_phases, level_error
+    phases = phases - phases[0]
+    return (phases if phases[-1] >= 0 else -phases), error
+
+
+def _with_levels(flat: Array, phases: Array) -> tuple[npt.NDArray[np.float64], float]:
+    """Let each picture have a brightness of its own; returns phases and their standard deviation, radians.
+
+    ``s_n (a + b cos(phi_n) + c sin(phi_n))`` lies on a cone. Its apex tells every ``s_n`` but for what goes
+    with the phase's own cosine and sine: they are taken not to, which is true to ``std(s) sqrt(2 / n)``.
+    """
+    values, vectors = np.linalg.eigh(flat @ flat.T)
+    points = vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], 0))
+    levels = np.ones(len(points))
+    for _ in range(_ROUNDS):
+        turn = np.stack([np.ones_like(phases), np.cos(phases), np.sin(phases)], axis=1)
+        scaled = points / levels[:, None]
+        model = np.linalg.lstsq(turn, scaled, rcond=None)[0]
+        if np.linalg.cond(model) > _FLAT_CONE:
+            return phases, float("inf")
+        on_cone = turn @ model
+        levels = (points * on_cone).sum(axis=1) / (on_cone**2).sum(axis=1)
+        levels /= levels.mean()
+        places = np.linalg.solve(model.T, (points / levels[:, None]).T).T
+        phases = np.unwrap(np.arctan2(places[:, 2], places[:, 1]))
+    radius = np.hypot(places[:, 1], places[:, 2]) / places[:, 0]
+    noise = ((radius / radius.mean() - 1) ** 2).sum() / max(len(points) - _OF_ELLIPSE, 1)
+    return phases, float(np.sqrt(noise + 2 * levels.var() / len(points)))
 
 
 def mode(index: int, shape: tuple[int, int]) -> npt.NDArray[np.float64]:

@@ -3,8 +3,8 @@
 The SLM's image falls onto a scattering mask (scale 1, a relay whose distortion moves the image), the mask's
 far field onto a camera in the focal plane of a lens (Kuo 2020, Fig. 7.5). The field is sampled several times
 per mask pixel in the mask's own frame, SLM pixels are weighted by area at any sub-pixel place, free space
-between SLM image and mask is propagated, the intensity is sampled at twice the aperture's resolution and
-integrated over camera pixels. No hologram is computed here and no optimiser shares this code.
+between SLM image and mask is propagated, the far field's intensity is integrated over camera pixels without
+an approximation. No hologram is computed here and no optimiser shares this code.
 """
 
 from __future__ import annotations
@@ -16,6 +16,11 @@ import numpy.typing as npt
 import scipy.fft
 
 from recon.optics.jit import compiled
+
+_BEYOND = 16
+"""Samples kept on every side beyond the field of view, so that its border is interpolated from both sides."""
+_TAPS, _STEPS = 8, 512
+"""Samples that an interpolated one is made of, and places between two that have weights of their own."""
 
 Complex = npt.NDArray[np.complex64]
 Image = npt.NDArray[np.float32]
@@ -171,34 +176,54 @@ class ScatteringDisplay:
     def _on_sensor(self, field: Complex, mask_roll_mrad: float) -> Image:
         """Fourier transform by the lens, stop at the field of view, integrate over camera pixels.
 
-        The far field turns with the mask, the camera stays.
+        The far field turns with the mask, the camera stays. Its intensity has the aperture's auto-correlation
+        for a spectrum, so two samples a step of the aperture's resolution hold all of it: a camera pixel's
+        integral is a product there, and what lies between samples is interpolated.
         """
         spec, n = self.spec, self.spec.oversampling
-        height, width = self._coarse
-        far = scipy.fft.fft2(field, overwrite_x=True, workers=self.threads)
-        # Only the field of view is kept, twice as finely sampled, with the sampled cells' own envelope.
-        rows = scipy.fft.fftfreq(height, 1 / height).astype(int)
-        columns = scipy.fft.fftfreq(width, 1 / width).astype(int)
-        ey, ex = (np.sinc(scipy.fft.fftfreq(m)).astype(np.complex64) for m in far.shape)
-        inside = far[np.ix_(rows, columns)]
-        _propagate(inside, ey[rows], ex[columns])
-        inside = scipy.fft.ifft2(inside, overwrite_x=True, workers=self.threads)
-        fine = scipy.fft.fft2(inside, (2 * height, 2 * width), workers=self.threads)
-        scale = 1.0 / (n**4 * height * width)
-        sums = np.zeros((fine.shape[0] + 1, fine.shape[1] + 1))
-        _add_up(fine, sums)
+        kept, far = [], field
+        for axis, cells in ((1, self._coarse[1]), (0, self._coarse[0])):
+            side = 2 * scipy.fft.next_fast_len(cells + _BEYOND, real=True)
+            at = np.arange(side) - side // 2
+            padded = scipy.fft.fft(far, 2 * n * cells, axis=axis, workers=self.threads)
+            far = padded.take(at % (2 * n * cells), axis=axis)
+            kept.append(np.sinc(at / (2 * n * cells)).astype(np.complex64))  # the sampled cells' own envelope
+        _propagate(far, kept[1], kept[0])
+        light = far.real**2 + far.imag**2
+        spectrum = scipy.fft.rfft2(light, overwrite_x=True, workers=self.threads)
+        pixel = spec.sensor_pitch_um / spec.field_um
+        lags = scipy.fft.fftfreq(light.shape[0]), scipy.fft.rfftfreq(light.shape[1])
+        down, across = (
+            np.sinc(lag * 2 * cells * pixel).astype(np.complex64)
+            for lag, cells in zip(lags, self._coarse, strict=True)
+        )
+        _propagate(spectrum, down, across)
+        # Three samples a step: eight of them then make any place between, to a part in a thousand.
+        half, fine = light.shape[0] // 2, (light.shape[0] * 3 // 2, light.shape[1] * 3 // 2)
+        padded = np.zeros((fine[0], spectrum.shape[1]), np.complex64)
+        padded[:half], padded[-half:] = spectrum[:half], spectrum[half:]
+        light = scipy.fft.irfft2(padded, fine, overwrite_x=True, workers=self.threads)
+        light *= np.float32(2.25 / (n**4 * self._coarse[0] * self._coarse[1]))
         sensor = np.empty(spec.sensor_shape, np.float32)
-        _integrate(
-            sums,
+        _read(
+            light,
+            _taps(),
             sensor,
-            spec.sensor_pitch_um / spec.field_um,
-            spec.sensor_offset_um[0] / spec.field_um,
-            spec.sensor_offset_um[1] / spec.field_um,
+            self._coarse,
+            pixel,
+            (spec.sensor_offset_um[0] / spec.field_um, spec.sensor_offset_um[1] / spec.field_um),
             (spec.sensor_roll_mrad - mask_roll_mrad) * 1e-3,
             4 * spec.lens_distortion,
-            scale,
         )
         return sensor
+
+
+def _taps() -> Image:
+    """Return the weights of ``_TAPS`` samples for every ``1 / _STEPS`` between two of them, sum 1."""
+    away = np.arange(_TAPS) - (_TAPS // 2 - 1) - np.arange(_STEPS + 1)[:, None] / _STEPS
+    taper = np.i0(6.0 * np.sqrt(np.clip(1 - (2 * away / _TAPS) ** 2, 0, None)))
+    weights = np.sinc(away) * taper
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float32)
 
 
 @compiled
@@ -262,59 +287,43 @@ def _slope(spectrum: Complex, slope: Complex, fy2: Image, fx2: Image) -> None:
 
 
 @compiled
-def _add_up(field: Complex, sums: npt.NDArray[np.float64]) -> None:
-    """Write ``sums[i, j]``: intensity above row ``i`` and left of column ``j``, the axis in the middle."""
-    height, width = field.shape
-    for i in range(height):
-        row = field[(i + height - height // 2) % height]
-        total = 0.0
-        for j in range(width):
-            value = row[(j + width - width // 2) % width]
-            total += value.real * value.real + value.imag * value.imag
-            sums[i + 1, j + 1] = sums[i, j + 1] + total
-
-
-@compiled
-def _sum_up_to(sums: npt.NDArray[np.float64], y: float, x: float) -> float:
-    """Integral of the intensity from the corner to a point between samples."""
-    y = min(max(y, 0.0), sums.shape[0] - 1.0)
-    x = min(max(x, 0.0), sums.shape[1] - 1.0)
-    i, j = min(int(y), sums.shape[0] - 2), min(int(x), sums.shape[1] - 2)
-    y, x = y - i, x - j
-    above = sums[i, j] * (1 - x) + sums[i, j + 1] * x
-    below = sums[i + 1, j] * (1 - x) + sums[i + 1, j + 1] * x
-    between: float = above * (1 - y) + below * y
-    return between
-
-
-@compiled
-def _integrate(
-    sums: npt.NDArray[np.float64],
+def _read(
+    light: Image,
+    taps: Image,
     sensor: Image,
+    cells: tuple[int, int],
     pixel: float,
-    offset_y: float,
-    offset_x: float,
+    offset: tuple[float, float],
     roll: float,
     cubic: float,
-    scale: float,
 ) -> None:
-    """Mean intensity over every camera pixel; lengths in units of the field of view."""
-    height, width = sums.shape[0] - 1, sums.shape[1] - 1
+    """Interpolate pixel means to every camera pixel's place; lengths in units of the field of view.
+
+    Beyond the field it is dark; a pixel on its border has the part that is inside.
+    """
     for i in range(sensor.shape[0]):
         for j in range(sensor.shape[1]):
-            a = (i - 0.5 * (sensor.shape[0] - 1)) * pixel + offset_y
-            b = (j - 0.5 * (sensor.shape[1] - 1)) * pixel + offset_x
+            a = (i - 0.5 * (sensor.shape[0] - 1)) * pixel + offset[0]
+            b = (j - 0.5 * (sensor.shape[1] - 1)) * pixel + offset[1]
             y, x = a + roll * b, b - roll * a
             # The lens moves the image point at r to r (1 + cubic r^2); here its inverse, to first order.
             shrink = 1.0 / (1.0 + cubic * (x * x + y * y))
             y, x = y * shrink, x * shrink
-            # Sample k of n lies at (k - n / 2) / n and stands for the light half a step around it.
-            top, left = (y + 0.5 - pixel / 2) * height + 0.5, (x + 0.5 - pixel / 2) * width + 0.5
-            down, right = top + pixel * height, left + pixel * width
-            total = (
-                _sum_up_to(sums, down, right)
-                - _sum_up_to(sums, top, right)
-                - _sum_up_to(sums, down, left)
-                + _sum_up_to(sums, top, left)
-            )
-            sensor[i, j] = total * scale / ((down - top) * (right - left))
+            part_y = min(max((0.5 - abs(y)) / pixel + 0.5, 0.0), 1.0)
+            part_x = min(max((0.5 - abs(x)) / pixel + 0.5, 0.0), 1.0)
+            if part_y == 0.0 or part_x == 0.0:
+                sensor[i, j] = 0.0
+                continue
+            v = 3 * y * cells[0] + 0.5 * light.shape[0]
+            u = 3 * x * cells[1] + 0.5 * light.shape[1]
+            row, column = int(np.floor(v)), int(np.floor(u))
+            down = taps[int((v - row) * _STEPS + 0.5)]
+            across = taps[int((u - column) * _STEPS + 0.5)]
+            total = 0.0
+            for r in range(_TAPS):
+                line = light[(row + r - _TAPS // 2 + 1) % light.shape[0]]
+                inner = 0.0
+                for c in range(_TAPS):
+                    inner += across[c] * line[(column + c - _TAPS // 2 + 1) % light.shape[1]]
+                total += down[r] * inner
+            sensor[i, j] = max(total, 0.0) * part_y * part_x

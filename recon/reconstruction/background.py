@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.errors import InputError
 from recon.reconstruction.choice import Decision
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.part import expects_background
@@ -66,10 +67,15 @@ class Trial:
     """Share by which the square must fall for a background that is light."""
 
     @property
+    def explains(self) -> bool:
+        """Whether a background explains what nothing else does."""
+        return self.without**2 - self.lit**2 > GAIN
+
+    @property
     def helps(self) -> bool:
         """Whether a background explains what nothing else does, or is light."""
         fall = self.without**2 - self.lit**2
-        return fall > GAIN or (self.light >= LIGHT and fall >= self.light_gain * self.without**2)
+        return self.explains or (self.light >= LIGHT and fall >= self.light_gain * self.without**2)
 
 
 def trial_of(channels: Sequence[Problem]) -> Trial:
@@ -107,6 +113,39 @@ def _tried(problem: Problem) -> Trial:
     assert lit.background is not None
     light = float(lit.background[0][valid].mean()) / max(float(data[valid].mean()), 1e-30)
     return Trial(without, with_it, light, EVEN_GAIN if expects_background(problem) else LIGHT_GAIN)
+
+
+def beyond_of(
+    trial: Trial | None, again: Trial | None, overrides: Overrides, prevented: str | None
+) -> Decision:
+    """Decide whether planes beyond the farthest depth take part, where nothing but a background explains.
+
+    Parameters
+    ----------
+    trial, again : Trial or None
+        Without such planes and with them; None where nobody looked.
+    overrides : Overrides
+    prevented : str or None
+        Why there can be none.
+
+    Raises InputError where they are wished for and cannot be had.
+    """
+    asked = overrides.beyond is not None
+    if overrides.beyond and prevented:
+        raise InputError(f"Planes cannot be added beyond the depths (beyond=on): {prevented}.")
+    if trial is None or again is None:
+        why = prevented or ("" if asked else "what the depths leave unexplained asks for none")
+        value = "planes" if overrides.beyond else "none"
+        return Decision("beyond", value, why, overruled=asked, open=False)
+    helps = trial.without**2 - again.without**2 > GAIN
+    why = (
+        f"on pixels held out a coarse pass misses by {trial.without:.1f} times noise and usual error of the "
+        f"model, with planes beyond the farthest depth by {again.without:.1f} times (the square must fall by "
+        f"{GAIN:g})"
+    )
+    numbers = {"held_out_without": trial.without, "held_out_with": again.without}
+    up, down = (None, "none") if helps else ("planes", None)
+    return Decision("beyond", "planes" if helps else "none", why, up, down, numbers=numbers)
 
 
 def background_of(trial: Trial | None, overrides: Overrides, *, given: bool) -> Decision:

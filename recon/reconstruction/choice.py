@@ -13,8 +13,9 @@ from recon.camera.camera_model import ModelName
 from recon.reconstruction.options import Precision
 
 Name = Literal[
-    "model", "planes", "between", "field", "binning", "channels", "background", "iterations", "precision"
-]
+    "model", "planes", "between", "beyond", "field", "binning", "channels", "background", "iterations",
+    "precision",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +63,8 @@ class Choice:
         Depths that the calibration has.
     between : tuple of int
         Planes added half way between depths ``k`` and ``k + 1``; the result has their light on these.
+    beyond : bool
+        Whether planes are added beyond the farthest depth; the result has their light in its background.
     binning : int
         Pixels to average along each axis.
     merged : bool
@@ -93,13 +96,14 @@ class Choice:
     """Change an iteration at which to stop."""
     decisions: tuple[Decision, ...]
     seconds: float
+    beyond: bool = False
 
     @property
     def key(self) -> str:
         """What tells the problem that was chosen from others: kept work of another is not gone on with."""
         chosen = (
             self.model, self.planes, self.between, self.binning, self.merged, self.background,
-            self.precision, self.psf_window, self.acceptance_px,
+            self.precision, self.psf_window, self.acceptance_px, *(["beyond"] if self.beyond else []),
         )  # fmt: skip
         return hashlib.sha256(repr(chosen).encode()).hexdigest()[:8]
 

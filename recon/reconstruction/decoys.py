@@ -161,7 +161,7 @@ def _small(problem: Problem, longest_px: int) -> _Small:
             break
         factor //= 2
     depths = problem.depths
-    planes = np.unique(np.linspace(0, problem.n_planes - 1, MOST_PLANES).round().astype(int))
+    planes = np.unique(np.linspace(0, problem.n_depths - 1, MOST_PLANES).round().astype(int))
     if local := depths.varies and depths.field_error > VARIED:
         calibration = reduced_calibration(problem.calibration, 1, tuple(planes.tolist()))
     else:  # depths by number: they only have to differ

@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 
+from recon.camera.camera_model import CAMERAS
 from recon.priors import Prior
 from recon.reconstruction.pilot import pilot
 from recon.reconstruction.problem import Problem
@@ -63,12 +64,14 @@ class Law:
     most: float
 
 
-LAWS: Mapping[Literal["tv", "l1"], Law] = {
+LAWS: Mapping[Literal["tv", "l1", "tv, varying"], Law] = {
     "tv": Law(0.083, -0.95, 3.1, 1.2, 12.0, 8.0),
     "l1": Law(1.4, -0.75, 3.6, 2.1, 3.0, 256.0),
+    "tv, varying": Law(0.2, -0.55, 1.24, 0.0, 12.0, 8.0),
 }
 """By what the prior counts; fitted on the scenes of `benchmarks/weights.py --tuning` and on the pairs. That
-of total variation is nearly the maximum a posteriori: what is left of the data over the steps' scale."""
+of total variation is nearly the maximum a posteriori: what is left of the data over the steps' scale. Where
+PSFs vary over the field what one of them leaves is no misfit of theirs, and it takes no part."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,8 @@ class FirstLook:
     passed_on : float
         Noise that the adjoint passes on, in units of the noise: less than 1 where pixels are erased, which
         is as if there were less light, not more noise.
+    varying : bool
+        Whether the picture is then solved with PSFs that vary over the field.
     """
 
     steepness: float
@@ -95,10 +100,11 @@ class FirstLook:
     misfit: float
     seconds: float
     passed_on: float = 1.0
+    varying: bool = False
 
     def weight(self, prior: str) -> float:
         """Return the weight of a prior by name, in units of the noise."""
-        law = LAWS[kind_of(prior)]
+        law = LAWS["tv, varying" if self.varying else kind_of(prior)]
         misfit = min(max(self.misfit, 1.0), law.most_misfit)
         steepness = float(np.clip(self.steepness, 1e-6, STEEPEST * misfit))
         factor = law.factor * 2 ** (law.lit * self.lit)
@@ -116,8 +122,9 @@ class FirstLook:
 def look_at(problem: Problem, cancel: threading.Event | None = None) -> FirstLook | None:
     """Look at a picture through one PSF; None where a weight is given, or none is asked for.
 
-    A background that is estimated as well takes no part: it changes nothing of the picture's steps. With l1
-    light then counts as much as it is seen, and the law does not hold.
+    Where PSFs vary over the field it is the central one, and a background that is estimated as well takes
+    no part: neither changes much of the picture's steps. With l1 light then counts as much as it is seen,
+    and the law does not hold.
 
     Parameters
     ----------
@@ -129,8 +136,9 @@ def look_at(problem: Problem, cancel: threading.Event | None = None) -> FirstLoo
     named = not isinstance(problem.prior, Prior) and is_weighted(problem.prior_name)
     if options.tau is not None or not named or problem.solver.one_step:
         return None
-    if problem.smooth and kind_of(problem.prior_name) == "tv":
-        problem = replace(problem, smooth=False)
+    varying = problem.varies and problem.model not in CAMERAS
+    if kind_of(problem.prior_name) == "tv":
+        problem = replace(problem, smooth=False, model="convolution" if varying else problem.model)
     if not problem.is_plain or problem.patterned:
         return None
     # Whatever device and precision the picture is solved with, the weight is the same.
@@ -149,4 +157,5 @@ def look_at(problem: Problem, cancel: threading.Event | None = None) -> FirstLoo
         float(np.sqrt(np.mean(found.left[problem.valid].astype(np.float64) ** 2))),
         found.outcome.seconds,
         passed_on,
+        varying,
     )

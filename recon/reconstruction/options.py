@@ -32,6 +32,8 @@ class Overrides:
         ``"all"``: every calibrated depth takes part; or those that do, ascending, counted from 0.
     between : bool or None
         Whether planes are added between all depths that take part.
+    beyond : bool or None
+        Whether planes are added beyond the farthest depth.
     binning : int or None
     channels : str or None
         ``"all"``: no merging; ``"merged"``.
@@ -46,6 +48,7 @@ class Overrides:
     model: ModelName | None = None
     planes: Literal["all"] | tuple[int, ...] | None = None
     between: bool | None = None
+    beyond: bool | None = None
     binning: int | None = None
     channels: str | None = None
     background: bool | None = None
@@ -63,6 +66,7 @@ class Overrides:
             "model": {m: m for m in model_names() if m != "auto"},
             "planes": None,
             "between": {"on": True, "off": False},
+            "beyond": {"on": True, "off": False},
             "binning": None,
             "channels": {"all": "all", "merged": "merged"},
             "background": {"on": True, "off": False},
@@ -221,7 +225,8 @@ class ReconstructionOptions:
     choose: Overrides | None = option(
         None,
         help="Overrule one of auto's choices (repeatable): model=, planes=all|0-3,7, between=on|off, "
-        "field=all, binning=N, channels=all|merged, background=on|off, precision=float32|float64.",
+        "beyond=on|off, field=all, binning=N, channels=all|merged, background=on|off, "
+        "precision=float32|float64.",
         metavar="NAME=VALUE",
         group=_CHOICE,
         parse_all=_overrides,

@@ -327,6 +327,13 @@ class Part:
             raise ValueError("No background was asked for.")
         return self._usual + self.removal.background(self.data - self.camera.forward(solution))
 
+    def from_beyond(self, solution: Array) -> Array:
+        """Return the light from planes beyond the farthest depth on the sensor, as ``data``."""
+        own = self.problem.n_depths
+        psfs = self._scaled(self.problem.levelled[0].central[own:])
+        camera = Convolution(psfs, self.problem.sensor_shape, dtype=self.dtype)
+        return camera.forward(np.ascontiguousarray(solution[:, own:]))
+
     def residual(self, solution: Array, background: Array | None) -> Array:
         """Return what a solution and its background leave of the data, as ``data``; 0 where erased."""
         rest: Array = self._measured - self.camera.forward(solution)

@@ -12,7 +12,9 @@ import numpy.typing as npt
 from recon.analysis.correlation import similarity
 from recon.camera.camera_model import Depths, members_of_depths
 from recon.camera.refocus import refocus
+from recon.camera.registration import rescaled
 from recon.errors import InputError
+from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.choice import Choice, Decision
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.part import Part
@@ -28,6 +30,9 @@ UNLIKE = 0.8
 time. Beads between planes gained 1.5 dB at 0.66 and nothing at 0.92."""
 MADE_ALIKE = 0.9
 """What a PSF made for a depth between them must be expected to agree to with one measured there."""
+BEYOND = (0.97, 0.94, 0.88, 0.76, 0.52, 0.25)
+"""Sizes of the patterns of light from beyond the farthest depth, relative to that depth's. Thin diffusers
+shrink them with distance, down to some 0.9; the smaller ones stand for light scattered or not bent."""
 TV_LEAVES = 2.0
 """How many times noise's reach total variation leaves unexplained: up to 1.4 times where planes were left out
 rightly, from 2.6 times where wrongly, on two scenes of beads, each with one PSF and with nine a depth."""
@@ -222,6 +227,66 @@ def _prevented(calibration: Calibration, depths: Depths) -> str | None:
     return None
 
 
+def no_beyond(prior: str | Prior, model: str, n_planes: int) -> str | None:
+    """Return why no planes can be added beyond the farthest depth, in words; None where they can."""
+    if n_planes == 1:
+        return "one depth was calibrated"
+    if model != "convolution":
+        return "PSFs that vary over the field are not brought to other depths"
+    if isinstance(prior, Prior) or not PRIORS.is_own(prior):
+        return "a prior from outside may tie depths to one another"
+    loose = PRIORS[prior].kind == "l1" or not PRIORS[prior].weighted
+    if not loose and not any(isinstance(t, TotalVariation) for t in PRIORS[prior](1.0).terms()):
+        return f"the prior {prior} ties depths to one another"
+    return None
+
+
+def with_planes_beyond(calibration: Calibration, of: Calibration | None = None) -> Calibration:
+    """Return a calibration with :data:`BEYOND` after its depths: the farthest one's light, smaller patterns.
+
+    The farthest depth has the smallest pattern, where depths are not known.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    of : Calibration, optional
+        With all depths, where the first has lost some.
+    """
+    of = of or calibration
+    positions = of.source_positions_um
+    ends = [_on_axis(of, group) for group in members_of_depths(positions)]
+    z_um = positions[ends, 2]
+    if np.isfinite(z_um).all():
+        end = ends[int(np.argmax(z_um))]
+    else:
+        end = min((ends[0], ends[-1]), key=lambda k: _spread(of.psfs[k]))
+    made = np.stack([rescaled(of.psfs[end], 1 / size) / np.float32(size**2) for size in BEYOND])
+    places = np.repeat(positions[end][None], len(BEYOND), axis=0)
+    places[:, 2] /= BEYOND  # told apart, and from the others
+    return replace(
+        calibration,
+        psfs=np.concatenate([calibration.psfs, made]),
+        source_positions_um=np.concatenate([calibration.source_positions_um, places]),
+    )
+
+
+def _on_axis(calibration: Calibration, group: npt.NDArray[np.intp]) -> int:
+    """Return which source of a depth lies nearest to the axis."""
+    x, y = calibration.source_positions_um[group, :2].T
+    return int(group[int(np.argmin(np.nan_to_num(np.hypot(x, y))))])
+
+
+def _spread(psf: Array) -> float:
+    """Return the mean squared distance of a PSF's light from its middle, pixels squared."""
+    light = psf.sum(axis=0, dtype=np.float64)
+    light = light / max(float(light.sum()), 1e-30)
+    total = 0.0
+    for axis, n in enumerate(light.shape):
+        profile, places = light.sum(axis=1 - axis), np.arange(n)
+        total += float(profile @ (places - profile @ places) ** 2)
+    return total
+
+
 def signs_of_light(
     residual: Array, left_out: Calibration, channel: int, window: tuple[int, int] | None
 ) -> npt.NDArray[np.float64]:
@@ -238,10 +303,9 @@ def signs_of_light(
     """
     from scipy.signal import fftconvolve
 
-    positions, signs = left_out.source_positions_um, []
-    for group in members_of_depths(positions):
-        off_axis = np.nan_to_num(np.hypot(positions[group, 0], positions[group, 1]))
-        psfs = left_out.psfs[group[int(np.argmin(off_axis))]]
+    signs = []
+    for group in members_of_depths(left_out.source_positions_um):
+        psfs = left_out.psfs[_on_axis(left_out, group)]
         psf = psfs[channel if len(psfs) > 1 else 0].astype(np.float64)
         for axis, m in enumerate(window or psf.shape):
             first = psf.shape[axis] // 2 - m // 2

@@ -11,6 +11,8 @@ data shows in the residual; a share of that size passes for places and light (:d
 
 from __future__ import annotations
 
+import threading
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -88,7 +90,7 @@ def points_problem(problem: Problem) -> Problem | None:
     return replace(given, model=problem.model, smooth=problem.smooth, reduction=None, choice=None)
 
 
-def points_of(result: Reconstruction, problem: Problem) -> PointErrors:
+def points_of(result: Reconstruction, problem: Problem, cancel: threading.Event | None = None) -> PointErrors:
     """Return the points of a picture.
 
     Parameters
@@ -96,8 +98,16 @@ def points_of(result: Reconstruction, problem: Problem) -> PointErrors:
     result : Reconstruction
     problem : Problem
         As :func:`points_problem` returned it.
+    cancel : threading.Event, optional
+        Set it to stop after the round in progress.
     """
-    part = Part(problem, slice(0, 1))
+    with closing(Part(problem, slice(0, 1))) as part:
+        return _points(result, problem, part, cancel)
+
+
+def _points(
+    result: Reconstruction, problem: Problem, part: Part, cancel: threading.Event | None
+) -> PointErrors:
     psf = np.asarray(problem.depths.central[0, 0] / problem.energy[0], np.float32)
     camera = PointImages(psf[None], FieldFunctions(0, np.zeros((1, 2))), problem.sensor_shape)
     centre = result.grid.centre
@@ -111,7 +121,7 @@ def points_of(result: Reconstruction, problem: Problem) -> PointErrors:
         covariance = _covariance(camera, part, found)
         sure = found.light > SURE * np.sqrt(np.maximum(covariance[:, 2, 2], 0))
         sure &= np.isfinite(covariance).all(axis=(1, 2))
-        if sure.all():
+        if sure.all() or (cancel is not None and cancel.is_set()):
             break
         found = Points(found.places[sure], found.light[sure])
         covariance = covariance[sure]

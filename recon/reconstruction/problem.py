@@ -224,6 +224,11 @@ class Problem:
         return len(self.depths.central)
 
     @property
+    def n_depths(self) -> int:
+        """Planes that are calibrated depths; the others, at the end, are beyond them."""
+        return self.n_planes - self.extent.beyond
+
+    @property
     def sensor_shape(self) -> tuple[int, int]:
         """Height and width of the measurement."""
         return self.data.shape[1], self.data.shape[2]
@@ -283,7 +288,7 @@ class Problem:
 
         Of many PSFs it is their root mean square, which keeps how bright they are beside one another.
         """
-        psfs = self.depths.central
+        psfs = self.depths.central[: self.n_depths]
         if self.is_plain:
             own = np.sqrt(np.sum(psfs[0].astype(np.float64) ** 2, axis=(1, 2)))
             return np.asarray(own, np.float32)
@@ -340,8 +345,18 @@ class Problem:
     @property
     def axis_weights(self) -> Array:
         """Weights of the z, y and x differences of total variation, (3,) or (n_z, 3)."""
-        given = self.options.axis_weights
-        return self.grid.axis_weights() if given is None else np.asarray(given, float)
+        given, own = self.options.axis_weights, self.n_depths
+        if own == self.n_planes:
+            return self.grid.axis_weights() if given is None else np.asarray(given, float)
+        # Depths as they are; planes beyond them are tied neither to these nor to one another.
+        grid = self.grid
+        shape = (own, *grid.shape[1:])
+        depths = replace(grid, shape=shape, z_um=grid.z_um[:own], pitch_um=grid.pitch_um[:own])
+        weights = np.ones((self.n_planes, 3))
+        weights[:own] = depths.axis_weights() if given is None else np.asarray(given, float)
+        weights[own:, 1:] = weights[own - 1, 1:]
+        weights[own - 1 :, 0] = 0
+        return weights
 
     def _require_axis_weights(self, given: npt.ArrayLike) -> None:
         """Refuse weights of differences that the prior does not take, or that are none."""
@@ -355,10 +370,10 @@ class Problem:
                 "none that can be weighed: leave them out, or take tv or tv-isotropic."
             )
         weights = np.asarray(given)
-        shapes = ((3,), (self.n_planes, 3))
+        shapes = ((3,), (self.n_depths, 3))
         if weights.dtype.kind not in "uif" or weights.shape not in shapes:
             raise InputError(
-                f"axis_weights are numbers for the z, y and x differences, (3,) or ({self.n_planes}, 3), a "
+                f"axis_weights are numbers for the z, y and x differences, (3,) or ({self.n_depths}, 3), a "
                 f"row a depth; found {given!r}."
             )
         if not (np.isfinite(weights).all() and (weights >= 0).all()):

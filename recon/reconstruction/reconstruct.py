@@ -29,7 +29,7 @@ from recon.reconstruction.selection import choose
 from recon.reconstruction.solve import Progress, rules_of, solve
 from recon.reconstruction.solvers import SOLVERS
 from recon.reconstruction.uncertainty import refused, uncertain
-from recon.solvers.base import Keeper
+from recon.solvers.base import IterationRecord, Keeper
 from recon.types import Calibration
 from recon.verdict.evidence import evidence_of, not_judged, observations, unsettled_by
 from recon.verdict.judge import Verdict, method_name, unlike_any, verdict_on
@@ -100,7 +100,8 @@ def reconstruct(
         result = replace(result, refinement=refinement, provenance=provenance)
     if not options.judged:
         return replace(result, basis=None)
-    return judged(result, problem, started=warm is not None, on_stage=course.stage("judge"))
+    stage = course.stage("judge")
+    return judged(result, problem, started=warm is not None, on_stage=stage, cancel=cancel)
 
 
 def require_two_images(problem: Problem) -> None:
@@ -127,7 +128,13 @@ SHARE, LEAST = 3, 20
 """Of a result's iterations a third are run without held-out pixels, and so many at least."""
 
 
-def held_out_error(result: Reconstruction, problem: Problem) -> float:
+def held_out_error(
+    result: Reconstruction,
+    problem: Problem,
+    *,
+    on_stage: Stage | None = None,
+    cancel: threading.Event | None = None,
+) -> float | None:
     """Return the root mean square error of a tenth of the pixels by a shorter run without them.
 
     Parameters
@@ -135,12 +142,19 @@ def held_out_error(result: Reconstruction, problem: Problem) -> float:
     result : Reconstruction
     problem : Problem
         That was solved; of several channels that are solved one by one the one with most signal counts.
+    on_stage : callable, optional
+        ``on_stage(share, what)`` after each iteration.
+    cancel : threading.Event, optional
+        Set it to do without.
 
     Returns
     -------
-    float
-        In units of the noise, which it holds itself: 1 is as good as can be.
+    float or None
+        In units of the noise, which it holds itself: 1 is as good as can be. None where it was cancelled.
     """
+    stopped = cancel or threading.Event()
+    if stopped.is_set():
+        return None
     unseen = problem.valid & (np.random.default_rng(0).random(problem.valid.shape) < HELD_OUT)
     spread = [float(d[v].std()) for d, v in zip(problem.data, problem.valid, strict=True)]
     channels = next(c for c in parts_of(problem) if c.start <= int(np.argmax(spread)) < c.stop)
@@ -154,7 +168,16 @@ def held_out_error(result: Reconstruction, problem: Problem) -> float:
     part = Part(seen, channels)
     try:
         part.weigh(result.tau)
-        solution = part.lifted(offered.make(part, None).run(rules).solution)
+        solver = offered.make(part, None)
+
+        def tell(_: object, record: IterationRecord) -> None:
+            if on_stage is not None:
+                share = record.iteration / (rules.iterations or record.iteration)
+                on_stage(share, "judging: pixels held out")
+
+        solution = part.lifted(solver.run(rules, callback=tell, cancel=stopped).solution)
+        if stopped.is_set():
+            return None
         told = part.camera.forward(solution)
         if part.removal is not None:
             told = told + part.background(solution)
@@ -165,7 +188,12 @@ def held_out_error(result: Reconstruction, problem: Problem) -> float:
 
 
 def judged(
-    result: Reconstruction, problem: Problem, *, started: bool = False, on_stage: Stage | None = None
+    result: Reconstruction,
+    problem: Problem,
+    *,
+    started: bool = False,
+    on_stage: Stage | None = None,
+    cancel: threading.Event | None = None,
 ) -> Reconstruction:
     """Return the result with a verdict on whether to trust it and whether the calibration is its own.
 
@@ -181,6 +209,8 @@ def judged(
         Whether it was started from another result.
     on_stage : callable, optional
         ``on_stage(share, what)`` as it goes on.
+    cancel : threading.Event, optional
+        Set it to do without held-out pixels.
     """
     problem, small = result.basis or (problem, result)
     tell = on_stage or (lambda *_: None)
@@ -191,7 +221,8 @@ def judged(
             check = check_calibration(problem, on_stage=tell)
             verdict = verdict if check is None else verdict.with_calibration(check)
             if unlike_any(verdict):
-                verdict = replace(verdict, held_out=held_out_error(small, problem))
+                missed = held_out_error(small, problem, on_stage=tell, cancel=cancel)
+                verdict = replace(verdict, held_out=missed)
         except Exception as error:  # noqa: BLE001 - the verdict says what it says without it
             said = (
                 *said,
@@ -240,8 +271,8 @@ def _verdict(
         # One plane is a picture: it fails as pictures do, by a wrong depth for one.
         evidence = evidence_of(
             observations(problem.measurement.image, problem.data, problem.valid, problem.noise),
-            result.volume,
-            problem.depths.central,
+            result.volume[: problem.n_depths],
+            problem.depths.central[: problem.n_depths],
             list(result.residuals),
             max(
                 unsettled_by(h, r, problem.stop_tolerance, started=started)

@@ -18,7 +18,7 @@ from recon.errors import InputError
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import Colours, colours, merged
 from recon.reconstruction.measurement import Measurement, Noise, central
-from recon.reconstruction.planes import put_back, with_planes_between
+from recon.reconstruction.planes import BEYOND, put_back, with_planes_between, with_planes_beyond
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import Reconstruction
 from recon.types import Calibration
@@ -57,11 +57,15 @@ class Reduction:
         return image if factor == 1 else _channels_first(image, 2, lambda c: enlarged(c, factor, shape))
 
     def volume(self, planes: Array) -> Floats:
-        """Bring a volume (n_z, height, width[, n_channels]) back; depths that were left out are empty."""
+        """Bring a volume (n_z, height, width[, n_channels]) back; depths that were left out are empty.
+
+        Planes beyond the farthest depth, which are the last, are not part of it.
+        """
         if self.choice.n_planes == 1:
             return self.picture(planes[0])[None]
         whole = np.zeros((self.choice.n_planes, *self.picture(planes[0]).shape), np.float32)
-        for at, plane in zip(places_of(self.choice), planes, strict=True):
+        places = places_of(self.choice)
+        for at, plane in zip(places, planes[: len(places)], strict=True):
             picture, below = self.picture(plane), int(at)
             if at == below:
                 whole[below] += picture
@@ -94,7 +98,8 @@ class Reduction:
             residual=None if small.residual is None else self._larger(small.residual),
             choice=choice,
             empty_planes=tuple(
-                replace(e, planes=_empty(choice, [places[z] for z in e.planes])) for e in small.empty_planes
+                replace(e, planes=_empty(choice, [places[z] for z in e.planes if z < len(places)]))
+                for e in small.empty_planes
             ),
             # Only a state on the measurement's own pixels and channels can start another run.
             state=small.state if self.on_own_pixels else None,
@@ -122,6 +127,7 @@ class Reduction:
             volume = _channels_first(volume, 3, lambda v: block_mean(v, factor, about_axis=True) * factor**2)
         # Light of planes between is on the calibrated ones: there it begins.
         planes = [volume[int(at)] if at == int(at) else np.zeros_like(volume[0]) for at in places_of(choice)]
+        planes += [np.zeros_like(volume[0])] * (len(BEYOND) if choice.beyond else 0)
         state = before.state if self.on_own_pixels else None
         return replace(before, volume=np.stack(planes).astype(np.float32), state=state)
 
@@ -155,7 +161,10 @@ def reduced(choice: Choice, problem: Problem) -> Problem:
     planes = None if len(places) == len(every) else tuple(every.index(at) for at in places)
     rest = tuple(z for z, at in enumerate(every) if at not in places)
     left_out = reduced_calibration(calibration, factor, rest) if rest else None
+    every_depth = calibration
     calibration = reduced_calibration(calibration, factor, planes)
+    if choice.beyond:
+        calibration = with_planes_beyond(calibration, reduced_calibration(every_depth, factor, None))
     window = tuple(max(n // factor, 1) for n in choice.psf_window)
     small = tuple(min(w, n) for w, n in zip(window, calibration.psfs.shape[2:], strict=True))
     warnings = problem.warnings
@@ -182,6 +191,7 @@ def reduced(choice: Choice, problem: Problem) -> Problem:
             (small[0], small[1]),
             None if choice.acceptance_px is None else choice.acceptance_px / factor,
             left_out,
+            len(BEYOND) if choice.beyond else 0,
         ),
     )
     return replace(

@@ -37,6 +37,15 @@ def background_in_words(problem: Problem, background: npt.NDArray[Any] | None) -
     ]
 
 
+def beyond_in_words(problem: Problem, beyond: npt.NDArray[Any]) -> list[str]:
+    """Say how much of the light was taken for light from beyond the depths (shaped as the data)."""
+    share = float(beyond.mean()) / max(abs(float(problem.data[problem.valid].mean())), 1e-30)
+    return [
+        f"{share:.0%} of the light on the sensor is taken for light from beyond the farthest calibrated "
+        "depth: it is part of the background, not of the volume (--choose beyond=off: none is)."
+    ]
+
+
 def residual_in_words(problem: Problem, outcome: Outcome, residual: float, noise: float) -> list[str]:
     """Return a warning where a run of one part ended far from its data, or went away from them.
 

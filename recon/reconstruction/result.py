@@ -112,7 +112,8 @@ class Reconstruction:
     seconds : float
         Wall time of the solver.
     background : ndarray or None
-        The smooth background that was estimated along with the volume, measurement units; shaped as the
+        The smooth background that was estimated along with the volume, and light from beyond its depths
+        where that was looked for, measurement units; shaped as the
         measurement.
     empty_planes : tuple of EmptyPlanes
         One a channel, with l1: depth planes that were left out because they stayed empty, and whether the

@@ -9,14 +9,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.camera_model import CAMERAS, ModelName
+from recon.camera.camera_model import CAMERAS, Extent, ModelName
 from recon.errors import InputError
-from recon.reconstruction.background import FLOOR, Trial, background_of, floor, trial_of
+from recon.reconstruction.background import (
+    FLOOR,
+    Trial,
+    background_of,
+    beyond_of,
+    floor,
+    trial_of,
+)
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import channels_of, merged
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import Overrides, ReconstructionOptions
-from recon.reconstruction.planes import between_of, planes_of
+from recon.reconstruction.planes import BEYOND, between_of, no_beyond, planes_of, with_planes_beyond
 from recon.reconstruction.probe import COARSE_PX, camera_cost, coarse_copy, coarse_passes
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import on_blocks, reduced, reduced_calibration
@@ -88,7 +95,9 @@ def with_background(problem: Problem, calibration: Calibration) -> Problem:
     said = options.estimate_background is not None or problem.measurement.background is not None
     if said or problem.patterned or model in CAMERAS:
         return problem
-    asked = replace(options, model="auto", choose=Overrides(model=model, binning=1, channels="all"))
+    asked = replace(
+        options, model="auto", choose=Overrides(model=model, binning=1, channels="all", beyond=False)
+    )
     choice = choice_for(Problem.of(problem.measurement, calibration, asked))
     if choice.background != problem.smooth:
         options = replace(options, estimate_background=choice.background)
@@ -134,8 +143,17 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     model, by_model = model_of(depths, overrides, contrast, costs)
     sparse = coarse_passes(coarse) if looked else None
     tell(0.4, "choosing: a background")
-    given = measurement.background is not None
-    smooth = background_of(_trial(problem, coarse, model) if lit else None, overrides, given=given)
+    trial = _trial(problem, coarse, model) if lit else None
+    again = None
+    prevented = no_beyond(problem.prior, model, len(depths.z_um))
+    if trial is not None and trial.explains and overrides.beyond is not False and prevented is None:
+        farther = with_planes_beyond(calibration)
+        coarser = _coarse(data, valid, farther, problem.options.z_um, beyond=len(BEYOND))
+        again = _trial(problem, coarser, model)
+    beyond = beyond_of(trial, again, overrides, prevented)
+    if beyond.value != "none" and again is not None:
+        trial = again
+    smooth = background_of(trial, overrides, given=given)
     estimated = smooth.value == "estimated"
     planes, dropped = planes_of(sparse, depths, overrides)
     between, added = between_of(calibration, depths, planes, overrides)
@@ -158,7 +176,7 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     decisions = (
         by_model,
         dropped,
-        *([added] if len(depths.z_um) > 1 else []),
+        *([added, beyond] if len(depths.z_um) > 1 else []),
         field,
         binning,
         merge,
@@ -182,6 +200,7 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
             replace(d, why=held[d.name], overruled=False) if d.name in held else d for d in decisions
         ),
         seconds=time.perf_counter() - began,
+        beyond=beyond.value != "none",
     )
 
 
@@ -234,8 +253,10 @@ def _held(problem: Problem, overrides: Overrides) -> tuple[Overrides, dict[str, 
     return overrides, held
 
 
-def _coarse(data: Array, valid: Array, calibration: Calibration, z_um: float | None) -> list[Problem]:
-    """Return small copies of every channel."""
+def _coarse(
+    data: Array, valid: Array, calibration: Calibration, z_um: float | None, *, beyond: int = 0
+) -> list[Problem]:
+    """Return small copies of every channel; the calibration's last planes may be beyond its depths."""
     # Erased pixels cannot be averaged with others: the coarse pass then has all pixels.
     factor = -(-max(data.shape[1:]) // COARSE_PX) if valid.all() else 1
     options = ReconstructionOptions(z_um=z_um, estimate_background=False)
@@ -245,7 +266,7 @@ def _coarse(data: Array, valid: Array, calibration: Calibration, z_um: float | N
         own = calibration.psfs[:, c : c + 1] if several else calibration.psfs
         small = reduced_calibration(replace(calibration, psfs=own, background=None), factor, None)
         photograph = on_blocks(data[c : c + 1], valid[c : c + 1], None, factor, flat=True)
-        coarse.append(Problem.of(photograph, small, options))
+        coarse.append(Problem.of(photograph, small, options, extent=Extent(beyond=beyond)))
     return coarse
 
 

@@ -18,7 +18,7 @@ from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.planes import limit_of, signs_in_words, signs_of_light
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reduction import Reduction
-from recon.reconstruction.residual import background_in_words, residual_in_words
+from recon.reconstruction.residual import background_in_words, beyond_in_words, residual_in_words
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solvers import OfferedSolver
@@ -265,6 +265,14 @@ def _run(
     residual = float("nan") if rest is None else float(np.linalg.norm(rest))
     if outcome.history:
         residual = outcome.history[-1].data_residual
+    doubts = [
+        *residual_in_words(problem, outcome, residual, part.noise_norm),
+        *background_in_words(problem, smooth),
+    ]
+    if problem.n_depths < problem.n_planes:
+        beyond = part.from_beyond(solution)
+        doubts += beyond_in_words(problem, beyond)
+        smooth = beyond if smooth is None else smooth + beyond
     return _Solved(
         volume=problem.measured(solution, part.channels),
         state=_state(part, solution),
@@ -277,10 +285,7 @@ def _run(
         noise_norm=part.noise_norm,
         residual=residual,
         rest=rest,
-        doubts=[
-            *residual_in_words(problem, outcome, residual, part.noise_norm),
-            *background_in_words(problem, smooth),
-        ],
+        doubts=doubts,
     )
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
 from statistics import NormalDist
@@ -169,22 +170,24 @@ def uncertain(
     """
     began = time.monotonic()
     solved, small = result.basis or (problem, result)
-    replicas = Replicas(solved, small)
-    total = np.zeros(small.volume.shape)
-    for number in range(REPEATS):
-        total += replicas.squared_error(number, replicas.shrink, cancel)
-        if cancel is not None and cancel.is_set():
-            words = "No uncertainty: it was interrupted before the repetitions were done."
-            return replace(result, warnings=(*result.warnings, words))
-        if on_stage is not None:
-            done = number + 1
-            on_stage(done / REPEATS, f"uncertainty: repetition {done} of {REPEATS}")
+    interrupted = "No uncertainty: it was interrupted before the repetitions were done."
+    with closing(Replicas(solved, small)) as replicas:
+        total = np.zeros(small.volume.shape)
+        for number in range(REPEATS):
+            total += replicas.squared_error(number, replicas.shrink, cancel)
+            if cancel is not None and cancel.is_set():
+                return replace(result, warnings=(*result.warnings, interrupted))
+            if on_stage is not None:
+                done = number + 1
+                on_stage(done / REPEATS, f"uncertainty: repetition {done} of {REPEATS}")
     deviation = replicas.deviation(total / REPEATS)
     binning = 1 if solved.choice is None else solved.choice.binning
     if solved.reduction is not None:
         deviation = solved.reduction.volume(deviation)
     fitted = points_problem(solved)
-    points = None if fitted is None else points_of(result, fitted)
+    points = None if fitted is None else points_of(result, fitted, cancel)
+    if cancel is not None and cancel.is_set():
+        return replace(result, warnings=(*result.warnings, interrupted))
     found = Uncertainty(
         deviation,
         REPEATS,
@@ -247,6 +250,11 @@ class Replicas:
         rng = np.random.default_rng(0)
         for left, valid in zip(self._rest, problem.valid, strict=True):
             left[~valid] = rng.choice(left[valid], np.count_nonzero(~valid))
+
+    def close(self) -> None:
+        """Remove what the parts kept on disk."""
+        for part in self._parts:
+            part.close()
 
     def _placed(self, part: Part, like: Reconstruction) -> Array:
         shape = part.camera.domain_shape

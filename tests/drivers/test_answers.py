@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from drivers.common.answers import within
+from drivers.common.stream import FrameStream
 from drivers.errors import DeviceError, DeviceTimeoutError
 from drivers.frame import FrameMetadata
 from instrument.bench.bench import Bench
@@ -95,4 +96,19 @@ def test_a_camera_that_hangs_ends_a_run_and_the_other_devices_are_made_safe(
     assert "exposure ended" in "".join(failure.value.__notes__)
     assert Run.open(run_paths(tmp_path)[0]).condition is RunCondition.FAILED
     assert light_is_off(bench)
+    let_go.set()
+
+
+@pytest.mark.usefixtures("soon")
+def test_a_stream_that_is_given_up_lets_go_of_its_readers_and_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera, let_go, shown = FreeRunningCamera(), threading.Event(), threading.Event()
+    stream = FrameStream(camera)
+    stream.start()
+    stream.subscribe(lambda _: shown.set())
+    assert shown.wait(20)
+    monkeypatch.setattr(camera, "stop_sequence", lambda: let_go.wait(30))
+    with pytest.raises(DeviceTimeoutError, match="ending its sequence"):
+        stream.close()
+    assert stream.newest() is None
+    assert not any(t.name.startswith("subscri") and t.is_alive() for t in threading.enumerate())
     let_go.set()

@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("aiohttp", reason='pip install "diffuserbench[remote]"')
 
 import aiohttp
+import numpy as np
 
 from drivers.errors import DeviceError, DeviceLostError, StoppedError
 from drivers.led_array import LedPattern
@@ -170,11 +171,11 @@ def test_a_slow_network_loses_frames_and_counts_them_and_a_stop_does_not_wait(
         network.bytes_per_s = float("inf")
 
 
-def test_frames_are_handed_out_in_their_order() -> None:
+def test_frames_are_handed_out_in_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever stands between: proxies may hand messages on in another order than they came."""
     from types import SimpleNamespace
 
-    from drivers.remote.wire import pack_frame
+    from drivers.remote.wire import pieces
     from tests.mocks.devices import MockCamera, MockOptions, MockWorld, MockWorldOptions
 
     class Stream:
@@ -191,15 +192,20 @@ def test_frames_are_handed_out_in_their_order() -> None:
 
     with MockCamera(MockOptions(), MockWorld(MockWorldOptions())) as taken:
         frames = [taken.snap() for _ in range(4)]
-    packed = [b"".join(pack_frame(frame, number)) for number, frame in enumerate(frames)]
-    messages = [SimpleNamespace(type=aiohttp.WSMsgType.BINARY, data=packed[n]) for n in (1, 0, 3, 2)]
+    monkeypatch.setattr("drivers.remote.wire._PIECE_BYTES", 500)
+    sent = [piece for number, frame in enumerate(frames) for piece in pieces(frame, number)]
+    assert len(sent) > 12
+    np.random.default_rng(3).shuffle(sent)
+    messages = [SimpleNamespace(type=aiohttp.WSMsgType.BINARY, data=bytes(piece)) for piece in sent]
     camera = RemoteCamera(RemoteOptions())
     camera._link.require = lambda: None  # type: ignore[method-assign]
     camera._link.begin = lambda work: work.close()  # type: ignore[method-assign]
     camera._stream = stream = Stream(messages)  # type: ignore[assignment]
     asyncio.run(camera._receive(stream))  # type: ignore[arg-type]
-    ids = [camera._ring.popleft().metadata.frame_id for _ in range(4)]
-    assert ids == [frame.metadata.frame_id for frame in frames]
+    for frame in frames:
+        came = camera._ring.popleft()
+        assert came.metadata.frame_id == frame.metadata.frame_id
+        np.testing.assert_array_equal(came.image, frame.image)
 
 
 # Who may, and who may not ---

@@ -16,8 +16,9 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image, write_image
 from instrument.files.sample_images import SAMPLES, load_sample
 from instrument.files.slm_image import levels_phase, phase_levels, read_slm_image
-from recon.holography import HologramModel, HologramOptions
+from recon.holography import HologramModel, HologramOptions, spot_array
 from recon.holography.judge import compare
+from recon.holography.spot_list import SpotField
 
 
 @pytest.fixture
@@ -141,6 +142,49 @@ def test_an_slm_of_few_levels_gets_a_pattern_on_them(capsys):
     assert found == pytest.approx(facts["metrics"][0]["psnr_db"], abs=0.05)
     assert main(["hologram", "picture.png", "--levels", "5", "--out", "five.png"]) == 2
     assert "5 phase levels" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("here")
+def test_spots_without_a_mask_come_from_an_array_or_a_list(capsys):
+    assert main(["hologram", "--spots", "4x6", "--expansion", "1"]) == 0
+    assert "24 spots: " in capsys.readouterr().out
+    levels, facts = read_slm_image("slm.png")
+    assert facts["spot_scores"]["deviation"] < 0.005
+    assert facts["expansion"] == 1
+    assert len(facts["spots"]["places"]) == 24
+    config = parse_config(Path("bench.toml").read_text(), Path("bench.toml"))
+    display = bench_display(config, ((96, 128), 8.0), expansion=1)
+    assert len(np.unique(display.mask.field())) == 1
+    shown = SpotField(display, spot_array(4, 6)).score(
+        np.exp(1j * levels_phase(levels, facts["binning"]))[None]
+    )
+    assert shown.efficiency == pytest.approx(facts["spot_scores"]["efficiency"], rel=1e-3)
+    assert Path("slm-preview.png").is_file()
+    Path("list.csv").write_text("y,x,intensity\n0.3,0.4,1\n0.6,0.7,two\n")
+    assert main(["hologram", "--spots", "list.csv", "--out", "list.png"]) == 2
+    assert "line 3: intensity is 'two'" in capsys.readouterr().err
+    Path("list.csv").write_text("y,x,intensity\n0.3,0.4,1\n0.6,0.7,2\n")
+    assert main(["hologram", "--spots", "list.csv", "--out", "list.png"]) == 0
+    for wrong, words in (
+        (["picture.png", "--spots", "2x2"], "Give a TARGET picture, or --spots"),
+        (["--spots", "2x2", "--video"], "--video does not apply"),
+        (["--spots", "nowhere.csv"], "ROWSxCOLUMNS or a CSV file"),
+    ):
+        assert main(["hologram", *wrong, "--out", "other.png"]) == 2
+        assert words in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("here")
+def test_the_limit_is_said_before_anything_is_computed(capsys):
+    assert main(["hologram", "picture.png", "--limit", "--iterations", "10", "--lift", "0.2"]) == 0
+    said = capsys.readouterr().out
+    assert "no number of frames shows this picture better than" in said
+    assert "black at 0.3 of white" in said
+    assert "black at 0.1 of white" not in said
+    assert not Path("slm.png").exists()
+    assert main(["hologram", "picture.png", "--limit", "--color"]) == 2
+    lifted = HologramOptions(lift=0.2, envelope="correct")
+    assert prepare_target(read_image("picture.png").pixels, bench(), lifted).image.min() >= 0.2
 
 
 @pytest.mark.usefixtures("here")

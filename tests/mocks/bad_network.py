@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from collections.abc import Coroutine
 from typing import Any, Self
@@ -15,6 +16,8 @@ class BadNetwork:
     ----------
     bytes_per_s : float
         What each connection carries from the server at most.
+    delay_s : float
+        What everything takes each way.
     silent : bool
         Whether everything is swallowed while connections stay open, as with a cable that is pulled.
     held : bytes
@@ -23,6 +26,7 @@ class BadNetwork:
 
     def __init__(self, to_port: int) -> None:
         self.bytes_per_s = float("inf")
+        self.delay_s = 0.0
         self.silent = False
         self.held = b""
         self.is_holding = threading.Event()
@@ -67,18 +71,36 @@ class BadNetwork:
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         there, back = await asyncio.open_connection("127.0.0.1", self._to_port)
         self._writers |= {writer, back}
-        for task in (
-            asyncio.create_task(self._forward(reader, back, to_server=True)),
-            asyncio.create_task(self._forward(there, writer, to_server=False)),
-        ):
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+        for source, sink, to_server in ((reader, back, True), (there, writer, False)):
+            on_its_way: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(256)
+            for work in (
+                self._depart(source, on_its_way),
+                self._arrive(on_its_way, sink, to_server=to_server),
+            ):
+                task = asyncio.create_task(work)
+                self._tasks.add(task)
+                task.add_done_callback(self._tasks.discard)
 
-    async def _forward(
-        self, source: asyncio.StreamReader, sink: asyncio.StreamWriter, *, to_server: bool
+    async def _depart(
+        self, source: asyncio.StreamReader, on_its_way: asyncio.Queue[tuple[float, bytes]]
     ) -> None:
-        try:
-            while data := await source.read(1 << 14):
+        data = b"-"
+        while data:
+            try:
+                data = await source.read(1 << 14)
+            except ConnectionError:
+                data = b""
+            await on_its_way.put((self._loop.time() + self.delay_s, data))
+
+    async def _arrive(
+        self, on_its_way: asyncio.Queue[tuple[float, bytes]], sink: asyncio.StreamWriter, *, to_server: bool
+    ) -> None:
+        with contextlib.suppress(ConnectionError):
+            while True:
+                due_s, data = await on_its_way.get()
+                await asyncio.sleep(due_s - self._loop.time())
+                if not data:
+                    break
                 if to_server and self.held and self.held in data:
                     self.is_holding.set()
                     await self._passing.wait()
@@ -87,11 +109,8 @@ class BadNetwork:
                 if not self.silent:
                     sink.write(data)
                     await sink.drain()
-        except ConnectionError:
-            pass
-        finally:
-            if not self.silent:
-                sink.close()
+        if not self.silent:
+            sink.close()
 
     def _run(self, work: Coroutine[Any, Any, Any]) -> Any:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()

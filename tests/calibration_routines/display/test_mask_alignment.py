@@ -11,7 +11,12 @@ import pytest
 
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.mask_alignment import AlignmentFailedError, AlignmentSettings, MaskAlignment
-from calibration_routines.display.slm_calibration import measure_flatness, measure_look_up_table
+from calibration_routines.display.slm_calibration import (
+    SlmProcedure,
+    measure_flatness,
+    measure_look_up_table,
+)
+from calibration_routines.procedure import CalibrationError
 from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config, template
@@ -207,6 +212,23 @@ def test_the_look_up_table_is_measured_through_an_unknown_mask() -> None:
         found = measure_look_up_table(DisplayBench(bench, 2), n_levels=17)
     true = 7.2 * (np.arange(256) / 255) ** 1.4
     assert np.abs(found.correction.phase_of_level_rad - true).max() < 0.05
+
+
+@pytest.mark.parametrize(("flicker", "kept"), [(0.01, True), (0.2, False)])
+def test_a_table_under_a_laser_that_flickers_is_right_or_not_written(
+    flicker: float, kept: bool, tmp_path: Path
+) -> None:
+    text = small(shape="[120, 160]").replace("settle_ms = 30.0", BENT) + f"\nflicker = {flicker}\n"
+    with Bench(parse_config(text, None)).open() as bench:
+        if not kept:
+            with pytest.raises(CalibrationError, match="the light flickers by"):
+                SlmProcedure(levels=9, out=tmp_path / "slm.json").carry_out(bench, tmp_path)
+            assert not list(tmp_path.iterdir())
+            return
+        found = measure_look_up_table(DisplayBench(bench, 2), n_levels=17)
+    true = 7.2 * (np.arange(256) / 255) ** 1.4
+    assert np.abs(found.correction.phase_of_level_rad - true).max() < 0.03
+    assert found.steadiness.flicker == pytest.approx(flicker, rel=0.7)
 
 
 def test_too_little_phase_is_noticed() -> None:

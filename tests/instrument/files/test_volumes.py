@@ -1,12 +1,16 @@
 """Volumes as OME-Zarr, read back by zarr-python and held against the OME-Zarr model library."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import zarr
 from ome_zarr_models.v05 import Image
 
-from instrument.files.volumes import write_volume_zarr
-from instrument.reconstruction.result_file import Outputs
+from instrument.files.volumes import write_volume_tiff, write_volume_zarr
+from instrument.reconstruction.job import Job
+from instrument.reconstruction.result_file import Outputs, write_reconstruction
+from recon import Calibration, Options, Problem, solve
 from recon.reconstruction.result import Grid
 
 Z_UM = np.array([9000.0, 10000.0, 11500.0])
@@ -28,12 +32,24 @@ def test_levels_scales_and_every_planes_own_size(tmp_path, volume):
     first, second, third = model.ome_attributes.multiscales[0].datasets
     assert first.coordinateTransformations[0].scale == [1500.0, 20.0, 20.0]
     assert second.coordinateTransformations[0].scale == [1500.0, 40.0, 40.0]
-    assert second.coordinateTransformations[1].translation == [0.0, 10.0, 10.0]
+    assert first.coordinateTransformations[1].translation == [9000.0, -3000.0, -2000.0]
+    assert second.coordinateTransformations[1].translation == [9000.0, -2990.0, -1990.0]
     assert third.path == "2"
     np.testing.assert_allclose(group["1"][1, 7, 9], volume[1, 14:16, 18:20].mean(), rtol=1e-6)
     assert group["0"].chunks == (1, 300, 200)
     assert group.attrs["diffuserbench"]["z_um"] == Z_UM.tolist()
     assert group.attrs["diffuserbench"]["simulated"] is True
+
+
+def test_an_ome_tiff_says_where_its_planes_lie(tmp_path, volume):
+    ome_types = pytest.importorskip("ome_types")
+    colour = np.stack([volume, 2 * volume, 3 * volume], -1)
+    write_volume_tiff(tmp_path / "v.ome.tif", iter(colour), colour.shape, GRID)
+    pixels = ome_types.from_tiff(tmp_path / "v.ome.tif").images[0].pixels
+    assert [(p.the_z, p.the_c, p.position_z) for p in pixels.planes] == [
+        (z, c, Z_UM[z]) for z in range(3) for c in range(3)
+    ]
+    assert (pixels.planes[0].position_x, pixels.planes[0].position_y) == (-2000.0, -3000.0)
 
 
 def test_colour_goes_first_and_unknown_sizes_have_no_unit(tmp_path, volume):
@@ -73,3 +89,17 @@ def test_a_folder_that_is_no_zarr_is_never_taken(tmp_path):
     assert outputs.preview.name == "v.png"
     with pytest.raises(Exception, match="is no Zarr folder"):
         outputs.check(0, overwrite=True)
+
+
+def test_what_an_older_result_left_beside_goes_with_it(tmp_path):
+    """An older residual beside a new picture would be taken for the new one's."""
+    calibration = Calibration(np.eye(16, dtype=np.float32)[None, None] + 0.1, np.full((1, 3), np.nan))
+    image = np.random.default_rng(0).random((16, 16)).astype(np.float32)
+    result = solve(Problem.of(image, calibration, Options(model="convolution", iterations=2, judged=False)))
+    outputs, job = Outputs.named(tmp_path / "a.tif"), Job(image, calibration, {})
+    write_reconstruction(outputs, replace(result, residual=image), job)
+    assert outputs.residual.exists()
+    write_reconstruction(outputs, replace(result, residual=None), job)
+    assert not outputs.residual.exists()
+    assert outputs.image.exists()
+    assert outputs.record.exists()

@@ -87,6 +87,31 @@ def test_tiff(run: Run, tmp_path: Path, name: str) -> None:
             assert json.loads(tiff.shaped_metadata[0]["frames"]) == STORED
 
 
+def test_ome_tiff_tells_when_and_where_each_frame_was_taken(tmp_path: Path) -> None:
+    ome_types = pytest.importorskip("ome_types")
+    plan = Plan(label="axial", parts=(Part(label="a", repeats=3),))
+    with RunWriter.create(tmp_path, label="axial", bench=BENCH, plan=plan) as writer:
+        for i in range(3):
+            place = {"x_um": 5.0, "y_um": -2.0, "z_um": 1000.0 + 250 * i}
+            stamp = replace(METADATA, host_time_ns=i * 10**9, black_level=64.0, stage_position=place)
+            writer.write([FrameToStore(i, image(i, False), stamp)])
+        run = writer.finish(FinishReason.COMPLETED)
+    export(run, tmp_path / "a.ome.tif")
+    picture = ome_types.from_tiff(tmp_path / "a.ome.tif")
+    pixels = picture.images[0].pixels
+    assert (pixels.size_z, pixels.size_t) == (3, 1)
+    assert (pixels.physical_size_z, pixels.significant_bits) == (250.0, 12)
+    assert [plane.position_z for plane in pixels.planes] == [1000.0, 1250.0, 1500.0]
+    assert [(plane.position_x, plane.exposure_time, plane.delta_t) for plane in pixels.planes] == [
+        (5.0, 0.01, 0.0), (5.0, 0.01, 1.0), (5.0, 0.01, 2.0)]  # fmt: skip
+    assert picture.images[0].acquisition_date == datetime(2026, 1, 1)
+    told = dict(picture.structured_annotations[0].value)
+    assert (told["black_level"], told["pixel_format"], told["simulated"]) == ("64.0", "Mono12", "true")
+    np.testing.assert_array_equal(
+        tifffile.imread(tmp_path / "a.ome.tif"), [image(i, False) for i in range(3)]
+    )
+
+
 def test_numpy(run: Run, tmp_path: Path) -> None:
     export(run, tmp_path / "a.npy", [4, 1])
     assert np.array_equal(np.load(tmp_path / "a.npy"), [run.frame(4), run.frame(1)])

@@ -20,6 +20,7 @@ from instrument.plan import Light, Part, Plan, PlanError
 from instrument.runs.acquire import acquire
 from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_control import RunControl
+from instrument.runs.timed import TimedSteps
 
 LEVELS = (40, 80, 120, 160, 200, 240)
 
@@ -94,6 +95,10 @@ def test_faults_are_named_and_the_sequence_is_taken_again(
     monkeypatch.setattr(Wires, "_pulses", third_lost)
     with open_bench() as bench:
         run = acquire(bench, steps_of_light(), tmp_path)
+        assert TimedSteps(bench, steps_of_light()).words() == (
+            "8 of 8 frames are timed by hardware, in 1 sequence; "
+            "the camera's pulses come on Line1, rising edge."
+        )
     assert notes(run, "sequence taken again") == ["no frame came of pattern 5"]
     assert attempts == [2 + 2 + 6] * 2
     assert brightness(run)[2] / brightness(run)[-1] == pytest.approx(0.5, abs=0.02)

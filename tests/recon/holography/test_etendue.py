@@ -5,7 +5,14 @@ from __future__ import annotations
 import pytest
 
 from recon.errors import InputError
-from recon.holography import Etendue, eyebox_for_field_of_view, field_of_view_for_eyebox, pixels_for
+from recon.holography import (
+    Etendue,
+    eyebox_for_field_of_view,
+    field_of_view_for_eyebox,
+    pixels_for,
+    pixels_per_degree,
+)
+from recon.holography.target import cutoff_radius
 
 GAEA = Etendue(pixels=4160, pitch_um=3.74, wavelength_nm=532)
 
@@ -29,6 +36,13 @@ def test_wide_field_and_large_eyebox_need_32500_pixels_and_270_pixels_per_degree
 def test_an_8k_slm_with_sixteenfold_expansion_serves_an_immersive_display():
     wide = Etendue(pixels=8192, pitch_um=4.0, wavelength_nm=532, expansion=16)
     assert eyebox_for_field_of_view(wide, 120) == pytest.approx(10, rel=0.02)
+
+
+def test_the_resolution_is_a_circle_of_as_many_frequencies_as_the_slm_has_pixels():
+    width, height = Etendue(960, 16, 660), Etendue(540, 16, 660)
+    found = pixels_per_degree(width, height)
+    assert found == pytest.approx(2 * cutoff_radius((540, 960)) / width.field_of_view_deg)
+    assert found == pytest.approx(344, abs=0.5)
 
 
 def test_lenses_trade_field_for_eyebox_and_the_product_stays():

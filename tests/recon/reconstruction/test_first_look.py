@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -57,6 +58,20 @@ def test_a_misfit_far_above_the_noise_asks_for_more_and_all_stays_within_limits(
     assert weight(10, 0.3, 4.0) < weight(2.5, 0.3, 4.0) / 2  # steps count beside what is left
     assert weight(0, 1.0, 2.0) == LAWS["tv"].most
     assert weight(1e9, 0.0, 0.0) == weight(STEEPEST, 0.0, 1.0) > 0
+
+
+def test_where_psfs_vary_the_central_one_looks_and_its_own_law_weighs():
+    scene = make_scene("text", size=32, grid=3)
+
+    def look(model, **options):
+        asked = ReconstructionOptions(model=model, **options)
+        return look_at(Problem.of(Measurement(scene.measurement), scene.calibration, asked))
+
+    plain, varying, lit = look("convolution"), look("lowrank"), look("local", estimate_background=True)
+    assert (varying.steepness, varying.lit, varying.misfit) == (plain.steepness, plain.lit, plain.misfit)
+    assert lit.weight("tv") == varying.weight("tv") == replace(varying, misfit=9.0).weight("tv")
+    assert varying.weight("tv") != plain.weight("tv")
+    assert look("lowrank", prior="l1") is None
 
 
 def test_nobody_looks_where_nothing_is_to_be_weighed():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from recon import Calibration, InputError, Measurement, Options, Problem, choose
 from recon.evaluation.scene import make_scene
 from recon.priors import PRIORS, NonNegativity, Prior, TotalVariation
 from recon.priors.named import NamedPrior
+from recon.reconstruction.reconstruct import held_out_error
 from recon.streams.joint import solve_together
 from recon.streams.video import stream_problem
 
@@ -164,3 +166,20 @@ def test_erasures_and_background_of_patterned_light_are_shaped_as_its_frames(pho
     assert np.isfinite(solve(each, replace(each.options, **QUICK)).image).all()
     with pytest.raises(InputError, match="24 x 24 pixels and 3 frames"):
         Problem.of(Measurement(frames, erasures=np.zeros((3, 24, 24)), patterns=patterns), psf)
+
+
+def test_pixels_held_out_tell_how_far_they_are_and_are_given_up(photograph) -> None:
+    image, psf = photograph
+    problem = Problem.of(image, psf, Options(**QUICK))
+    result, cancel, told = solve(problem), threading.Event(), []
+
+    def tell(share: float, what: str) -> None:
+        told.append((share, what))
+        if len(told) == 3:
+            cancel.set()
+
+    assert held_out_error(result, problem, on_stage=tell, cancel=cancel) is None
+    assert [what for _, what in told] == ["judging: pixels held out"] * 3
+    assert 0 < told[0][0] < told[2][0] < 1
+    assert held_out_error(result, problem, cancel=cancel) is None
+    assert held_out_error(result, problem) > 0

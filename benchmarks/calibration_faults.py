@@ -1,0 +1,306 @@
+"""Each calibration routine under each fault of the simulated bench: what it says, and what became of it.
+
+    python benchmarks/calibration_faults.py                          every routine, every fault
+    python benchmarks/calibration_faults.py --only axial lateral     some routines
+    python benchmarks/calibration_faults.py --fault flicker --sizes 0.25 0.5 1
+
+Each trial carries a routine out twice as a person would, on a bench without faults and on one with this fault
+alone, everything else alike, and holds the results against one another. The change is relative; of PSFs it is
+the largest of three: their shape once registered, their brightness relative to one another, and their places
+relative to the first (a tenth of a pixel counts as 1 %); a common shift and a common brightness are none. Of
+the angular and of the field's response it is the largest difference, of the SLM's table in turns.
+
+=========  ==============================================================================================
+harmless   the result changed by 2 % at the most, and nothing was said
+corrected  it changed by 2 % at the most, and the fault was said
+named      it changed by more, and the words name the fault
+found      it changed by more, and something was said, but of something else
+refused    there is no result, and the words name the fault (``refused*``: they name something else)
+missed     it changed by more, and nothing was said
+alarm      it changed by 2 % at the most, and something else was said
+=========  ==============================================================================================
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration_routines.optics.angular_response import AngularResponse
+from calibration_routines.optics.dpc import DiffuserSurface
+from calibration_routines.optics.photograph import Photograph, measure_field_response
+from calibration_routines.procedure import routines
+from calibration_routines.scatter import compare
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config, template
+from instrument.files.errors import BenchError
+from recon.camera.registration import moved
+from recon.errors import InputError
+
+Array = npt.NDArray[np.floating]
+TOLERATED = 0.02
+
+TINY = """
+[camera]
+driver = "simulated"
+[stage]
+driver = "simulated"
+{stage}
+[led_array]
+driver = "simulated"
+[source]
+rgb = [0, 255, 0]
+{source}
+[scene]
+control = "simulated"
+[geometry]
+{geometry}
+[simulated]
+preset = "tiny"
+time_scale = 0
+{world}
+"""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something wrong: tables of the configuration given its size, and what a right word about it holds."""
+
+    tables: Callable[[float], Mapping[str, str]]
+    size: float
+    words: str
+    display: bool = False
+    """Whether benches without the point source's stage can have it."""
+
+
+def _world(text: str) -> Callable[[float], Mapping[str, str]]:
+    return lambda size: {"world": text.format(size)}
+
+
+FAULTS = {
+    "flicker": Fault(_world("flicker = {0}"), 0.2, "flicker", display=True),
+    "drift": Fault(_world("drift_per_min = -{0}"), 0.3, "dimmer|taken out|drift", display=True),
+    "vibration": Fault(_world("vibration_px = {0}"), 0.5, "shake", display=True),
+    "ambient": Fault(
+        _world("ambient_e_per_s = {0}\nambient_period_s = 120"), 4e4, "other light", display=True
+    ),
+    "late hot": Fault(
+        _world("late_hot_pixels = {0:.0f}\nlate_hot_e_per_s = 1e6\nlate_hot_after_s = 8"),
+        300,
+        "turned hot",
+        display=True,
+    ),
+    "play": Fault(
+        lambda s: {"stage": "\n".join(f"axes.{a}_um.backlash = {s}" for a in "xyz")}, 200, "play|backlash"
+    ),
+    "slip x": Fault(
+        lambda s: {"stage": f"axes.x_um.slip = {s}\naxes.x_um.slip_at_move = 3"}, 500, "slip|lost|moved"
+    ),
+    "slip z": Fault(
+        lambda s: {"stage": f"axes.z_um.slip = {s}\naxes.z_um.slip_at_move = 6"}, 2000, "slip|lost|distance"
+    ),
+    "mount": Fault(
+        lambda s: {"stage": f"mount_offset_um = [{0.1 * s}, {-0.075 * s}, {s}]"}, 4000, "distance|mount"
+    ),
+    "lean": Fault(lambda s: {"stage": f"mount_tilt_mrad = [{s}, 0]"}, 10, "lean|mount"),
+    "wrong d": Fault(
+        lambda s: {"geometry": f"diffuser_distance_mm = {8.9 * (1 + s)}"}, 0.1, r"\bd\b|distance"
+    ),
+    "wrong pitch": Fault(lambda s: {"geometry": f"pixel_pitch_um = {13 * (1 + s)}"}, 0.1, r"pitch|\bd\b"),
+    "pinhole": Fault(
+        lambda s: {"world": f"source_diameter_um = {s}", "source": f"size_um = {s}"},
+        1500,
+        "source.*large|pinhole",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A routine on its bench: the configuration's text, how it is carried out, what its result is."""
+
+    text: str
+    carry_out: Callable[[Bench, Path], tuple[Array, list[str], bool]]
+    change: Callable[[Array, Array], float]
+    display: bool = False
+
+
+def _relative(found: Array, usual: Array) -> float:
+    return float(np.linalg.norm(found - usual) / np.linalg.norm(usual))
+
+
+def _of_psfs(found: Array, usual: Array) -> float:
+    """Return the largest change of shape, relative brightness and relative place (0.1 pixels: 1 %)."""
+    first, second = (psfs.mean(axis=1).astype(np.float32) for psfs in (found, usual))
+    changes = [compare(one, other) for one, other in zip(first, second, strict=True)]
+    levels = np.array([change.brightness for change in changes])
+    places = np.array([(change.rows, change.columns) for change in changes])
+    back = [moved(one, -c.rows, -c.columns) / c.brightness for one, c in zip(first, changes, strict=True)]
+    shapes = [_relative(one, other) for one, other in zip(back, second, strict=True)]
+    apart = float(np.hypot(*(places - places[0]).T).max())
+    return max(float(np.median(shapes)), float(levels.std() / levels.mean()), 0.1 * apart)
+
+
+def _largest(found: Array, usual: Array) -> float:
+    return float(np.abs(found - usual).max())
+
+
+def _routine(name: str, result: Callable[[Any], Array], **asked: Any) -> Callable[..., Any]:
+    def carry_out(bench: Bench, folder: Path) -> tuple[Array, list[str], bool]:
+        out = {"out": folder / f"{name}.json"} if name in ("slm", "mask") else {}
+        done = routines[name].asked(asked | out).carry_out(bench, folder)
+        return result(done), list(done.verdict), done.good
+
+    return carry_out
+
+
+def _psfs(done: Any) -> Array:
+    return np.asarray(done.result.calibration.psfs)
+
+
+def _response(done: Any) -> Array:
+    response = done.result
+    assert isinstance(response, AngularResponse)
+    return np.concatenate([response.along_x.response, response.along_y.response])
+
+
+def _height(done: Any) -> Array:
+    assert isinstance(done.result, DiffuserSurface)
+    return done.result.height_um
+
+
+def _picture(done: Any) -> Array:
+    assert isinstance(done.result, Photograph)
+    return done.result.measurement
+
+
+def _table(done: Any) -> Array:
+    return np.asarray(done.result.correction.phase_of_level_rad) / (2 * np.pi)
+
+
+def _field(bench: Bench, folder: Path) -> tuple[Array, list[str], bool]:
+    assert bench.stage is not None
+    bench.stage.home()
+    bench.place_source(0.0, 0.0, 100e3)
+    response = measure_field_response(bench, (6e3, 8e3), 100e3, 4.0, folder, average=4)
+    at = np.linspace(0, 0.08, 9)
+    words = [f"misfit {response.misfit:.3f}"]
+    return np.concatenate([response(0 * at, at), response(at, 0 * at)]), words, True
+
+
+_LED, _DISPLAY = template("led_microscope").replace("pixels = 384", "pixels = 160"), template("display")
+_NEAR = {"z_min_um": 60e3, "z_max_um": 150e3}
+TRIALS = {
+    "axial": Trial(TINY, _routine("axial", _psfs, **_NEAR, planes=7, reference_every=3), _of_psfs),
+    "lateral": Trial(
+        TINY,
+        _routine(
+            "lateral",
+            _psfs,
+            z_um=80e3,
+            spacing_um=6e3,
+            half_field_x_um=6e3,
+            half_field_y_um=6e3,
+            reference_every=3,
+        ),
+        _of_psfs,
+    ),
+    "volume": Trial(
+        TINY,
+        _routine(
+            "volume", _psfs, **_NEAR, planes=4, spacing_um=8e3, half_field_x_um=8e3, half_field_y_um=8e3
+        ),
+        _of_psfs,
+    ),
+    "angular": Trial(
+        TINY, _routine("angular", _response, largest_deg=9.0, step_deg=3.0, z_um=80e3), _largest
+    ),
+    "field": Trial(TINY, _field, _largest),
+    "photograph": Trial(TINY, _routine("photograph", _picture), _relative),
+    "dpc": Trial(
+        _LED, _routine("dpc", _height, objective_na=0.1, magnification=4.0), _relative, display=True
+    ),
+    "slm": Trial(_DISPLAY, _routine("slm", _table), _largest, display=True),
+}
+
+
+def _text(trial: Trial, fault: Fault | None, size: float) -> str:
+    tables = dict.fromkeys(("stage", "source", "geometry", "world"), "")
+    tables |= {} if fault is None else fault.tables(size)
+    return (
+        trial.text.format(**tables)
+        if not trial.display
+        else trial.text.rstrip() + "\n" + tables["world"] + "\n"
+    )
+
+
+def carried_out(trial: Trial, fault: Fault | None, size: float = 0.0) -> tuple[Array | None, list[str], bool]:
+    """Return a trial's result, what was said, and whether it calls itself good; None where it was refused."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            with open_bench(parse_config(_text(trial, fault, size), None)) as bench:
+                return trial.carry_out(bench, Path(folder))
+        except (BenchError, InputError) as error:
+            return None, [str(error)], False
+
+
+def judged(fault: Fault, usual: Array, trial: Trial, size: float) -> tuple[str, float, str]:
+    """Return what became of a fault, how much the result changed, and the sentence."""
+    result, words, good = carried_out(trial, fault, size)
+    telling = [line for line in words if re.search(fault.words, line)]
+    said = (telling or words or [""])[0]
+    if result is None:
+        return "refused" if telling else "refused*", float("nan"), said
+    change = trial.change(result, usual) if result.shape == usual.shape else float("nan")
+    doubted = not good
+    if change <= TOLERATED:
+        return ("alarm" if doubted and not telling else "corrected" if telling else "harmless"), change, said
+    return ("named" if doubted and telling else "found" if doubted else "missed"), change, said
+
+
+def main() -> None:
+    """Print a line for each routine and fault, and the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--only", nargs="+", choices=list(TRIALS), default=list(TRIALS))
+    parser.add_argument("--fault", nargs="+", choices=list(FAULTS), default=list(FAULTS))
+    parser.add_argument("--sizes", nargs="+", type=float, default=[1.0], help="Factors on the faults' sizes.")
+    parser.add_argument("--words", action="store_true", help="Print what was said, too.")
+    arguments = parser.parse_args()
+    rows: dict[str, list[str]] = {}
+    for name in arguments.only:
+        trial = TRIALS[name]
+        usual, words, good = carried_out(trial, None)
+        assert usual is not None, words
+        print(f"{name}: without faults {'good' if good else 'DOUBTED'}: {' '.join(words)[:300]}", flush=True)
+        for title in arguments.fault:
+            fault = FAULTS[title]
+            for factor in arguments.sizes:
+                row = rows.setdefault(f"{title} {fault.size * factor:g}", [])
+                if trial.display and not fault.display:
+                    row.append("")
+                    continue
+                began = time.process_time()
+                became, change, said = judged(fault, usual, trial, fault.size * factor)
+                row.append(became if np.isnan(change) else f"{became} {change:.1%}")
+                print(
+                    f"  {title} {fault.size * factor:g}: {row[-1]}, {time.process_time() - began:.1f} s",
+                    flush=True,
+                )
+                if arguments.words:
+                    print(f"    {said[:400]}", flush=True)
+    print("\n| fault | " + " | ".join(arguments.only) + " |\n|---" * 1 + "|---" * len(arguments.only) + "|")
+    for title, cells in rows.items():
+        print(f"| {title} | " + " | ".join(cells) + " |")
+
+
+if __name__ == "__main__":
+    main()

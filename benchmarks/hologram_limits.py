@@ -1,0 +1,92 @@
+"""What any number of frames could reach, beside six frames, and what lifting the picture's black is worth.
+
+Run it as::
+
+python benchmarks/hologram_limits.py --slm 68x120 --iterations 100 --out hologram-limits.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+
+from instrument.files.sample_images import load_sample
+from recon.base.metrics import ssim
+from recon.base.threads import set_threads
+from recon.holography import (
+    DcTerm,
+    Display,
+    HologramModel,
+    HologramOptions,
+    Target,
+    compute_hologram,
+    hologram_limit,
+    random_mask,
+)
+from recon.holography.judge import low_pass, seen_image
+
+PICTURES = ("portrait", "relief", "leaves", "head")
+LIFTS = (0.0, 0.1, 0.2, 0.3, 0.5)
+
+
+def limits(display: Display, name: str, iterations: int) -> list[tuple[str, float]]:
+    """Bound, what the relaxation reaches, and six frames, in dB."""
+    target = Target(load_sample(name, display.mask.shape), white=1.0)
+    limit = hologram_limit(display, target, HologramOptions(iterations=iterations, tolerance=0))
+    frames = compute_hologram(HologramModel(display, [target], frames=6), iterations=iterations, tolerance=0)
+    return [
+        ("bound", limit.bound_db),
+        ("relaxation", limit.reached_db),
+        ("six frames", frames.history[-1].psnr_db),
+    ]
+
+
+def lifted(display: Display, name: str, iterations: int) -> list[tuple[str, float]]:
+    """SSIM to the original picture, of equal mean and fitted by gain and offset."""
+    image = load_sample(name, display.mask.shape)
+    wanted = np.fft.fftshift(low_pass(np.fft.ifftshift(image), display.slm_shape))
+    lines = []
+    for lift in LIFTS:
+        model = HologramModel(display, [Target(lift + (1 - lift) * image, white=1.0)])
+        seen = seen_image(compute_hologram(model, iterations=iterations, tolerance=0).slm, display)
+        gain, offset = np.polyfit(seen.ravel(), wanted.ravel(), 1)
+        for words, shown in (
+            ("equal mean", seen * wanted.mean() / seen.mean()),
+            ("fitted", gain * seen + offset),
+        ):
+            lines.append((f"black at {lift}, SSIM, {words}", ssim(shown, wanted, data_range=1.0)))
+    return lines
+
+
+def main() -> None:
+    """Run all and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--slm", default="68x120")
+    parser.add_argument("--iterations", type=int, default=100)
+    parser.add_argument("--out", type=Path, default=Path("hologram-limits.csv"))
+    options = parser.parse_args()
+    rows, columns = (int(n) for n in options.slm.split("x"))
+    set_threads(1)
+    with options.out.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["expansion", "picture", "case", "value"])
+        for q in (4, 16):
+            k = round(q**0.5)
+            mask = random_mask((rows * k, columns * k))
+            dirty = Display((rows, columns), mask, dc=DcTerm(0.1, 0.6))
+            for name in PICTURES:
+                found = limits(Display((rows, columns), mask), name, options.iterations)
+                found += lifted(dirty, name, options.iterations) if q == 16 else []
+                for case, value in found:
+                    print(f"{q}x {name}: {case}: {value:.3f}", flush=True)
+                    writer.writerow([q, name, case, f"{value:.3f}"])
+
+
+if __name__ == "__main__":
+    main()

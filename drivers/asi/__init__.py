@@ -1,0 +1,1 @@
+"""ASI controllers: MS-2000 and Tiger."""

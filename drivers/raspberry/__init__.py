@@ -1,0 +1,1 @@
+"""Cameras on the CSI connector of a Raspberry Pi, through picamera2."""

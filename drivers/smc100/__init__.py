@@ -1,0 +1,1 @@
+"""Newport SMC100 controllers."""

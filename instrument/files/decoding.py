@@ -1,0 +1,242 @@
+"""Decoding what an image file holds, to a plain array: TIFF, PNG, JPEG, BMP, NumPy, HDF5, MATLAB."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import tifffile
+
+from instrument.files import reading
+from instrument.files.errors import FileError
+from instrument.files.named_arrays import is_hdf5, is_matlab, ordered, read_hdf5, read_matlab
+
+READABLE = "TIFF, PNG, JPEG, BMP, .npy, .npz with one array, HDF5, MATLAB, OME-Zarr"
+Decoded = tuple[npt.NDArray[Any], tuple[str, ...]]
+"""An array as its file has it, stack first and colour last, and what was noticed in words."""
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_OPENCV_MAGIC = (_PNG_MAGIC, b"\xff\xd8", b"BM")
+_TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+MOST_IMAGE_BYTES = 1 << 35
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return a file's content; every failure is a FileError that says what is wrong."""
+    try:
+        data = reading.read_bytes(path, MOST_IMAGE_BYTES)
+    except FileNotFoundError:
+        raise FileError(path, "there is no such file.") from None
+    if not data:
+        raise FileError(path, "is empty (0 bytes).")
+    return data
+
+
+def decode(path: Path, inside: str = "") -> Decoded:
+    """Return a file's array; its content, not its name, tells the format.
+
+    ``inside`` names one of several arrays of an HDF5 or MATLAB file.
+
+    Raises FileError.
+    """
+    try:
+        reading.require_file(path, MOST_IMAGE_BYTES)
+        with path.open("rb") as file:
+            beginning = file.read(1024)
+    except FileNotFoundError:
+        raise FileError(path, "there is no such file.") from None
+    if is_hdf5(beginning):
+        return read_hdf5(path, inside, matlab=beginning.startswith(b"MATLAB"))
+    if is_matlab(beginning):
+        return read_matlab(path, inside)
+    if inside:
+        raise FileError(path, f"is no HDF5 or MATLAB file, so that nothing in it is called {inside}.")
+    data = read_bytes(path)
+    if data.startswith(b"\x93NUMPY"):
+        return _decode_npy(path, data)
+    if data.startswith(b"PK"):
+        return _decode_npz(path, data)
+    if data[:4] in _TIFF_MAGIC:
+        return _decode_tiff(path, data)
+    if not data.startswith(_OPENCV_MAGIC):
+        raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
+    return _decode_with_opencv(path, data)
+
+
+def _decode_npy(path: Path, data: bytes) -> Decoded:
+    try:
+        file = io.BytesIO(data)
+        version = np.lib.format.read_magic(file)
+        read = (
+            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        )
+        shape, _, dtype = read(file)
+        if math.prod(shape) * dtype.itemsize > len(data) - file.tell():
+            raise ValueError(f"it says {dtype} {shape}, which are more bytes than it has")
+        array: npt.NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
+    except Exception as error:  # noqa: BLE001 - the header is Python text, whose parser raises nearly anything
+        raise FileError(path, f"is damaged or no plain .npy array: {error!s:.200}.") from None
+    return array, ()
+
+
+def _decode_npz(path: Path, data: bytes) -> Decoded:
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+            if len(members) != 1:
+                listed = ", ".join(member.filename.removesuffix(".npy") for member in members[:8]) or "none"
+                raise FileError(path, f"holds {len(members)} arrays ({listed}); one image is expected.")
+            said = members[0].file_size
+            reading.require_plausible(path, said, len(data))
+            with archive.open(members[0]) as member:
+                content = member.read(said + 1)
+            if len(content) > said:
+                raise FileError(path, "is damaged: it holds more than it says.")
+            return _decode_npy(path, content)
+    except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise FileError(path, f"is no .npz with one plain array: {error}.") from None
+    except (NotImplementedError, RuntimeError) as error:  # another compression, a password
+        raise FileError(path, f"is no .npz with one plain array: {error}.") from None
+
+
+_WHOLE_BYTES = (1, 8, 16, 32, 64)
+_ORIENTATION = 274
+
+
+def _decode_tiff(path: Path, data: bytes) -> Decoded:
+    try:
+        with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+            if not tiff.series:
+                raise FileError(path, "is a TIFF without an image.")
+            series = tiff.series[0]
+            reading.require_plausible(path, series.size * series.dtype.itemsize, len(data))
+            page: Any = series.keyframe
+            notes = []
+            if page.photometric == tifffile.PHOTOMETRIC.PALETTE:
+                return _decode_with_opencv(path, data)
+            if page.bitspersample in _WHOLE_BYTES:
+                array = series.asarray()
+            else:
+                array = _unpacked(path, series, data)
+                notes.append(f"{page.bitspersample}-bit pixels unpacked")
+            if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE and array.dtype.kind == "u":
+                array = (1 << page.bitspersample) - 1 - array if page.bitspersample < 16 else ~array
+                notes.append("white-is-zero TIFF inverted")
+            if len(tiff.series) > 1:
+                notes.append(f"the first of its {len(tiff.series)} image series taken")
+            turned = int(page.tags.valueof(_ORIENTATION, 1))
+            if 2 <= turned <= 8:
+                array = _upright(array, turned, series.axes)
+                notes.append(f"turned upright as its orientation ({turned}) says")
+            array, said = ordered(path, array, series.axes)
+            return array, (*notes, *said)
+    except FileError:
+        raise
+    except Exception as error:  # noqa: BLE001 - a damaged TIFF raises nearly anything
+        if "imagecodecs" in str(error):  # a compression that only OpenCV knows here
+            return _decode_with_opencv(path, data)
+        raise FileError(path, f"is a damaged or unusual TIFF: {error}.") from None
+
+
+def _unpacked(path: Path, series: Any, data: bytes) -> npt.NDArray[np.uint16]:
+    """Return pixels of 2 to 15 bits that stand without gaps, the highest bit first, rows at whole bytes."""
+    page = series.keyframe
+    bits, fill = int(page.bitspersample), page.tags.valueof("FillOrder", 1)
+    if page.compression != 1 or page.is_tiled or page.planarconfig != 1 or fill != 1 or not 1 < bits < 16:
+        raise FileError(
+            path,
+            f"has {bits}-bit pixels, compressed, tiled or in an unusual order.",
+            "Convert it to 16 bit without compression.",
+        )
+    values = page.imagewidth * page.samplesperpixel
+    row_bytes = -(-values * bits // 8)
+    pages = []
+    for one in series.pages:
+        parts = zip(one.dataoffsets, one.databytecounts, strict=True)
+        packed = b"".join(data[offset : offset + count] for offset, count in parts)
+        rows = np.frombuffer(packed, np.uint8, page.imagelength * row_bytes).reshape(-1, row_bytes)
+        pixels = np.unpackbits(rows, axis=1)[:, : values * bits].reshape(len(rows), values, bits)
+        filled = np.pad(pixels, ((0, 0), (0, 0), (16 - bits, 0)))
+        pages.append(np.packbits(filled, axis=2).view(">u2")[..., 0].astype(np.uint16))
+    return np.stack(pages).reshape(series.shape)
+
+
+def _upright(array: npt.NDArray[Any], orientation: int, axes: str) -> npt.NDArray[Any]:
+    """Turn and mirror images so that the first row is at the top (TIFF 6.0, tag 274)."""
+    y, x = axes.index("Y"), axes.index("X")
+    if orientation >= 5:
+        array = np.swapaxes(array, y, x)
+    down = orientation in (3, 4, 7, 8)
+    left = orientation in (2, 3, 6, 7)
+    return np.flip(array, tuple(axis for axis, flips in ((y, down), (x, left)) if flips))
+
+
+def _decode_with_opencv(path: Path, data: bytes) -> Decoded:
+    if data[:4] in _TIFF_MAGIC:
+        _refuse_odd_bits(path, data)
+    if data.startswith(_PNG_MAGIC) and not _png_is_whole(data):
+        raise FileError(path, "is a damaged PNG: its parts are longer than the file, or out of order.")
+    shape = _shape_by_header(data)
+    if shape is not None:
+        reading.require_plausible(path, 8 * math.prod(shape), len(data))
+    # A damaged file is told of once, in our words.
+    loudness = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (cv2.error, MemoryError):
+        array = None
+    finally:
+        cv2.utils.logging.setLogLevel(loudness)
+    if array is None:
+        raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
+    if array.ndim == 3 and array.shape[-1] >= 3:
+        array = array[..., [2, 1, 0, *range(3, array.shape[-1])]]
+    lossy = ("JPEG is lossy and usually gamma-coded: prefer raw frames",) if data[:2] == b"\xff\xd8" else ()
+    return array, lossy
+
+
+def _refuse_odd_bits(path: Path, data: bytes) -> None:
+    """OpenCV stretches pixels of 9 to 15 bits to 16 without a word."""
+    with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+        bits = tiff.pages.first.bitspersample
+    if bits not in _WHOLE_BYTES:
+        raise FileError(
+            path, f"has {bits}-bit pixels that are compressed.", "Convert it to 16 bit without compression."
+        )
+
+
+def _png_is_whole(data: bytes) -> bool:
+    """Whether a PNG's parts fit into it: OpenCV takes memory for what each says it has."""
+    place = len(_PNG_MAGIC)
+    first = True
+    while place + 12 <= len(data):
+        length, kind = struct.unpack(">I4s", data[place : place + 8])
+        if first != (kind == b"IHDR") or place + 12 + length > len(data):
+            return False
+        if kind == b"IEND":
+            return True
+        first, place = False, place + 12 + length
+    return False
+
+
+def _shape_by_header(data: bytes) -> tuple[int, int] | None:
+    """Return the sides that a PNG, BMP or JPEG says it has; None where it says none."""
+    if data.startswith(_PNG_MAGIC):
+        width, height = struct.unpack(">II", data[16:24].ljust(8, b"\0"))
+        return width, height
+    if data.startswith(b"BM"):
+        width, height = struct.unpack("<ii", data[18:26].ljust(8, b"\0"))
+        return abs(width), abs(height)
+    found = re.search(rb"\xff[\xc0-\xc3\xc5-\xc7\xc9-\xcb\xcd-\xcf]...(..)(..)", data, re.DOTALL)
+    if found is None:
+        return None
+    return int.from_bytes(found[1], "big"), int.from_bytes(found[2], "big")

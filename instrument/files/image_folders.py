@@ -1,0 +1,75 @@
+"""Folders of images: in which order they are taken, and at which depths they say that they were."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from instrument.files import reading
+from instrument.files.errors import FileError
+
+SUFFIXES = {".tif", ".tiff", ".png", ".bmp", ".npy", ".jpg", ".jpeg"}
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_DEPTH = re.compile(r"(?:(?<=[a-zA-Z_=])-)?\d+(?:\.\d+)?(?= ?_?(nm|um|µm|μm|mm|cm)(?![a-zA-Z]))")
+_UM = {"nm": 1e-3, "um": 1.0, "µm": 1.0, "μm": 1.0, "mm": 1e3, "cm": 1e4}
+MICRO_MANAGER = "metadata.txt"
+
+
+def images_in(folder: Path) -> list[Path]:
+    """Return a folder's image files as people count: numbers by their value, 2 before 10."""
+    found = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
+    return sorted(found, key=lambda path: _natural(path.name))
+
+
+def in_order(folder: Path, paths: Sequence[Path]) -> tuple[list[Path], tuple[float, ...]]:
+    """Return files in the order of their depths, and the depths in micrometres; none where none are told.
+
+    Depths are what Micro-Manager's ``metadata.txt`` says, else the only length in each name (``z60.5mm``,
+    ``psf_-50um``). Without them the order stays.
+    """
+    depths = _micro_managers(folder, paths) or [_depth(path.name) for path in paths]
+    known = [depth for depth in depths if depth is not None]
+    if len(known) < len(paths) or len(set(known)) < len(known):
+        return list(paths), ()
+    pairs = sorted(zip(known, range(len(paths)), strict=True))
+    return [paths[number] for _, number in pairs], tuple(depth for depth, _ in pairs)
+
+
+def order_in_words(paths: Sequence[Path], depths_um: Sequence[float]) -> str:
+    """Say in which order files are taken, the first and the last ones by name."""
+    names = [path.name for path in paths]
+    shown = names if len(names) <= 6 else [*names[:3], "...", *names[-2:]]
+    words = f"{len(names)} files in the order {', '.join(shown)}"
+    if depths_um:
+        words += f", by their depths, {depths_um[0] / 1e3:g} to {depths_um[-1] / 1e3:g} mm"
+    return words
+
+
+def _natural(name: str) -> tuple[list[tuple[int, float, str]], str]:
+    parts: list[tuple[int, float, str]] = []
+    place = 0
+    for found in _NUMBER.finditer(name):
+        parts += [(1, 0.0, name[place : found.start()].casefold()), (0, float(found[0]), "")]
+        place = found.end()
+    return [*parts, (1, 0.0, name[place:].casefold())], name
+
+
+def _depth(name: str) -> float | None:
+    found = list(_DEPTH.finditer(name))
+    return float(found[0][0]) * _UM[found[0][1]] if len(found) == 1 else None
+
+
+def _micro_managers(folder: Path, paths: Sequence[Path]) -> list[float | None]:
+    """Return the z positions that Micro-Manager noted for files, versions 1.4 and 2.0; empty without them."""
+    file = folder / MICRO_MANAGER
+    if not file.is_file():
+        return []
+    try:
+        noted: Any = reading.parse_json(reading.read_bytes(file))
+        frames = [entry for entry in noted.values() if isinstance(entry, dict) and "ZPositionUm" in entry]
+        by_name = {str(entry["FileName"]).rpartition("/")[2]: float(entry["ZPositionUm"]) for entry in frames}
+    except (OSError, ValueError, KeyError, AttributeError, TypeError, FileError):
+        return []  # another program's file: the images are read all the same
+    return [by_name.get(path.name) for path in paths]

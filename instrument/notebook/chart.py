@@ -1,0 +1,93 @@
+"""Charts in a notebook: what every setting costs on a photograph of one's own, against how good it is."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from instrument.evaluation.chart import ChartData, make_chart, title_of
+from instrument.evaluation.chart_problems import problem_of_job, problem_of_scene
+from instrument.evaluation.figures import chart_figure, write_charts
+from instrument.files.atomic import write_json
+from instrument.files.errors import BenchError
+from instrument.notebook.result import Result, show_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, repr=False)
+class Chart(ChartData):
+    """A :class:`ChartData` that shows and saves itself."""
+
+    def __repr__(self) -> str:
+        """Say in a line what it is."""
+        settings = {point.setting for point in self.points}
+        return (
+            f"<Chart of {title_of(self)}: {len(settings)} settings, {len(self.front())} points on the front>"
+        )
+
+    def figure(self) -> Figure:
+        """Return the chart as a figure."""
+        return chart_figure(self)
+
+    def show(self) -> None:
+        """Show it: below the cell of a notebook, else in a window."""
+        show_figure(self.figure())
+
+    def save(self, folder: Path | str) -> tuple[Path, ...]:
+        """Write chart.png, .html, .csv and .json into a folder; errors as ``write_text``."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        record = folder / "chart.json"
+        write_json(record, self.to_json())
+        return (record, *write_charts(folder, self))
+
+
+def chart(
+    subject: Result | str,
+    *,
+    budget_s: float = 60.0,
+    size: int = 48,
+    seed: int = 0,
+    folder: Path | str | None = None,
+    on_progress: Callable[[str, float], object] | None = None,
+) -> Chart:
+    """Chart every method, model, prior, binning and precision, each in its own process, quick ones first.
+
+    A script needs ``if __name__ == "__main__":`` around it, as with all processes of Python; a notebook not.
+
+    Parameters
+    ----------
+    subject : Result or str
+        A result: its photograph, scored by pixels that are held out. Or the name of a simulated scene with
+        ground truth (``"sparse-picture"``, ``"beads"`` ...), of ``size`` pixels and ``seed``.
+    budget_s : float
+        Seconds for all settings together.
+    folder : path, optional
+        Where the chart is kept while it is made: the same call goes on where it stopped.
+    on_progress : callable, optional
+        ``on_progress(setting, seconds_left)`` before each.
+
+    Raises BenchError when there was no time for any setting; InputError when the subject cannot be charted.
+    """
+    if isinstance(subject, Result):
+        asked = subject.provenance.get("options", {}).get("z_um")
+        problem, about = problem_of_job(subject.job, asked, volume=not subject.is_picture)
+    else:
+        problem, about = problem_of_scene(subject, size, seed)
+    with tempfile.TemporaryDirectory() as scratch:
+        kept = Path(scratch if folder is None else folder)
+        kept.mkdir(parents=True, exist_ok=True)
+
+        def tell(_place: int, _total: int, setting: object, left_s: float) -> None:
+            if on_progress is not None:
+                on_progress(str(getattr(setting, "name", setting)), left_s)
+
+        data = make_chart(problem, about, kept / "chart.json", budget_s=budget_s, on_progress=tell)
+    if not data.points:
+        raise BenchError("There was no time for any setting: give a longer budget_s.")
+    return Chart(**{f.name: getattr(data, f.name) for f in fields(ChartData)})

@@ -1,0 +1,139 @@
+"""Holograms in a notebook: from a picture to the SLM's pattern and what will be seen of it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.bench.config import BenchConfig
+from instrument.display.hologram import (
+    HologramResult,
+    bench_display,
+    compute_and_judge,
+    load_alignment,
+    prepare_target,
+    slm_size,
+)
+from instrument.display.hologram_files import HologramFiles, hologram_figure
+from instrument.files.images import ImageFile, read_image
+from instrument.files.sample_images import SAMPLES
+from instrument.notebook.reconstruct import bench_config
+from instrument.notebook.result import show_figure
+from recon.base.declare import with_overrides
+from recon.holography import HologramOptions, HologramRecord
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Picture = Path | str | ImageFile | npt.ArrayLike
+
+
+@dataclass(frozen=True, slots=True, repr=False, eq=False)
+class HologramShown(HologramResult):
+    """A :class:`HologramResult` that shows and saves itself.
+
+    Attributes
+    ----------
+    files : HologramFiles
+        What it was computed for.
+    """
+
+    files: HologramFiles = field(kw_only=True)
+
+    def __repr__(self) -> str:
+        """Say in a line what it is and how good."""
+        height, width = self.hologram.slm.shape[-2:]
+        score, display = self.scores[0], self.files.displays[0]
+        return (
+            f"<Hologram {height} x {width}, expansion {display.expansion}: {score.psnr_db:.1f} dB, "
+            f"SSIM {score.ssim:.2f}, {self.efficiency:.1%} of the light, {self.hologram.seconds:.1f} s>"
+        )
+
+    @property
+    def phase_rad(self) -> npt.NDArray[np.floating]:
+        """The pattern, (n_frames, height, width), radians."""
+        return np.asarray(self.hologram.phase_rad)
+
+    def figure(self) -> Figure:
+        """Return a page: wanted and seen picture, raw light, the SLM's phase, how it was optimised."""
+        lines = [(name, str(value)) for name, value in self.files.display_facts(0).items()]
+        return hologram_figure(self, title="Hologram", facts=lines)
+
+    def show(self) -> None:
+        """Show the page: below the cell of a notebook, else in a window."""
+        show_figure(self.figure())
+
+    def save(self, out: Path | str, *, overwrite: bool = False) -> tuple[Path, ...]:
+        """Write pattern, description and preview as the terminal does; ``.png``, of a complex SLM ``.npy``.
+
+        Raises FileError when a file exists or cannot be written.
+        """
+        files = HologramFiles(Path(out), self.files.binning, self.files.options, self.files.displays)
+        files.check(overwrite=overwrite)
+        files.write(0, 0, self)
+        return tuple(files.files())
+
+
+def hologram(
+    picture: Picture | Sequence[Path | str | ImageFile],
+    bench: BenchConfig | Path | str | None = None,
+    options: HologramOptions | None = None,
+    *,
+    slm: tuple[int, int] | None = None,
+    z_mm: float | Sequence[float] = 0.0,
+    on_progress: Callable[[HologramRecord, Any], object] | None = None,
+    cancel: threading.Event | None = None,
+    **overrides: Any,
+) -> HologramShown:
+    """Compute the SLM's pattern that shows a picture through the bench's mask, and what will be seen of it.
+
+    Parameters
+    ----------
+    picture : path, image, array, or the name of a sample; or a list of files
+        Intensity; of several one a plane, with a ``z_mm`` each.
+    bench : path or str, optional
+        As for ``db.bench``: its SLM and ``[display]`` are computed for.
+    options : HologramOptions, optional
+    slm : (int, int), optional
+        Other SLM pixels than the bench's, height and width: few, for a quick look.
+    z_mm : float or sequence of float
+        Depth behind the focal plane, millimetres.
+    on_progress : callable, optional
+        ``on_progress(record, slm)`` after each iteration.
+    cancel : threading.Event, optional
+        Set it to stop.
+    **overrides
+        Single options by name; ``alignment``: a file of ``align mask``.
+
+    Raises InputError, BenchError or FileError: what was found, what was expected, what to do.
+    """
+    alignment = overrides.pop("alignment", None)
+    options = with_overrides(options or HologramOptions(), overrides)
+    config = bench_config(bench)
+    shape, pitch_um = slm_size(config)
+    display = options.display_of(bench_display(config, (slm or shape, pitch_um), expansion=options.expansion))
+    if alignment is not None:
+        display = load_alignment(Path(alignment)).of(display)
+    pictures = list(picture) if isinstance(picture, list | tuple) else [picture]
+    depths = [float(z) for z in np.broadcast_to(np.asarray(z_mm, float), (len(pictures),))]
+    targets = [
+        prepare_target(_pixels(one), display, options, z_mm=z)
+        for one, z in zip(pictures, depths, strict=True)
+    ]
+    found = compute_and_judge(display, targets, options, callback=on_progress, cancel=cancel)
+    files = HologramFiles(Path("slm.png"), config.display.slm_binning, options, [display])
+    return HologramShown(**{f.name: getattr(found, f.name) for f in fields(HologramResult)}, files=files)
+
+
+def _pixels(picture: Any) -> npt.NDArray[Any]:
+    if isinstance(picture, str) and picture in SAMPLES and not Path(picture).exists():
+        return np.asarray(SAMPLES[picture].load())
+    if isinstance(picture, Path | str | ImageFile):
+        return read_image(picture).pixels
+    return np.asarray(picture)

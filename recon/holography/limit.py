@@ -1,0 +1,187 @@
+"""What any number of frames could reach for a picture, a mask and a phase SLM: a bound with its gap.
+
+The mean of frames knows an SLM field ``s`` by ``X = mean(s s^H)`` only: positive, with ones on its diagonal.
+All such matrices, few of which are frames of phases, are a convex set with the loss a convex quadratic on it:
+its least value there is below that of any frames. ``X = V V^H`` with a few columns and rows of length 1 finds
+it (Burer and Monteiro 2003). With the loss's gradient ``Q`` there, ``y_i`` the real part of ``(Q X)_ii`` and
+
+    gap = -N min(0, least eigenvalue of Q - diag(y))
+
+every other ``X'`` has ``loss(X') >= loss(X) + tr(Q (X' - X)) >= loss(X) - gap``. Scaled as a dual variable
+may be, the same ``Q`` gives ``(2 loss - gap)^2 / (4 loss)``, which is never less. Light that the SLM does not
+modulate is one more row, which all frames share.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+from recon.holography.display import Display
+from recon.holography.model import HologramModel
+from recon.holography.optimise import HologramRecord, HologramStop, _Lbfgs, _Point, _Watch
+from recon.holography.options import HologramOptions
+from recon.holography.target import ORDER, Target
+
+Array = npt.NDArray[Any]
+
+COLUMNS = 6
+"""Of V: more do not lower the loss by a hundredth of a decibel at 16x."""
+BANDS = (0.0, 0.05, 0.15, 0.4, 1.0)
+"""Edges, in parts of the eye's cut-off, of the bands that are told apart."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What no number of frames can exceed.
+
+    Attributes
+    ----------
+    bound_db : float
+        Of the seen image's PSNR (the target's white as peak, the target's light): no frames are better.
+    reached_db : float
+        Of the relaxation's own solution; the bound is as sharp as the two are close.
+    wanted, reached : ndarray, float64, (n_bands,)
+        Contrast that the picture has in each band of spatial frequencies (:data:`BANDS`), rms relative to the
+        mean, and the part of it that is reached, 1 for all.
+    stop_reason : HologramStop
+    seconds : float
+    """
+
+    bound_db: float
+    reached_db: float
+    wanted: npt.NDArray[np.float64]
+    reached: npt.NDArray[np.float64]
+    stop_reason: HologramStop
+    seconds: float
+
+
+def hologram_limit(
+    display: Display,
+    target: Target,
+    options: HologramOptions | None = None,
+    *,
+    callback: Callable[[HologramRecord, Array], object] | None = None,
+    cancel: threading.Event | None = None,
+) -> Limit:
+    """Find what any number of frames of a phase SLM could reach.
+
+    Parameters
+    ----------
+    display : Display
+    target : Target
+    options : HologramOptions
+        Its iterations, time, tolerance and seed. The loss is "frequency": what an eye resolves counts.
+    callback, cancel
+        As :func:`recon.holography.compute_hologram`.
+
+    Raises InputError for another loss or a complex SLM.
+    """
+    options = options or HologramOptions()
+    if options.complex_slm or options.loss != "frequency":
+        raise InputError("The limit is known for a phase SLM and the loss 'frequency'.")
+    model = HologramModel(display, [target], options, frames=COLUMNS)
+    variable = _Rows(model)
+    rng = np.random.default_rng(options.seed)
+    start = rng.normal(size=(2, COLUMNS, *display.slm_shape)).astype(np.float32)
+    search = _Lbfgs(variable, variable.pack(start[0] + 1j * start[1]))
+    history, reason = _Watch(options, callback, cancel).run(search, options.iterations, None)
+    slm = variable.field(search.x)
+    found = model.evaluate(slm)
+    gap = _gap(model, slm, found.gradient)
+    peak = model.peaks[0] ** 2
+    least = max(2 * found.loss - gap, 0.0) ** 2 / (2 * found.loss)
+    wanted, reached = _bands(model, slm)
+    return Limit(
+        -10 * np.log10(least / peak) if least > 0 else float("inf"),
+        -10 * np.log10(2 * found.loss / peak),
+        wanted,
+        reached,
+        reason,
+        history[-1].seconds,
+    )
+
+
+class _Rows:
+    """Fields whose power, summed over all columns, is that of as many phase frames at every SLM pixel."""
+
+    def __init__(self, model: HologramModel) -> None:
+        self.model = model
+        self.first_step = 0.5
+
+    def pack(self, slm: Array) -> Array:
+        return self._normed(slm.astype(self.model.dtype))[0].view(np.float32).ravel()
+
+    def field(self, x: Array) -> Array:
+        return self._normed(self._inside(x))[0]
+
+    def evaluate(self, x: Array) -> tuple[_Point, Array]:
+        slm, length = self._normed(self._inside(x))
+        found = self.model.evaluate(slm)
+        along = np.sum((np.conj(slm) * found.gradient).real, axis=0) / len(slm)
+        gradient = 2 * (found.gradient - slm * along) / length
+        return _Point(found.loss, found.seen_psnr_db), gradient.astype(np.complex64).view(np.float32).ravel()
+
+    def _inside(self, x: Array) -> Array:
+        return x.view(np.complex64).reshape(self.model.frames, *self.model.display.slm_shape)
+
+    def _normed(self, z: Array) -> tuple[Array, Array]:
+        length = np.sqrt(np.mean(np.abs(z) ** 2, axis=0))
+        return np.asarray(z / length, np.complex64), length
+
+
+def _bands(model: HologramModel, slm: Array) -> tuple[Array, Array]:
+    """Return the contrast wanted in each band, and the part of it that is reached."""
+    wanted, seen = model.lags(), model.lags(slm)
+    y, x = model.band.lags()
+    radius = np.hypot(y[:, None], x) / model.band.cutoff
+    weight = np.where(x == 0, 1.0, 2.0) / (1 + radius ** (2 * ORDER)) ** 2
+    found = []
+    for low, high in pairwise(BANDS):
+        inside = (radius > low) & (radius <= high)
+        power = float(np.sum((weight * np.abs(wanted) ** 2)[inside]))
+        missed = float(np.sum((weight * np.abs(seen - wanted) ** 2)[inside]))
+        contrast = np.sqrt(power) / abs(wanted[0, 0])
+        found.append((contrast, max(0.0, 1 - np.sqrt(missed / power)) if power else 1.0))
+    contrasts, parts = np.array(found).T
+    return contrasts, parts
+
+
+def _gap(model: HologramModel, slm: Array, gradient: Array) -> float:
+    """Return how far the loss may be above the relaxation's least."""
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+
+    display = model.display
+    alpha, dc = display.dc.modulated, display.dc.amplitude
+    slope = model.slope()
+    single = HologramModel(display, model.targets, model.options, frames=1)
+    # Multipliers: of each SLM pixel, and of the light that is not modulated.
+    pixels = np.sum((np.conj(slm) * gradient).real, axis=0).astype(np.float64)
+    rest = float(np.sum((np.conj(dc) / alpha * gradient).real)) if dc else 0.0
+    n = slm[0].size
+
+    def apply(x: Array) -> Array:
+        x = np.asarray(x, np.complex64).ravel()
+        field = x[:n].reshape(display.slm_shape)
+        back = single.weighed(alpha * field + dc * x[n], slope)
+        out = np.empty(n + 1, np.complex64)
+        out[:n] = (alpha * back - pixels * field).ravel()
+        out[n] = np.conj(dc) * back.sum() - rest * x[n] if dc else 0
+        return out
+
+    operator = LinearOperator((n + 1, n + 1), matvec=apply, dtype=np.complex64)
+    start = np.random.default_rng(0).normal(size=n + 1).astype(np.complex64)
+    try:
+        values, vectors = eigsh(operator, k=1, which="SA", tol=1e-3, v0=start, ncv=32, maxiter=80)
+        least, vector = float(values[0]), vectors[:, 0]
+        residual = float(np.linalg.norm(apply(vector) - least * vector))
+    except ArpackNoConvergence:
+        return float("inf")
+    return float((n + 1) * max(0.0, residual - least))

@@ -1,0 +1,276 @@
+"""Holograms of spots at any places, in one plane or several: weighted Gerchberg-Saxton.
+
+The field at each spot is a plain sum over the SLM, not a sample of an FFT, so that spots lie exactly where
+they were asked for, through a mask or without one. Spots of one row share half of that sum: an array costs
+little more than one of its columns.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+from recon.holography.display import Display
+from recon.holography.optimise import Hologram, HologramRecord, HologramStop
+from recon.holography.options import HologramOptions
+
+Array = npt.NDArray[Any]
+
+EVEN = 0.002
+"""Deviation of the spots' brightness, relative, at which the search ends."""
+LEARNS = 0.5
+"""Part of the iterations in which the spots' phases are free; then they are held while weights go on
+(Kim 2019), which is what makes them even to a part in a thousand."""
+
+
+@dataclass(frozen=True)
+class SpotList:
+    """Where light is wanted, and how much.
+
+    Attributes
+    ----------
+    places : ndarray, float64, (n, 2)
+        ``(y, x)`` in fractions of the field, (0, 0) its top left corner; 0.5, 0.5 is the axis, where light is
+        that the SLM does not modulate.
+    intensity : ndarray, float64, (n,)
+        As it is seen, any scale, above 0.
+    z_mm : ndarray, float64, (n,)
+        Behind the focal plane.
+    """
+
+    places: npt.NDArray[np.float64]
+    intensity: npt.NDArray[np.float64]
+    z_mm: npt.NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        n = len(self.places)
+        if not n or self.places.shape != (n, 2) or self.intensity.shape != (n,) or self.z_mm.shape != (n,):
+            raise InputError(
+                "Spots need a place (y, x), an intensity and a depth each, and at least one spot."
+            )
+        found = np.column_stack([self.places, self.intensity, self.z_mm])
+        if not np.isfinite(found).all():
+            raise InputError("Spots need finite places, intensities and depths.")
+        if self.places.min() < 0 or self.places.max() > 1:
+            raise InputError("Spots lie in 0 to 1 of the field, (0, 0) its top left corner.")
+        if self.intensity.min() <= 0:
+            raise InputError("A spot's intensity is above 0: leave out what shall be dark.")
+        if len(np.unique(found[:, [0, 1, 3]], axis=0)) < n:
+            raise InputError("Two spots have the same place.")
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+
+def spot_array(rows: int, columns: int, *, extent: float = 0.6, z_mm: float = 0.0) -> SpotList:
+    """Return an even array about the axis, ``extent`` of the field wide and high."""
+    if rows < 1 or columns < 1 or not 0 < extent <= 1:
+        raise InputError(
+            f"A spot array has rows and columns and an extent in 0 to 1, not {rows} x {columns}, {extent:g}."
+        )
+    y, x = (0.5 + extent * (np.arange(n) - (n - 1) / 2) / max(n - 1, 1) for n in (rows, columns))
+    places = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
+    return SpotList(places, np.ones(len(places)), np.full(len(places), float(z_mm)))
+
+
+@dataclass(frozen=True, slots=True)
+class SpotScores:
+    """How spots came out.
+
+    Attributes
+    ----------
+    relative : ndarray, float64, (n,)
+        Intensity of each over what was asked for, mean 1.
+    efficiency : float
+        Part of the light on the SLM that is in all spots together, each a resolution cell of the aperture.
+    """
+
+    relative: npt.NDArray[np.float64]
+    efficiency: float
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation over mean."""
+        return float(self.relative.std())
+
+
+class SpotField:
+    """Takes SLM fields to the light at spots, and back.
+
+    Parameters
+    ----------
+    display : Display
+        Its mask, displacement and DC term are part of it.
+    spots : SpotList
+    """
+
+    def __init__(self, display: Display, spots: SpotList) -> None:
+        from recon.holography import _kernels  # late: numba takes half a second to import
+
+        self._kernels = _kernels
+        self.display, self.spots = display, spots
+        self._table = display.mask.response(display.wavelength_nm).astype(np.complex64)
+        nodes = display.displacement
+        self._nodes = None if nodes is None else np.ascontiguousarray(nodes, np.float32)
+        self._field = np.empty(display.mask.shape, np.complex64)
+        nu = spots.places - 0.5
+        self._planes = []
+        for z_mm in np.unique(spots.z_mm):
+            here = np.flatnonzero(spots.z_mm == z_mm)
+            rows, row_of = np.unique(nu[here, 0], return_inverse=True)
+            down = _wave(rows, display.mask.shape[0])
+            groups = [here[row_of == n] for n in range(len(rows))]
+            across = [_wave(nu[group, 1], display.mask.shape[1]) for group in groups]
+            hy, hx = (h.astype(np.complex64) for h in display.defocus(float(z_mm)))
+            self._planes.append(((hy, hx), down, groups, across))
+        self.envelope = np.prod(np.sinc(display.mask_fill * nu) ** 2, axis=1)
+        """Intensity of the mask pixels' diffraction at each spot, (n,)."""
+
+    def at_spots(self, slm: Array) -> npt.NDArray[np.complex64]:
+        """Return the field at each spot, complex64 (n,), of an SLM field (height, width); 1 for all light."""
+        display = self.display
+        pattern = np.ascontiguousarray(display.dc.modulated * slm + display.dc.amplitude, np.complex64)
+        found = np.empty(len(self.spots), np.complex64)
+        for defocus, down, groups, across in self._planes:
+            self._fill(pattern, defocus)
+            lines = down @ self._field
+            for line, group, wave in zip(lines, groups, across, strict=True):
+                found[group] = wave @ line
+        return np.asarray(found / self._field.size, np.complex64)
+
+    def back(self, coefficients: Array) -> npt.NDArray[np.complex64]:
+        """Return the adjoint: the SLM field, complex64 (height, width), that adds up at the spots."""
+        out = np.zeros(self.display.slm_shape, np.complex64)
+        for defocus, down, groups, across in self._planes:
+            lines = np.stack([coefficients[g] @ w.conj() for g, w in zip(groups, across, strict=True)])
+            np.matmul(down.conj().T, lines.astype(np.complex64), out=self._field)
+            self._gather(out, defocus)
+        return out
+
+    def _fill(self, pattern: Array, defocus: tuple[Array, Array]) -> None:
+        mask, k, rows = self.display.mask.levels, self.display.factor, self._field.shape[0]
+        hy, hx = defocus
+        if self._nodes is None:
+            self._kernels.fill(self._field, pattern, mask, self._table, hy, hx, k, 0, rows)
+        else:
+            self._kernels.fill_displaced(
+                self._field, pattern, mask, self._table, hy, hx, self._nodes, k, 0, rows
+            )
+
+    def _gather(self, out: Array, defocus: tuple[Array, Array]) -> None:
+        mask, k = self.display.mask.levels, self.display.factor
+        hy, hx = defocus
+        if self._nodes is None:
+            self._kernels.gather(out, self._field, mask, self._table, hy, hx, k, 0, len(out))
+        else:
+            rows = self._field.shape[0]
+            self._kernels.gather_displaced(
+                out, self._field, mask, self._table, hy, hx, self._nodes, k, 0, rows
+            )
+
+    def score(self, slm: Array) -> SpotScores:
+        """Return how the spots of SLM frames, complex (n_frames, height, width), come out."""
+        light = np.mean([np.abs(self.at_spots(frame)) ** 2 for frame in slm], axis=0) * self.envelope
+        relative = light / self.spots.intensity
+        return SpotScores(np.asarray(relative / relative.mean(), np.float64), float(light.sum()))
+
+
+def _wave(nu: Array, cells: int) -> npt.NDArray[np.complex64]:
+    return np.exp(-2j * np.pi * np.outer(nu, np.arange(cells) - (cells - 1) / 2)).astype(np.complex64)
+
+
+def compute_spots(
+    display: Display,
+    spots: SpotList,
+    options: HologramOptions | None = None,
+    *,
+    initial: Array | None = None,
+    callback: Callable[[HologramRecord, Array], object] | None = None,
+    cancel: threading.Event | None = None,
+) -> tuple[Hologram, SpotScores]:
+    """Compute SLM phases that show spots, as even as asked for.
+
+    Weighted Gerchberg-Saxton: the phase of a weighted sum of the spots' waves, weights that grow where a spot
+    is too dim. The phases are on the SLM's levels (256, or as the options say) all the way, so that rounding
+    is made up for too, and the DC light at each spot counts.
+
+    Parameters
+    ----------
+    display : Display
+    spots : SpotList
+    options : HologramOptions
+        Its frames, seed, phase levels, iterations and time; ``envelope="ignore"`` leaves the mask pixels'
+        envelope out, else spots are as bright as asked for where they are seen.
+    initial : ndarray, complex, (n_frames, height, width), optional
+        Warm start: the spots' phases are taken from it.
+    callback : callable, optional
+        ``callback(record, slm)`` after each iteration; the record's loss is the spots' deviation.
+    cancel : threading.Event, optional
+
+    Raises InputError for a complex SLM, which this method does not use.
+    """
+    options = options or HologramOptions()
+    if options.complex_slm:
+        raise InputError("Spots are computed for a phase SLM.")
+    field = SpotField(options.display_of(display), spots)
+    step = 2 * np.pi / (options.phase_levels or 256)
+    rng = np.random.default_rng(options.seed)
+    wanted = np.sqrt(spots.intensity / field.envelope)
+    weights = wanted / wanted.mean()
+    # Rounded at random: an array's phases repeat over the SLM, and so would errors of rounding.
+    dither = rng.random((options.frames, *display.slm_shape), np.float32)
+    shape = (options.frames, len(spots))
+    phases: Array = rng.uniform(0, 2 * np.pi, shape)
+    if initial is not None:
+        phases = np.stack([np.angle(field.at_spots(frame)) for frame in initial])
+    history: list[HologramRecord] = []
+    best: tuple[float, Array] | None = None
+    began, aside = time.perf_counter(), 0.0
+    reason = HologramStop.ITERATIONS
+    for number in range(options.iterations + 1):
+        back = np.stack([field.back(weights * np.exp(1j * phase)) for phase in phases])
+        slm = np.exp(1j * step * np.floor(np.angle(back) / step + dither)).astype(np.complex64)
+        seen = np.stack([field.at_spots(frame) for frame in slm])
+        brightness = np.sqrt(np.mean(np.abs(seen) ** 2, axis=0)) / wanted
+        deviation = float(brightness.std() / brightness.mean())
+        even = float((brightness**2).std() / (brightness**2).mean())
+        if best is None or even < best[0]:
+            best = even, slm
+        seconds = time.perf_counter() - began - aside
+        history.append(HologramRecord(number, seconds, even, -20 * np.log10(max(deviation, 1e-6))))
+        if callback is not None:
+            paused = time.perf_counter()
+            callback(history[-1], slm)
+            aside += time.perf_counter() - paused
+        if even <= EVEN:
+            reason = HologramStop.EVEN
+        elif cancel is not None and cancel.is_set():
+            reason = HologramStop.CANCELLED
+        elif options.time_s is not None and seconds >= options.time_s:
+            reason = HologramStop.TIME
+        else:
+            weights = weights * np.sqrt(np.clip(brightness.mean() / np.maximum(brightness, 1e-9), 0.1, 10))
+            weights /= weights.mean()
+            if number < LEARNS * options.iterations:
+                phases = np.angle(seen)
+            continue
+        break
+    assert best is not None
+    found = Hologram(best[1], tuple(history), reason, history[-1].seconds)
+    return found, field.score(found.slm)
+
+
+def brighter_where_dim(spots: SpotList, measured: Array, gain: float = 0.8) -> SpotList:
+    """Return spots asked to be brighter where a camera saw less than was asked for (and darker where more).
+
+    ``measured`` are the spots' intensities over those of ``spots``' own request, any scale, (n,).
+    """
+    ratio = np.maximum(np.asarray(measured, float) / np.mean(measured), 0.05)
+    return replace(spots, intensity=spots.intensity * ratio**-gain)

@@ -1,0 +1,98 @@
+"""A stage with play and a wrong scale is measured by the PSF, and its play is taken out of sweeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration_routines.optics.stage_play import StageCheck, StageProcedure
+from drivers.simulated.world import SimulatedWorld
+from drivers.stage import approached
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config
+from instrument.files.errors import SettingsError
+from instrument.plan import Part, Plan, SourcePoints, check, estimate
+from instrument.plan.model import PlanError
+from instrument.runs.acquire import abilities_of
+
+TINY = """
+[camera]
+driver = "simulated"
+[stage]
+driver = "simulated"
+{stage}
+[led_array]
+driver = "simulated"
+[source]
+rgb = [0, 255, 0]
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+time_scale = 0
+"""
+LOOSE = "axes = {x_um = {backlash = 200, scale = 1.05}, y_um = {backlash = 120}, z_um = {backlash = 200}}\n"
+
+
+def tiny(stage: str = "") -> Bench:
+    return open_bench(parse_config(TINY.format(stage=stage), None))
+
+
+def test_play_and_scale_of_each_axis_are_found_and_said(tmp_path: Path) -> None:
+    with tiny(LOOSE) as bench:
+        done = StageProcedure(StageCheck(turns=2, average=1, dark_frames=2)).carry_out(bench, tmp_path)
+        assert bench.led_array is not None
+        assert bench.led_array.pattern.is_dark
+    found = {axis.name: axis for axis in done.result.axes}  # type: ignore[attr-defined]
+    assert [found[name].play_um for name in ("x_um", "y_um", "z_um")] == pytest.approx(
+        [210, 120, 200], abs=10
+    )
+    assert found["x_um"].scale_error == pytest.approx(0.05, abs=0.005)
+    assert abs(found["y_um"].scale_error) < 0.005
+    assert not done.good
+    assert [words.split(" ")[1] for words in done.verdict if words.startswith("Quality")] == [
+        "x",
+        "x",
+        "y",
+        "z",
+    ]
+    assert done.verdict[-1].startswith("For [stage] of bench.toml: play = { x_um = 2")
+    with pytest.raises(SettingsError, match="choose another place or a smaller reach"), tiny() as bench:
+        StageProcedure(StageCheck(z_um=8.2e3)).outlook(bench)
+
+
+def there_and_back(z_um: float) -> Plan:
+    points = SourcePoints(points_um=((0, 0, 80e3), (0, 0, z_um)))
+    return Plan(label="p", parts=(Part(label="p", positions=points),))
+
+
+def test_the_source_comes_to_every_place_from_one_side() -> None:
+    stage = "play = { x_um = 205, y_um = 118, z_um = 207 }\n" + LOOSE.replace(", scale = 1.05", "")
+    places = np.random.default_rng(2).uniform((-20e3, -20e3, 60e3), (20e3, 20e3, 150e3), (12, 3))
+    places[5] = places[4] + (0.0, 50.0, -20.0)
+    with tiny(stage) as bench:
+        assert bench.stage is not None
+        world = bench.shared["simulated"]
+        assert isinstance(world, SimulatedWorld)
+        bench.stage.home()
+        for place in places:
+            bench.place_source(*place)
+            assert world.source_position_um == pytest.approx(tuple(place), abs=10)
+        with pytest.raises(PlanError, match="cannot be approached from below"):
+            check(there_and_back(8.1e3), abilities_of(bench))
+        cost = estimate(there_and_back(60e3), abilities_of(bench))
+        assert cost.approaches == 2
+        assert cost.approach_seconds > 0
+
+
+def test_an_axis_goes_below_a_place_only_where_it_must() -> None:
+    play = {"x_um": 10.0}
+    here = {"x_um": 0.0, "y_um": 0.0}
+    assert approached(here, {"x_um": 20.0, "y_um": -5.0}, play) == [{"x_um": 20.0, "y_um": -5.0}]
+    assert approached(here, {"x_um": 8.0}, play) == [{"x_um": -7.0}, {"x_um": 8.0}]
+    assert approached(here, {"x_um": 8.0}, play, ["x_um"]) == [{"x_um": 8.0}]
+    assert approached(here, {"x_um": 0.0}, play, ["x_um"]) == [{"x_um": 0.0}]
+    assert approached(here, {"x_um": -1.0}, play, ["x_um"]) == [{"x_um": -16.0}, {"x_um": -1.0}]
+    assert approached(here, {"y_um": -5.0}, play) == [{"y_um": -5.0}]

@@ -1,0 +1,120 @@
+"""Elliptec, SMC100 and ASI stages keep the contract over their emulators, and say what fails."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from drivers.asi.stage import AsiOptions, AsiStage
+from drivers.elliptec.stage import ElliptecOptions, ElliptecStage
+from drivers.errors import DeviceError
+from drivers.smc100.stage import Smc100Options, Smc100Stage
+from drivers.testing.stage import StageContract
+from tests.mocks.port_stages import AsiController, ElliptecBus, Smc100Chain
+
+
+def elliptec(bus: ElliptecBus) -> ElliptecStage:
+    axes = {"x_um": {"address": "0"}, "roll_mrad": {"address": "1", "reverse": True}}
+    return ElliptecStage(ElliptecOptions.model_validate({"port": str(bus.link), "axes": axes}))
+
+
+def smc100(chain: Smc100Chain) -> Smc100Stage:
+    axes = {"x_um": {"number": 1}, "z_um": {"number": 2, "reverse": True, "lower_limit": -8000.0}}
+    return Smc100Stage(Smc100Options.model_validate({"port": str(chain.link), "axes": axes}))
+
+
+def asi(controller: AsiController) -> AsiStage:
+    axes = {"x_um": {"letter": "X", "home_at_um": 5000.0}, "z_um": {"letter": "Z", "home_at_um": 900.0}}
+    return AsiStage(AsiOptions.model_validate({"port": str(controller.link), "axes": axes}))
+
+
+class PortStageContract(StageContract):
+    emulator: Any
+    stage_of: Any
+
+    @pytest.fixture(autouse=True)
+    def _emulated(self, tmp_path: Path) -> Iterator[None]:
+        self.device = type(self).emulator(tmp_path)
+        yield
+        self.device.port.unplug()
+
+    def make(self) -> Any:
+        return type(self).stage_of(self.device)
+
+
+class TestElliptec(PortStageContract):
+    emulator = ElliptecBus
+    stage_of = staticmethod(elliptec)
+
+
+class TestElliptecMuteWhenBusy(PortStageContract):
+    emulator = staticmethod(lambda folder: ElliptecBus(folder, mute_when_busy=True))
+    stage_of = staticmethod(elliptec)
+
+
+class TestSmc100(PortStageContract):
+    emulator = Smc100Chain
+    stage_of = staticmethod(smc100)
+
+
+class TestAsi(PortStageContract):
+    emulator = AsiController
+    stage_of = staticmethod(asi)
+
+
+def test_elliptec_failures_are_said(tmp_path: Path) -> None:
+    bus = ElliptecBus(tmp_path)
+    with elliptec(bus) as stage:
+        stage.home()
+        stage.move_to({"x_um": 30_000.0}, wait=False)
+        bus.axes["0"].halt()
+        bus.status["0"] = 2
+        with pytest.raises(DeviceError, match=r"x_um \(module 0\): it did not reach its place in time"):
+            stage.wait(5.0)
+    wrong = {"port": str(bus.link), "axes": {"x_um": {"address": "1"}}}
+    with pytest.raises(DeviceError, match=r"is an ELL14, which turns .*cannot be x_um"):
+        ElliptecStage(ElliptecOptions.model_validate(wrong)).open()
+    bus.port.unplug()
+    with pytest.raises(ValidationError, match="are both address 0"):
+        ElliptecOptions.model_validate({"port": "p", "axes": {"x_um": {}, "y_um": {}}})
+
+
+def test_smc100_failures_are_said_and_a_disabled_axis_is_enabled(tmp_path: Path) -> None:
+    chain = Smc100Chain(tmp_path)
+    with smc100(chain) as stage:
+        assert "LTA-HS" in stage.identity.model
+        stage.home()
+        chain.states[1] = 0x3C
+        assert stage.move_to({"x_um": 123.4})["x_um"] == pytest.approx(123.4)
+        stage.home()  # it has its reference: to its zero
+        assert stage.position()["x_um"] == pytest.approx(0.0, abs=0.2)
+        chain.errors[1] = 0x0020
+        with pytest.raises(DeviceError, match=r"x_um \(controller 1\): following error"):
+            stage.move_to({"x_um": 50.0})
+    chain.port.unplug()
+
+
+def test_asi_says_its_refusals_and_reads_what_is_configured_at_home(tmp_path: Path) -> None:
+    controller = AsiController(tmp_path)
+    with asi(controller) as stage:
+        assert stage.identity.firmware == "USB-9.53"
+        stage.home()
+        assert stage.position() == {"x_um": 5000.0, "z_um": 900.0}
+        with pytest.raises(DeviceError, match=r"refuses 'Q X': it does not know the command \(error 1\)"):
+            stage._query("Q X")
+    found = AsiStage.probe(str(controller.link))
+    assert found is not None
+    assert found.driver == "asi"
+    controller.port.unplug()
+    with pytest.raises(DeviceError, match="no port"):
+        asi(controller).open()
+
+
+def test_a_wrong_port_is_no_such_stage(tmp_path: Path) -> None:
+    controller = AsiController(tmp_path)
+    assert ElliptecStage.probe(str(controller.link)) is None
+    controller.port.unplug()

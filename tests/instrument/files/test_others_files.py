@@ -1,0 +1,170 @@
+"""Files that other programs wrote: in their order, with their axes, turned and packed as they are."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+import tifffile
+import zarr
+
+from instrument.files.errors import FileError
+from instrument.files.images import read, read_image, read_stack, write_image
+from instrument.reconstruction.mosaic import mosaic_of, suspected_mosaic
+from recon.camera.factors import PATTERNS, split_bayer
+
+RNG = np.random.default_rng(3)
+STACK = RNG.integers(0, 4096, (5, 8, 6)).astype(np.uint16)
+PICTURE = STACK[0]
+
+
+@pytest.mark.parametrize(
+    ("names", "depths_um"),
+    [
+        ([f"psf_{n}.tif" for n in range(1, 13)], ()),
+        (["z60mm.tif", "z60.5mm.tif", "z68mm.tif", "z115mm.tif"], (6e4, 6.05e4, 6.8e4, 1.15e5)),
+        (["psf z-50um.tif", "psf z-8um.tif", "psf z0um.tif", "psf z10um.tif"], (-50.0, -8.0, 0.0, 10.0)),
+        (["2026-11-02_a.tif", "2026-11-10_a.tif"], ()),
+        (["10x_1mm.tif", "10x_2mm.tif", "10x_10mm.tif"], (1e3, 2e3, 1e4)),
+    ],
+)  # fmt: skip
+def test_a_folder_is_read_in_the_order_that_people_mean(
+    tmp_path: Path, names: list[str], depths_um: tuple[float, ...]
+) -> None:
+    for number in RNG.permutation(len(names)):
+        write_image(tmp_path / names[number], np.full((4, 4), number, np.uint8))
+    stack = read_stack(tmp_path)
+    assert stack.pixels[:, 0, 0].tolist() == list(range(len(names)))
+    assert stack.metadata == {"files": names, "depths_um": pytest.approx(list(depths_um))}
+    assert names[-1] in stack.notes[0]
+
+
+def test_micro_managers_z_positions_give_the_order(tmp_path: Path) -> None:
+    noted = {"Summary": {"ZStep_um": 5}}
+    for number, z in enumerate((10.0, 0.0, -10.0)):
+        name = f"img_channel000_position000_time000000000_z{number:03d}.tif"
+        tifffile.imwrite(tmp_path / name, np.full((4, 4), number, np.uint16))
+        noted[f"Metadata-Default/{name}"] = {"ZPositionUm": z, "FileName": f"Default/{name}"}
+    (tmp_path / "metadata.txt").write_text(json.dumps(noted))
+    stack = read_stack(tmp_path)
+    assert stack.pixels[:, 0, 0].tolist() == [2, 1, 0]
+    assert stack.metadata["depths_um"] == [-10.0, 0.0, 10.0]
+
+
+def test_axes_of_imagej_and_ome(tmp_path: Path) -> None:
+    colours = RNG.integers(0, 255, (5, 3, 8, 6)).astype(np.uint8)
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, colours, imagej=True, metadata={"axes": "ZCYX"})
+    np.testing.assert_array_equal(read_stack(path).pixels, np.moveaxis(colours, 1, -1))
+    tifffile.imwrite(path, STACK[:, None], imagej=True, metadata={"axes": "TCYX"})
+    np.testing.assert_array_equal(read_stack(path).pixels, STACK)
+    tifffile.imwrite(path, colours[0], imagej=True, metadata={"axes": "CYX"})
+    np.testing.assert_array_equal(read_image(path).pixels, np.moveaxis(colours[0], 0, -1))
+    tifffile.imwrite(path, STACK[:4].reshape(2, 2, 8, 6), ome=True, metadata={"axes": "TZYX"})
+    with pytest.raises(FileError, match=r"holds images in 2 \(T\) x 2 \(Z\); one stack is expected"):
+        read_stack(path)
+    tifffile.imwrite(path, STACK[:2], ome=True, metadata={"axes": "CYX"})
+    assert "its 2 channels taken as the images of a stack" in read_stack(path).notes
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_tiffs_orientation_is_followed(tmp_path: Path, orientation: int) -> None:
+    upright = RNG.integers(0, 255, (5, 7, 3)).astype(np.uint8)
+    # Row and column of the stored image by those of the upright one (TIFF 6.0, page 36).
+    rows, columns = np.mgrid[:5, :7]
+    down, right = 4 - rows, 6 - columns
+    stored = {1: (rows, columns), 2: (rows, right), 3: (down, right), 4: (down, columns),
+              5: (columns, rows), 6: (right, rows), 7: (right, down), 8: (columns, down)}  # fmt: skip
+    image = np.empty((7, 5, 3) if orientation > 4 else (5, 7, 3), np.uint8)
+    image[stored[orientation]] = upright
+    tifffile.imwrite(tmp_path / "a.tif", image, extratags=[(274, "H", 1, orientation, True)])
+    read = read_image(tmp_path / "a.tif")
+    np.testing.assert_array_equal(read.pixels, upright)
+    assert any("orientation" in note for note in read.notes) == (orientation > 1)
+
+
+def test_packed_pixels_keep_their_values(tmp_path: Path) -> None:
+    path = tmp_path / "packed.tif"
+    for bits in (10, 12, 14):
+        values = RNG.integers(0, 1 << bits, (9, 7)).astype(np.uint16)
+        rows = ["".join(f"{value:0{bits}b}" for value in row) for row in values]
+        packed = b"".join(int(r + "0" * (-len(r) % 8), 2).to_bytes(-(-len(r) // 8), "big") for r in rows)
+        tifffile.imwrite(path, np.zeros((9, 14), np.uint8), metadata=None)
+        with tifffile.TiffFile(path, mode="r+b") as tiff:  # as one that says what it packs
+            page = tiff.pages.first
+            for tag, value in ((258, bits), (256, 7), (279, len(packed))):
+                page.tags[tag].overwrite(value)
+            offset = page.dataoffsets[0]
+        data = bytearray(path.read_bytes())
+        data[offset : offset + len(packed)] = packed
+        path.write_bytes(data)
+        read = read_image(path)
+        np.testing.assert_array_equal(read.pixels, values)
+        assert read.notes == (f"{bits}-bit pixels unpacked",)
+
+
+def test_arrays_of_hdf5_and_matlab_files(tmp_path: Path) -> None:
+    h5 = tmp_path / "psfs.h5"
+    with h5py.File(h5, "w") as file:
+        file["measurement/psf"] = STACK
+        file["gain"] = 3.0
+    np.testing.assert_array_equal(read_stack(h5).pixels, STACK)
+    with h5py.File(h5, "a") as file:
+        file["photograph"] = PICTURE
+    with pytest.raises(FileError, match=r"2 arrays that could be images: measurement/psf \(5, 8, 6\), photo"):
+        read(h5)
+    np.testing.assert_array_equal(read_image(f"{h5}::photograph").pixels, PICTURE)
+    with pytest.raises(FileError, match="holds no array called psf"):
+        read_image(f"{h5}::psf")
+    mat = tmp_path / "psfs.mat"
+    scipy.io.savemat(mat, {"psf": np.moveaxis(STACK, 0, -1), "z": np.arange(5)}, do_compression=True)
+    np.testing.assert_array_equal(read_stack(mat).pixels, STACK)
+    with h5py.File(tmp_path / "new.mat", "w", userblock_size=512) as file:
+        file["psf"] = np.moveaxis(STACK, 0, -1).T  # as MATLAB 7.3 has it
+    header = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    (tmp_path / "new.mat").write_bytes(header.ljust(512, b"\0") + (tmp_path / "new.mat").read_bytes()[512:])
+    np.testing.assert_array_equal(read_stack(tmp_path / "new.mat").pixels, STACK)
+    for path in (h5, mat):
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        with pytest.raises(FileError, match="damaged or unusual"):
+            read(path)
+
+
+def test_ome_zarr_of_both_versions(tmp_path: Path) -> None:
+    for version in (2, 3):
+        folder = tmp_path / f"{version}.zarr"
+        group = zarr.open_group(folder, mode="w", zarr_format=version)
+        array = group.create_array("0", shape=(1, 1, 5, 8, 6), dtype="uint16", chunks=(1, 1, 1, 8, 6))
+        array[:] = STACK[None, None]
+        axes = [{"name": name, "unit": "micrometer"} if name == "z" else {"name": name} for name in "tczyx"]
+        scale = [{"type": "scale", "scale": [1.0, 1.0, 2.5, 1.0, 1.0]}]
+        facts = {
+            "multiscales": [{"axes": axes, "datasets": [{"path": "0", "coordinateTransformations": scale}]}]
+        }
+        group.attrs.update(facts if version == 2 else {"ome": facts})
+        stack = read(folder)
+        np.testing.assert_array_equal(stack.pixels, STACK)
+        assert "planes every 2.5 micrometer as it says" in stack.notes
+
+
+def test_a_raw_frame_of_a_mosaic_is_recognised_or_asked_about(tmp_path: Path) -> None:
+    scene = 100.0 + RNG.random((80, 90)).cumsum(axis=1)
+    for pattern in PATTERNS:
+        seen = split_bayer(scene, pattern)[0] @ np.array([0.5, 1.0, 0.7])
+        raw = seen.astype(np.uint16)
+        path = tmp_path / "raw.tif"
+        tifffile.imwrite(path, raw)
+        assert f"--bayer {pattern}" in suspected_mosaic(read_image(path))
+        told = bytes("RGB".index(colour) for colour in pattern)
+        tifffile.imwrite(path, raw, extratags=[(33422, "B", 4, told, True)])
+        assert mosaic_of(read_image(path)) == pattern
+    for rows, columns in ((1.0, 1.0), (1.1, 1.0), (1.0, 1.1)):  # grey; sensors read out by two amplifiers
+        grey = scene.copy()
+        grey[::2] *= rows
+        grey[:, ::2] *= columns
+        tifffile.imwrite(path, grey.astype(np.uint16))
+        assert suspected_mosaic(read_image(path)) == ""

@@ -1,0 +1,175 @@
+"""Elliptec modules, SMC100 and ASI controllers on a pseudo-terminal, written from their makers' manuals."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from tests.mocks.moving_axis import MovingAxis
+from tests.mocks.pty_device import Answer, PtyDevice
+
+
+def commands_of(received: bytes, known: str) -> tuple[list[bytes], bytes]:
+    """Cut a stream without ends into commands."""
+    found, rest = [], received
+    while match := re.match(known.encode(), rest):
+        found.append(match[0])
+        rest = rest[match.end() :]
+    return found, rest
+
+
+class ElliptecBus:
+    """Modules by address. ``mute_when_busy``: they tell no place during a move."""
+
+    def __init__(self, folder: Path, *, mute_when_busy: bool = False) -> None:
+        self.axes = {"0": MovingAxis(0, 60 * 1024, 40_000, 700), "1": MovingAxis(0, 143_360, 90_000, 500)}
+        self.about = {"0": (20, 60, 1024), "1": (14, 360, 143_360)}
+        self.mute_when_busy = mute_when_busy
+        self.status: dict[str, int] = {}
+        self.port = PtyDevice(
+            folder,
+            self.answer,
+            lambda got: commands_of(got, "[0-9A-F](in|gs|gp|st|ho[01]|ma[0-9A-F]{8})[\r\n]*"),
+        )
+        self.link = self.port.link
+
+    def answer(self, command: bytes) -> list[Answer]:
+        text = command.decode().strip()
+        address, words = text[0], text[1:3]
+        axis = self.axes.get(address)
+        if axis is None:
+            return []
+        return (
+            [f"{address}{self.say(address, axis, words, text[3:])}\r\n".encode()]
+            if words
+            not in (
+                "ma",
+                "ho",
+            )
+            else self.go(axis, words, text[3:])
+        )
+
+    def go(self, axis: MovingAxis, words: str, value: str) -> list[Answer]:
+        axis.home(0) if words == "ho" else axis.go(int(value, 16))
+        return []
+
+    def say(self, address: str, axis: MovingAxis, words: str, _value: str) -> str:
+        moving = axis.moving
+        if words == "in":
+            kind, travel, pulses = self.about[address]
+            return f"IN{kind:02X}1140TEST2023{'17'}{'81'}{travel:04X}{pulses:08X}"
+        if words == "gs":
+            return f"GS{9 if moving else self.status.pop(address, 0):02X}"
+        if words == "st":
+            axis.stop()
+            return "GS00"
+        if moving and self.mute_when_busy:
+            return "GS09"
+        return f"PO{axis.place & 0xFFFFFFFF:08X}"
+
+
+class Smc100Chain:
+    """Controllers by number; counts are 0.1 micrometres."""
+
+    def __init__(self, folder: Path) -> None:
+        self.axes = {1: MovingAxis(-10_000, 250_000, 400_000, 700), 2: MovingAxis(-100, 90_000, 400_000, 500)}
+        self.states = dict.fromkeys(self.axes, 0x0A)
+        self.errors = dict.fromkeys(self.axes, 0)
+        self.refusal = dict.fromkeys(self.axes, "@")
+        self.port = PtyDevice(folder, self.answer)
+        self.link = self.port.link
+
+    def state(self, number: int) -> int:
+        axis = self.axes[number]
+        _ = axis.place
+        if self.states[number] == 0x1E and not axis.homing:
+            self.states[number] = 0x32
+        if self.states[number] == 0x28 and not axis.moving:
+            self.states[number] = 0x33
+        return self.states[number]
+
+    def answer(self, line: bytes) -> list[Answer]:
+        found = re.fullmatch(r"(\d+)([A-Z]{2})(.*)", line.decode().strip())
+        if found is None or int(found[1]) not in self.axes:
+            return []
+        number, words, value = int(found[1]), found[2], found[3]
+        said = self.say(number, words, value)
+        return [] if said is None else [f"{number}{words}{said}\r\n".encode()]
+
+    def say(self, number: int, words: str, value: str) -> str | None:
+        axis, state = self.axes[number], self.state(number)
+        fixed = {"ID": "LTA-HS", "VE": " SMC_CC_2.0", "VA": "40", "SU": "0.0001"}
+        ends = {"SL": axis.lowest, "SR": axis.highest}
+        if words in fixed:
+            return fixed[words]
+        if words in ends:
+            return f"{ends[words] / 1e4:g}"
+        match words:
+            case "TS":
+                return f"{self.errors[number]:04X}{state:02X}"
+            case "TP":
+                return f"{axis.place / 1e4:.8g}" if abs(axis.place) > 9 else f"{axis.place / 1e4:.1E}"
+            case "TE":
+                refused, self.refusal[number] = self.refusal[number], "@"
+                return refused
+            case "ST":
+                axis.stop()
+            case "OR" if state == 0x0A:
+                axis.home(0)
+                self.states[number] = 0x1E
+            case "MM" if state in (0x3C, 0x32, 0x33):
+                self.states[number] = 0x34 if value == "1" else 0x3C
+            case "PA" if state in (0x32, 0x33, 0x34):
+                target = round(1e4 * float(value))
+                if axis.lowest <= target <= axis.highest:
+                    axis.go(target)
+                    self.states[number] = 0x28
+                else:
+                    self.refusal[number] = "G"
+            case _:
+                self.refusal[number] = "H" if state == 0x0A else "J" if state == 0x3C else "D"
+        return None
+
+
+class AsiController:
+    """Axes X and Z, tenths of micrometres; HOME leads to the upper end."""
+
+    def __init__(self, folder: Path) -> None:
+        self.axes = {"X": MovingAxis(-50_000, 50_000, 60_000, 700), "Z": MovingAxis(-9000, 9000, 60_000, 5)}
+        self.port = PtyDevice(folder, self.answer, lambda got: ((w := got.split(b"\r"))[:-1], w[-1]))
+        self.link = self.port.link
+
+    def answer(self, line: bytes) -> list[Answer]:
+        return [f"{self.say(line.decode().strip())}\r\n".encode()]
+
+    def say(self, text: str) -> str:
+        if text == "/":
+            return "B" if any(axis.moving for axis in self.axes.values()) else "N"
+        if text == "\\":
+            moved = any(axis.moving for axis in self.axes.values())
+            for axis in self.axes.values():
+                axis.stop()
+            return ":N-21" if moved else ":A"
+        if text == "V":
+            return ":A Version: USB-9.53"
+        found = re.fullmatch(r"(\S+) ([A-Z])(=-?\d+|\?)?", text)
+        if found is None:
+            return ":N-1"
+        words, axis, value = found[1], self.axes.get(found[2]), found[3] or ""
+        if axis is None:
+            return ":N-2"
+        if value == "?":
+            asked = {"SL": axis.lowest / 1e4, "SU": axis.highest / 1e4, "S": axis.speed_per_s / 1e4}
+            return f":A {found[2]}={asked[words]:.6f}" if words in asked else ":N-1"
+        match words:
+            case "W":
+                return f":A {axis.place} "
+            case "M":
+                axis.go(int(value[1:]))
+            case "H":
+                axis.set_place(int(value[1:]))
+            case "!":
+                axis.go(axis.highest)
+            case _:
+                return ":N-1"
+        return ":A"

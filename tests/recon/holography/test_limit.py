@@ -1,0 +1,84 @@
+"""The limit: a true bound, held against dense matrices and against many frames."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from recon.errors import InputError
+from recon.holography import (
+    DcTerm,
+    Display,
+    HologramModel,
+    HologramOptions,
+    HologramStop,
+    Target,
+    compute_hologram,
+    hologram_limit,
+    random_mask,
+)
+from recon.holography.limit import COLUMNS, _gap
+
+SHAPE, K = (12, 16), 4
+
+
+def picture():
+    y, x = np.mgrid[0 : 1 : SHAPE[0] * K * 1j, 0 : 1 : SHAPE[1] * K * 1j]
+    return np.where((y - 0.5) ** 2 + (x - 0.4) ** 2 < 0.08, 1.0, 0.05 + 0.1 * x)
+
+
+@pytest.mark.parametrize("dc", [0.0, 0.1])
+def test_no_number_of_frames_passes_the_bound(dc):
+    display = Display(SHAPE, random_mask((SHAPE[0] * K, SHAPE[1] * K), seed=2), dc=DcTerm(dc, 0.6))
+    limit = hologram_limit(display, Target(picture(), white=1.0), HologramOptions(iterations=150))
+    assert limit.reached_db <= limit.bound_db < limit.reached_db + 0.5
+    for frames in (1, 8):
+        model = HologramModel(display, [Target(picture(), white=1.0)], frames=frames)
+        shown = compute_hologram(model, iterations=150).history[-1].psnr_db
+        assert shown < limit.bound_db
+    assert shown > limit.bound_db - 2
+    assert limit.wanted.max() > 0.5
+    assert 0 <= limit.reached.min() <= limit.reached.max() <= 1
+
+
+@pytest.mark.parametrize("dc", [0.0, 0.2])
+def test_the_gap_is_that_of_the_dense_matrix_and_bounds_the_loss_of_other_matrices(dc):
+    shape = (6, 5)
+    display = Display(shape, random_mask((12, 10), seed=1), dc=DcTerm(dc, 0.4))
+    target = [Target(np.random.default_rng(0).random((12, 12)))]
+    model = HologramModel(display, target, frames=COLUMNS)
+    rng = np.random.default_rng(3)
+
+    def rows():
+        z = rng.normal(size=(COLUMNS, *shape)) + 1j * rng.normal(size=(COLUMNS, *shape))
+        return np.asarray(z / np.sqrt(np.mean(np.abs(z) ** 2, axis=0)), np.complex64)
+
+    slm = rows()
+    found = model.evaluate(slm)
+    gap = _gap(model, slm, found.gradient)
+    n = slm[0].size
+    single = HologramModel(display, target)
+    model.evaluate(slm)
+    slope = model.slope()
+    alpha, light = display.dc.modulated, display.dc.amplitude
+    into = np.vstack([alpha * np.eye(n), np.full((1, n), light)]).T  # unmodulated light is one more row
+    columns = [single.weighed(np.eye(n)[i].reshape(shape), slope).ravel() for i in range(n)]
+    dense = into.conj().T @ np.array(columns).T @ into
+    whole = np.vstack([slm.reshape(COLUMNS, n).T, np.ones((1, COLUMNS))]) / np.sqrt(COLUMNS)
+    y = np.sum((whole.conj() * (dense @ whole)).real, axis=1)
+    least = np.linalg.eigvalsh(dense - np.diag(y))[0]
+    assert gap == pytest.approx(-(n + 1) * least, rel=0.03)
+    for _ in range(5):
+        assert model.evaluate(rows()).loss >= found.loss - gap
+
+
+def test_it_can_be_interrupted_and_is_a_bound_all_the_same():
+    display = Display(SHAPE, random_mask((SHAPE[0] * K, SHAPE[1] * K), seed=2))
+    stop = threading.Event()
+    early = hologram_limit(display, Target(picture(), white=1.0), callback=lambda *_: stop.set(), cancel=stop)
+    assert early.stop_reason is HologramStop.CANCELLED
+    assert early.bound_db > hologram_limit(display, Target(picture(), white=1.0)).reached_db
+    with pytest.raises(InputError, match="loss 'frequency'"):
+        hologram_limit(display, Target(picture()), HologramOptions(loss="none"))
