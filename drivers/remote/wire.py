@@ -217,7 +217,7 @@ def load_error(device: str, said: Mapping[str, str]) -> errors.DeviceError:
 _LENGTH = struct.Struct("<I")
 _ALIGNED = 8
 _PIECE = struct.Struct("<IQQ")
-_PIECE_BYTES = 1 << 18
+_PIECE_BYTES = 1 << 20
 
 
 @functools.cache
@@ -241,7 +241,7 @@ def pack_frame(frame: Frame) -> bytes:
 
 
 def pieces(frame: Frame, number: int) -> list[bytes]:
-    """Return a sequence's frame in messages of at most a quarter of a megabyte.
+    """Return a sequence's frame in messages of at most a megabyte.
 
     Each says the frame's number, from 0, the frame's size and its own place in it: a message that is whole
     keeps a connection, and its thread, busy for long.
@@ -257,7 +257,7 @@ class Assembly:
     """Puts frames together from their pieces, in whatever order these come, and gives them in theirs."""
 
     def __init__(self) -> None:
-        self._parts: dict[int, tuple[bytearray, list[int]]] = {}
+        self._parts: dict[int, tuple[memoryview, list[int]]] = {}
         self._expected = 0
 
     def add(self, piece: bytes) -> Iterator[Frame]:
@@ -269,7 +269,8 @@ class Assembly:
             number, size, place = _PIECE.unpack_from(piece)
         except struct.error as error:
             raise ValueError(f"no piece of a frame: {error}") from None
-        whole, left = self._parts.setdefault(number, (bytearray(size), [size]))
+        whole, left = self._parts.get(number) or (np.empty(size, np.uint8).data, [size])
+        self._parts[number] = whole, left
         whole[place : place + len(piece) - _PIECE.size] = memoryview(piece)[_PIECE.size :]
         left[0] -= len(piece) - _PIECE.size
         while (first := self._parts.get(self._expected)) is not None and first[1] == [0]:
@@ -278,7 +279,7 @@ class Assembly:
             yield unpack_frame(first[0])
 
 
-def unpack_frame(message: bytes | bytearray) -> Frame:
+def unpack_frame(message: bytes | memoryview) -> Frame:
     """Return a frame, whose image looks at the message; it reached this computer now.
 
     Raises ValueError when the message is no frame.
@@ -286,7 +287,7 @@ def unpack_frame(message: bytes | bytearray) -> Frame:
     try:
         (length,) = _LENGTH.unpack_from(message)
         begin = _LENGTH.size + length
-        said = json.loads(message[_LENGTH.size : begin])
+        said = json.loads(bytes(message[_LENGTH.size : begin]))
         metadata = _metadata().validate_python(said["metadata"])
         pixels = np.frombuffer(message, "<u1" if said["bits"] == 8 else "<u2", offset=begin)
         image = pixels.reshape(said["shape"])
