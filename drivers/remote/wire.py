@@ -23,7 +23,7 @@ import io
 import json
 import struct
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from types import FunctionType
@@ -66,6 +66,7 @@ class Values:
     """A type's values as JSON has them, arrays and frames included."""
 
     def __init__(self, hint: Any) -> None:
+        self._is_list = get_origin(hint) is Sequence  # of arrays, all of one shape
         self.is_array = get_origin(hint) is np.ndarray or any(
             get_origin(part) is np.ndarray for part in get_args(hint)
         )
@@ -89,7 +90,7 @@ class Values:
             return self._adapter.validate_python(value)
         array = np.load(io.BytesIO(base64.b64decode(value, validate=True)), allow_pickle=False)
         array.flags.writeable = False
-        return array
+        return list(array) if self._is_list else array
 
 
 def plain(value: Any) -> Any:
@@ -149,6 +150,19 @@ class Call:
         return getattr(device, self.name)(**given)
 
 
+def _hints(function: FunctionType, interface: type) -> dict[str, Any]:
+    """Return a function's types, with what an interface means by the type variables of its bases."""
+    meant: dict[Any, Any] = {}
+    for base in getattr(interface, "__orig_bases__", ()):
+        meant |= zip(getattr(get_origin(base), "__parameters__", ()), get_args(base), strict=False)
+    return {
+        name: hint[tuple(meant[variable] for variable in variables)]
+        if (variables := getattr(hint, "__parameters__", ()))
+        else hint
+        for name, hint in get_type_hints(function).items()
+    }
+
+
 @functools.cache
 def calls(kind: Kind) -> Mapping[str, Call]:
     """Return what a kind of device is asked for from afar, by name."""
@@ -158,7 +172,7 @@ def calls(kind: Kind) -> Mapping[str, Call]:
         function = member.fget if isinstance(member, property) else member
         if name.startswith("_") or name in _AT_HOME or not isinstance(function, FunctionType):
             continue
-        hints = get_type_hints(function)
+        hints = _hints(function, INTERFACES[kind])
         gives = Values(hints.pop("return"))
         is_read = isinstance(member, property)
         verb: Literal["GET", "POST", "PUT"] = "GET" if is_read else "POST"

@@ -57,14 +57,14 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
 
     One convolution a depth by the central PSFs, on as few pixels as still tell one per cent of size; of PSFs
     that vary over the field only whether they are the photograph's at all, and where they vary much by all of
-    them, turned too. None where the light is patterned, the camera model comes from outside, or one PSF was
-    chosen of a field that varies much: nothing is known of such.
+    them, turned too. None where the light is patterned, the camera model comes from outside, one PSF was
+    chosen of a field that varies much, or no decoy differs: nothing is known of such.
     """
     if problem.patterned or problem.model in CAMERAS:
         return None
     done = count(1)
 
-    def compete(small: _Small, iterations: int) -> CalibrationCheck:
+    def compete(small: _Small, iterations: int, *, lit: bool) -> CalibrationCheck:
         def scored(how: Transformation) -> Score:
             if on_stage is not None:  # how many there will be depends on what they say
                 on_stage(1 - DECOYS / (DECOYS + next(done)), "judging: the calibration among its decoys")
@@ -74,12 +74,17 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
 
     (few_px, quick), (more_px, thorough) = QUICK, THOROUGH
     few, lit = _small(problem, few_px), problem.smooth or problem.n_planes > 1
-    check = compete(few, quick)
+    if not few.decoys():
+        return None
+    check = compete(few, quick, lit=lit)
     if check.sure:
         return check
-    again = compete(few if lit else _small(problem, more_px), thorough)
+    again = compete(few if lit else _small(problem, more_px), thorough, lit=lit)
     # A faint photograph's large pixels may tell what small ones do not.
     check = again if again.fit is not Fit.UNTOLD else check
+    if check.wrong and not lit:  # by stray light, or by light from beyond the field?
+        again = compete(few, thorough, lit=True)
+        check = again if again.fit is Fit.FITS else check
     given = _given(problem).depths
     one = given.varies and not problem.depths.varies and given.field_error > VARIED
     return None if one and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check

@@ -47,7 +47,7 @@ TOLD_SHARE = 0.002
 CERTAIN = 2.5
 """Standard errors by which tiles must say so as well, of a decoy or of the calibration: chance alone makes
 them of sixteen tiles once in eighty times (Student's t)."""
-SPEAKS_NATS = 150.0
+SPEAKS_NATS = 200.0
 """Odds among all that were tried from which a photograph has its say on foreign ones."""
 NOT_OWN = 1.0
 """Standard errors by which tiles prefer the calibration to each of its far decoys, up to which it is not the
@@ -193,7 +193,7 @@ def check_of(scores: Mapping[Transformation, Score], pixels: int) -> Calibration
     others = [score for how, score in far.items() if how != better]
     if is_ahead(decoys[better], (given, *others), pixels):
         return CalibrationCheck(Fit.OFF, scores, pixels, better)
-    if is_ahead(given, far.values(), pixels):
+    if is_ahead(given, (far or decoys).values(), pixels):
         return CalibrationCheck(Fit.FITS, scores, pixels)
     objectives = [score.objective for score in (given, *decoys.values())]
     speaks = (max(objectives) - min(objectives)) * pixels / 2 > SPEAKS_NATS
