@@ -13,7 +13,8 @@ the angular and of the field's response it is the largest difference, of the SLM
 =========  ==============================================================================================
 harmless   the result changed by 2 % at the most, and nothing was said
 corrected  it changed by 2 % at the most, and the fault was said
-named      it changed by more, and the words name the fault
+named      it changed by more, the words name the fault, and the result does not call itself good
+told       it changed by more, the words name the fault, but the result calls itself good
 found      it changed by more, and something was said, but of something else
 refused    there is no result, and the words name the fault (``refused*``: they name something else)
 missed     it changed by more, and nothing was said
@@ -264,6 +265,8 @@ def judged(fault: Fault, usual: Array, trial: Trial, size: float) -> tuple[str, 
     doubted = not good
     if change <= TOLERATED:
         return ("alarm" if doubted and not telling else "corrected" if telling else "harmless"), change, said
+    if telling and not doubted:
+        return "told", change, said
     return ("named" if doubted and telling else "found" if doubted else "missed"), change, said
 
 

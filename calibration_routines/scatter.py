@@ -33,6 +33,7 @@ _LINEAR_PX = 0.4  # a picture moves so far as its gradient tells; beyond, it is 
 _SLOPE = np.array([-1, 9, -45, 0, 45, -9, 1], np.float32) / 60
 """A derivative of sixth order: the usual one of second order takes fine structure for flatter than it is."""
 _UNLIKE = 0.3  # part of an image's contrast that a fit leaves: beyond, it is looked for elsewhere
+_BORDER_PX = 8
 _POOR = 0.1  # part of its contrast that is left of a moved image
 _FLAT = 0.3  # contrast, relative to the mean, below which other light cannot be told from brightness
 _SHAKEN_PX = 0.05  # frames that scatter less are averaged as they are
@@ -122,6 +123,23 @@ def _fitted(seen: Float, other: Float) -> tuple[Change, float]:
         float(np.hypot(noise[1], noise[2]) / abs(safe)),
     )
     return change, float(rest.std() / max(target.std(), 1e-12))
+
+
+def growth(image: Float, reference: Float) -> float:
+    """Return by which share an image, (height, width), is larger than the reference about its centre.
+
+    A linear fit. Both lie on one another; what moved in at the border by that is left out.
+    """
+    rows, columns = (np.arange(n) - (n - 1) / 2 for n in reference.shape)
+    wide = reference.astype(np.float64)
+    down, right = (ndimage.correlate1d(wide, _SLOPE, axis=axis) for axis in (0, 1))
+    radial = -(rows[:, None] * down + columns * right)
+    inner = tuple(slice(min(_BORDER_PX, n // 4), n - min(_BORDER_PX, n // 4)) for n in reference.shape)
+    parts = (radial, -down, -right, wide, np.ones_like(radial))
+    design = np.stack([part[inner].ravel() for part in parts], axis=1)
+    target = image[inner].ravel().astype(np.float64)
+    solution = np.linalg.lstsq(design.T @ design, design.T @ target, rcond=None)[0]
+    return float(solution[0] / solution[3]) if solution[3] else 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -221,7 +221,7 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     drift = drift_of(run, points, dark)
     images, scatter = _images(run, points, dark, drift)
     ambient = dark.brightening_per_ms * run.metadata(run.steps(PSF)[0]).exposure_ms / float(images[0].mean())
-    findings = (*scatter.findings("place"), *ambient_findings(ambient))
+    findings = (*scatter.findings("picture"), *ambient_findings(ambient))
     response = analyse_angular(
         images,
         points.points_um,

@@ -235,8 +235,8 @@ def measure_field_response(
         Frames a place.
 
     Raises PlanError when a place is out of reach (nothing moved); CalibrationError when the sensor's edge
-    cuts the pattern at one of the places, the light flickers or the bench shakes too much for what was
-    averaged, or the run ended early.
+    cuts the pattern at one of the places, the light flickers too much for what was averaged, or the run ended
+    early.
     """
     half_y, half_x = half_field_um
     places = (
@@ -262,7 +262,8 @@ def measure_field_response(
     )
     run = completed(acquire(bench, plan, folder, on_progress=None if listener is None else listener.frame))
     light, scatters = zip(*(_light(run, place) for place in places), strict=True)
-    if findings := pooled(scatters).findings("place"):
+    steady_place = replace(pooled(scatters), motion_px=0.0)  # all light is summed, wherever it falls
+    if findings := steady_place.findings("place"):
         raise CalibrationError(f"The response over the field cannot be measured: {' '.join(findings)}")
     return fit_field_response(places, light)
 

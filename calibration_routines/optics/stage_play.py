@@ -35,7 +35,7 @@ from calibration_routines.psf.analysis import dark_model, light_of
 from calibration_routines.psf.exposure import expose_source
 from calibration_routines.psf.sampling import known, source_limits
 from calibration_routines.psf.sweep_plan import DARK
-from calibration_routines.scatter import Scatter, compare, pooled
+from calibration_routines.scatter import Scatter, compare, growth, pooled
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, SettingsError
 from instrument.files.record import RecordFormat, plain
@@ -337,7 +337,7 @@ def _moved_um(image: Float, reference: Float, name: str, record: StageRecord) ->
     larger, total = 0.0, image
     for _ in range(3):  # by Newton: the size is linear only while it changes little
         total = _resized(moved(image, -change.rows, -change.columns), 1 / (1 + larger))
-        larger = (1 + larger) * (1 + _growth(total, reference)) - 1
+        larger = (1 + larger) * (1 + growth(total, reference)) - 1
     return float(-larger * z_um * (z_um + d_um) / d_um / (1 + larger * (z_um + d_um) / d_um))
 
 
@@ -346,16 +346,6 @@ def _resized(image: Float, factor: float) -> Float:
     middle = (np.array(image.shape) - 1) / 2
     resized = ndimage.affine_transform(image, [1 / factor] * 2, middle * (1 - 1 / factor), order=3)
     return np.asarray(resized, np.float32)
-
-
-def _growth(image: Float, reference: Float) -> float:
-    """Return by which share an image is larger than the reference, about its centre: a linear fit."""
-    rows, columns = (np.arange(n) - (n - 1) / 2 for n in reference.shape)
-    down, right = np.gradient(reference.astype(np.float64))
-    radial = -(rows[:, None] * down + columns * right)
-    design = np.stack([c.ravel() for c in (radial, -down, -right, reference, np.ones_like(radial))], axis=1)
-    solution = np.linalg.lstsq(design.T @ design, design.T @ image.ravel().astype(np.float64), rcond=None)[0]
-    return float(solution[0] / solution[3])
 
 
 def stage_lines(found: StagePlay) -> list[str]:

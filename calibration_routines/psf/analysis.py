@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy import fft, ndimage
 
 from calibration_routines.psf.exposure import hot_pixels
+from calibration_routines.psf.mount_fit import MountFit, fit_mount
 from calibration_routines.psf.psf_quality import (
     PsfQuality,
     measure_psf,
@@ -19,7 +20,7 @@ from calibration_routines.psf.psf_quality import (
 )
 from calibration_routines.psf.stage_fit import Drift, StageFit, judge_drift, judge_points
 from calibration_routines.psf.sweep_options import PointSweep
-from calibration_routines.psf.sweep_plan import DARK, REFERENCE
+from calibration_routines.psf.sweep_plan import DARK, FEATURE_PX, REFERENCE
 from calibration_routines.scatter import STEADY, TOLERATED, Scatter, Steadied, pooled, steadied
 from instrument.runs.run import Run
 from recon.base.blocks import block_mean
@@ -121,6 +122,8 @@ class SweepAnalysis:
     """Of the frames of all points."""
     findings: tuple[str, ...] = ()
     """What is wrong with light, place or dark frames, whatever the point."""
+    mount: MountFit | None = None
+    """Where the source stands by the central PSFs; None where they do not tell."""
 
 
 def analyse_sweep(
@@ -150,6 +153,7 @@ def analyse_sweep(
     quality: list[PsfQuality] = []
     scatters: list[Scatter] = []
     ambient: list[float] = []
+    off_axis: list[bool] = []
     removed_in_all: Float | None = None
     reference_ms = 0.0
     for plane in planes:
@@ -158,6 +162,7 @@ def analyse_sweep(
         steady = plane_light(plane, dark)
         mean = steady.mean
         scatters.append(steady.scatter)
+        off_axis.append(plane.off_axis)
         ambient.append(dark.brightening_per_ms * plane.exposure_ms / max(float(mean.mean()), 1e-9))
         light = block_mean(channels_first(mean), binning)
         cleaned, stray = remove_low_frequencies(light, dct_order)
@@ -171,6 +176,13 @@ def analyse_sweep(
     stacked = np.stack(psfs)
     judged, stages = judge_points(quality, stacked, binned(geometry, binning))
     scatter = pooled(scatters)
+    central = [i for i, q in enumerate(judged) if q.similarity is None and not off_axis[i]]
+    mount = fit_mount(
+        [judged[i] for i in central],
+        stacked[central].sum(axis=(1, 2, 3), dtype=np.float64),
+        binned(geometry, binning),
+        scatter.brightness_error,
+    )
     return SweepAnalysis(
         psfs=stacked,
         background=removed_in_all / np.float32(len(psfs)),
@@ -178,7 +190,12 @@ def analyse_sweep(
         reference_exposure_ms=reference_ms,
         stages=stages,
         scatter=scatter,
-        findings=(*scatter.findings(), *ambient_findings(max(ambient, key=abs))),
+        findings=(
+            *scatter.findings(),
+            *ambient_findings(max(ambient, key=abs)),
+            *(() if mount is None else mount.findings),
+        ),
+        mount=mount,
     )
 
 
@@ -271,8 +288,6 @@ def noise_of_mean(frames: Counts | Float) -> float:
     return 1.4826 / 2**0.5 * float(np.median(np.abs(step - np.median(step))))
 
 
-FEATURE_PX = 2.0
-"""Binned pixels that the finest structure must still cover: Nyquist (Kuo 2020, Sec. 4.3)."""
 _LOCAL_MEAN_PX = 16.0  # structure coarser than this does not count
 _REACH_PX = 24
 

@@ -26,9 +26,18 @@ from calibration_routines.psf.psf_quality import (
     judge_sweep,
     with_finding,
 )
-from calibration_routines.scatter import NO_CHANGE, STEADY, TOLERATED, Change, Scatter, compare, reduction
+from calibration_routines.scatter import (
+    NO_CHANGE,
+    STEADY,
+    TOLERATED,
+    Change,
+    Scatter,
+    compare,
+    growth,
+    reduction,
+)
 from recon.base.blocks import block_mean
-from recon.camera.registration import Registration, register
+from recon.camera.registration import Registration, moved, register
 from recon.types import Geometry
 
 Float = npt.NDArray[np.float32]
@@ -39,6 +48,8 @@ MAX_BRIGHTNESS_DRIFT = 0.1
 _LEAST_VISITS = 3  # of a lamp that flickers: fewer do not tell a slope
 _SURE = 3.0  # standard deviations of a visit's brightness: what is less is not called a drift
 _CORRECTABLE = (0.2, 5.0)  # brightness over the first visit's: beyond, it is another light, not a drift
+MAX_GROWTH = 5e-4
+"""Change of the pattern's size between two visits that is called a motion along the axis."""
 MAX_PLACE_DRIFT_PX = 0.5
 """Shift of the reference's pattern that is called a drift, pixels."""
 
@@ -61,6 +72,8 @@ class Drift:
     """Standard deviation of a visit's brightness, as its frames scatter."""
     ambient: tuple[float, ...] = ()
     """Even light that came in since the first visit, in units of its mean."""
+    growth: tuple[float, ...] = ()
+    """Share by which the pattern is larger than at the first visit: nearer, where it grew."""
 
     @property
     def is_correctable(self) -> bool:
@@ -109,10 +122,19 @@ def judge_drift(
         Of the visits' frames: what it explains is not called a drift.
     """
     compared = [NO_CHANGE, *(compare(visit, visits[0]) for visit in visits[1:])]
+    grown = [_growth(visit, visits[0], change) for visit, change in zip(visits, compared, strict=True)]
     findings: list[str] = []
     for k in range(1, len(visits)):
         points = (before_point[k - 1], min(before_point[k], last_point))
         findings += judge_visit((compared[k - 1], compared[k]), points, scatter)
+        larger = grown[k] - grown[k - 1]
+        if abs(larger) > MAX_GROWTH:
+            size, way = ("larger", "nearer") if larger > 0 else ("smaller", "farther")
+            findings.append(
+                f"between points {points[0] + 1} and {points[1]} the reference's pattern became "
+                f"{abs(larger):.2%} {size}: the source came {way}. z lost steps, or something slipped along "
+                "the axis: look at the coupling, and take the sweep again."
+            )
     return Drift(
         tuple(before_point),
         tuple(change.brightness for change in compared),
@@ -121,7 +143,17 @@ def judge_drift(
         tuple(seconds),
         scatter.brightness_error,
         tuple(change.ambient for change in compared),
+        tuple(grown),
     )
+
+
+def _growth(visit: Float, first: Float, change: Change) -> float:
+    """Return by which share the pattern of a visit is larger than that of the first; 0 where unknown."""
+    if not np.isfinite(change.shift_px) or visit is first:
+        return 0.0
+    factor = reduction(first)
+    seen, other = block_mean(visit, factor), block_mean(first, factor)
+    return growth(moved(seen, -change.rows / factor, -change.columns / factor), other)
 
 
 def judge_visit(

@@ -45,6 +45,7 @@ from calibration_routines.psf.sweep_plan import (
     expose_sweep,
     plan_lines,
     retake_plan,
+    size_findings,
     sweep_plan,
 )
 from calibration_routines.psf.sweep_watch import SweepWatch, TakeAgain, retake_dimming
@@ -142,7 +143,14 @@ def calibrate_sweep(
     listener.exposures(exposures)
     listener.planned(plan_lines(bench, points, plan, where))
     listener.step("sweeping")
-    record = SweepRecord(points, exposures, bench.geometry, bench.label, bool(bench.simulated_kinds))
+    record = SweepRecord(
+        points,
+        exposures,
+        bench.geometry,
+        bench.label,
+        bool(bench.simulated_kinds),
+        bench.config.source.size_um,
+    )
     runner = SWEEP.prepare(bench, plan, where, record, control, listener)
     watch_sweep(bench, runner, listener)
     return _finished(runner.execute(), record, bench, control, listener)
@@ -247,10 +255,13 @@ class _TakenSweep:
 
     def analysed(self) -> SweepAnalysis:
         """Turn the frames into PSFs and judge them."""
-        sweep = self.sweep
-        return analyse_sweep(
-            self._planes(), self.dark, self.record.geometry, dct_order=sweep.dct_order, binning=sweep.binning
+        sweep, record = self.sweep, self.record
+        found = analyse_sweep(
+            self._planes(), self.dark, record.geometry, dct_order=sweep.dct_order, binning=sweep.binning
         )
+        geometry = binned(record.geometry, sweep.binning)
+        large = size_findings(record.source_size_um, geometry, sweep.depths_um[0])
+        return replace(found, findings=(*large, *found.findings))
 
     def _planes(self) -> Iterator[PlaneFrames]:
         visits = self.run.steps(REFERENCE)
@@ -302,6 +313,7 @@ class _TakenSweep:
                 "drift": None if drift is None else plain(drift) | {"corrected": drift.is_correctable},
                 "scatter": plain(analysis.scatter) | {"findings": list(analysis.findings)},
                 "late_hot_pixels": self.dark.late_hot,
+                "mount": None if analysis.mount is None else plain(analysis.mount),
                 "good": not any(findings) and not (drift and drift.findings),
             },
             provenance=self._provenance(exposures, analysis.reference_exposure_ms),

@@ -122,6 +122,8 @@ def _point(sweep: PointSweep, label: str, point: Position, exposure_ms: float) -
     )
 
 
+FEATURE_PX = 2.0
+"""Pixels that the finest structure must still cover: Nyquist (Kuo 2020, Sec. 4.3)."""
 _MUCH_BYTES = 10e9  # of a sweep, above which the plan says how to need less
 
 
@@ -262,6 +264,23 @@ class SweepRecord:
     geometry: Geometry
     bench: str
     simulated: bool
+    source_size_um: float | None = None
+    """Diameter of the pinhole, as the bench's configuration has it."""
+
+
+def size_findings(size_um: float | None, geometry: Geometry, z_um: float) -> tuple[str, ...]:
+    """Return what is to be said of a source too large for the resolution, seen from the nearest depth."""
+    d_mm, pitch_um = geometry.diffuser_distance_mm, geometry.pixel_pitch_um
+    if size_um is None or d_mm is None or pitch_um is None:
+        return ()
+    image_px = 1e3 * d_mm / z_um * size_um / pitch_um
+    if image_px <= FEATURE_PX:
+        return ()
+    return (
+        f"the source is too large: its {size_um:g} um ([source] size_um) are {image_px:.1f} pixels wide on "
+        f"the sensor at z = {z_um / 1e3:.4g} mm, and the PSF is blurred (at most {FEATURE_PX:g}): take "
+        f"a pinhole of {FEATURE_PX * pitch_um * z_um / (1e3 * d_mm):.2g} um or less, or go farther away.",
+    )
 
 
 def _with_points(old: dict[str, Any]) -> dict[str, Any]:

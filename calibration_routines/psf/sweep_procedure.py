@@ -11,7 +11,13 @@ from calibration_routines.psf.psf_quality import place_of
 from calibration_routines.psf.sampling import reachable_depths_um
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep, finish_sweep, watch_sweep
 from calibration_routines.psf.sweep_options import AskedSweep, AxialSweep, LateralSweep, VolumeSweep
-from calibration_routines.psf.sweep_plan import SWEEP, SweepExposures, check_sweep, plan_lines
+from calibration_routines.psf.sweep_plan import (
+    SWEEP,
+    SweepExposures,
+    check_sweep,
+    plan_lines,
+    size_findings,
+)
 from calibration_routines.psf.sweep_watch import SourceVisit, SweepEvent
 from calibration_routines.scatter import TOLERATED
 from instrument.bench.bench import Bench
@@ -38,6 +44,8 @@ class SweepProcedure(Procedure):
         if len(planned.sweep.points_um) > 1:
             caveat += " Dark frames are for two exposures; one suffices if all points get the same."
         lines = plan_lines(bench, planned.sweep, plan, folder)
+        size_um = bench.config.source.size_um
+        lines += [f"Note: {w}" for w in size_findings(size_um, bench.geometry, planned.sweep.depths_um[0])]
         return replace(outlook, plan_lines=(*lines, caveat))
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:

@@ -23,7 +23,7 @@ import io
 import json
 import struct
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from types import FunctionType
@@ -66,6 +66,7 @@ class Values:
     """A type's values as JSON has them, arrays and frames included."""
 
     def __init__(self, hint: Any) -> None:
+        self._is_list = get_origin(hint) is Sequence  # of arrays, all of one shape
         self.is_array = get_origin(hint) is np.ndarray or any(
             get_origin(part) is np.ndarray for part in get_args(hint)
         )
@@ -89,7 +90,7 @@ class Values:
             return self._adapter.validate_python(value)
         array = np.load(io.BytesIO(base64.b64decode(value, validate=True)), allow_pickle=False)
         array.flags.writeable = False
-        return array
+        return list(array) if self._is_list else array
 
 
 def plain(value: Any) -> Any:
@@ -149,6 +150,19 @@ class Call:
         return getattr(device, self.name)(**given)
 
 
+def _hints(function: FunctionType, interface: type) -> dict[str, Any]:
+    """Return a function's types, with what an interface means by the type variables of its bases."""
+    meant: dict[Any, Any] = {}
+    for base in getattr(interface, "__orig_bases__", ()):
+        meant |= zip(getattr(get_origin(base), "__parameters__", ()), get_args(base), strict=False)
+    return {
+        name: hint[tuple(meant[variable] for variable in variables)]
+        if (variables := getattr(hint, "__parameters__", ()))
+        else hint
+        for name, hint in get_type_hints(function).items()
+    }
+
+
 @functools.cache
 def calls(kind: Kind) -> Mapping[str, Call]:
     """Return what a kind of device is asked for from afar, by name."""
@@ -158,7 +172,7 @@ def calls(kind: Kind) -> Mapping[str, Call]:
         function = member.fget if isinstance(member, property) else member
         if name.startswith("_") or name in _AT_HOME or not isinstance(function, FunctionType):
             continue
-        hints = get_type_hints(function)
+        hints = _hints(function, INTERFACES[kind])
         gives = Values(hints.pop("return"))
         is_read = isinstance(member, property)
         verb: Literal["GET", "POST", "PUT"] = "GET" if is_read else "POST"
@@ -217,7 +231,7 @@ def load_error(device: str, said: Mapping[str, str]) -> errors.DeviceError:
 _LENGTH = struct.Struct("<I")
 _ALIGNED = 8
 _PIECE = struct.Struct("<IQQ")
-_PIECE_BYTES = 1 << 18
+_PIECE_BYTES = 1 << 20
 
 
 @functools.cache
@@ -241,7 +255,7 @@ def pack_frame(frame: Frame) -> bytes:
 
 
 def pieces(frame: Frame, number: int) -> list[bytes]:
-    """Return a sequence's frame in messages of at most a quarter of a megabyte.
+    """Return a sequence's frame in messages of at most a megabyte.
 
     Each says the frame's number, from 0, the frame's size and its own place in it: a message that is whole
     keeps a connection, and its thread, busy for long.
@@ -257,7 +271,7 @@ class Assembly:
     """Puts frames together from their pieces, in whatever order these come, and gives them in theirs."""
 
     def __init__(self) -> None:
-        self._parts: dict[int, tuple[bytearray, list[int]]] = {}
+        self._parts: dict[int, tuple[memoryview, list[int]]] = {}
         self._expected = 0
 
     def add(self, piece: bytes) -> Iterator[Frame]:
@@ -269,7 +283,8 @@ class Assembly:
             number, size, place = _PIECE.unpack_from(piece)
         except struct.error as error:
             raise ValueError(f"no piece of a frame: {error}") from None
-        whole, left = self._parts.setdefault(number, (bytearray(size), [size]))
+        whole, left = self._parts.get(number) or (np.empty(size, np.uint8).data, [size])
+        self._parts[number] = whole, left
         whole[place : place + len(piece) - _PIECE.size] = memoryview(piece)[_PIECE.size :]
         left[0] -= len(piece) - _PIECE.size
         while (first := self._parts.get(self._expected)) is not None and first[1] == [0]:
@@ -278,7 +293,7 @@ class Assembly:
             yield unpack_frame(first[0])
 
 
-def unpack_frame(message: bytes | bytearray) -> Frame:
+def unpack_frame(message: bytes | memoryview) -> Frame:
     """Return a frame, whose image looks at the message; it reached this computer now.
 
     Raises ValueError when the message is no frame.
@@ -286,7 +301,7 @@ def unpack_frame(message: bytes | bytearray) -> Frame:
     try:
         (length,) = _LENGTH.unpack_from(message)
         begin = _LENGTH.size + length
-        said = json.loads(message[_LENGTH.size : begin])
+        said = json.loads(bytes(message[_LENGTH.size : begin]))
         metadata = _metadata().validate_python(said["metadata"])
         pixels = np.frombuffer(message, "<u1" if said["bits"] == 8 else "<u2", offset=begin)
         image = pixels.reshape(said["shape"])

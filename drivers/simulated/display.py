@@ -46,6 +46,9 @@ class DisplayOptions(CommonOptions):
         2e5, gt=0, description="Mean electrons a second in a camera pixel inside the field of view."
     )
     mask_seed: int = Field(0, ge=0, description="Of the random binary mask.")
+    masked: bool = Field(
+        True, description="Whether there is a mask; without one mask_pitch_um is the SLM's pitch."
+    )
     mask_pitch_um: float = Field(4.0, gt=0, description="Pitch of the mask's pixels.")
     wavelength_nm: float = Field(660.0, gt=0, description="Of the laser; the mask is made for it.")
     focal_mm: float = Field(35.0, gt=0, description="Focal length of the Fourier lens.")
@@ -154,7 +157,7 @@ class DisplayWorld(Surroundings):
                 sensor_pitch_um=self.sensor.pitch_um,
                 **options.model_dump(include={field.name for field in fields(DisplaySpec)}),
             )
-            self._optics = ScatteringDisplay(spec, pi * bits)
+            self._optics = ScatteringDisplay(spec, pi * bits * options.masked)
         return self._optics
 
     def _flatness_map(self, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:

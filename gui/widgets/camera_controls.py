@@ -32,6 +32,14 @@ from recon.base.declare import options_of
 _READ_BACK_MS = 3000
 _WHILE_RUNNING = ("exposure_ms", "gain")
 """What is set while the stream runs; for the others it pauses."""
+_OFFERED = {
+    "binning": "binnings",
+    "pixel_format": "pixel_formats",
+    "trigger_mode": "trigger_modes",
+    "trigger_line": "trigger_lines",
+    "trigger_edge": "trigger_edges",
+}
+"""Settings that are chosen, and what the camera offers for each."""
 _SET = tuple(o.name for o in options_of(CameraOptions))
 
 
@@ -51,14 +59,7 @@ class CameraForm(QWidget):
         self.state: CameraState | None = None
         self.form = OptionsForm(
             [CameraOptions],
-            {
-                "binning": Behaviour(offers=lambda: self._offered("binnings")),
-                "pixel_format": Behaviour(offers=lambda: self._offered("pixel_formats")),
-                **{
-                    f"trigger_{what}": Behaviour(offers=partial(self._offered, f"trigger_{what}s"))
-                    for what in ("mode", "line", "edge")
-                },
-            },
+            {name: Behaviour(offers=partial(self._offered, offered)) for name, offered in _OFFERED.items()},
         )
         self.widgets = self.form.widgets
         self.form.refused.connect(panel.refused)
@@ -147,11 +148,12 @@ class CameraForm(QWidget):
             number = self.form.fields[name]
             assert isinstance(number, NumberField)
             number.set_limits(*limits)
-        for name, offered in (("binning", "binnings"), ("pixel_format", "pixel_formats")):
+        for name, offered in _OFFERED.items():
             choice = self.form.fields[name]
             assert isinstance(choice, ChoiceField)
             if not choice.is_being_edited:
                 choice.offer(self._offered(offered))
+            choice.widget.setEnabled(bool(getattr(state, offered)))
         present = {name: getattr(state, name) for name in _SET}
         self.form.show_present(present | {"roi": ", ".join(map(str, state.roi.as_tuple()))})
         has_thermometer = state.temperature_c is not None

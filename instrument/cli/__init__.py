@@ -59,6 +59,7 @@ COMMANDS: Mapping[str, Command] = {
         "bench:devices_app",
     ),
     "serve": Command(BENCH, "offer the devices to another computer, and a page in the browser", "serve"),
+    "completion": Command(BENCH, "print completions for bash and zsh", "completion"),
     "calibrate": Command(BENCH, "measure PSFs, the sensor, the diffuser, or an SLM", "calibrate"),
     "snap": Command(BENCH, "take a photograph", "capture:snap_app"),
     "plan": Command(ACQUISITION, "look at a plan before anything moves, or write one", "plan"),

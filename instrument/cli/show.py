@@ -74,13 +74,15 @@ class ShowOptions(CaptureOptions, _Shown):
         group="Of a run",
     )
 
-    def check(self, n_patterns: int) -> None:
-        """Refuse what does not go together, or a file that exists.
+    def check(self, n_patterns: int, *, spots: bool) -> None:
+        """Refuse what does not go together for pictures or spots, or a file that exists.
 
         Raises BenchError or FileError.
         """
         capture = self.capture
-        if (capture is None) != (self.target is None):
+        if spots and self.target is not None:
+            raise BenchError("Spots are compared with what was asked for: leave --target out.")
+        if not spots and (capture is None) != (self.target is None):
             raise BenchError("Give --capture FILE and --target FILE together.")
         if capture is not None:
             require_new(capture, overwrite=self.force)
@@ -97,6 +99,7 @@ class ShowOptions(CaptureOptions, _Shown):
         "diffuserbench show runs/2026-11-21_14-03-22_axial-sweep",
         "diffuserbench show slm.png --bench display.toml --seconds 60",
         "diffuserbench show slm.png --bench display.toml --capture seen.png --target picture.png",
+        "diffuserbench show spots.png --bench display.toml --capture seen.png --refine 4",
         "diffuserbench show slm-frame1.png slm-frame2.png --capture seen.png --target picture.png",
     )
 )
@@ -124,7 +127,6 @@ def show(
         _show_run(what[0], options.picture)
         return
     given.refuse("a hologram", "hologram")
-    options.check(len(what))
     _show_hologram(what, options, bench)
 
 
@@ -134,8 +136,12 @@ def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -
 
     from calibration_routines.display.display_io import DisplayBench, bring_mask
     from instrument.display.hologram import load_alignment
-    from instrument.files.slm_image import levels_phase, load_slm_correction, read_slm_image
+    from instrument.files.images import side_car
+    from instrument.files.slm_image import SLM_PHASE, levels_phase, load_slm_correction, read_slm_image
 
+    beside = side_car(what[0])
+    spots = beside.exists() and "spots" in SLM_PHASE.read(beside)
+    options.check(len(what), spots=spots)
     correction = load_slm_correction(options.slm_calibration) if options.slm_calibration else None
     place = load_alignment(options.alignment) if options.alignment else None
     read = [read_slm_image(path) for path in what]
@@ -151,6 +157,8 @@ def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -
         fields = [np.exp(1j * levels_phase(levels, binning)) for levels, _ in read]
         if options.capture is None:
             _hold(io, fields, options.seconds)
+        elif spots:
+            _capture_spots(io, fields, read[0][1], what[0], options, place)
         else:
             _capture(io, fields, read[0][1], what[0], options, place)
 
@@ -223,6 +231,58 @@ def _capture(
     if found.capture.saturated_fraction > 1e-3:
         percent = 100 * found.capture.saturated_fraction
         typer.echo(f"Warning: {percent:.1f} % of the camera's pixels are saturated.", err=True)
+    typer.echo(f"Wrote {options.capture}")
+
+
+def _capture_spots(
+    io: DisplayBench,
+    fields: list[Any],
+    facts: dict[str, Any],
+    pattern: Path,
+    options: ShowOptions,
+    place: Alignment | None,
+) -> None:
+    """Photograph spots, say how even they are, write."""
+    import numpy as np
+
+    from calibration_routines.display.hologram_photograph import display_of_pattern
+    from calibration_routines.display.spot_photograph import photograph_spots, write_spots_seen
+    from instrument.display.spots import spots_of_facts
+    from instrument.files.slm_image import phase_levels, write_slm_image
+    from recon.holography import HologramOptions
+
+    assert options.capture is not None
+    opened = io.bench
+    assert opened.slm is not None
+    slm = opened.slm.shape, opened.slm.pixel_pitch_um
+    said = facts["options"]
+    computed = HologramOptions(
+        seed=said["seed"], phase_levels=said["phase_levels"], envelope=said["envelope"]
+    )
+    found = photograph_spots(
+        io,
+        np.array(fields),
+        display_of_pattern(opened.config, slm, facts, place),
+        spots_of_facts(pattern, facts),
+        options,
+        computed,
+        progress=lambda n, deviation: typer.echo(f"round {n}: deviation {deviation:.2%}", err=True),
+    )
+    simulated = bool(opened.simulated_kinds)
+    typer.echo(f"camera registered to {found.camera_residual_px:.2f} px{' (SIMULATED)' if simulated else ''}")
+    first, best = found.deviations[0], min(found.deviations)
+    if options.refine:
+        path = pattern.with_name(f"{pattern.stem}-refined.png")
+        kept = {name: fact for name, fact in facts.items() if name not in ("format", "levels_per_turn")}
+        kept |= {"refined_by_camera": True, "captured_deviations": list(found.deviations)}
+        write_slm_image(path, phase_levels(np.angle(found.slm[0]), io.binning), kept)
+        typer.echo(f"camera in the loop: deviation {first:.2%} -> {best:.2%}; {path}")
+    write_spots_seen(options.capture, found, simulated=simulated)
+    least, greatest = found.relative.min(), found.relative.max()
+    typer.echo(
+        f"photographed: {len(found.relative)} spots, {least:.3f} to {greatest:.3f} of what was asked for, "
+        f"deviation {best:.2%}"
+    )
     typer.echo(f"Wrote {options.capture}")
 
 

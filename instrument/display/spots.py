@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ import numpy as np
 from instrument.display.hologram_files import HologramFiles
 from instrument.files.errors import FileError
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
-from instrument.files.record import plain
+from instrument.files.images import side_car
+from instrument.files.record import plain, value_of
 from instrument.files.slm_image import phase_levels, write_slm_image
 from recon.base.declare import record
 from recon.errors import InputError
@@ -64,6 +66,14 @@ def read_spots(path: Path) -> SpotList:
         return SpotList(np.column_stack([found["y"], found["x"]]), found["intensity"], found["z_mm"])
     except InputError as error:
         raise FileError(path, str(error)) from error
+
+
+def spots_of_facts(pattern: Path, facts: Mapping[str, Any]) -> SpotList:
+    """Return the spots that a pattern was computed for; FileError where what is beside it is damaged."""
+    try:
+        return value_of(SpotList, facts["spots"])
+    except (LookupError, TypeError, ValueError) as error:
+        raise FileError(side_car(pattern), f"does not say which spots: {error}.") from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -214,7 +214,7 @@ class OutputOptions:
     figure: Path | None = option(
         None,
         help="Also a summary figure (.png, .pdf, .svg).",
-        applies=("picture",),
+        applies=_KEPT,
         group=_OUTPUT,
     )
     checkpoint: Path | None = option(

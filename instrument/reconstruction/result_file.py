@@ -54,11 +54,13 @@ class Outputs:
 
         With ``uncertainty`` a picture's standard deviations and points are among them. Raises FileError.
         """
+        if figure is not None and figure.suffix.lower() not in (".png", ".pdf", ".svg"):
+            raise FileError(figure, "a figure is written as .png, .pdf or .svg.")
         if volume and is_zarr_name(out):
             if not (stem := stem_of(out)):
                 raise FileError(out, "has no name before its suffix.", "Call it volume.ome.zarr, say.")
             record, residual = out.with_name(f"{stem}.json"), out.with_name(f"{stem}-residual.tif")
-            return cls(out, out.with_name(f"{stem}.png"), record, residual=residual)
+            return cls(out, out.with_name(f"{stem}.png"), record, figure, residual=residual)
         if out.suffix.lower() not in (".tif", ".tiff"):
             raise FileError(
                 out,
@@ -67,8 +69,6 @@ class Outputs:
                 else "a reconstruction is written as float32 TIFF: the name must end in .tif.",
                 "A preview .png and a .json with the settings are written beside it.",
             )
-        if figure is not None and figure.suffix.lower() not in (".png", ".pdf", ".svg"):
-            raise FileError(figure, "a figure is written as .png, .pdf or .svg.")
         deviation = out.with_name(f"{out.stem}-deviation{out.suffix}") if uncertainty else None
         points = out.with_name(f"{out.stem}-points.csv") if uncertainty else None
         residual = out.with_name(f"{out.stem}-residual{out.suffix}")
@@ -268,7 +268,9 @@ def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
         write_volume_zarr(outputs.image, result.volume, result.grid, about)
     else:
         write_volume_tiff(outputs.image, result.volume, result.volume.shape, result.grid)
-    save_figure(volume_figure(result, simulated=job.simulated), outputs.preview)
+    page = volume_figure(result, simulated=job.simulated)
+    for path in filter(None, (outputs.preview, outputs.figure)):
+        save_figure(page, path)
     _write_residual(outputs, result, job)
     write_json(outputs.record, reconstruction_record(result, job, volume=True))
     _take_away_others(outputs, result)

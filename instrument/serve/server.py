@@ -44,7 +44,7 @@ _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 _LONGEST_REQUEST = 256 << 20
-_FRAME_WAIT_S, _CLOSING_S = 0.2, 1.0
+_FRAME_WAIT_S, _CLOSING_S, _GIVE_WAY_S = 0.2, 1.0, 0.002
 _STATE_S, _PICTURE_S = 1.0, 0.1
 """How often a page hears of the state, and sees a picture, at most."""
 _PAGE_HEADERS = {
@@ -88,6 +88,8 @@ class BenchServer:
         self._runner: web.AppRunner | None = None
         self._links: weakref.WeakSet[web.WebSocketResponse] = weakref.WeakSet()
         self._frames: asyncio.Task[Any] | None = None
+        self._overtakers = 0
+        """Stops that are being carried out: meanwhile no frame is sent."""
 
     # Starting and ending -------------------------------------------------------------------------
     def start(self) -> Self:
@@ -221,7 +223,13 @@ class BenchServer:
         number = int(request.headers.get(NUMBER_HEADER, "0"))
         pool = self._overtaking if call.verb == "PUT" else self._pool
         key = self._operator(request).key
-        made = await self._loop.run_in_executor(pool, self.operation.make, call, kind, key, number, arguments)
+        self._overtakers += call.verb == "PUT"
+        try:
+            made = await self._loop.run_in_executor(
+                pool, self.operation.make, call, kind, key, number, arguments
+            )
+        finally:
+            self._overtakers -= call.verb == "PUT"
         if isinstance(made, Frame):
             return web.Response(body=await self._in_thread(pack_frame, made))
         return web.json_response({"value": call.gives.dump(made)}, dumps=_dumps)
@@ -333,6 +341,8 @@ class BenchServer:
                     pass
                 self.operation.newest_frame = frame
                 for piece in await self._in_thread(pieces, frame, number):
+                    while self._overtakers:  # pictures can wait
+                        await asyncio.sleep(_GIVE_WAY_S)
                     await link.send_bytes(piece)
                 number += 1
         except DeviceError as error:

@@ -66,6 +66,15 @@ def _terms(y: Array, x: Array) -> Array:
     return np.stack([y**i * x**j for i in range(4) for j in range(4 - i)], axis=-1)
 
 
+def polynomial_map(nominal: CameraMap, places: Array, shifts: Array) -> CameraMap:
+    """Return a map with its third-order correction fitted to ``shifts`` (row, column) at places, pixels."""
+    terms = _terms(places[:, 0], places[:, 1])
+    solution = np.linalg.lstsq(terms, shifts, rcond=None)[0]
+    left = shifts - terms @ solution
+    residual = float(np.sqrt(np.sum(left**2) / max(2 * len(places) - solution.size, 1)))
+    return CameraMap(nominal.shape, nominal.pixels_across, nominal.coefficients + solution, residual)
+
+
 def mask_speckle(display: Display) -> npt.NDArray[np.float32]:
     """Return the far field of the mask alone over the field of view, at twice the mask's own sampling."""
     import scipy.fft

@@ -119,7 +119,7 @@ class SpotField:
         self._table = display.mask.response(display.wavelength_nm).astype(np.complex64)
         nodes = display.displacement
         self._nodes = None if nodes is None else np.ascontiguousarray(nodes, np.float32)
-        self._field = np.empty(display.mask.shape, np.complex64)
+        self._field = np.zeros(display.mask.shape, np.complex64)  # what is displaced reads it for its type
         nu = spots.places - 0.5
         self._planes = []
         for z_mm in np.unique(spots.z_mm):
@@ -209,7 +209,7 @@ def compute_spots(
         Its frames, seed, phase levels, iterations and time; ``envelope="ignore"`` leaves the mask pixels'
         envelope out, else spots are as bright as asked for where they are seen.
     initial : ndarray, complex, (n_frames, height, width), optional
-        Warm start: the spots' phases are taken from it.
+        Warm start: the spots' phases are taken from it and kept, so that little else changes.
     callback : callable, optional
         ``callback(record, slm)`` after each iteration; the record's loss is the spots' deviation.
     cancel : threading.Event, optional
@@ -258,7 +258,7 @@ def compute_spots(
         else:
             weights = weights * np.sqrt(np.clip(brightness.mean() / np.maximum(brightness, 1e-9), 0.1, 10))
             weights /= weights.mean()
-            if number < LEARNS * options.iterations:
+            if initial is None and number < LEARNS * options.iterations:
                 phases = np.angle(seen)
             continue
         break

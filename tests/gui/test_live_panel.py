@@ -68,6 +68,14 @@ def test_a_wrong_exposure_is_refused_at_the_field(qtbot: QtBot, live: LivePanel)
     assert not live.form.widgets["exposure_ms"].property("refused")
 
 
+def test_trigger_line_and_edge_are_chosen_from_what_the_camera_has(qtbot: QtBot, live: LivePanel) -> None:
+    widgets = live.form.widgets
+    assert [widgets["trigger_mode"].itemText(n) for n in range(3)] == ["free_run", "software", "hardware"]
+    widgets["trigger_edge"].setCurrentIndex(1)
+    qtbot.waitUntil(lambda: live.form.state.trigger_edge == "falling", timeout=WAIT_MS)
+    assert live.session.bench.camera.trigger_edge == "falling"
+
+
 def test_binning_pauses_the_stream_and_goes_on(qtbot: QtBot, live: LivePanel) -> None:
     live.form.widgets["binning"].setCurrentIndex(1)
     qtbot.waitUntil(

@@ -14,7 +14,7 @@ import pytest
 import tifffile
 
 from instrument.bench.bench import open_bench
-from instrument.cli import COMMANDS, main
+from instrument.cli import COMMANDS, completion, main
 from instrument.files.slm_image import write_slm_image
 
 MOCK_BENCH = """\
@@ -390,3 +390,24 @@ def test_a_commands_help_imports_no_heavy_library(name: str) -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60, env=environment
     )
     assert shown.stdout.endswith("[]\n")
+
+
+def test_bash_completes_commands_options_and_their_words(tmp_path: Path) -> None:
+    (tmp_path / "completion.sh").write_text(completion.script())
+    asked = {
+        "reconstruct --prior tv-": "tv-isotropic tv-haar",
+        "calibrate sl": "slm",
+        "snap --av": "--average",
+    }
+    lines = ["source completion.sh"]
+    for words in asked:
+        lines += [
+            f"COMP_WORDS=(diffuserbench {words})",
+            "COMP_CWORD=$((${#COMP_WORDS[@]}-1))",
+            "_diffuserbench",
+        ]
+        lines += ['echo "${COMPREPLY[*]}"']
+    said = subprocess.run(
+        ["bash", "-c", "\n".join(lines)], capture_output=True, text=True, cwd=tmp_path, check=True
+    )
+    assert said.stdout.splitlines() == list(asked.values())
