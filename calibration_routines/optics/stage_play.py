@@ -302,15 +302,15 @@ def _axis(name: str, visits: Mapping[str, list[Float]], record: StageRecord) -> 
     um = {what: np.array([_moved_um(i, reference, name, record) for i in v]) for what, v in visits.items()}
     if not all(np.isfinite(values).all() for values in um.values()):
         raise CalibrationError(
-            f"The pattern was not found again while {name[0]} moved: choose a smaller reach (--reach), or a "
-            "place where the whole pattern falls onto the sensor (--z)."
+            f"The pattern was not found again while {name[0]} moved: choose a smaller --reach-um, or a place "
+            "where the whole pattern falls onto the sensor (--z)."
         )
     up, above, down, below = (um[what] for what in _TURN)
     play = down - up
     if np.abs(np.median(play)) > _PLAY_PART * record.reach_um:
         raise CalibrationError(
             f"{name[0]} stays {abs(np.median(play)):.4g} um behind, nearly all of its reach of "
-            f"{record.reach_um:g} um: choose a larger --reach."
+            f"{record.reach_um:g} um: choose a larger --reach-um."
         )
     scale = np.median([*(above - up), *(down - below)]) / record.reach_um - 1
     # From one turn to the next, in the median: steps lost once do not make a stage imprecise.
@@ -411,7 +411,7 @@ ROUTINES = (
         needs=("stage",),
         purpose=STAGE,
         finish=_finish,
-        examples=("diffuserbench calibrate stage --dry-run", "diffuserbench calibrate stage --reach 500"),
+        examples=("diffuserbench calibrate stage --dry-run", "diffuserbench calibrate stage --reach-um 500"),
     ),
 )
 """Row of :data:`calibration_routines.procedure.routines`."""
