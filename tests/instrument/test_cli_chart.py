@@ -203,7 +203,8 @@ def test_holograms_are_charted(monkeypatch, tmp_path):
         assert told in result.output
     record = json.loads((tmp_path / "chart.json").read_text())
     assert record["kind"] == "hologram"
-    assert {p["group"] for p in record["pareto"]} == {"4x", "9x"}
+    groups = {"4x", "9x", "4x, complex SLM", "9x, complex SLM"}
+    assert {p["group"] for p in record["pareto"]} == groups
     assert (
         (tmp_path / "chart.csv")
         .read_text()
