@@ -148,10 +148,12 @@ def _slm(bench: Bench) -> str:
     slm = bench.slm
     assert slm is not None
     means = []
-    for level in (0, 255):
-        slm.display(np.full(slm.shape, level, np.uint8))
-        means.append(float(bench.camera.snap().image.mean()))
-    took = _timed(slm.blank, 3)
+    try:
+        for level in (0, 255):
+            slm.display(np.full(slm.shape, level, np.uint8))
+            means.append(float(bench.camera.snap().image.mean()))
+    finally:
+        took = _timed(slm.blank, 3)
     return f"mean {means[0]:.5g} counts at level 0, {means[1]:.5g} at 255; a blank image takes {took}"
 
 

@@ -172,4 +172,10 @@ def test_a_falling_edge_and_another_line(tmp_path: Path) -> None:
         run = acquire(bench, steps_of_light(), tmp_path)
         assert run.reason is FinishReason.COMPLETED
         with pytest.raises(DeviceError, match="no frame came on Line2"):
-            acquire(bench, steps_of_light(trigger_line="Line2"), tmp_path)
+            acquire(bench, steps_of_light(trigger_line="Line2", trigger_edge="rising"), tmp_path)
+        camera = bench.camera
+        assert (camera.trigger_line, camera.trigger_edge, camera.trigger_mode) == (
+            "Line1",
+            "falling",
+            "free_run",
+        )
