@@ -32,6 +32,9 @@ WEIGHT = 0.25
 STEEPEST = 2.5
 """Steepness up to which the laws were fitted, in units of what is left where that is more than the noise:
 beyond, smaller weights would take ever more iterations."""
+UNLIKE = 7.5
+"""Where PSFs vary: what the central one may leave of the data for its picture to tell anything, in units of
+the noise (7.3 at most on the scenes of the law)."""
 LIT = 0.1
 """A pixel is lit from this share of the brightest (99.9th percentile)."""
 
@@ -120,11 +123,12 @@ class FirstLook:
 
 
 def look_at(problem: Problem, cancel: threading.Event | None = None) -> FirstLook | None:
-    """Look at a picture through one PSF; None where a weight is given, or none is asked for.
+    """Look at a picture through one PSF; None where a weight is given or not asked for, or it tells nothing.
 
     Where PSFs vary over the field it is the central one, and a background that is estimated as well takes
-    no part: neither changes much of the picture's steps. With l1 light then counts as much as it is seen,
-    and the law does not hold.
+    no part: neither changes much of the picture's steps. Where that PSF tells nothing of the picture, as of a
+    close scene far off the axis, the table's weight holds, as without a look. With l1 light then counts as
+    much as it is seen, and the law does not hold.
 
     Parameters
     ----------
@@ -151,10 +155,13 @@ def look_at(problem: Problem, cancel: threading.Event | None = None) -> FirstLoo
     picture = found.solution[:, 0, rows, columns].astype(np.float64)
     steps = [np.abs(np.diff(picture, axis=axis)).mean() for axis in (1, 2) if picture.shape[axis] > 1]
     brightest = np.percentile(picture, 99.9)
+    misfit = float(np.sqrt(np.mean(found.left[problem.valid].astype(np.float64) ** 2)))
+    if varying and misfit > UNLIKE:
+        return None
     return FirstLook(
         float(sum(steps)) * passed_on,
         float(np.mean(picture > LIT * brightest)),
-        float(np.sqrt(np.mean(found.left[problem.valid].astype(np.float64) ** 2))),
+        misfit,
         found.outcome.seconds,
         passed_on,
         varying,
