@@ -65,7 +65,7 @@ def thorough(bench: Bench, *, moves: bool = False) -> Iterator[Finding]:
         except (DeviceError, BenchError) as error:
             yield Finding(kind, name, str(error), failed=True)
         finally:
-            if bench.led_array is not None:
+            if bench.led_array is not None and bench.led_array.is_open:
                 bench.led_array.off()
 
 

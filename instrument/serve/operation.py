@@ -51,7 +51,8 @@ class _Hold:
 class Operation:
     """Opens a bench's devices for one operator at a time, and closes them when he has gone, however.
 
-    Between operators nothing is open: the devices are free for other programs of this computer.
+    Between operators nothing is open, but the camera while somebody looks at the page: other programs of this
+    computer may use the devices.
 
     Parameters
     ----------
