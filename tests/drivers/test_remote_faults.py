@@ -197,6 +197,16 @@ def test_the_end_of_a_sequence_is_not_that_of_the_next_one(
     until(lambda: server.operation.operator is None)
 
 
+def test_pieces_that_are_none_end_the_sequence_in_words(
+    options: RemoteOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serving, "pieces", lambda frame, number: [b"another version's"])
+    with RemoteCamera(options) as camera:
+        camera.start_sequence()
+        with pytest.raises(DeviceLostError, match="broke during a sequence: no piece of a frame"):
+            camera.next_frame(PATIENCE_S)
+
+
 def test_stop_says_what_could_not_be_made_safe_though_nobody_operates(server: BenchServer) -> None:
     server.operation.stop("somebody")
     server.operation.trouble = "The LED array: off failed."
