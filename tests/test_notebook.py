@@ -69,6 +69,11 @@ def test_a_result_shows_draws_and_saves_itself(scene: tuple[np.ndarray, np.ndarr
     np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), found.image)
     with pytest.raises(db.FileError, match="exists already"):
         found.save(tmp_path / "a.npy")
+    with pytest.raises(db.FileError, match="exists already"):
+        found.save(tmp_path / "c.npy", figure=tmp_path / "a.png")
+    with pytest.raises(db.BenchError, match="a multiple of 90"):
+        found.save(tmp_path / "c.npy", rotate_deg=45)
+    assert not (tmp_path / "c.npy").exists()
     assert db.open_result(tmp_path / "b.tif").facts()
 
 
@@ -143,6 +148,8 @@ def test_a_hologram_shows_and_saves_itself(tmp_path: Path) -> None:
     assert repr(found).startswith("<Hologram 16 x 16, expansion ")
     assert found.phase_rad.shape == (1, 16, 16)
     assert all(path.exists() for path in found.save(tmp_path / "slm.png"))
+    with pytest.warns(UserWarning, match="the middle 20 x 20 of the picture's 20 x 30 pixels"):
+        db.hologram(np.ones((20, 30), np.float32), "display", slm=(32, 32), iterations=1)
 
 
 def test_a_chart_of_a_result_is_drawn(

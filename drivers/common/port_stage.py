@@ -14,7 +14,7 @@ from drivers.common.polled_stage import PolledStage, StageState
 from drivers.common.serial_transport import SerialTransport
 from drivers.common.stage_axes import AxisMap, AxisOptions
 from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, port_claim
-from drivers.errors import DeviceError, DeviceTimeoutError
+from drivers.errors import DeviceError
 from drivers.registry.buses import lasting_name
 from drivers.stage import StageAxis
 
@@ -100,7 +100,7 @@ class PortStage(PolledStage):
         link.open()
         try:
             model, serial_number, firmware = stage._identify()
-        except (DeviceTimeoutError, DeviceError):
+        except DeviceError:
             return None
         finally:
             link.close()
@@ -162,15 +162,15 @@ class PortStage(PolledStage):
 
     def _came_home(self, name: str, *, moving: bool) -> bool:
         """Whether an axis that was sent home has just come to rest, for controllers that do not tell."""
-        if name not in self._homing:
+        began_s = self._homing.get(name)
+        if began_s is None:
             return False
         if moving:
             self._left.add(name)
             return False
-        if name not in self._left and time.monotonic() - self._homing[name] < _LEAVING_S:
+        if name not in self._left and time.monotonic() - began_s < _LEAVING_S:
             return False
-        del self._homing[name]
-        return True
+        return self._homing.pop(name, None) is not None  # a stop may have come between
 
 
 def distinct(places: Mapping[str, object], what: str) -> None:

@@ -1,4 +1,4 @@
-"""A stage of Thorlabs Elliptec modules on one bus (ELLx modules protocol manual, issue 10).
+"""A stage of Thorlabs Elliptec modules on one bus (ELLx protocol).
 
 A command is an address (0 to F), two letters and hexadecimal digits: ``0ma00001000``. A module answers with
 its address and two capital letters: ``0PO00001000`` (a place) or ``0GS09`` (a status: busy). It answers to a

@@ -73,8 +73,13 @@ class RemoteCamera(RemoteDevice, Camera):
         ended: DeviceError | None = None
         async for message in stream:
             if message.type is aiohttp.WSMsgType.BINARY:
-                for frame in assembly.add(message.data):
-                    self._put(stream, frame)
+                try:
+                    for frame in assembly.add(message.data):
+                        self._put(stream, frame)
+                except ValueError as error:
+                    await _left(stream)
+                    ended = await self._link.broke("a sequence", str(error))
+                    break
             elif message.type is aiohttp.WSMsgType.TEXT and "error" in (said := json.loads(message.data)):
                 ended = load_error(self.name, said["error"])
         if ended is None and self._stream is stream:

@@ -254,21 +254,24 @@ class Link:
     async def frames(self, n_buffers: int, window: int) -> aiohttp.ClientWebSocketResponse:
         """Start a sequence; returns the connection that its frames come over.
 
-        Raises DeviceError when the camera refuses.
+        Raises DeviceError when the camera refuses; DeviceLostError when the connection broke meanwhile.
         """
         import aiohttp
 
         self.require()
         assert self._session is not None
-        stream = await self._session.ws_connect(
-            "/api/devices/camera/frames",
-            params={"n_buffers": n_buffers, "window": window},
-            protocols=(PROTOCOL,),
-            max_msg_size=0,
-        )
+        try:
+            stream = await self._session.ws_connect(
+                "/api/devices/camera/frames",
+                params={"n_buffers": n_buffers, "window": window},
+                protocols=(PROTOCOL,),
+                max_msg_size=0,
+            )
+        except (aiohttp.ClientError, OSError) as error:
+            raise await self.broke("the start of a sequence", str(error) or type(error).__name__) from error
         first = await stream.receive()
         if first.type is not aiohttp.WSMsgType.TEXT:
-            raise self._unreachable("it ended the connection")
+            raise await self.broke("the start of a sequence", "its frames' connection ended")
         if "error" in (said := json.loads(first.data)):
             await stream.close()
             raise load_error(self._name, said["error"])

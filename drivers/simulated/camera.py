@@ -103,7 +103,8 @@ class SimulatedCamera(SimulatedCameraSettings):
         if n_buffers < 1:
             raise LimitError(self.name, f"cannot stream into {n_buffers} buffers.", "Ask for one or more.")
         self._abort.clear()
-        self.world.clock.wait(1e-3 * self.options.start_ms, self._abort)
+        if not self.world.clock.wait(1e-3 * self.options.start_ms, self._abort):
+            raise StoppedError(self.name, "the sequence was stopped before it began.")
         with self._arrived:
             self._ring = deque(maxlen=n_buffers)
             self._triggers = 0

@@ -104,7 +104,7 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
         self._require()
         self.check(pattern)
         self._darkened.clear()
-        self.world.clock.wait(1e-3 * self.options.command_ms, self._darkened)
+        self._command()
         self._show(pattern)
         return self._pattern
 
@@ -127,7 +127,7 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
             self.check(pattern)
         if self._armed is None or self._armed[0] != tuple(patterns):  # each is a command
             self._darkened.clear()
-            self.world.clock.wait(1e-3 * self.options.command_ms * len(patterns), self._darkened)
+            self._command(len(patterns))
         self._armed = (tuple(patterns), period_ms)
         return period_ms
 
@@ -147,6 +147,11 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
         self._require()
         if not whole:
             raise StoppedError(self.name, "the light was turned off during its sequence.")
+
+    def _command(self, count: int = 1) -> None:
+        """Take the time of commands; nothing is shown once the light was turned off meanwhile."""
+        if not self.world.clock.wait(1e-3 * self.options.command_ms * count, self._darkened):
+            raise StoppedError(self.name, "the light was turned off meanwhile.")
 
     def _show_unless_darkened(self, pattern: LedPattern) -> None:
         self._show(OFF if self._darkened.is_set() else pattern)

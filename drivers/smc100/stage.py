@@ -1,4 +1,4 @@
-"""A stage of Newport SMC100 controllers on one chain (SMC100CC/PP user's manual, ASCII commands).
+"""A stage of Newport SMC100 controllers on one chain (SMC100CC and SMC100PP, ASCII commands).
 
 A command is the controller's number, two letters and a value: ``1PA1.5``; questions are answered with the
 same letters: ``1TP1.49988``. Commands that set answer nothing: ``1TE`` says whether the last one was taken.
@@ -48,7 +48,7 @@ _REFUSALS = {
     "K": "it is ready already",
     "L": "it is homing",
     "M": "it is moving",
-    "N": "the target is beyond its software limits",
+    "N": "it is beyond its software limits",
     "P": "it is tracking",
     "S": "communication timed out",
     "U": "its memory failed",
@@ -152,7 +152,10 @@ class Smc100Stage(PortStage):
         self._tell(name, f"PA{place:.6f}")
 
     def _send_home(self, name: str) -> None:
-        self._tell(name, "OR" if self._status(name)[1] in _NOT_REFERENCED else "PA0")
+        if self._status(name)[1] in _NOT_REFERENCED:
+            self._tell(name, "OR")
+        else:
+            self._send_move(name, 0.0)
 
     def _halt(self) -> None:
         numbers = [axis.number for axis in self.axis_options.values()]  # type: ignore[attr-defined]

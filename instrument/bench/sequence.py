@@ -159,20 +159,26 @@ def take_sequence(
 def _triggered(wire: Wire, count: int) -> Iterator[Camera]:
     """Have the camera wait for pulses, and be as before at the end."""
     camera = wire.bench.camera
-    before = camera.trigger_mode
-    if wire.line is not None and wire.line != camera.trigger_line:
-        camera.set_trigger_line(wire.line)
-    if wire.edge is not None and wire.edge != camera.trigger_edge:
-        camera.set_trigger_edge(wire.edge)
-    camera.set_trigger_mode("hardware")
+    mode, line, edge = camera.trigger_mode, camera.trigger_line, camera.trigger_edge
     try:
+        _listen(camera, wire.line or line, wire.edge or edge)
+        camera.set_trigger_mode("hardware")
         camera.start_sequence(count + 8)
         try:
             yield camera
         finally:
             camera.stop_sequence()
     finally:
-        camera.set_trigger_mode(before)
+        camera.set_trigger_mode(mode)
+        _listen(camera, line, edge)
+
+
+def _listen(camera: Camera, line: str, edge: TriggerEdge) -> None:
+    """Have the hardware trigger come in on a line, by an edge of its pulses."""
+    if line != camera.trigger_line:
+        camera.set_trigger_line(line)
+    if edge != camera.trigger_edge:
+        camera.set_trigger_edge(edge)
 
 
 def _played(
@@ -243,7 +249,8 @@ def _faults(frames: Sequence[Frame], count: int, wire: Wire, period_ms: float) -
     if lost:
         return [f"{lost} of {count} frames were lost between camera and program"]
     if not frames:
-        return [f"no frame came on {wire.bench.camera.trigger_line or 'the trigger input'}"]
+        line = wire.line or wire.bench.camera.trigger_line or "the trigger input"
+        return [f"no frame came on {line}"]
     times_ms, by_device = _times_ms([frame.metadata for frame in frames])
     limits = wire.source.sequence_limits
     spare_ms = period_ms - wire.bench.camera.exposure_ms - (limits.settle_ms if limits else 0.0)

@@ -65,7 +65,7 @@ def thorough(bench: Bench, *, moves: bool = False) -> Iterator[Finding]:
         except (DeviceError, BenchError) as error:
             yield Finding(kind, name, str(error), failed=True)
         finally:
-            if bench.led_array is not None:
+            if bench.led_array is not None and bench.led_array.is_open:
                 bench.led_array.off()
 
 
@@ -148,10 +148,12 @@ def _slm(bench: Bench) -> str:
     slm = bench.slm
     assert slm is not None
     means = []
-    for level in (0, 255):
-        slm.display(np.full(slm.shape, level, np.uint8))
-        means.append(float(bench.camera.snap().image.mean()))
-    took = _timed(slm.blank, 3)
+    try:
+        for level in (0, 255):
+            slm.display(np.full(slm.shape, level, np.uint8))
+            means.append(float(bench.camera.snap().image.mean()))
+    finally:
+        took = _timed(slm.blank, 3)
     return f"mean {means[0]:.5g} counts at level 0, {means[1]:.5g} at 255; a blank image takes {took}"
 
 

@@ -124,7 +124,8 @@ class SnapOptions(CaptureOptions):
 def snap(options: SnapOptions, bench: BenchOption = None) -> None:
     """Take a photograph and write it with its metadata (exposure, gain, stage position, light ...).
 
-    The exposure is found where neither --exposure-ms nor bench.toml gives one; a dark frame needs it given.
+    The exposure is found where neither --exposure-ms nor bench.toml gives one. For a dark frame nothing is
+    found: give it the photograph's.
     The bench is opened for it and made safe again: light off, motion stopped.
     """
     light = options.light()

@@ -14,7 +14,7 @@ app = App()
 _SCRIPT = """\
 # Completions of diffuserbench for bash and zsh.
 [ -n "$ZSH_VERSION" ] && autoload -U +X compinit bashcompinit && compinit && bashcompinit
-typeset -A _diffuserbench_words _diffuserbench_values
+typeset -gA _diffuserbench_words _diffuserbench_values
 {tables}
 _diffuserbench() {{
   local cur="${{COMP_WORDS[COMP_CWORD]}}" prev="${{COMP_WORDS[COMP_CWORD-1]}}" key="" place word

@@ -417,7 +417,12 @@ def _spots(
     """Compute a hologram of spots, say how even they are, write."""
     given = [
         flag
-        for flag, value in (("--video", inputs.video), ("--color", inputs.color), ("--z-mm", inputs.z_mm))
+        for flag, value in (
+            ("--limit", inputs.limit),
+            ("--video", inputs.video),
+            ("--color", inputs.color),
+            ("--z-mm", inputs.z_mm),
+        )
         if value
     ]
     if given or inputs.weights is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -112,14 +112,7 @@ def _draw(path: Path, spots: SpotList, display: Display, hologram: Hologram, sco
     phase = np.mod(np.angle(hologram.slm[0]), 2 * np.pi)
     first = float(spots.z_mm[0])
     padding = 2 if display.mask.levels.size < 2e6 else 1
-    straight = Display(
-        display.slm_shape,
-        display.mask,
-        display.slm_pitch_um,
-        display.wavelength_nm,
-        display.focal_mm,
-        display.dc,
-    )
+    straight = replace(display, displacement=None)
     seen = np.fft.fftshift(intensity(hologram.slm, straight, z_mm=first, padding=padding))
     side = 480
     blocks = [np.linspace(0, n, side + 1).astype(int)[:-1] for n in seen.shape]

@@ -29,7 +29,9 @@ def in_order(folder: Path, paths: Sequence[Path]) -> tuple[list[Path], tuple[flo
     Depths are what Micro-Manager's ``metadata.txt`` says, else the only length in each name (``z60.5mm``,
     ``psf_-50um``). Without them the order stays.
     """
-    depths = _micro_managers(folder, paths) or [_depth(path.name) for path in paths]
+    depths = _micro_managers(folder, paths)
+    if None in depths or not depths:  # none, or of other files
+        depths = [_depth(path.name) for path in paths]
     known = [depth for depth in depths if depth is not None]
     if len(known) < len(paths) or len(set(known)) < len(known):
         return list(paths), ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -16,6 +17,7 @@ from instrument.display.hologram import (
     HologramResult,
     bench_display,
     compute_and_judge,
+    crop_words,
     load_alignment,
     prepare_target,
     slm_size,
@@ -122,10 +124,10 @@ def hologram(
         display = load_alignment(Path(alignment)).of(display)
     pictures = list(picture) if isinstance(picture, list | tuple) else [picture]
     depths = [float(z) for z in np.broadcast_to(np.asarray(z_mm, float), (len(pictures),))]
-    targets = [
-        prepare_target(_pixels(one), display, options, z_mm=z)
-        for one, z in zip(pictures, depths, strict=True)
-    ]
+    pixels = [_pixels(one) for one in pictures]
+    if said := next(filter(None, (crop_words(p, options.fit) for p in pixels)), ""):
+        warnings.warn(said, stacklevel=2)
+    targets = [prepare_target(p, display, options, z_mm=z) for p, z in zip(pixels, depths, strict=True)]
     found = compute_and_judge(display, targets, options, callback=on_progress, cancel=cancel)
     files = HologramFiles(Path("slm.png"), config.display.slm_binning, options, [display])
     return HologramShown(**{f.name: getattr(found, f.name) for f in fields(HologramResult)}, files=files)

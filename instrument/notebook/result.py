@@ -63,10 +63,10 @@ class Result(Reconstruction):
     def seen(self, *, rotate_deg: int = 0) -> Shown:
         """Return the picture for a screen, 8 bit; of a volume the brightest over depth, coloured by depth."""
         if self.is_picture:
-            return as_seen(np.rot90(self.image, rotate_deg // 90))
+            return as_seen(np.rot90(self.image, _turns(rotate_deg)))
         from instrument.reconstruction.result_figures import volume_seen
 
-        return np.rot90(volume_seen(self.volume), rotate_deg // 90)
+        return np.rot90(volume_seen(self.volume), _turns(rotate_deg))
 
     def plot(self, axes: Axes | None = None, *, rotate_deg: int = 0) -> Axes:
         """Draw the picture into Matplotlib axes, its own or given ones, and return them."""
@@ -114,14 +114,19 @@ class Result(Reconstruction):
         figure : path, optional
             Also the page (.png, .pdf, .svg).
 
-        Raises FileError when a file exists or cannot be written, naming it.
+        Raises FileError when a file exists or cannot be written, naming it; BenchError for another angle.
         """
         out, page = Path(out), None if figure is None else Path(figure)
+        turns = _turns(rotate_deg)
+        if turns and not self.is_picture and out.suffix.lower() != ".png":
+            raise BenchError("rotate_deg turns pictures, and what is seen of a volume: leave it out here.")
+        if page is not None:
+            require_new(page, overwrite=overwrite)
         if out.suffix.lower() in (".png", ".npy"):
             require_new(out, overwrite=overwrite)
             pixels: npt.NDArray[Any] = self.seen(rotate_deg=rotate_deg)
             if out.suffix.lower() == ".npy":
-                pixels = np.rot90(self.image, rotate_deg // 90) if self.is_picture else self.volume
+                pixels = np.rot90(self.image, turns) if self.is_picture else self.volume
             write_image(out, pixels)
             written: tuple[Path, ...] = (out,)
         else:
@@ -138,7 +143,6 @@ class Result(Reconstruction):
         if page is not None:
             from instrument.files.figures import save_figure
 
-            require_new(page, overwrite=overwrite)
             written = (*written, save_figure(self.figure(rotate_deg=rotate_deg), page))
         return written
 
@@ -156,6 +160,12 @@ class Result(Reconstruction):
             f"<img style='max-width:100%;min-width:256px' src='data:image/png;base64,{picture}'/>"
             f"<details><summary>How it was made</summary><table>{rows}</table></details>{doubts}"
         )
+
+
+def _turns(rotate_deg: int) -> int:
+    if rotate_deg % 90:
+        raise BenchError(f"rotate_deg is a multiple of 90, not {rotate_deg}.")
+    return rotate_deg // 90
 
 
 def _title(shown: object) -> str:

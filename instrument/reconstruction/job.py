@@ -328,7 +328,7 @@ def _window(crop: Crop | None, image: ImageFile) -> tuple[int, int]:
 
 
 def _refuse_constant(image: ImageFile) -> None:
-    lowest, highest = float(image.pixels.min()), float(image.pixels.max())
+    lowest, highest = float(np.nanmin(image.pixels)), float(np.nanmax(image.pixels))
     if lowest == highest:
         raise FileError(
             image.path, f"the image is constant (every pixel is {highest:g}).", "Was the scene lit?"

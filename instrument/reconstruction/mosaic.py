@@ -64,9 +64,9 @@ def suspected_mosaic(image: ImageFile) -> str:
     if image.is_colour or "pixel_format" in image.metadata or min(height, width) < 64:
         return ""
     cells = image.pixels[:height, :width].astype(np.float64).reshape(height // 2, 2, width // 2, 2)
-    a, b, c, d = cells.mean(axis=(0, 2)).ravel()
+    a, b, c, d = np.nanmean(cells, axis=(0, 2)).ravel()
     spread = max(a, b, c, d) - min(a, b, c, d)
-    if spread <= _PHASES * (np.mean((a, b, c, d)) - np.percentile(image.pixels, 1)):
+    if spread <= _PHASES * (np.mean((a, b, c, d)) - np.nanpercentile(image.pixels, 1)):
         return ""
     greens = {("GRBG", "GBRG"): abs(a - d), ("RGGB", "BGGR"): abs(b - c)}
     patterns = min(greens, key=lambda one: greens[one])

@@ -51,7 +51,8 @@ class _Hold:
 class Operation:
     """Opens a bench's devices for one operator at a time, and closes them when he has gone, however.
 
-    Between operators nothing is open: the devices are free for other programs of this computer.
+    Between operators nothing is open, but the camera while somebody looks at the page: other programs of this
+    computer may use the devices.
 
     Parameters
     ----------
@@ -103,6 +104,8 @@ class Operation:
             bench = self._bench or Bench(self.config)
             try:
                 device = bench.open_device(kind)
+                if self._ended is not None:  # meanwhile
+                    raise self._ended
             except BaseException:
                 if self._bench is None:
                     self._close(bench)
@@ -141,7 +144,7 @@ class Operation:
             if self._dropped is bench:
                 return
             self._dropped = bench
-        for hold in self._holds.values():
+        for hold in list(self._holds.values()):  # a device may be being opened
             hold.stopped_at = 1 << 62  # nothing that is still on its way is carried out
         failure: StepsFailedError | None = None
         try:
@@ -162,12 +165,15 @@ class Operation:
     def stop(self, who: str) -> None:
         """Make the bench safe and end its operation, whoever operates.
 
-        Raises StepsFailedError naming what could not be made safe; all was tried.
+        Raises StepsFailedError naming what could not be made safe; all was tried. Raises BenchError when
+        nobody operates, and something could not be made safe before.
         """
         operator = self.operator
         if operator is not None:
             reason = StoppedError("bench", f"STOP was pressed by {who}.", "Open it again to go on.")
             self.drop(operator, reason)
+        elif self.trouble:
+            raise BenchError(self.trouble)
 
     def end(self, reason: DeviceError) -> None:
         """Make the bench safe and close it for good; errors as ``stop``."""

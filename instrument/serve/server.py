@@ -88,6 +88,9 @@ class BenchServer:
         self._runner: web.AppRunner | None = None
         self._links: weakref.WeakSet[web.WebSocketResponse] = weakref.WeakSet()
         self._frames: asyncio.Task[Any] | None = None
+        """Sends the frames of the newest sequence."""
+        self._sequences = asyncio.Lock()
+        """No sequence is started while the end of one before it is still being carried out."""
         self._overtakers = 0
         """Stops that are being carried out: meanwhile no frame is sent."""
 
@@ -198,7 +201,7 @@ class BenchServer:
         if not said:  # of a browser's WebSocket
             protocols = request.headers.get("Sec-WebSocket-Protocol", "")
             said = protocols.partition(",")[2].strip()
-        return hmac.compare_digest(said.encode(), self._serving.token.encode())
+        return hmac.compare_digest(said.encode("utf-8", "surrogateescape"), self._serving.token.encode())
 
     @staticmethod
     def _operator(request: web.Request) -> Operator:
@@ -314,21 +317,28 @@ class BenchServer:
         link = await self._linked(request)
         try:
             camera = cast(Camera, self.operation.device("camera", key))
-            await self._in_thread(camera.start_sequence, n_buffers)
+            async with self._sequences:
+                await self._in_thread(camera.start_sequence, n_buffers)
+                credit = asyncio.Semaphore(window)
+                sending = self._frames = asyncio.create_task(self._send_frames(link, camera, credit))
         except DeviceError as error:
             await _part(link, error)
             return link
-        credit = asyncio.Semaphore(window)
-        self._frames = asyncio.create_task(self._send_frames(link, camera, credit))
         try:
             await link.send_json({"started": True})
             async for _ in link:
                 credit.release()
         finally:
-            self._frames.cancel()
-            self._frames = None
-            await asyncio.shield(self._loop.run_in_executor(self._overtaking, _stop_sequence, camera))
+            sending.cancel()
+            await asyncio.shield(self._end_sequence(sending, camera))
         return link
+
+    async def _end_sequence(self, sending: asyncio.Task[Any], camera: Camera) -> None:
+        """Stop a camera's sequence, unless its operator has stopped it and begun the next one already."""
+        async with self._sequences:
+            if self._frames is sending:
+                self._frames = None
+                await self._loop.run_in_executor(self._overtaking, _stop_sequence, camera)
 
     async def _send_frames(
         self, link: web.WebSocketResponse, camera: Camera, credit: asyncio.Semaphore

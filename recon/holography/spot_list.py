@@ -214,7 +214,7 @@ def compute_spots(
         ``callback(record, slm)`` after each iteration; the record's loss is the spots' deviation.
     cancel : threading.Event, optional
 
-    Raises InputError for a complex SLM, which this method does not use.
+    Raises InputError for a complex SLM, which this method does not use, and a warm start of another shape.
     """
     options = options or HologramOptions()
     if options.complex_slm:
@@ -226,9 +226,12 @@ def compute_spots(
     weights = wanted / wanted.mean()
     # Rounded at random: an array's phases repeat over the SLM, and so would errors of rounding.
     dither = rng.random((options.frames, *display.slm_shape), np.float32)
-    shape = (options.frames, len(spots))
-    phases: Array = rng.uniform(0, 2 * np.pi, shape)
+    phases: Array = rng.uniform(0, 2 * np.pi, (options.frames, len(spots)))
     if initial is not None:
+        if np.shape(initial) != dither.shape:
+            raise InputError(
+                f"A warm start is {dither.shape} here (frames, height, width), not {np.shape(initial)}."
+            )
         phases = np.stack([np.angle(field.at_spots(frame)) for frame in initial])
     history: list[HologramRecord] = []
     best: tuple[float, Array] | None = None

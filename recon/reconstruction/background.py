@@ -125,6 +125,7 @@ def beyond_of(
     trial, again : Trial or None
         Without such planes and with them; None where nobody looked.
     overrides : Overrides
+        Of the caller, whose wish counts.
     prevented : str or None
         Why there can be none.
 
@@ -133,7 +134,7 @@ def beyond_of(
     asked = overrides.beyond is not None
     if overrides.beyond and prevented:
         raise InputError(f"Planes cannot be added beyond the depths (beyond=on): {prevented}.")
-    if trial is None or again is None:
+    if asked or trial is None or again is None:
         why = prevented or ("" if asked else "what the depths leave unexplained asks for none")
         value = "planes" if overrides.beyond else "none"
         return Decision("beyond", value, why, overruled=asked, open=False)

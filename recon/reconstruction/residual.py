@@ -23,11 +23,13 @@ NEGATIVE = 0.25
 """Share of the data's mean below zero from which on a background is said to be negative."""
 
 
-def background_in_words(problem: Problem, background: npt.NDArray[Any] | None) -> list[str]:
-    """Return a warning where a background (shaped as the data, units of the noise) is no light."""
+def background_in_words(
+    problem: Problem, background: npt.NDArray[Any] | None, channels: slice = slice(None)
+) -> list[str]:
+    """Return a warning where a background (shaped as the channels' data, units of the noise) is no light."""
     if background is None:
         return []
-    share = float(background.mean()) / max(abs(float(problem.data[problem.valid].mean())), 1e-30)
+    share = _share(problem, background, channels)
     if share > -NEGATIVE:
         return []
     return [
@@ -37,9 +39,15 @@ def background_in_words(problem: Problem, background: npt.NDArray[Any] | None) -
     ]
 
 
-def beyond_in_words(problem: Problem, beyond: npt.NDArray[Any]) -> list[str]:
-    """Say how much of the light was taken for light from beyond the depths (shaped as the data)."""
-    share = float(beyond.mean()) / max(abs(float(problem.data[problem.valid].mean())), 1e-30)
+def _share(problem: Problem, light: npt.NDArray[Any], channels: slice) -> float:
+    """Return some light's mean relative to that of the data of its channels."""
+    mean = float(problem.data[channels][problem.valid[channels]].mean())
+    return float(light.mean()) / max(abs(mean), 1e-30)
+
+
+def beyond_in_words(problem: Problem, beyond: npt.NDArray[Any], channels: slice = slice(None)) -> list[str]:
+    """Say how much of the light was taken for light from beyond the depths (shaped as the channels' data)."""
+    share = _share(problem, beyond, channels)
     return [
         f"{share:.0%} of the light on the sensor is taken for light from beyond the farthest calibrated "
         "depth: it is part of the background, not of the volume (--choose beyond=off: none is)."

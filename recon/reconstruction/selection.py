@@ -146,7 +146,8 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     trial = _trial(problem, coarse, model) if lit else None
     again = None
     prevented = no_beyond(problem.prior, model, len(depths.z_um))
-    if trial is not None and trial.explains and overrides.beyond is not False and prevented is None:
+    looks = trial is not None and (trial.explains if overrides.beyond is None else overrides.beyond)
+    if looks and prevented is None:
         farther = with_planes_beyond(calibration)
         coarser = _coarse(data, valid, farther, problem.options.z_um, beyond=len(BEYOND))
         again = _trial(problem, coarser, model)

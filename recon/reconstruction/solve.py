@@ -265,13 +265,14 @@ def _run(
     residual = float("nan") if rest is None else float(np.linalg.norm(rest))
     if outcome.history:
         residual = outcome.history[-1].data_residual
+    rows = slice(None) if problem.patterned else part.channels
     doubts = [
         *residual_in_words(problem, outcome, residual, part.noise_norm),
-        *background_in_words(problem, smooth),
+        *background_in_words(problem, smooth, rows),
     ]
     if problem.n_depths < problem.n_planes:
         beyond = part.from_beyond(solution)
-        doubts += beyond_in_words(problem, beyond)
+        doubts += beyond_in_words(problem, beyond, rows)
         smooth = beyond if smooth is None else smooth + beyond
     return _Solved(
         volume=problem.measured(solution, part.channels),

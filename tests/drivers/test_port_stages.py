@@ -92,6 +92,8 @@ def test_smc100_failures_are_said_and_a_disabled_axis_is_enabled(tmp_path: Path)
         assert stage.move_to({"x_um": 123.4})["x_um"] == pytest.approx(123.4)
         stage.home()  # it has its reference: to its zero
         assert stage.position()["x_um"] == pytest.approx(0.0, abs=0.2)
+        chain.states[2] = 0x3C
+        stage.home()
         chain.errors[1] = 0x0020
         with pytest.raises(DeviceError, match=r"x_um \(controller 1\): following error"):
             stage.move_to({"x_um": 50.0})

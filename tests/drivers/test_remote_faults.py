@@ -26,6 +26,8 @@ from drivers.remote.options import RemoteOptions
 from drivers.remote.wire import OPERATOR_HEADER
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
+from instrument.files.errors import BenchError
+from instrument.serve import server as serving
 from instrument.serve.server import BenchServer, Serving
 from tests.drivers.test_remote import BENCH, TOKEN
 from tests.mocks.bad_network import BadNetwork
@@ -171,6 +173,47 @@ def test_a_slow_network_loses_frames_and_counts_them_and_a_stop_does_not_wait(
         network.bytes_per_s = float("inf")
 
 
+def test_the_end_of_a_sequence_is_not_that_of_the_next_one(
+    server: BenchServer, options: RemoteOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop = serving._stop_sequence
+
+    def late(camera: Any) -> None:
+        time.sleep(0.3)
+        stop(camera)
+
+    monkeypatch.setattr(serving, "_stop_sequence", late)
+    with RemoteCamera(options) as camera:
+        camera.set_exposure_ms(1.0)
+        for _ in range(2):
+            camera.start_sequence()
+            camera.next_frame(PATIENCE_S)
+            camera.stop_sequence()
+        camera.start_sequence()
+        until_s = time.monotonic() + 0.6
+        while time.monotonic() < until_s:
+            camera.next_frame(PATIENCE_S)
+        assert camera.is_streaming
+    until(lambda: server.operation.operator is None)
+
+
+def test_pieces_that_are_none_end_the_sequence_in_words(
+    options: RemoteOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serving, "pieces", lambda frame, number: [b"another version's"])
+    with RemoteCamera(options) as camera:
+        camera.start_sequence()
+        with pytest.raises(DeviceLostError, match="broke during a sequence: no piece of a frame"):
+            camera.next_frame(PATIENCE_S)
+
+
+def test_stop_says_what_could_not_be_made_safe_though_nobody_operates(server: BenchServer) -> None:
+    server.operation.stop("somebody")
+    server.operation.trouble = "The LED array: off failed."
+    with pytest.raises(BenchError, match="off failed"):
+        server.operation.stop("somebody")
+
+
 def test_frames_are_handed_out_in_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever stands between: proxies may hand messages on in another order than they came."""
     from types import SimpleNamespace
@@ -250,7 +293,12 @@ def test_without_the_token_nothing_is_answered(
         ("GET", "/api/devices/camera/hold"),
         ("GET", "/api/devices/camera/frames"),
     ):
-        for headers in ({}, {"Authorization": "Bearer wrong"}, {"Sec-WebSocket-Protocol": "diffuserbench"}):
+        for headers in (
+            {},
+            {"Authorization": "Bearer wrong"},
+            {"Authorization": "Bearer \udcff"},  # a byte that is no UTF-8
+            {"Sec-WebSocket-Protocol": "diffuserbench"},
+        ):
             status, text = asyncio.run(ask(verb, path, headers=headers))
             assert status == 401, path
             assert "needs its token" in text

@@ -399,7 +399,7 @@ def test_bash_completes_commands_options_and_their_words(tmp_path: Path) -> None
         "calibrate sl": "slm",
         "snap --av": "--average",
     }
-    lines = ["source completion.sh"]
+    lines = ["lazily() { source completion.sh; }", "lazily"]  # as bash-completion does
     for words in asked:
         lines += [
             f"COMP_WORDS=(diffuserbench {words})",

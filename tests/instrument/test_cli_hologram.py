@@ -168,6 +168,7 @@ def test_spots_without_a_mask_come_from_an_array_or_a_list(capsys):
     for wrong, words in (
         (["picture.png", "--spots", "2x2"], "Give a TARGET picture, or --spots"),
         (["--spots", "2x2", "--video"], "--video does not apply"),
+        (["--spots", "2x2", "--limit"], "--limit does not apply"),
         (["--spots", "nowhere.csv"], "ROWSxCOLUMNS or a CSV file"),
     ):
         assert main(["hologram", *wrong, "--out", "other.png"]) == 2

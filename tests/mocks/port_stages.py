@@ -1,4 +1,4 @@
-"""Elliptec modules, SMC100 and ASI controllers on a pseudo-terminal, written from their makers' manuals."""
+"""Elliptec modules, SMC100 and ASI controllers on a pseudo-terminal, written as their drivers expect them."""
 
 from __future__ import annotations
 

@@ -168,3 +168,6 @@ def test_a_raw_frame_of_a_mosaic_is_recognised_or_asked_about(tmp_path: Path) ->
         grey[:, ::2] *= columns
         tifffile.imwrite(path, grey.astype(np.uint16))
         assert suspected_mosaic(read_image(path)) == ""
+        grey[7, 8:20] = np.nan
+        tifffile.imwrite(path, grey.astype(np.float32))
+        assert suspected_mosaic(read_image(path, holes=True)) == ""

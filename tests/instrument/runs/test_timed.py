@@ -65,12 +65,19 @@ def notes(run: Run, kind: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "simulated",
-    ["", "pulse_jitter_us = 20", "missed_pulses = 0.02", "extra_pulses = 0.02"],
+    ("simulated", "fault"),
+    [
+        ("", ""),
+        ("pulse_jitter_us = 20", ""),
+        ("missed_pulses = 0.02\nseed = 2", "no frame came of pattern"),  # seeds whose first attempt has one
+        ("extra_pulses = 0.04\nseed = 3", "no pattern asked for frames at"),
+    ],
     ids=["clean", "jitter", "missed", "extra"],
 )
-def test_frame_k_is_of_pattern_k(tmp_path: Path, simulated: str) -> None:
-    with open_bench(simulated) as bench:
+def test_frame_k_is_of_pattern_k(tmp_path: Path, simulated: str, fault: str) -> None:
+    # A fast camera between slow pulses: one that nobody sent finds it idle.
+    wire = 'sent_by = "led_array"\nperiod_ms = 30.0'
+    with open_bench(simulated, "frames_per_s = 1000.0", wire) as bench:
         run = acquire(bench, steps_of_light(average=2), tmp_path)
         assert bench.camera.trigger_mode == "free_run"
         assert bench.led_array is not None
@@ -79,6 +86,8 @@ def test_frame_k_is_of_pattern_k(tmp_path: Path, simulated: str) -> None:
     assert brightness(run) / brightness(run)[-1] == pytest.approx(np.array(LEVELS) / 240, abs=0.02)
     assert [run.metadata(n).led_pattern for n in range(8)] == ["off"] * 2 + [f"level {n}" for n in LEVELS]
     assert run.records[5].average == 2
+    again = notes(run, "sequence taken again")
+    assert [fault in words for words in again] == [True] * bool(fault)
 
 
 def test_faults_are_named_and_the_sequence_is_taken_again(
@@ -172,4 +181,10 @@ def test_a_falling_edge_and_another_line(tmp_path: Path) -> None:
         run = acquire(bench, steps_of_light(), tmp_path)
         assert run.reason is FinishReason.COMPLETED
         with pytest.raises(DeviceError, match="no frame came on Line2"):
-            acquire(bench, steps_of_light(trigger_line="Line2"), tmp_path)
+            acquire(bench, steps_of_light(trigger_line="Line2", trigger_edge="rising"), tmp_path)
+        camera = bench.camera
+        assert (camera.trigger_line, camera.trigger_edge, camera.trigger_mode) == (
+            "Line1",
+            "falling",
+            "free_run",
+        )

@@ -76,6 +76,8 @@ def test_spots_in_two_planes_through_a_mask_get_what_was_asked_for():
     found, scores = compute_spots(display, asked, frames_of(2))
     assert found.slm.shape == (2, *SHAPE)
     assert scores.deviation < 0.005
+    with pytest.raises(InputError, match="A warm start is"):
+        compute_spots(display, asked, frames_of(3), initial=found.slm)
     # What a camera saw too dim is asked for brighter.
     again = brighter_where_dim(asked, np.r_[0.5, np.ones(7)], gain=1.0)
     assert again.intensity[0] / asked.intensity[0] == pytest.approx(

@@ -14,7 +14,7 @@ from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.residual import background_in_words
+from recon.reconstruction.residual import background_in_words, beyond_in_words
 
 
 def lit(stray: float) -> TestScene:
@@ -69,3 +69,14 @@ def test_a_background_below_zero_is_said() -> None:
     assert background_in_words(problem, np.full(problem.data.shape, -0.1 * mean)) == []
     (text,) = background_in_words(problem, np.full(problem.data.shape, -0.8 * mean))
     assert "-0.80 of the data's light" in text
+
+
+def test_light_is_counted_beside_its_own_channels() -> None:
+    scene = lit(0.0)
+    red = scene.measurement[..., None]
+    problem = Problem.of(np.concatenate([red, 0.1 * red], axis=-1), scene.calibration)
+    faint = problem.data[1:]
+    (text,) = background_in_words(problem, -0.8 * faint, slice(1, 2))
+    assert "-0.80 of the data's light" in text
+    (text,) = beyond_in_words(problem, 0.3 * faint, slice(1, 2))
+    assert text.startswith("30% of the light")
