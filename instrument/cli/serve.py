@@ -60,7 +60,7 @@ def serve(options: ServeOptions, bench: BenchOption = None) -> None:
     """Offer the bench's devices to another computer, where the driver is called remote, and to a browser.
 
     One operator at a time. When his connection is lost, or somebody presses STOP on the page, the light is
-    put off and motion stopped. Nothing is open while nobody operates.
+    put off and motion stopped. While nobody operates the page shows the camera, and nothing else is open.
     """
     config = load_and_say(bench)
     try:
