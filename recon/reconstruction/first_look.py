@@ -32,6 +32,8 @@ WEIGHT = 0.25
 STEEPEST = 2.5
 """Steepness up to which the laws were fitted, in units of what is left where that is more than the noise:
 beyond, smaller weights would take ever more iterations."""
+NEARLY_NOISE = ((1.3, 2.0), (1.0, 2.0))
+"""What is left, and the unit of steepness by it: near the noise it is the noise, as far as that is known."""
 UNLIKE = 7.5
 """Where PSFs vary: what the central one may leave of the data for its picture to tell anything, in units of
 the noise (7.3 at most on the scenes of the law)."""
@@ -109,7 +111,8 @@ class FirstLook:
         """Return the weight of a prior by name, in units of the noise."""
         law = LAWS["tv, varying" if self.varying else kind_of(prior)]
         misfit = min(max(self.misfit, 1.0), law.most_misfit)
-        steepness = float(np.clip(self.steepness, 1e-6, STEEPEST * misfit))
+        unit = misfit if misfit > 2 else float(np.interp(misfit, *NEARLY_NOISE))
+        steepness = float(np.clip(self.steepness, 1e-6, STEEPEST * unit))
         factor = law.factor * 2 ** (law.lit * self.lit)
         weight = factor * steepness**law.steepness * misfit**law.misfit
         return float(min(weight, law.most)) * self.passed_on
