@@ -99,9 +99,7 @@ def test_refuses_in_words(files, arguments, words, run):
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    "options", [("--rotate", "180"), ("--allow-saturated",), ("--mixed-depth",), ("--figure", "fig.png")]
-)
+@pytest.mark.parametrize("options", [("--rotate", "180"), ("--allow-saturated",), ("--mixed-depth",)])
 def test_an_option_for_pictures_is_refused_not_ignored(files, run, options):
     folder, image, out = files
     code, output = run("--volume", folder, "--image", image, "--out", out, *options)
