@@ -40,6 +40,8 @@ _OFFERED = {
     "trigger_edge": "trigger_edges",
 }
 """Settings that are chosen, and what the camera offers for each."""
+_OF_HARDWARE = ("trigger_line", "trigger_edge")
+"""Settings that mean nothing without a hardware trigger."""
 _SET = tuple(o.name for o in options_of(CameraOptions))
 
 
@@ -62,6 +64,7 @@ class CameraForm(QWidget):
             {name: Behaviour(offers=partial(self._offered, offered)) for name, offered in _OFFERED.items()},
         )
         self.widgets = self.form.widgets
+        self.form.hide_fields(_OF_HARDWARE)
         self.form.refused.connect(panel.refused)
         self.form.settled.connect(self._settled)
         self.temperature = label("–")
@@ -154,6 +157,7 @@ class CameraForm(QWidget):
             if not choice.is_being_edited:
                 choice.offer(self._offered(offered))
             choice.widget.setEnabled(bool(getattr(state, offered)))
+        self.form.hide_fields(() if state.trigger_mode == "hardware" else _OF_HARDWARE)
         present = {name: getattr(state, name) for name in _SET}
         self.form.show_present(present | {"roi": ", ".join(map(str, state.roi.as_tuple()))})
         has_thermometer = state.temperature_c is not None
