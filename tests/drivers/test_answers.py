@@ -112,3 +112,5 @@ def test_a_stream_that_is_given_up_lets_go_of_its_readers_and_frames(monkeypatch
     assert stream.newest() is None
     assert not any(t.name.startswith("subscri") and t.is_alive() for t in threading.enumerate())
     let_go.set()
+    monkeypatch.undo()
+    camera.stop_sequence()
