@@ -195,15 +195,19 @@ def test_stop_during_a_retake_stops_the_sweep(bench: Bench, tmp_path: Path) -> N
     control = KeepingControl()
     found = expose_sweep(bench, SWEEP)
     too_long = replace(found, exposures_ms=tuple(1.6 * e for e in found.exposures_ms))
+    stops: list[Thread] = []
 
     def hear(event: SweepEvent) -> None:
         if isinstance(event, PointTaken) and event.retaking:
-            Thread(target=control.runners[0].stop).start()
+            stops.append(Thread(target=control.runners[0].stop))
+            stops[-1].start()
 
     with pytest.raises(CalibrationError, match="ended early"):
         calibrate_sweep(
             bench, SWEEP, tmp_path, exposures=too_long, control=control, listener=Following(on_event=hear)
         )
+    for stop in stops:
+        stop.join()  # before the bench is closed
     assert control.runners[0].status.reason is FinishReason.STOPPED
     assert bench.led_array is not None
     assert bench.led_array.pattern.is_dark
