@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -160,6 +161,7 @@ def found_installation() -> Path | None:
         from pymmcore_plus import find_micromanager
     except ImportError:
         return None
+    logging.getLogger("pymmcore-plus").setLevel(logging.WARNING)  # else it prints what it looks at
     found = find_micromanager()
     return Path(found) if found else None
 

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.camera import Camera, TriggerEdge
+from drivers.common.answers import STOP_ANSWER_S, within
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import OFF, LedArray, LedPattern
@@ -225,9 +226,11 @@ def _played(
         if not failed:
             raise
     finally:
-        if player.is_alive():
-            source.off() if isinstance(source, LedArray) else source.blank()
-        player.join()
+        try:
+            if player.is_alive():
+                source.off() if isinstance(source, LedArray) else source.blank()
+        finally:
+            within(STOP_ANSWER_S, source.name, "ending its sequence", player.join)
     if failed:
         raise failed[0]
     return frames, f"{early} frame{'s' if early > 1 else ''} came" if early else ""
