@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from instrument.bench.config import BenchConfig
-from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
+from instrument.cli.app import App, BenchOption, examples, load_and_say
 from instrument.cli.progress import first_interrupt_cancels, one_task, progress_bar
 from instrument.display.hologram import (
     HologramResult,
@@ -33,6 +33,7 @@ from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image, read_stack
 from instrument.files.sample_images import DEFAULT_SAMPLES, SAMPLES, load_sample
+from instrument.tasks.task import saying_what_is_left
 from recon.base.declare import option
 from recon.base.option_text import size
 from recon.holography import (
