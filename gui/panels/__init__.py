@@ -86,6 +86,13 @@ PANELS: Mapping[str, PanelEntry] = {
         "Ctrl+Shift+H",
         "Compute a hologram, show it, photograph it",
     ),
+    "tasks": PanelEntry(
+        "Files",
+        "gui.panels.tasks:TasksPanel",
+        "centre",
+        "Ctrl+Shift+F",
+        "All that is done with files: verify, export, analyse, compare, videos, activity, charts, maps",
+    ),
     "charts": PanelEntry(
         "Charts", "gui.panels.charts:ChartsPanel", "centre", "Ctrl+Shift+C", "Where methods fail"
     ),
