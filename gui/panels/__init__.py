@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from importlib import import_module
 from typing import Literal, NamedTuple
+
+from PySide6.QtWidgets import QWidget
 
 from gui.panel import Panel
 from gui.session import BenchSession
@@ -25,11 +27,22 @@ class PanelEntry(NamedTuple):
     """Keys that bring it to the front."""
     tip: str
 
-    def made(self, session: BenchSession) -> Panel:
-        """Import the panel's class and return one of it."""
+    def load(self) -> type[Panel]:
+        """Return the panel's class, with all that it needs imported and compiled; for any thread."""
         module, _, name = self.place.partition(":")
-        panel: Panel = getattr(import_module(module), name)(session)
+        kind: type[Panel] = getattr(import_module(module), name)
+        kind.prepare()
+        return kind
+
+    def slices(self, session: BenchSession) -> Generator[None, None, Panel]:
+        """Make the panel, with a ``yield`` after each of its parts, and return it."""
+        panel = self.load()(session)
         panel.title = self.title
+        yield
+        yield from panel.parts()
+        for part in panel.findChildren(QWidget):  # what showing it first would do in one go
+            part.ensurePolished()
+            yield
         return panel
 
 
