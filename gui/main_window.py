@@ -26,6 +26,7 @@ from gui.jobs import Job
 from gui.making import PanelMaker
 from gui.panel import Panel
 from gui.panels import PANELS
+from gui.panels.unserved import UnservedPanel
 from gui.session import BenchSession
 from gui.session_news import OperatorRequest, name_of
 from gui.theme import THEMES, apply_theme, colours
@@ -33,6 +34,7 @@ from gui.widgets.building import PanelPlace, button, fill, label, tabs
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.plots import restyle_all
+from instrument.bench.config import BenchConfig
 
 _AREAS = {
     "top right": Qt.DockWidgetArea.RightDockWidgetArea,
@@ -67,7 +69,7 @@ class DeviceChips(QWidget):
             self.show_state(kind)
         pairs = zip(self.chips.values(), self.reconnect_buttons.values(), strict=True)
         shown: list[QWidget] = [widget for pair in pairs for widget in pair]
-        fill(self, *(shown or [label("no devices")]), across=True, spacing=4)
+        fill(self, *(shown or [label("No bench is open")]), across=True, spacing=4)
         session.device_changed.connect(self.show_state)
 
     def show_state(self, kind: str) -> None:
@@ -119,6 +121,8 @@ class MainWindow(QMainWindow):
         self.question: Question | None = None
         """The question that was asked last, while it is open."""
         self._closing_question: Question | None = None
+        self.next_bench: BenchConfig | None = None
+        """What is to be opened once this bench is closed."""
         self.setWindowTitle(f"diffuserbench – {session.config.label}")
         self.setDockOptions(
             QMainWindow.DockOption.AllowTabbedDocks
@@ -135,7 +139,8 @@ class MainWindow(QMainWindow):
         self._make_stop_keys()
         session.device_changed.connect(self._show_simulated)
         session.asked.connect(self._ask_operator)
-        session.handed_on.connect(lambda name, path: self.bring(name, lambda panel: panel.take(path)))
+        session.handed_on.connect(self._hand_on)
+        session.bench_wanted.connect(self.change_bench)
         session.closed.connect(self._close_now)
         session.jobs.job_started.connect(self._job_started)
         session.jobs.job_ended.connect(self._job_ended)
@@ -145,7 +150,16 @@ class MainWindow(QMainWindow):
         self.panel("log")  # from the first line on
         self._fill_current()
 
+    def change_bench(self, config: BenchConfig) -> None:
+        """Close this bench, after asking where something runs, so that another is opened in its place."""
+        self.next_bench = config
+        self.close()
+
     # Panels --------------------------------------------------------------------------------------
+    def _hand_on(self, name: str, what: object) -> None:
+        """Show a panel, and have it work with what another one hands on; empty: nothing."""
+        self.bring(name, lambda panel: panel.take(what) if what else None)
+
     def panel(self, name: str) -> Panel:
         """Return a panel of the table, made now if it was not yet."""
         return self.maker.whole(name)
@@ -190,8 +204,13 @@ class MainWindow(QMainWindow):
                 first[entry.area] = dock
             dock.visibilityChanged.connect(partial(self._dock_seen, name))
             self._docks[name] = dock
+        if self.session.kinds:  # else the start page
+            self.tabs.setCurrentWidget(self._places["live"])
         for dock in first.values():
             dock.raise_()
+        if not self.session.kinds:
+            for dock in self._docks.values():
+                dock.hide()
         if self._compact:
             for area in ("top right", "bottom"):
                 self.tabifyDockWidget(first["right"], first[area])
@@ -264,6 +283,7 @@ class MainWindow(QMainWindow):
         ):
             self._add_action(camera, words, keys, partial(self._on_live_panel, what))
         bench = self.menuBar().addMenu("&Bench")
+        self._add_action(bench, "&Another bench …", "Ctrl+O", partial(self.bring, "start"))
         for kind in self.session.kinds:
             reconnect = partial(self.session.reconnect, kind)
             self._add_action(bench, f"Reconnect the {name_of(kind)}", "", reconnect)
@@ -286,7 +306,10 @@ class MainWindow(QMainWindow):
         ends = what == "record" and getattr(panel, "is_recording", False)  # no number keeps it from ending
         if not ends and isinstance(typed, NumberEdit) and panel.isAncestorOf(typed) and not typed.submit():
             return  # refused where it stands
-        getattr(panel, what)()
+        if isinstance(panel, UnservedPanel):
+            self.bring("live")  # it says why
+        else:
+            getattr(panel, what)()
 
     def set_theme(self, name: str) -> None:
         """Change the looks of the whole program and remember it."""
@@ -397,6 +420,8 @@ class MainWindow(QMainWindow):
         self._closing_question = None
         if agreed:
             self._end()
+        else:
+            self.next_bench = None
 
     def _end(self) -> None:
         self.job_label.setText("Closing: light off, motion stopped …")
@@ -410,13 +435,15 @@ class MainWindow(QMainWindow):
         self.close()
 
     def _keep_layout(self) -> None:
+        if not self.session.kinds:
+            return  # a page to start from is no layout for a bench
         self._settings.setValue("docks", sorted(self._docks))
         self._settings.setValue("geometry", self.saveGeometry())
         self._settings.setValue("state", self.saveState())
         self._settings.sync()
 
     def _restore_layout(self) -> None:
-        if self._settings.value("docks") != sorted(self._docks):
+        if not self.session.kinds or self._settings.value("docks") != sorted(self._docks):
             return  # kept by a program with other panels: their docks would land anywhere
         geometry, state = self._settings.value("geometry"), self._settings.value("state")
         if geometry is not None:

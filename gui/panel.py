@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from PySide6.QtCore import QTimer
 from PySide6.QtGui import QGuiApplication
@@ -74,8 +74,8 @@ class Panel(QWidget):
         QGuiApplication.clipboard().setText(self.as_python())
         self.session.log("info", f"{self.title}: copied as Python.")
 
-    def take(self, path: Path) -> None:
-        """Work with a file or folder that another panel hands on; for panels that can."""
+    def take(self, what: Any) -> None:
+        """Work with what another panel hands on: mostly the path of a file or folder; for panels that can."""
         raise NotImplementedError
 
     def shutdown(self) -> None:

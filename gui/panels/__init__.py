@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 from PySide6.QtWidgets import QWidget
 
 from gui.panel import Panel
+from gui.panels.unserved import UnservedPanel, why_not
 from gui.session import BenchSession
 
 Area = Literal["centre", "top right", "right", "bottom"]
@@ -26,6 +27,10 @@ class PanelEntry(NamedTuple):
     shortcut: str
     """Keys that bring it to the front."""
     tip: str
+    needs: tuple[str, ...] = ()
+    """Kinds of devices without which it can do nothing."""
+    tried_on: str = "default"
+    """The simulated bench that serves it, one of ``instrument.bench.config_file.TEMPLATES``."""
 
     def load(self) -> type[Panel]:
         """Return the panel's class, with all that it needs imported and compiled; for any thread."""
@@ -36,7 +41,11 @@ class PanelEntry(NamedTuple):
 
     def slices(self, session: BenchSession) -> Generator[None, None, Panel]:
         """Make the panel, with a ``yield`` after each of its parts, and return it."""
-        panel = self.load()(session)
+        panel: Panel
+        if why := why_not(session, self.title, self.needs, self.tried_on):
+            panel = UnservedPanel(session, self.title, why, self.tried_on)
+        else:
+            panel = self.load()(session)
         panel.title = self.title
         yield
         yield from panel.parts()
@@ -46,14 +55,25 @@ class PanelEntry(NamedTuple):
         return panel
 
 
+_CAMERA = ("camera",)
 PANELS: Mapping[str, PanelEntry] = {
-    "live": PanelEntry("Live view", "gui.panels.live:LivePanel", "centre", "Ctrl+1", "The camera, running"),
+    "start": PanelEntry(
+        "Start",
+        "gui.panels.start:StartPanel",
+        "centre",
+        "Alt+Home",
+        "Try a simulated bench, open yours, or work with files",
+    ),
+    "live": PanelEntry(
+        "Live view", "gui.panels.live:LivePanel", "centre", "Ctrl+1", "The camera, running", _CAMERA
+    ),
     "sweeps": PanelEntry(
         "Sweeps",
         "gui.panels.sweeps:SweepsPanel",
         "centre",
         "Ctrl+4",
         "Calibration routines and plans: plan, carry out, judge",
+        _CAMERA,
     ),
     "runs": PanelEntry(
         "Runs", "gui.panels.runs:RunsPanel", "centre", "Ctrl+5", "Past runs: look at them, or go on"
@@ -64,6 +84,8 @@ PANELS: Mapping[str, PanelEntry] = {
         "centre",
         "Ctrl+Shift+A",
         "Find the scattering mask and bring it to its place",
+        ("camera", "slm"),
+        "display",
     ),
     "reconstructions": PanelEntry(
         "Reconstructions",
@@ -88,13 +110,21 @@ PANELS: Mapping[str, PanelEntry] = {
         "top right",
         "Ctrl+2",
         "What the newest frame shows, with its latency",
+        _CAMERA,
     ),
     "stage": PanelEntry(
-        "Stage", "gui.panels.stage:StagePanel", "right", "Ctrl+7", "Position, targets, jog, home"
+        "Stage", "gui.panels.stage:StagePanel", "right", "Ctrl+7", "Position, targets, jog, home", ("stage",)
     ),
     "led_array": PanelEntry(
-        "LED array", "gui.panels.led_array:LedPanel", "right", "Ctrl+8", "Which LEDs are lit"
+        "LED array",
+        "gui.panels.led_array:LedPanel",
+        "right",
+        "Ctrl+8",
+        "Which LEDs are lit",
+        ("led_array",),
     ),
-    "slm": PanelEntry("SLM", "gui.panels.slm:SlmPanel", "right", "Ctrl+9", "What is on the SLM"),
+    "slm": PanelEntry(
+        "SLM", "gui.panels.slm:SlmPanel", "right", "Ctrl+9", "What is on the SLM", ("slm",), "display"
+    ),
     "log": PanelEntry("Log", "gui.panels.log:LogPanel", "bottom", "Ctrl+0", "What happened, with filters"),
 }

@@ -18,6 +18,7 @@ from gui.forms.reconstruct import CALIBRATION, PSF, ReconstructForm, SoFar, Writ
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.session import BenchSession
+from gui.session_news import OwnFiles
 from gui.theme import as_shown
 from gui.widgets.building import button, fill, in_row, label, split, tabs
 from gui.widgets.dialogues import Question, choose_path
@@ -382,8 +383,12 @@ class ReconstructionsPanel(Panel):
         self.refresh()
 
     # The panel -----------------------------------------------------------------------------------
-    def take(self, path: Path) -> None:
-        """Put a calibration's folder, or a photograph, into the form."""
+    def take(self, what: Path | OwnFiles) -> None:
+        """Put a calibration's folder, a photograph, or one with its PSF into the form; open a result."""
+        if isinstance(what, OwnFiles):
+            self._take_own(what)
+            return
+        path = what
         self.tabs.setCurrentWidget(self.form)
         form = self.form
         if path.is_dir() and form.kind == PSF:
@@ -392,6 +397,15 @@ class ReconstructionsPanel(Panel):
         if not path.is_dir() and not form.text(form.source) and form.kind != PSF:
             folder = self.session.runs_folder
             self._newest.ask(lambda: newest_calibration(folder), self._offer_calibration)
+
+    def _take_own(self, files: OwnFiles) -> None:
+        if files.result is not None:
+            self.open(files.result)
+            return
+        self.tabs.setCurrentWidget(self.form)
+        self.form.options.set_values({"kind": PSF})
+        self.form.options.set_values({"psf": files.psf, "image": files.photograph})
+        self.form.start.setFocus()
 
     def _offer_calibration(self, newest: Path | None) -> None:
         """Begin with the newest calibration where none was named."""
