@@ -15,7 +15,7 @@ from instrument.bench.config_file import load_config
 from instrument.cli.app import App, BenchOption, RunFolder, examples, open_and_say
 from instrument.cli.options import Given
 from instrument.cli.progress import one_task
-from instrument.files.errors import FileError
+from instrument.files.errors import BenchError, FileError
 from instrument.files.volumes import is_zarr_name, uneven_steps
 from instrument.plan.model import load_plan
 from instrument.runs.export import export as export_run
@@ -101,7 +101,7 @@ def _slice(text: str) -> slice:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Which frames of a run are written, and how fast a film of them plays."""
+    """Which frames of a run are written, how fast a film of them plays, and on which voxels a volume."""
 
     label: str | None = option(None, help="Only steps of this label.", applies=("run",))
     frames: slice | None = option(
@@ -118,6 +118,19 @@ class ExportOptions:
         flags=("--fps",),
         applies=("run",),
     )
+    metric: bool = option(
+        False,
+        help="On voxels of one size, upright: each plane of a reconstruction has a pitch of its own.",
+        applies=("volume",),
+    )
+    voxel_um: float | None = option(
+        None,
+        help="Edge of the voxels, cubes, with --metric.",
+        default_words="the middle plane's pixels and the step beside it",
+        unit="um",
+        above=0,
+        applies=("volume",),
+    )
 
 
 @export_app.command(
@@ -125,7 +138,7 @@ class ExportOptions:
         "diffuserbench export RUN psfs.ome.tif --label psf",
         "diffuserbench export RUN video.mp4",
         "diffuserbench export RUN frames/ --frames 0:100",
-        "diffuserbench export volume.tif volume.ome.zarr",
+        "diffuserbench export volume.tif volume.ome.zarr --metric",
     )
 )
 def export(
@@ -148,9 +161,9 @@ def export(
     Frames that are not there (gaps of a recording, steps not done) are left out, and said.
     """
     if _is_result(run):
-        given.refuse("a reconstruction", "reconstruction")
-        _export_result(run, out)
+        _export_result(run, out, options, given)
         return
+    given.refuse("a run", "run")
     found = Run.open(run)
     wanted = set(range(found.n_frames)[options.frames or slice(None)])
     if options.label is not None:
@@ -168,11 +181,18 @@ def _is_result(path: Path) -> bool:
     return path.is_file() or is_zarr_name(path)
 
 
-def _export_result(path: Path, target: Path) -> None:
+def _export_result(path: Path, target: Path, options: ExportOptions, given: Given) -> None:
     from instrument.reconstruction.stored_result import export_result, open_result
 
     result = open_result(path)
     try:
+        kind = "picture" if result.volume is None else "volume"
+        given.refuse(f"a {kind}", kind)
+        if options.voxel_um is not None and not options.metric:
+            raise BenchError("--voxel-um is the size of --metric's voxels: give --metric too.")
+        if options.metric:
+            result = result.metric(options.voxel_um)
+            typer.echo(f"{'Voxels':<12}{result.voxels_in_words()}")
         with one_task("Planes") as advance:
             export_result(result, target, advance=advance)
         steps = "" if result.planes_um is None else uneven_steps(result.planes_um[0])
