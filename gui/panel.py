@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from PySide6.QtCore import QTimer
 from PySide6.QtGui import QGuiApplication
@@ -25,6 +25,8 @@ _T = TypeVar("_T")
 
 class Panel(QWidget):
     """A part of the window. Subclasses fill ``body`` and say ``as_python``.
+
+    One with many widgets makes them in ``parts``, so that STOP is heard in between.
 
     Parameters
     ----------
@@ -50,6 +52,14 @@ class Panel(QWidget):
         self._fade = after_rest(self, _REFUSAL_MS, self.accepted)
         fill(self, (self.body, 1), in_row((self._note, 1), self.copy_button), margins=(8, 8, 8, 4), spacing=4)
 
+    @classmethod
+    def prepare(cls) -> None:
+        """Import and compile what the panel needs first; in any thread, before one is made."""
+
+    def parts(self) -> Iterator[None]:
+        """Make the panel's widgets, with a ``yield`` at least every 20 ms of processor time."""
+        yield
+
     @property
     def jobs(self) -> JobRunner:
         """Where the panel's work is done."""
@@ -64,8 +74,8 @@ class Panel(QWidget):
         QGuiApplication.clipboard().setText(self.as_python())
         self.session.log("info", f"{self.title}: copied as Python.")
 
-    def take(self, path: Path) -> None:
-        """Work with a file or folder that another panel hands on; for panels that can."""
+    def take(self, what: Any) -> None:
+        """Work with what another panel hands on: mostly the path of a file or folder; for panels that can."""
         raise NotImplementedError
 
     def shutdown(self) -> None:
@@ -111,6 +121,16 @@ class Panel(QWidget):
         except BusyError as error:
             self.refused(field, str(error))
             return None
+
+
+_P = TypeVar("_P", bound=Panel)
+
+
+def whole(panel: _P) -> _P:
+    """Return a panel with all its parts made, at once."""
+    for _ in panel.parts():
+        pass
+    return panel
 
 
 class DevicePanel(Panel):

@@ -55,6 +55,8 @@ class BenchSession(QObject):
         An :class:`OperatorRequest`: something is to be done by hand.
     handed_on : str, Path
         A panel's name and a file or folder that another panel gives it to work with.
+    bench_wanted : object
+        Another bench is to be opened in this one's place: its BenchConfig.
     opened, closed
         Every device was tried; everything was closed.
     """
@@ -66,6 +68,7 @@ class BenchSession(QObject):
     stopped = Signal()
     asked = Signal(object)
     handed_on = Signal(str, object)
+    bench_wanted = Signal(object)
     opened = Signal()
     closed = Signal()
     _from_thread = Signal(object)
@@ -74,7 +77,7 @@ class BenchSession(QObject):
         super().__init__(parent)
         self.config = config
         self.bench = Bench(config, self._ask)
-        self.live = LiveCamera(self.bench.camera)
+        self.live = LiveCamera(self.bench.camera if config.devices else None)
         self.jobs = JobRunner(self)
         self.jobs.job_ended.connect(self._job_ended)
         self._states: dict[str, DeviceState] = {kind: DeviceState("closed") for kind in self.bench.devices}

@@ -135,6 +135,11 @@ QLabel#reason {{ color: {c.error}; font-size: 9pt; }}
 QLabel#refusal {{ color: {c.warning}; }}
 QLabel#dim, QLabel[role="dim"] {{ color: {c.dim}; }}
 QLabel[role="value"] {{ color: {c.text}; font-weight: 600; }}
+QLabel[role="title"] {{ color: {c.text}; font-size: 16pt; font-weight: 600; }}
+QLabel[role="hint"] {{ color: {c.dim}; font-size: 11pt; }}
+QCommandLinkButton {{ background: {c.field}; border: 1px solid {c.line}; border-radius: 6px; padding: 8px;
+  text-align: left; color: {c.text}; }}
+QCommandLinkButton:hover, QCommandLinkButton:focus {{ border-color: {c.accent}; }}
 QLabel[role="heading"] {{ color: {c.dim}; font-size: 9pt; font-weight: 600; }}
 QPushButton, QToolButton {{ background: {c.field}; border: 1px solid {c.line}; border-radius: 4px;
   padding: 4px 10px; }}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -17,6 +18,7 @@ from gui.forms.reconstruct import CALIBRATION, PSF, ReconstructForm, SoFar, Writ
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.session import BenchSession
+from gui.session_news import OwnFiles
 from gui.theme import as_shown
 from gui.widgets.building import button, fill, in_row, label, split, tabs
 from gui.widgets.dialogues import Question, choose_path
@@ -52,6 +54,10 @@ class ReconstructionsPanel(Panel):
         self._explaining: Job | None = None
         self._opening: Job | None = None
         self._first_picture = True
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
+        session = self.session
         self.list = QListWidget()
         self.list.setToolTip("Reconstructions in the data folder, the newest first (Enter opens)")
         self.list.setAlternatingRowColors(True)
@@ -62,16 +68,21 @@ class ReconstructionsPanel(Panel):
         self.refresh_button = button("Refresh", "Look into the data folder again", self.refresh)
         tip = "Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)"
         self.export_button = button("Export…", tip, self._choose_export, enabled=False)
+        yield
         self.form = ReconstructForm()
         self.form.asked.connect(self.reconstruct)
         self.form.questioned.connect(self.explain)
         self.form.stopped.connect(self._stop)
         self.form.refused.connect(self.refused)
+        yield
         self.picture = PictureView()
+        yield
         self.volume = VolumeView(self.jobs)
         self.volume.failed.connect(lambda why: self.refused(None, why))
+        yield
         self.facts = FactsView()
         self.convergence = ConvergenceView()
+        yield
         self.heading = label(selectable=True)
         self.place = label(role="dim")
         self.place.setAlignment(Qt.AlignmentFlag.AlignRight)
@@ -83,7 +94,7 @@ class ReconstructionsPanel(Panel):
         self.viewers = QStackedWidget()
         for widget in (empty, self.picture, self.volume):
             self.viewers.addWidget(widget)
-        self._arrange()
+        yield from self._arrange()
         session.run_finished.connect(lambda _: self.refresh())
         folder = self.session.runs_folder / "reconstructions"
         self._names = SuggestedName(self.jobs, self.form.options, folder, ".tif")
@@ -93,12 +104,15 @@ class ReconstructionsPanel(Panel):
         self.form.options.settled.connect(self._settled)
         self.refresh()
 
-    def _arrange(self) -> None:
+    def _arrange(self) -> Iterator[None]:
         buttons = in_row(self.open_button, self.refresh_button, self.export_button)
         results = fill(QWidget(), (self.list, 1), buttons, margins=(0, 6, 0, 0))
         self.tabs = tabs({"Results": results, "Reconstruct": self.form})
+        yield
         below = split(self.facts, self.convergence, sizes=[330, 330])
+        yield
         top = fill(QWidget(), in_row(self.heading, (self.place, 1)), (self.viewers, 1))
+        yield
         right = split(top, below, sizes=[520, 170], down=True, stretch=1)
         right.setStretchFactor(0, 3)
         fill(self.body, split(self.tabs, right, sizes=[330, 840], stretch=1))
@@ -369,8 +383,12 @@ class ReconstructionsPanel(Panel):
         self.refresh()
 
     # The panel -----------------------------------------------------------------------------------
-    def take(self, path: Path) -> None:
-        """Put a calibration's folder, or a photograph, into the form."""
+    def take(self, what: Path | OwnFiles) -> None:
+        """Put a calibration's folder, a photograph, or one with its PSF into the form; open a result."""
+        if isinstance(what, OwnFiles):
+            self._take_own(what)
+            return
+        path = what
         self.tabs.setCurrentWidget(self.form)
         form = self.form
         if path.is_dir() and form.kind == PSF:
@@ -379,6 +397,15 @@ class ReconstructionsPanel(Panel):
         if not path.is_dir() and not form.text(form.source) and form.kind != PSF:
             folder = self.session.runs_folder
             self._newest.ask(lambda: newest_calibration(folder), self._offer_calibration)
+
+    def _take_own(self, files: OwnFiles) -> None:
+        if files.result is not None:
+            self.open(files.result)
+            return
+        self.tabs.setCurrentWidget(self.form)
+        self.form.options.set_values({"kind": PSF})
+        self.form.options.set_values({"psf": files.psf, "image": files.photograph})
+        self.form.start.setFocus()
 
     def _offer_calibration(self, newest: Path | None) -> None:
         """Begin with the newest calibration where none was named."""

@@ -134,10 +134,46 @@ def button(
     return made
 
 
+class Hint(QWidget):
+    """What stands where there is nothing to be seen yet: one sentence, and one button for what comes next.
+
+    Parameters
+    ----------
+    words : str
+    answer : str
+        On the button.
+    clicked : callable
+    other : (str, callable), optional
+        A second, quiet button.
+    """
+
+    def __init__(
+        self,
+        words: str,
+        answer: str,
+        clicked: Callable[[], object],
+        other: tuple[str, Callable[[], object]] | None = None,
+    ) -> None:
+        super().__init__()
+        self.words = label(words, "hint", wraps=True)
+        self.words.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self.button = button(answer, "", lambda: clicked())
+        parts: list[Part] = [self.words, in_row(None, self.button, None)]
+        if other is not None:
+            quiet = button(other[0], "", lambda: other[1]())
+            quiet.setFlat(True)
+            parts.append(in_row(None, quiet, None))
+        fill(self, None, *parts, None, margins=(16, 8, 16, 8), spacing=10)
+
+    def say(self, words: str) -> None:
+        """Say something else."""
+        self.words.setText(words)
+
+
 def label(
     words: str = "", role: str = "", *, selectable: bool = False, wraps: bool = False, yields: bool = False
 ) -> QLabel:
-    """Return a label. ``role``: ``"dim"``, ``"value"``, ``"heading"``; one that ``yields`` widens nothing."""
+    """Return a label. ``role``: dim, value, heading, title, hint; one that ``yields`` widens nothing."""
     made = QLabel(words)
     made.setWordWrap(wraps)
     if role:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,9 +13,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from instrument.bench.config import BenchConfig
-from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
+from instrument.cli.app import App, BenchOption, examples, load_and_say
 from instrument.cli.progress import first_interrupt_cancels, one_task, progress_bar
+from instrument.cli.spots import say_limit, say_spots
 from instrument.display.hologram import (
     HologramResult,
     bench_display,
@@ -28,11 +27,11 @@ from instrument.display.hologram import (
     slm_size,
 )
 from instrument.display.hologram_files import HologramFiles, rows, write_chart, write_csv
-from instrument.display.spots import SpotFiles, spots_of
 from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image, read_stack
 from instrument.files.sample_images import DEFAULT_SAMPLES, SAMPLES, load_sample
+from instrument.tasks.task import Given, saying_what_is_left
 from recon.base.declare import option
 from recon.base.option_text import size
 from recon.holography import (
@@ -42,16 +41,12 @@ from recon.holography import (
     HologramRecord,
     HologramStop,
     Target,
-    compute_spots,
     eyebox_for_field_of_view,
     field_of_view_for_eyebox,
-    hologram_limit,
     pixels_for,
     pixels_per_degree,
 )
 from recon.holography.judge import GRIDS, METHODS, Cell, run_table
-from recon.holography.limit import BANDS
-from recon.holography.target import make_band
 
 hologram_app, etendue_app, table_app = App(), App(), App()
 
@@ -230,6 +225,9 @@ def _print_table(cells: list[Cell], note: str) -> None:
         console.print(shown)
 
 
+_OF_PICTURES = ("picture",)
+
+
 @dataclass(frozen=True, kw_only=True)
 class HologramInputs:
     """What is shown, for which display, and where the pattern goes."""
@@ -240,11 +238,13 @@ class HologramInputs:
         "of the field from the top left), and where wanted intensity, z_mm.",
         metavar="ROWSxCOLUMNS|FILE",
         group="Files",
+        applies=("spots",),
     )
     limit: bool = option(
         False,
         help="Compute no pattern: say what any number of frames could reach for this picture, mask and SLM.",
         group="What counts",
+        applies=("limit",),
     )
     z_mm: tuple[float, ...] = option(
         (),
@@ -252,15 +252,28 @@ class HologramInputs:
         default_words="0",
         unit="mm",
         group="Files",
+        applies=("picture", "limit"),
     )
     video: bool = option(
-        False, help="TARGET is a folder or stack; each frame starts from the last.", group="Files"
+        False,
+        help="TARGET is a folder or stack; each frame starts from the last.",
+        group="Files",
+        applies=_OF_PICTURES,
     )
-    color: bool = option(False, help="Field-sequential colour: one pattern a channel.", group="Files")
+    color: bool = option(
+        False, help="Field-sequential colour: one pattern a channel.", group="Files", applies=_OF_PICTURES
+    )
     wavelengths: tuple[float, float, float] = option(
-        (638.0, 520.0, 450.0), help="With --color, nm.", above=0, metavar="R G B", group="Files"
+        (638.0, 520.0, 450.0),
+        help="With --color, nm.",
+        above=0,
+        metavar="R G B",
+        group="Files",
+        applies=_OF_PICTURES,
     )
-    weights: Path | None = option(None, help="A weight image instead of the fovea.", group="What counts")
+    weights: Path | None = option(
+        None, help="A weight image instead of the fovea.", group="What counts", applies=_OF_PICTURES
+    )
     alignment: Path | None = option(None, help="From align mask.", group="Display")
     out: Path = option(
         Path("slm.png"),
@@ -291,6 +304,7 @@ class HologramInputs:
     )
 )
 def hologram(
+    given: Given,
     inputs: HologramInputs,
     options: HologramOptions,
     target: Annotated[
@@ -311,7 +325,8 @@ def hologram(
     config = load_and_say(bench)
     size = slm_size(config)
     if inputs.spots is not None:
-        _spots(inputs, options, config, size)
+        given.refuse("--spots", "spots")
+        say_spots(inputs.spots, inputs.out, options, (config, size, inputs.alignment), overwrite=inputs.force)
         return
     assert target is not None
     if inputs.weights is not None:
@@ -329,9 +344,10 @@ def hologram(
         found = load_alignment(inputs.alignment)
         displays = [found.of(display) for display in displays]
     if inputs.limit:
-        if inputs.color or inputs.video or len(target) > 1:
-            raise BenchError("--limit is for one picture in one plane and colour.")
-        _limit(pictures[0][0], displays[0], options, depths[0])
+        given.refuse("--limit", "limit")
+        if len(target) > 1:
+            raise BenchError("--limit is for one picture in one plane.")
+        say_limit(pictures[0][0], displays[0], options, depths[0])
         return
     frames = len(pictures) if inputs.video else 0
     writer = HologramFiles(inputs.out, config.display.slm_binning, options, displays, video=frames)
@@ -354,104 +370,6 @@ def hologram(
                 if result.hologram.stop_reason is HologramStop.CANCELLED:
                     typer.echo("Interrupted: this is the pattern so far.", err=True)
                     raise typer.Exit(130)
-
-
-LIFTS = (0.1, 0.3)
-"""How far black is lifted where the limit says what would help."""
-
-
-def _limit(picture: Pixels, display: Display, options: HologramOptions, z_mm: float) -> None:
-    """Say what could be reached, which frequencies fall short, and what would help."""
-    lifts = [options.lift, *(lift for lift in LIFTS if lift > options.lift)]
-    found = []
-    with first_interrupt_cancels() as cancel:
-        for lift in lifts:
-            target = prepare_target(picture, display, replace(options, lift=lift), z_mm=z_mm)
-            with one_task("limit" if lift == options.lift else f"black at {lift:g}", LIMIT_STEPS) as advance:
-
-                def show(record: HologramRecord, _slm: object, advance: Any = advance) -> None:
-                    advance(float(record.iteration), note=f"{record.psnr_db:.2f} dB")
-
-                steps = replace(options, iterations=min(options.iterations, LIMIT_STEPS))
-                found.append(hologram_limit(display, target, steps, callback=show, cancel=cancel))
-            if found[-1].stop_reason is HologramStop.CANCELLED:
-                typer.echo(
-                    "Interrupted: this is a bound all the same, less sharp than it could be.", err=True
-                )
-                break
-    here = found[0]
-    typer.echo(
-        f"limit: no number of frames shows this picture better than {_decibels(here.bound_db)} through this "
-        f"mask (a bound; {here.reached_db:.2f} dB is reached by what need not be frames of phases)"
-    )
-    least = display.factor / make_band(display.slm_shape, display.factor, "alias-free").cutoff
-    for (low, high), wanted, reached in zip(pairwise(BANDS), here.wanted, here.reached, strict=True):
-        why = ""
-        if reached < 0.7 and low < least:
-            why = "   set by the mask within an SLM pixel, not by the SLM"
-        elif reached < 0.7:
-            why = "   more contrast than so many SLM pixels can make"
-        typer.echo(
-            f"  {low:.2f} to {high:.2f} of the finest the eye resolves: contrast {wanted:.2f}, "
-            f"{reached:.0%} reached{why}"
-        )
-    for lift, better in zip(lifts[1:], found[1:], strict=False):
-        best = _decibels(better.bound_db)
-        typer.echo(f"  black at {lift:g} of white (--lift {lift:g}): at most {best} of it")
-
-
-def _decibels(bound_db: float) -> str:
-    return f"{bound_db:.2f} dB" if bound_db < 60 else "60 dB (no limit in sight)"
-
-
-LIMIT_STEPS = 60
-"""Iterations of the limit: bound and solution are then 0.3 dB apart at 16x."""
-
-
-def _spots(
-    inputs: HologramInputs,
-    options: HologramOptions,
-    config: BenchConfig,
-    size: tuple[tuple[int, int], float],
-) -> None:
-    """Compute a hologram of spots, say how even they are, write."""
-    given = [
-        flag
-        for flag, value in (
-            ("--limit", inputs.limit),
-            ("--video", inputs.video),
-            ("--color", inputs.color),
-            ("--z-mm", inputs.z_mm),
-        )
-        if value
-    ]
-    if given or inputs.weights is not None:
-        raise BenchError(f"{given[0] if given else '--weights'} does not apply to --spots.")
-    spots = spots_of(inputs.spots or "")
-    display = options.display_of(bench_display(config, size, expansion=options.expansion))
-    if inputs.alignment is not None:
-        display = load_alignment(inputs.alignment).of(display)
-    writer = HologramFiles(inputs.out, config.display.slm_binning, options, [display])
-    writer.check(overwrite=inputs.force)
-    with saying_what_is_left(*writer.files()), first_interrupt_cancels() as cancel:
-        with one_task("spots", options.iterations) as advance:
-
-            def show(record: HologramRecord, _slm: object) -> None:
-                advance(float(record.iteration), note=f"deviation {record.loss:.2%}")
-
-            found, scores = compute_spots(display, spots, options, callback=show, cancel=cancel)
-        SpotFiles(writer).write(spots, found, scores)
-    last = found.history[-1]
-    typer.echo(f"spots: {last.iteration} iterations, {found.seconds:.1f} s: {found.stop_reason}")
-    least, greatest = scores.relative.min(), scores.relative.max()
-    typer.echo(
-        f"  {len(spots)} spots: {least:.3f} to {greatest:.3f} of the brightness asked for, "
-        f"deviation {scores.deviation:.2%} (computed)"
-    )
-    typer.echo(f"  light: {scores.efficiency:.1%} of what falls on the SLM is in the spots")
-    if found.stop_reason is HologramStop.CANCELLED:
-        typer.echo("Interrupted: this is the pattern so far.", err=True)
-        raise typer.Exit(130)
 
 
 def _compute(

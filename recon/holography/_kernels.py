@@ -92,7 +92,7 @@ def fill_displaced(
             at_y, at_x = _place(row, y, x, width)
             j, in_j = _cell(at_y, k)
             i, in_i = _cell(at_x, k)
-            value = field[y, x] * 0
+            value = table[0] * 0  # not of the field: what is in it may be no number
             for b in range(1 if in_j == 1 else 2):
                 wy = 1 - in_j if b else in_j
                 for a in range(1 if in_i == 1 else 2):

@@ -22,6 +22,7 @@ LIGHT = 0.1
 """Of the light on a complex SLM: at 16x a tenth is 2.5 to 7 dB better than a phase SLM, and a hundredth
 0.4 dB more (benchmarks/hologram_limits.py)."""
 
+_OF_PICTURES, _LIMITED = ("picture",), ("picture", "limit")
 _PICTURE, _COUNTS, _STOP, _SLM, _RARE = "Picture", "What counts", "When to stop", "Display", "Rarely needed"
 
 
@@ -39,12 +40,14 @@ class HologramOptions:
         "borders, or is stretched.",
         choices=get_args(Fit),
         group=_PICTURE,
+        applies=_LIMITED,
     )
     srgb: bool = option(
         False,
         help="The picture's values are sRGB-coded and are decoded to intensities; else they are intensities.",
         label="sRGB-coded",
         group=_PICTURE,
+        applies=_LIMITED,
     )
     lift: float = option(
         0.0,
@@ -54,12 +57,14 @@ class HologramOptions:
         below=1,
         metavar="PART",
         group=_PICTURE,
+        applies=_LIMITED,
     )
     loss: str | Loss = option(
         "frequency",
         help="Which differences count (Kuo 2020, Eqs. 7.16, 7.17 and 7.19).",
         choices=LOSSES.names,
         group=_COUNTS,
+        applies=_OF_PICTURES,
     )
     centre: tuple[float, float] = option(
         (0.5, 0.5),
@@ -68,6 +73,7 @@ class HologramOptions:
         metavar="Y,X",
         label="Fovea's centre",
         group=_COUNTS,
+        applies=_OF_PICTURES,
     )
     radius: float = option(
         0.28,
@@ -77,6 +83,7 @@ class HologramOptions:
         metavar="R",
         label="Fovea's radius",
         group=_COUNTS,
+        applies=_OF_PICTURES,
     )
     periphery: float = option(
         0.1,
@@ -86,6 +93,7 @@ class HologramOptions:
         metavar="W",
         label="Elsewhere",
         group=_COUNTS,
+        applies=_OF_PICTURES,
     )
     weights: npt.NDArray[Any] | None = option(
         None,
@@ -93,6 +101,7 @@ class HologramOptions:
         flags=("",),
         group=_COUNTS,
         recorded=False,
+        applies=_OF_PICTURES,
     )
     envelope: Envelope = option(
         "shade",
@@ -111,7 +120,12 @@ class HologramOptions:
         group=_SLM,
     )
     frames: int = option(
-        1, help="Time-multiplexed frames, whose intensities average.", least=1, metavar="N", group=_SLM
+        1,
+        help="Time-multiplexed frames, whose intensities average.",
+        least=1,
+        metavar="N",
+        group=_SLM,
+        applies=("picture", "spots"),
     )
     complex_slm: bool = option(
         False,
@@ -119,6 +133,7 @@ class HologramOptions:
         flags=("--complex",),
         label="Complex SLM",
         group=_SLM,
+        applies=_OF_PICTURES,
     )
     light: float | None = option(
         None,
@@ -130,6 +145,7 @@ class HologramOptions:
         metavar="SHARE",
         label="Light",
         group=_SLM,
+        applies=_OF_PICTURES,
     )
     phase_levels: int | None = option(
         None,
@@ -140,6 +156,7 @@ class HologramOptions:
         flags=("--levels",),
         metavar="N",
         group=_SLM,
+        applies=("picture", "spots"),
     )
     iterations: int = option(
         100, help="At most so many.", least=0, flags=("--iterations", "-n"), metavar="N", group=_STOP
@@ -164,6 +181,7 @@ class HologramOptions:
         metavar="DB",
         label="PSNR",
         group=_STOP,
+        applies=_OF_PICTURES,
     )
     tolerance: float = option(
         1e-5,
@@ -172,6 +190,7 @@ class HologramOptions:
         least=0,
         metavar="X",
         group=_STOP,
+        applies=_LIMITED,
     )
     method: Method = option(
         "lbfgs",
@@ -180,12 +199,14 @@ class HologramOptions:
         choices=get_args(Method),
         flags=("--method", "-m"),
         group=_RARE,
+        applies=_OF_PICTURES,
     )
     grid: Grid = option(
         "alias-free",
         help="Grid that is optimised on; dissertation: the mask's own, which aliases.",
         choices=get_args(Grid),
         group=_RARE,
+        applies=_OF_PICTURES,
     )
     seed: int = option(0, help="Of the random start.", group=_RARE)
 

@@ -119,7 +119,7 @@ class SpotField:
         self._table = display.mask.response(display.wavelength_nm).astype(np.complex64)
         nodes = display.displacement
         self._nodes = None if nodes is None else np.ascontiguousarray(nodes, np.float32)
-        self._field = np.zeros(display.mask.shape, np.complex64)  # what is displaced reads it for its type
+        self._field = np.zeros(display.mask.shape, np.complex64)
         nu = spots.places - 0.5
         self._planes = []
         for z_mm in np.unique(spots.z_mm):

@@ -167,8 +167,9 @@ def test_spots_without_a_mask_come_from_an_array_or_a_list(capsys):
     assert main(["hologram", "--spots", "list.csv", "--out", "list.png"]) == 0
     for wrong, words in (
         (["picture.png", "--spots", "2x2"], "Give a TARGET picture, or --spots"),
-        (["--spots", "2x2", "--video"], "--video does not apply"),
-        (["--spots", "2x2", "--limit"], "--limit does not apply"),
+        (["--spots", "2x2", "--video"], "--spots these do not apply: --video (for a picture)"),
+        (["--spots", "2x2", "--limit", "--srgb"], "--limit (for a limit); --srgb (for a picture or a limit)"),
+        (["picture.png", "--limit", "--frames", "2"], "--limit these do not apply: --frames"),
         (["--spots", "nowhere.csv"], "ROWSxCOLUMNS or a CSV file"),
     ):
         assert main(["hologram", *wrong, "--out", "other.png"]) == 2

@@ -19,7 +19,7 @@ from recon.holography import (
     hologram_limit,
     random_mask,
 )
-from recon.holography.limit import COLUMNS, _gap
+from recon.holography.limit import COLUMNS, DENSE, _below_least, _gap
 
 SHAPE, K = (12, 16), 4
 
@@ -72,6 +72,12 @@ def test_the_gap_is_that_of_the_dense_matrix_and_bounds_the_loss_of_other_matric
     assert gap == pytest.approx(-(n + 1) * least, rel=0.03)
     for _ in range(5):
         assert model.evaluate(rows()).loss >= found.loss - gap
+
+
+def test_no_eigenvalue_is_below_what_lanczos_tells_even_where_the_least_is_alone_and_near_others():
+    for few in (np.array([-1.0]), np.array([-1.0, -0.99, -0.98])):
+        values = np.concatenate([few, np.linspace(-0.97, 3.0, DENSE)]).astype(np.float32)
+        assert -1.1 < _below_least(lambda x, values=values: values * x, len(values)) <= -1.0
 
 
 def test_it_can_be_interrupted_and_is_a_bound_all_the_same():
