@@ -36,7 +36,9 @@ def reconstruct_photograph(
 ) -> None:
     """Reconstruct, tell, write; exit code 130 where it was interrupted. ``explain``: only say what with."""
     if output.explain:
-        _print_choice(request.explain(request.prepare()))
+        job = request.prepare()
+        _print_choice(request.explain(job))
+        typer.echo(f"{'Will take':<12}{request.forecast(job)}")
         return
     outputs.check(0, overwrite=output.force)
     is_volume = isinstance(request, VolumeRequest)
