@@ -33,6 +33,7 @@ from gui.widgets.building import PanelPlace, button, fill, label, tabs, text_vie
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.plots import restyle_all
+from gui.widgets.step_strip import StepStrip
 from instrument.bench.config import BenchConfig
 
 _AREAS = {
@@ -160,6 +161,13 @@ class MainWindow(QMainWindow):
         if what:
             panel.take(what)
 
+    def _take_step(self, panel: str, what: object) -> None:
+        """Go where the next step is taken."""
+        if panel == "reconnect":
+            self.session.reconnect(what)  # type: ignore[arg-type]
+        else:
+            self._hand_on(panel, what)
+
     def panel(self, name: str) -> Panel:
         """Return a panel of the table, made now if it was not yet."""
         if name not in self._panels:
@@ -260,6 +268,15 @@ class MainWindow(QMainWindow):
         bar.addWidget(self.stop_button)
         bar.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
         self.addToolBar(Qt.ToolBarArea.TopToolBarArea, bar)
+        self.strip = StepStrip(self.session)
+        self.strip.wanted.connect(self._take_step)
+        below = QToolBar("What comes next")
+        below.setObjectName("next-bar")
+        below.setMovable(False)
+        below.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
+        below.addWidget(self.strip)
+        self.addToolBarBreak(Qt.ToolBarArea.TopToolBarArea)
+        self.addToolBar(Qt.ToolBarArea.TopToolBarArea, below)
 
     def _make_status_bar(self) -> None:
         self.job_label = label("Ready")
