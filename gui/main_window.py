@@ -294,7 +294,9 @@ class MainWindow(QMainWindow):
             action = self._add_action(view, entry.title, entry.shortcut, partial(self.show_panel, name))
             action.setToolTip(entry.tip)
         theme = self.menuBar().addMenu("&Theme")
-        for number, (name, words) in enumerate((("dark", "&Dark"), ("red", "&Red, for the dark room"))):
+        for number, (name, words) in enumerate(
+            (("dark", "&Dark"), ("red", "&Red, for the dark room"), ("light", "&Light"))
+        ):
             self._add_action(theme, words, f"Ctrl+Shift+{number + 1}", partial(self.set_theme, name))
         camera = self.menuBar().addMenu("&Camera")
         for words, keys, what in (
