@@ -9,14 +9,14 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import App, examples, saying_what_is_left
-from instrument.cli.options import Only
+from instrument.cli.app import App, examples
 from instrument.files.errors import BenchError, FileError
 from instrument.files.volumes import is_zarr_name
 from instrument.reconstruction.activity import ActivitySettings, find_activity, write_activity
 from instrument.reconstruction.options import InputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.video_files import VideoPictures
 from instrument.runs.run_files import STATE
+from instrument.tasks.task import Only, saying_what_is_left
 from recon.base.declare import option
 from recon.reconstruction.options import ReconstructionOptions
 

@@ -13,8 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
-from instrument.cli.options import Given
+from instrument.cli.app import App, BenchOption, examples, load_and_say
 from instrument.cli.progress import first_interrupt_cancels, one_task, progress_bar
 from instrument.cli.spots import say_limit, say_spots
 from instrument.display.hologram import (
@@ -32,6 +31,7 @@ from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image, read_stack
 from instrument.files.sample_images import DEFAULT_SAMPLES, SAMPLES, load_sample
+from instrument.tasks.task import Given, saying_what_is_left
 from recon.base.declare import option
 from recon.base.option_text import size
 from recon.holography import (

@@ -9,11 +9,11 @@ from typing import Annotated
 import typer
 
 from instrument.cli.app import App, examples
-from instrument.cli.options import Given
 from instrument.files.errors import BenchError
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.request import VolumeRequest, request_of
 from instrument.reconstruction.result_file import Outputs
+from instrument.tasks.task import Given
 from recon.reconstruction.options import ReconstructionOptions
 
 app = App()

@@ -6,7 +6,6 @@ import time
 
 import typer
 
-from instrument.cli.app import saying_what_is_left
 from instrument.cli.progress import first_interrupt_cancels, one_task
 from instrument.files.errors import duration
 from instrument.files.volumes import uneven_steps
@@ -24,6 +23,7 @@ from instrument.reconstruction.video import (
     solve_video,
 )
 from instrument.reconstruction.video_work import BlockReport, require_crew
+from instrument.tasks.task import saying_what_is_left
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS

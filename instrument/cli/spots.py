@@ -7,13 +7,13 @@ from pathlib import Path
 import typer
 
 from instrument.bench.config import BenchConfig
-from instrument.cli.app import saying_what_is_left
 from instrument.cli.progress import first_interrupt_cancels, one_task
 from instrument.display.hologram import bench_display, load_alignment
 from instrument.display.hologram_files import HologramFiles
 from instrument.display.limit import lifts_of, limit_lines, limits_of_lifts
 from instrument.display.spots import SpotFiles, spots_of
 from instrument.files.images import Pixels
+from instrument.tasks.task import saying_what_is_left
 from recon.holography import Display, HologramOptions, HologramRecord, HologramStop, compute_spots
 
 
