@@ -34,6 +34,7 @@ from gui.widgets.building import PanelPlace, button, fill, label, tabs
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.plots import restyle_all
+from gui.widgets.step_strip import StepStrip
 from instrument.bench.config import BenchConfig
 
 _AREAS = {
@@ -159,6 +160,13 @@ class MainWindow(QMainWindow):
         """Show a panel, and have it work with what another one hands on; empty: nothing."""
         self.bring(name, lambda panel: panel.take(what) if what else None)
 
+    def _take_step(self, panel: str, what: object) -> None:
+        """Go where the next step is taken."""
+        if panel == "reconnect":
+            self.session.reconnect(what)  # type: ignore[arg-type]
+        else:
+            self._hand_on(panel, what)
+
     def panel(self, name: str) -> Panel:
         """Return a panel of the table, made now if it was not yet."""
         return self.maker.whole(name)
@@ -255,6 +263,15 @@ class MainWindow(QMainWindow):
         bar.addWidget(self.stop_button)
         bar.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
         self.addToolBar(Qt.ToolBarArea.TopToolBarArea, bar)
+        self.strip = StepStrip(self.session)
+        self.strip.wanted.connect(self._take_step)
+        below = QToolBar("What comes next")
+        below.setObjectName("next-bar")
+        below.setMovable(False)
+        below.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
+        below.addWidget(self.strip)
+        self.addToolBarBreak(Qt.ToolBarArea.TopToolBarArea)
+        self.addToolBar(Qt.ToolBarArea.TopToolBarArea, below)
 
     def _make_status_bar(self) -> None:
         self.job_label = label("Ready")
@@ -272,7 +289,9 @@ class MainWindow(QMainWindow):
             action = self._add_action(view, entry.title, entry.shortcut, partial(self.bring, name))
             action.setToolTip(entry.tip)
         theme = self.menuBar().addMenu("&Theme")
-        for number, (name, words) in enumerate((("dark", "&Dark"), ("red", "&Red, for the dark room"))):
+        for number, (name, words) in enumerate(
+            (("dark", "&Dark"), ("red", "&Red, for the dark room"), ("light", "&Light"))
+        ):
             self._add_action(theme, words, f"Ctrl+Shift+{number + 1}", partial(self.set_theme, name))
         camera = self.menuBar().addMenu("&Camera")
         for words, keys, what in (

@@ -151,6 +151,11 @@ class ProcedurePanel(Panel):
         """The form that is shown, as a widget."""
         return self.views[self.routine.name]
 
+    def take(self, what: str) -> None:
+        """Choose a routine, by its name."""
+        self.choice.setCurrentIndex([routine.name for routine in self.routines].index(what))
+        self.run_bar.start_button.setFocus()
+
     def procedure(self) -> Procedure | None:
         """Return what the form asks for; None, and fields marked, where it makes no sense."""
         values = self.view.values()
