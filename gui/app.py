@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -69,11 +70,16 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
     try:
         window = MainWindow(session, settings, app.primaryScreen().availableSize())
         window.show()
+        app.processEvents()  # the first sight of it, before there is anything to stop
+        # What stays is not looked through for garbage again and again, 0.1 s during which nothing answers.
+        session.opened.connect(gc.freeze)
+        window.maker.made.connect(gc.freeze)
         if not session.is_closing:
             session.open()
         status = app.exec()
         session.join()
     finally:
+        gc.unfreeze()  # of this window
         sys.excepthook = sys.__excepthook__
         for number, handler in before.items():
             signal.signal(number, handler)

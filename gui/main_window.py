@@ -22,17 +22,19 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from gui.jobs import Job, words_for
+from gui.jobs import Job
+from gui.making import PanelMaker
 from gui.panel import Panel
 from gui.panels import PANELS
 from gui.panels.unserved import UnservedPanel
 from gui.session import BenchSession
 from gui.session_news import OperatorRequest, name_of
 from gui.theme import THEMES, apply_theme, colours
-from gui.widgets.building import PanelPlace, button, fill, label, tabs, text_view
+from gui.widgets.building import PanelPlace, button, fill, label, tabs
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.plots import restyle_all
+from gui.widgets.step_strip import StepStrip
 from instrument.bench.config import BenchConfig
 
 _AREAS = {
@@ -112,8 +114,9 @@ class MainWindow(QMainWindow):
         self._compact = size.width() < _ROOMY.width() or size.height() < _ROOMY.height()
         self.session = session
         self._settings = settings
-        self._panels: dict[str, Panel] = {}
         self._places: dict[str, PanelPlace] = {}
+        self.maker = PanelMaker(session, self._places, self)
+        self._panels = self.maker.panels
         self._docks: dict[str, QDockWidget] = {}
         self._may_close = False
         self.question: Question | None = None
@@ -156,27 +159,38 @@ class MainWindow(QMainWindow):
     # Panels --------------------------------------------------------------------------------------
     def _hand_on(self, name: str, what: object) -> None:
         """Show a panel, and have it work with what another one hands on; empty: nothing."""
-        panel = self.show_panel(name)
-        if what:
-            panel.take(what)
+        self.bring(name, lambda panel: panel.take(what) if what else None)
+
+    def _take_step(self, panel: str, what: object) -> None:
+        """Go where the next step is taken."""
+        if panel == "reconnect":
+            self.session.reconnect(what)  # type: ignore[arg-type]
+        else:
+            self._hand_on(panel, what)
 
     def panel(self, name: str) -> Panel:
         """Return a panel of the table, made now if it was not yet."""
-        if name not in self._panels:
-            self._panels[name] = panel = PANELS[name].made(self.session)
-            self._places[name].hold(panel)
-        return self._panels[name]
+        return self.maker.whole(name)
 
     def show_panel(self, name: str) -> Panel:
-        """Bring a panel to the front, with the keyboard in it."""
+        """Bring a panel to the front, with the keyboard in it, and return it, made now if it was not yet."""
         panel = self.panel(name)
+        self.bring(name)
+        return panel
+
+    def bring(self, name: str, then: Callable[[Panel], object] = lambda _: None) -> None:
+        """Bring a panel to the front, with the keyboard in it; then do something with it, once it is made."""
         if name in self._docks:
             self._docks[name].show()
             self._docks[name].raise_()
         else:
             self.tabs.setCurrentWidget(self._places[name])
-        panel.setFocus(Qt.FocusReason.ShortcutFocusReason)
-        return panel
+
+        def shown(panel: Panel) -> None:
+            panel.setFocus(Qt.FocusReason.ShortcutFocusReason)
+            then(panel)
+
+        self.maker.ask(name, shown)
 
     def _make_panels(self) -> None:
         first: dict[str, QDockWidget] = {}
@@ -220,23 +234,13 @@ class MainWindow(QMainWindow):
 
     def _dock_seen(self, name: str, visible: bool) -> None:
         if visible:
-            self._try_to_fill(name)
+            self.maker.ask(name)
 
     def _fill_current(self, _index: int = 0) -> None:
         place = self.tabs.currentWidget()
         for name, widget in self._places.items():
             if widget is place:
-                self._try_to_fill(name)
-
-    def _try_to_fill(self, name: str) -> None:
-        """Make a panel; one that cannot be made says why in its place, and the others are not touched."""
-        try:
-            self.panel(name)
-        except Exception as error:  # noqa: BLE001 - a panel's failure must not end the window
-            text = words_for(error)
-            self.session.log("error", f"{PANELS[name].title}: {text}")
-            if self._places[name].content is None:
-                self._places[name].hold(text_view(text))
+                self.maker.ask(name)
 
     # Bars and menus ------------------------------------------------------------------------------
     def _make_top_bar(self) -> None:
@@ -260,6 +264,15 @@ class MainWindow(QMainWindow):
         bar.addWidget(self.stop_button)
         bar.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
         self.addToolBar(Qt.ToolBarArea.TopToolBarArea, bar)
+        self.strip = StepStrip(self.session)
+        self.strip.wanted.connect(self._take_step)
+        below = QToolBar("What comes next")
+        below.setObjectName("next-bar")
+        below.setMovable(False)
+        below.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
+        below.addWidget(self.strip)
+        self.addToolBarBreak(Qt.ToolBarArea.TopToolBarArea)
+        self.addToolBar(Qt.ToolBarArea.TopToolBarArea, below)
 
     def _make_status_bar(self) -> None:
         self.job_label = label("Ready")
@@ -274,10 +287,12 @@ class MainWindow(QMainWindow):
     def _make_menus(self) -> None:
         view = self.menuBar().addMenu("&View")
         for name, entry in PANELS.items():
-            action = self._add_action(view, entry.title, entry.shortcut, partial(self.show_panel, name))
+            action = self._add_action(view, entry.title, entry.shortcut, partial(self.bring, name))
             action.setToolTip(entry.tip)
         theme = self.menuBar().addMenu("&Theme")
-        for number, (name, words) in enumerate((("dark", "&Dark"), ("red", "&Red, for the dark room"))):
+        for number, (name, words) in enumerate(
+            (("dark", "&Dark"), ("red", "&Red, for the dark room"), ("light", "&Light"))
+        ):
             self._add_action(theme, words, f"Ctrl+Shift+{number + 1}", partial(self.set_theme, name))
         camera = self.menuBar().addMenu("&Camera")
         for words, keys, what in (
@@ -287,7 +302,7 @@ class MainWindow(QMainWindow):
         ):
             self._add_action(camera, words, keys, partial(self._on_live_panel, what))
         bench = self.menuBar().addMenu("&Bench")
-        self._add_action(bench, "&Another bench …", "Ctrl+O", partial(self.show_panel, "start"))
+        self._add_action(bench, "&Another bench …", "Ctrl+O", partial(self.bring, "start"))
         for kind in self.session.kinds:
             reconnect = partial(self.session.reconnect, kind)
             self._add_action(bench, f"Reconnect the {name_of(kind)}", "", reconnect)
@@ -303,12 +318,15 @@ class MainWindow(QMainWindow):
 
     def _on_live_panel(self, what: str) -> None:
         """Do what the live view offers, whatever panel is in front, with what is being typed there."""
-        panel, typed = self.panel("live"), QApplication.focusWidget()
+        self.maker.ask("live", lambda panel: self._do_on(panel, what))
+
+    def _do_on(self, panel: Panel, what: str) -> None:
+        typed = QApplication.focusWidget()
         ends = what == "record" and getattr(panel, "is_recording", False)  # no number keeps it from ending
         if not ends and isinstance(typed, NumberEdit) and panel.isAncestorOf(typed) and not typed.submit():
             return  # refused where it stands
         if isinstance(panel, UnservedPanel):
-            self.show_panel("live")  # it says why
+            self.bring("live")  # it says why
         else:
             getattr(panel, what)()
 

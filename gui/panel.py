@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -25,6 +25,8 @@ _T = TypeVar("_T")
 
 class Panel(QWidget):
     """A part of the window. Subclasses fill ``body`` and say ``as_python``.
+
+    One with many widgets makes them in ``parts``, so that STOP is heard in between.
 
     Parameters
     ----------
@@ -49,6 +51,14 @@ class Panel(QWidget):
         self.copy_button.setFlat(True)
         self._fade = after_rest(self, _REFUSAL_MS, self.accepted)
         fill(self, (self.body, 1), in_row((self._note, 1), self.copy_button), margins=(8, 8, 8, 4), spacing=4)
+
+    @classmethod
+    def prepare(cls) -> None:
+        """Import and compile what the panel needs first; in any thread, before one is made."""
+
+    def parts(self) -> Iterator[None]:
+        """Make the panel's widgets, with a ``yield`` at least every 20 ms of processor time."""
+        yield
 
     @property
     def jobs(self) -> JobRunner:
@@ -111,6 +121,16 @@ class Panel(QWidget):
         except BusyError as error:
             self.refused(field, str(error))
             return None
+
+
+_P = TypeVar("_P", bound=Panel)
+
+
+def whole(panel: _P) -> _P:
+    """Return a panel with all its parts made, at once."""
+    for _ in panel.parts():
+        pass
+    return panel
 
 
 class DevicePanel(Panel):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QStackedWidget, QWidget
+from PySide6.QtWidgets import QScrollArea, QStackedWidget, QWidget
 
 from calibration_routines.procedure import Outcome, Outlook, Procedure, Routine
 from gui.forms.options_form import OptionsForm
@@ -26,6 +26,27 @@ _CHECK_MS = 250
 _SLOW_MS = 700
 """A check that takes longer than this is shown to go on: what was said of other values must not stay."""
 _FORM_WIDTH_PX = 400
+
+
+class _Forms(dict[str, OptionsForm]):
+    """The forms of routines by their names, each made when it is first asked for.
+
+    Attributes
+    ----------
+    pages : dict
+        Where those that were shown stand.
+    """
+
+    def __init__(self, routines: Sequence[Routine], changed: Callable[[], object]) -> None:
+        super().__init__()
+        self._routines = {routine.name: routine for routine in routines}
+        self._changed = changed
+        self.pages: dict[str, QScrollArea] = {}
+
+    def __missing__(self, name: str) -> OptionsForm:
+        self[name] = form = OptionsForm(self._routines[name].declared)
+        form.changed.connect(self._changed)
+        return form
 
 
 class ProcedurePanel(Panel):
@@ -52,21 +73,24 @@ class ProcedurePanel(Panel):
         self.run = ProcedureRun(session, self)
         self.outlook: Outlook | None = None
         """Of the form as it stands, once it was checked."""
-        self.views = {routine.name: OptionsForm(routine.declared) for routine in self.routines}
+        self._start_words = words
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
+        session = self.session
         self.choice = choice([routine.title for routine in self.routines], "What to do")
         self.choice.setAccessibleName("Routine")
         self.stack = QStackedWidget()
         for number, routine in enumerate(self.routines):
             self.choice.setItemData(number, routine.help, Qt.ItemDataRole.ToolTipRole)
-            self.stack.addWidget(scrolled(self.views[routine.name]))
-            self.views[routine.name].changed.connect(self._typed)
+        self.views = _Forms(self.routines, self._typed)
         if len(self.routines) == 1:
             self.choice.hide()
         self.about = label(role="dim", wraps=True)
         tip = "What will be done and why, or what stands against it; can be copied"
         self.verdict = text_view(tip=tip)
         self.verdict.setMaximumHeight(150)
-        self.run_bar = RunBar(self.run, words)
+        self.run_bar = RunBar(self.run, self._start_words)
         tip = "Take what was measured to where it is used"
         self.use_button = button(self.use_words, tip, self._use)
         tip = "Open the run that ended early among the runs, where it is resumed"
@@ -75,6 +99,7 @@ class ProcedurePanel(Panel):
             after.hide()
         self._result: Path | None = None
         self._unfinished: Path | None = None
+        yield
         left = fill(
             QWidget(),
             self.choice,
@@ -86,11 +111,12 @@ class ProcedurePanel(Panel):
             self.go_on_button,
             margins=(0, 0, 6, 0),
         )
+        yield
         self.right = QWidget()
         """For the subclass."""
         sizes = [_FORM_WIDTH_PX, 3 * _FORM_WIDTH_PX]
         fill(self.body, split(left, self.right, sizes=sizes, stretch=1, firm=True))
-
+        yield
         self._started: set[str] = set()
         self._check_job: Job | None = None
         self._again = False
@@ -119,6 +145,11 @@ class ProcedurePanel(Panel):
     def view(self) -> OptionsForm:
         """The form that is shown, as a widget."""
         return self.views[self.routine.name]
+
+    def take(self, what: str) -> None:
+        """Choose a routine, by its name."""
+        self.choice.setCurrentIndex([routine.name for routine in self.routines].index(what))
+        self.run_bar.start_button.setFocus()
 
     def procedure(self) -> Procedure | None:
         """Return what the form asks for; None, and fields marked, where it makes no sense."""
@@ -185,6 +216,7 @@ class ProcedurePanel(Panel):
         self._slow.start()
         self._check_job.succeeded.connect(partial(self._checked, routine))
         self._check_job.failed.connect(self._check_failed)
+        self._check_job.cancelled.connect(lambda _: self._check_stopped())
         self._check_job.ended.connect(self._check_ended)
 
     def show_problem(self, error: BenchError) -> None:
@@ -240,7 +272,11 @@ class ProcedurePanel(Panel):
 
     # Inside --------------------------------------------------------------------------------------
     def _chosen(self) -> None:
-        self.stack.setCurrentIndex(self.choice.currentIndex())
+        page = self.views.pages.get(self.routine.name)
+        if page is None:
+            page = self.views.pages[self.routine.name] = scrolled(self.view)
+            self.stack.addWidget(page)
+        self.stack.setCurrentWidget(page)
         self.about.setText(f"{self.routine.help.removesuffix('.')}.")
         self._typed()
 
@@ -278,6 +314,13 @@ class ProcedurePanel(Panel):
     def _check_failed(self, why: str) -> None:
         self._say(why, wrong=True)
         self.run_bar.set_startable("It cannot be checked; see below the form.")
+
+    def _check_stopped(self) -> None:
+        """Have what STOP broke off checked anew, once the bench is free."""
+        self._again, self._unchecked = False, True
+        self._say(
+            "STOP ended the check of this form. It is checked again when the bench is safe.", wrong=False
+        )
 
     def _check_ended(self) -> None:
         self._check_job = None

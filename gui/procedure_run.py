@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Protocol
 
 from PySide6.QtCore import QObject, Signal
 from PySide6.QtWidgets import QWidget
@@ -272,6 +273,25 @@ class ProcedureRun(QObject):
 
 
 _STEPS = 1000
+_TIPS = (
+    "Wait before the next frame, light off; press again to go on",
+    "End before the next frame; what was taken is kept and can be resumed",
+)
+
+
+class Pausable(Protocol):
+    """What is carried out, as far as its buttons see it."""
+
+    looked: Any
+
+    def pause(self) -> None:
+        """Wait at the next step."""
+
+    def resume(self) -> None:
+        """Go on."""
+
+    def abort(self) -> None:
+        """End."""
 
 
 class RunBar(QWidget):
@@ -284,28 +304,29 @@ class RunBar(QWidget):
 
     Parameters
     ----------
-    run : ProcedureRun
+    run : ProcedureRun or TaskRun
         Is paused and aborted by the buttons, and shown.
     words : str
         On the start button.
+    tips : (str, str)
+        Of the buttons that pause and abort.
     """
 
     start = Signal()
 
-    def __init__(self, run: ProcedureRun, words: str) -> None:
+    def __init__(self, run: Pausable, words: str, tips: tuple[str, str] = _TIPS) -> None:
         super().__init__()
         self.start_button = button(words, clicked=self.start, shortcut="Ctrl+Return", primary=True)
-        tip = "Wait before the next frame, light off; press again to go on"
-        self.pause_button = button("Pause", tip, checkable=True)
+        self.pause_button = button("Pause", tips[0], checkable=True)
         self.pause_button.clicked.connect(lambda on: run.pause() if on else run.resume())
-        tip = "End before the next frame; what was taken is kept and can be resumed"
-        self.abort_button = button("Abort", tip, run.abort)
+        self.abort_button = button("Abort", tips[1], run.abort)
         self.bar = share_bar(_STEPS)
         self.words = label(role="dim", wraps=True, yields=True)
         buttons = in_row((self.start_button, 2), self.pause_button, self.abort_button)
         fill(self, buttons, self.bar, self.words, margins=(0, 4, 0, 0))
         run.looked.connect(self.show_situation)
         self._why_not = ""
+        self._when_paused = ", light off" if tips is _TIPS else ""
         self.set_running(False)
 
     def set_startable(self, why_not: str = "") -> None:
@@ -334,7 +355,7 @@ class RunBar(QWidget):
         elif now.total:
             words.append(f"{now.done / now.total:.0%}")
         if now.paused:
-            words.append("PAUSED, light off")
+            words.append(f"PAUSED{self._when_paused}")
         elif now.seconds_left is not None:
             words.append(f"{'at most ' if now.at_most else ''}{duration(now.seconds_left)} left")
         self.words.setText(", ".join(words))

@@ -13,9 +13,11 @@ import numpy.typing as npt
 from matplotlib import cbook
 
 from drivers.device import DriverOptions
+from drivers.simulated.living import POWER, LivingLight
 from drivers.simulated.options import PRESETS, Preset, WorldOptions
 from drivers.simulated.scene_light import SceneLight
 from drivers.simulated.surroundings import Surroundings
+from recon.optics.animal import Animal, draw_animal
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.fall_off import (
     FallOff,
@@ -134,7 +136,14 @@ class SimulatedWorld(Surroundings):
         self._cache: OrderedDict[Any, Image] = OrderedDict()
         self._emission: Rgb = (0.0, 0.0, 0.0)
         self._carrier: Callable[[], Position] = lambda: (0.0, 0.0, 1e3 * preset.source_distance_mm)
-        self._scene = make_scene(options, preset, self.distance_um)
+        self.animal: Animal | None = None
+        """What lives, where the scene does."""
+        if options.scene == "animal":
+            self.animal = draw_animal(*_place(options, preset, self.distance_um), options.seed)
+        self._living: dict[tuple[Rgb, int], LivingLight] = {}
+        self._born_s: float | None = None
+        alive = self.animal
+        self._scene = alive.scene(POWER) if alive else make_scene(options, preset, self.distance_um)
         self._scene_number = 0
         self._scene_light: SceneLight | None = None
         self._screen: tuple[Scene, ...] = ()
@@ -249,9 +258,12 @@ class SimulatedWorld(Surroundings):
             light = picture if light is None else light + picture
         if self.scene_lit and scene is not None:
             seen = product(self._glow(self.options.scene_rgb), weights)
-            picture = self._cached(
-                ("scene", number, seen, binning), lambda: self._render(scene, seen, binning)
-            )
+            if self.animal is not None:
+                picture = self._alive(self.animal, seen, binning)
+            else:
+                picture = self._cached(
+                    ("scene", number, seen, binning), lambda: self._render(scene, seen, binning)
+                )
             light = picture if light is None else light + picture
         leds = self._scene_light
         if leds is not None and scene is not None:
@@ -274,6 +286,19 @@ class SimulatedWorld(Surroundings):
             settings=RenderSettings(spectral_samples=self.options.spectral_samples),
         )
 
+    def _alive(self, animal: Animal, seen: Rgb, binning: int) -> Image:
+        with self._lock:
+            if (seen, binning) not in self._living:
+                self._living[seen, binning] = LivingLight(self, animal, seen, binning)
+            return self._living[seen, binning].at(self.alive_s)
+
+    @property
+    def alive_s(self) -> float:
+        """Simulated seconds since the animal was first seen."""
+        if self._born_s is None:
+            self._born_s = self.clock.now_s
+        return self.clock.now_s - self._born_s
+
     def light_key(self) -> tuple[Any, ...]:
         """Something that changes whenever :meth:`photons_per_s` does."""
         glow = self.emission
@@ -282,6 +307,8 @@ class SimulatedWorld(Surroundings):
         key: tuple[Any, ...] = (place, glow, self._scene_number if self.scene_lit else None)
         if self._screen:
             key = (*key, "screen", *self._screen)
+        if self.scene_lit and self.animal is not None:
+            key = (*key, self.alive_s)
         return key if self._scene_light is None else (*key, self._scene_number, self._scene_light)
 
     # The scene and the truth about it ---
@@ -293,7 +320,7 @@ class SimulatedWorld(Surroundings):
     def set_scene(self, scene: Scene | None) -> None:
         """Put another scene in front of the camera (None: nothing)."""
         with self._lock:
-            self._scene = scene
+            self._scene, self.animal = scene, None
             self._scene_number += 1
             for key in [key for key in self._cache if key[0] == "scene"]:
                 del self._cache[key]

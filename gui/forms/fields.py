@@ -294,7 +294,7 @@ class EntryField(OptionField):
         empty = default_shown(option) or ("none" if optional else "")
         self.widget: Entry = Entry(self._understood, self.tip, empty)
         self.whole = self.widget
-        if option.kinds == (Path,):
+        if Path in (option.item, *option.kinds[:1]) and len(option.kinds) == 1:
             browse = "folder" if option.declaration.metavar == "FOLDER" else behaviour.browse
             self.whole = path = PathEntry(self.widget, browse, behaviour.filters)
             path.button.setAccessibleName(f"Choose {self.bare_label}")
@@ -324,6 +324,8 @@ class EntryField(OptionField):
         said = self.option.declaration
         if said.parse_all is not None:
             return re.split(r"[,;]?\s+", text)
+        if self.option.item is Path:
+            return [part.strip() for part in text.split(";") if part.strip()]
         if said.parse is None:
             has_parts = self.option.item is not None or isinstance(self.option.default, tuple)
             return text.replace(",", " ").split() if has_parts else text
@@ -346,7 +348,10 @@ class EntryField(OptionField):
         return self.widget.text()
 
     def _set(self, value: Any) -> None:
-        self.widget.setText("" if value is None else shown(self.option, value))
+        if self.option.item is Path:
+            self.widget.setText("; ".join(map(str, value or ())))
+        else:
+            self.widget.setText("" if value is None else shown(self.option, value))
 
 
 class LinesField(OptionField):

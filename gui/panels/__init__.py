@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from importlib import import_module
 from typing import Literal, NamedTuple
+
+from PySide6.QtWidgets import QWidget
 
 from gui.panel import Panel
 from gui.panels.unserved import UnservedPanel, why_not
@@ -30,13 +32,26 @@ class PanelEntry(NamedTuple):
     tried_on: str = "default"
     """The simulated bench that serves it, one of ``instrument.bench.config_file.TEMPLATES``."""
 
-    def made(self, session: BenchSession) -> Panel:
-        """Import the panel's class and return one of it, or say why this bench cannot serve it."""
-        if why := why_not(session, self.title, self.needs, self.tried_on):
-            return UnservedPanel(session, self.title, why, self.tried_on)
+    def load(self) -> type[Panel]:
+        """Return the panel's class, with all that it needs imported and compiled; for any thread."""
         module, _, name = self.place.partition(":")
-        panel: Panel = getattr(import_module(module), name)(session)
+        kind: type[Panel] = getattr(import_module(module), name)
+        kind.prepare()
+        return kind
+
+    def slices(self, session: BenchSession) -> Generator[None, None, Panel]:
+        """Make the panel, with a ``yield`` after each of its parts, and return it."""
+        panel: Panel
+        if why := why_not(session, self.title, self.needs, self.tried_on):
+            panel = UnservedPanel(session, self.title, why, self.tried_on)
+        else:
+            panel = self.load()(session)
         panel.title = self.title
+        yield
+        yield from panel.parts()
+        for part in panel.findChildren(QWidget):  # what showing it first would do in one go
+            part.ensurePolished()
+            yield
         return panel
 
 
@@ -85,6 +100,13 @@ PANELS: Mapping[str, PanelEntry] = {
         "centre",
         "Ctrl+Shift+H",
         "Compute a hologram, show it, photograph it",
+    ),
+    "tasks": PanelEntry(
+        "Files",
+        "gui.panels.tasks:TasksPanel",
+        "centre",
+        "Ctrl+Shift+F",
+        "All that is done with files: verify, export, analyse, compare, videos, activity, charts, maps",
     ),
     "charts": PanelEntry(
         "Charts", "gui.panels.charts:ChartsPanel", "centre", "Ctrl+Shift+C", "Where methods fail"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -53,6 +54,10 @@ class ReconstructionsPanel(Panel):
         self._explaining: Job | None = None
         self._opening: Job | None = None
         self._first_picture = True
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
+        session = self.session
         self.list = QListWidget()
         self.list.setToolTip("Reconstructions in the data folder, the newest first (Enter opens)")
         self.list.setAlternatingRowColors(True)
@@ -63,16 +68,21 @@ class ReconstructionsPanel(Panel):
         self.refresh_button = button("Refresh", "Look into the data folder again", self.refresh)
         tip = "Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)"
         self.export_button = button("Export…", tip, self._choose_export, enabled=False)
+        yield
         self.form = ReconstructForm()
         self.form.asked.connect(self.reconstruct)
         self.form.questioned.connect(self.explain)
         self.form.stopped.connect(self._stop)
         self.form.refused.connect(self.refused)
+        yield
         self.picture = PictureView()
+        yield
         self.volume = VolumeView(self.jobs)
         self.volume.failed.connect(lambda why: self.refused(None, why))
+        yield
         self.facts = FactsView()
         self.convergence = ConvergenceView()
+        yield
         self.heading = label(selectable=True)
         self.place = label(role="dim")
         self.place.setAlignment(Qt.AlignmentFlag.AlignRight)
@@ -84,7 +94,7 @@ class ReconstructionsPanel(Panel):
         self.viewers = QStackedWidget()
         for widget in (empty, self.picture, self.volume):
             self.viewers.addWidget(widget)
-        self._arrange()
+        yield from self._arrange()
         session.run_finished.connect(lambda _: self.refresh())
         folder = self.session.runs_folder / "reconstructions"
         self._names = SuggestedName(self.jobs, self.form.options, folder, ".tif")
@@ -94,12 +104,15 @@ class ReconstructionsPanel(Panel):
         self.form.options.settled.connect(self._settled)
         self.refresh()
 
-    def _arrange(self) -> None:
+    def _arrange(self) -> Iterator[None]:
         buttons = in_row(self.open_button, self.refresh_button, self.export_button)
         results = fill(QWidget(), (self.list, 1), buttons, margins=(0, 6, 0, 0))
         self.tabs = tabs({"Results": results, "Reconstruct": self.form})
+        yield
         below = split(self.facts, self.convergence, sizes=[330, 330])
+        yield
         top = fill(QWidget(), in_row(self.heading, (self.place, 1)), (self.viewers, 1))
+        yield
         right = split(top, below, sizes=[520, 170], down=True, stretch=1)
         right.setStretchFactor(0, 3)
         fill(self.body, split(self.tabs, right, sizes=[330, 840], stretch=1))

@@ -24,12 +24,12 @@ from instrument.cli.app import (
     examples,
     naming_as_is,
     open_and_say,
-    saying_what_is_left,
 )
 from instrument.cli.progress import keys, one_task
 from instrument.files.errors import duration, size
 from instrument.runs.recorder import RecordingOptions, RecordingStatus, prepare_recording
 from instrument.runs.run import Run
+from instrument.tasks.task import saying_what_is_left
 from recon.base.declare import option
 
 snap_app, record_app = App(), App()
