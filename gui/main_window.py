@@ -15,7 +15,6 @@ from PySide6.QtWidgets import (
     QMenu,
     QMessageBox,
     QProgressBar,
-    QPushButton,
     QSizePolicy,
     QToolBar,
     QToolButton,
@@ -30,6 +29,7 @@ from gui.panels.unserved import UnservedPanel
 from gui.session import BenchSession
 from gui.session_news import OperatorRequest, name_of
 from gui.theme import THEMES, apply_theme, colours
+from gui.way_on import ReconnectButton
 from gui.widgets.building import PanelPlace, button, fill, label, tabs
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
@@ -60,12 +60,12 @@ class DeviceChips(QWidget):
         super().__init__(parent)
         self._session = session
         self.chips: dict[str, QToolButton] = {}
-        self.reconnect_buttons: dict[str, QPushButton] = {}
+        self.reconnect_buttons: dict[str, ReconnectButton] = {}
         for kind in session.kinds:
             chip = QToolButton()
             chip.setAutoRaise(True)
             chip.clicked.connect(partial(self._show_all, kind))
-            again = button("Reconnect", f"Open the {name_of(kind)} again", partial(session.reconnect, kind))
+            again = ReconnectButton(session, kind, self, "Reconnect")
             self.chips[kind], self.reconnect_buttons[kind] = chip, again
             self.show_state(kind)
         pairs = zip(self.chips.values(), self.reconnect_buttons.values(), strict=True)
@@ -83,7 +83,6 @@ class DeviceChips(QWidget):
         chip.setText(f"● {name_of(kind)}{word}")
         chip.setStyleSheet(f"color: {colour}; border: none; padding: 2px 4px;")
         chip.setToolTip(state.text or state.condition)
-        self.reconnect_buttons[kind].setVisible(state.condition == "failed")
 
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""
