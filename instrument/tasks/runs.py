@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from instrument.files.errors import BenchError
 from instrument.files.volumes import is_zarr_name, uneven_steps
 from instrument.runs.export import export as export_run
 from instrument.runs.inspection import verify as verify_run
@@ -53,7 +54,7 @@ def _slice(text: str) -> slice:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """What is written where, and how fast a film plays."""
+    """What is written where, how fast a film plays, and on which voxels a volume lies."""
 
     run: Path = option(
         help="The run's folder; or a reconstruction's file.", metavar="RUN|RESULT", positional=True
@@ -79,13 +80,26 @@ class ExportOptions:
         flags=("--fps",),
         applies=("run",),
     )
+    metric: bool = option(
+        False,
+        help="On voxels of one size, upright: each plane of a reconstruction has a pitch of its own.",
+        applies=("volume",),
+    )
+    voxel_um: float | None = option(
+        None,
+        help="Edge of the voxels, cubes, with --metric.",
+        default_words="the middle plane's pixels and the step beside it",
+        unit="um",
+        above=0,
+        applies=("volume",),
+    )
 
 
 @task(
     "diffuserbench export RUN psfs.ome.tif --label psf",
     "diffuserbench export RUN video.mp4",
     "diffuserbench export RUN frames/ --frames 0:100",
-    "diffuserbench export volume.tif volume.ome.zarr",
+    "diffuserbench export volume.tif volume.ome.zarr --metric",
 )
 def export(desk: Desk, options: ExportOptions, given: Given) -> Done:
     """Write a run's stored frames, or a reconstruction, for other programs; what is there stays as it is.
@@ -93,8 +107,8 @@ def export(desk: Desk, options: ExportOptions, given: Given) -> Done:
     Frames that are not there (gaps of a recording, steps not done) are left out, and said.
     """
     if _is_result(options.run):
-        given.refuse("a reconstruction", "reconstruction")
-        return _export_result(desk, options.run, options.out)
+        return _export_result(desk, options, given)
+    given.refuse("a run", "run")
     found, out = Run.open(options.run), options.out
     wanted = set(range(found.n_frames)[options.frames or slice(None)])
     if options.label is not None:
@@ -113,11 +127,18 @@ def _is_result(path: Path) -> bool:
     return path.is_file() or is_zarr_name(path)
 
 
-def _export_result(desk: Desk, path: Path, target: Path) -> Done:
+def _export_result(desk: Desk, options: ExportOptions, given: Given) -> Done:
     from instrument.reconstruction.stored_result import export_result, open_result
 
-    result = open_result(path)
+    result, target = open_result(options.run), options.out
     try:
+        kind = "picture" if result.volume is None else "volume"
+        given.refuse(f"a {kind}", kind)
+        if options.voxel_um is not None and not options.metric:
+            raise BenchError("--voxel-um is the size of --metric's voxels: give --metric too.")
+        if options.metric:
+            result = result.metric(options.voxel_um)
+            desk.fact("Voxels", result.voxels_in_words())
         with desk.step("Planes") as advance:
             export_result(result, target, advance=advance)
         steps = "" if result.planes_um is None else uneven_steps(result.planes_um[0])
