@@ -204,7 +204,7 @@ def _of_voxels(grid: Grid) -> str:
     """Say what the one voxel size of an OME file stands for."""
     if grid.is_metric:
         return "All voxels have one size; rows and columns go with y and x; values are light a voxel."
-    if not _voxel_um(grid):
+    if not voxel_um(grid):
         return "The size of the voxels is not known."
     return (
         "Perspective grid: voxels of plane z are pitch_um[z] wide, and the scale is the middle plane's. The "

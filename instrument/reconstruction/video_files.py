@@ -13,7 +13,7 @@ import numpy.typing as npt
 from drivers.frame import FrameMetadata
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import FileError
-from instrument.files.volumes import known, ome_attributes, voxel_um
+from instrument.files.volumes import grid_facts, ome_attributes, voxel_um
 from instrument.runs.run import Run
 
 STILL = {"um": 0.5, "mrad": 0.02}
@@ -77,7 +77,7 @@ def _stands(positions: Sequence[Mapping[str, float]]) -> bool:
 if TYPE_CHECKING:
     import zarr
 
-    from recon.reconstruction.result import Grid
+    from recon.camera.grid import Grid
 
 Floats = npt.NDArray[np.float32]
 
@@ -101,7 +101,8 @@ def create_output(
         From frame to frame.
     grid : Grid, optional
         Where the pixels lie in the object. One voxel size holds for all planes: the middle one's, as of a
-        volume; each plane's own stand in the attribute ``diffuserbench``.
+        volume; what :func:`~instrument.files.volumes.grid_facts` says stands in
+        the attribute ``diffuserbench``.
     attributes : dict
         JSON-compatible, for the attribute ``diffuserbench``.
     """
@@ -122,7 +123,7 @@ def create_output(
     )
     steps: dict[str, float | None] = {"t": period_s}
     if grid is not None:
-        attributes = attributes | {"z_um": known(grid.z_um), "pitch_um": known(grid.pitch_um)}
+        attributes = attributes | grid_facts(grid)
         pitch = float(grid.pitch_um[0])
         steps |= voxel_um(grid) if deep else dict.fromkeys("yx", pitch if np.isfinite(pitch) else None)
     group.attrs["ome"] = ome_attributes(path.name, names, steps)
