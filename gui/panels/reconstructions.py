@@ -59,6 +59,7 @@ class ReconstructionsPanel(Panel):
         """Make the widgets."""
         session = self.session
         self.list = QListWidget()
+        self.list.setAccessibleName("Reconstructions")
         self.list.setToolTip("Reconstructions in the data folder, the newest first (Enter opens)")
         self.list.setAlternatingRowColors(True)
         self.list.itemActivated.connect(self._open_item)

@@ -192,6 +192,7 @@ def choice(
     made = QComboBox()
     made.addItems(list(words))
     made.setToolTip(tip)
+    made.setAccessibleName(tip)
     if chosen is not None:
         made.currentIndexChanged.connect(chosen)
     return made
@@ -225,6 +226,7 @@ def text_view(text: str = "", tip: str = "") -> QPlainTextEdit:
     made = QPlainTextEdit(text)
     made.setReadOnly(True)
     made.setToolTip(tip)
+    made.setAccessibleName(tip or "Text")
     return made
 
 
@@ -245,7 +247,9 @@ def table(
     made.setEditTriggers(QTableWidget.EditTrigger.NoEditTriggers)
     made.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
     made.setTabKeyNavigation(False)
+    made.setCornerButtonEnabled(False)
     made.setToolTip(tip)
+    made.setAccessibleName(tip or ", ".join(columns))
     made.verticalHeader().setDefaultSectionSize(row_px)
     header = made.horizontalHeader()
     header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
