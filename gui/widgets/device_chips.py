@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from functools import partial
 
-from PySide6.QtWidgets import QPushButton, QToolButton, QWidget
+from PySide6.QtWidgets import QToolButton, QWidget
 
 from gui.session import BenchSession
 from gui.session_news import name_of
 from gui.theme import colours
-from gui.widgets.building import button, fill, label
+from gui.way_on import ReconnectButton
+from gui.widgets.building import fill, label
 from gui.widgets.dialogues import TextWindow
 
 
@@ -20,12 +21,12 @@ class DeviceChips(QWidget):
         super().__init__(parent)
         self._session = session
         self.chips: dict[str, QToolButton] = {}
-        self.reconnect_buttons: dict[str, QPushButton] = {}
+        self.reconnect_buttons: dict[str, ReconnectButton] = {}
         for kind in session.kinds:
             chip = QToolButton()
             chip.setAutoRaise(True)
             chip.clicked.connect(partial(self._show_all, kind))
-            again = button("Reconnect", f"Open the {name_of(kind)} again", partial(session.reconnect, kind))
+            again = ReconnectButton(session, kind, self, "Reconnect")
             self.chips[kind], self.reconnect_buttons[kind] = chip, again
             self.show_state(kind)
         pairs = zip(self.chips.values(), self.reconnect_buttons.values(), strict=True)
@@ -43,7 +44,6 @@ class DeviceChips(QWidget):
         chip.setText(f"● {name_of(kind)}{word}")
         chip.setStyleSheet(f"color: {colour}; border: none; padding: 2px 4px;")
         chip.setToolTip(state.text or state.condition)
-        self.reconnect_buttons[kind].setVisible(state.condition == "failed")
 
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""
