@@ -20,6 +20,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from gui.help import help_of
 from gui.jobs import Job
 from gui.making import PanelMaker
 from gui.panel import Panel
@@ -30,7 +31,7 @@ from gui.session_news import OperatorRequest, name_of
 from gui.theme import THEMES, apply_theme
 from gui.widgets.building import PanelPlace, button, label, tabs
 from gui.widgets.device_chips import DeviceChips
-from gui.widgets.dialogues import Question
+from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.plots import restyle_all
 from gui.widgets.step_strip import StepStrip
@@ -270,6 +271,20 @@ class MainWindow(QMainWindow):
             self._add_action(bench, f"Reconnect the {name_of(kind)}", "", reconnect)
         bench.addSeparator()
         self._add_action(bench, "&Quit", "Ctrl+Q", self.close)
+        about = self.menuBar().addMenu("&Help")
+        self._add_action(about, "&This panel, and all keys", "F1", self.show_help)
+
+    def show_help(self) -> TextWindow:
+        """Show what the panel that has the keyboard is for, and every key."""
+        focused = QApplication.focusWidget()
+        current = self.tabs.currentWidget()
+        shown = [name for name, panel in self._panels.items() if focused and panel.isAncestorOf(focused)]
+        shown += [name for name, place in self._places.items() if place is current and name in self._panels]
+        name = next(iter(shown), "start")
+        actions = [action for menu in self.menuBar().actions() for action in menu.menu().actions()]  # type: ignore[attr-defined]
+        window = TextWindow("Help", help_of(name, self.panel(name), focused, actions), self)
+        window.show()
+        return window
 
     def _add_action(self, menu: QMenu, words: str, keys: str, call: Callable[[], object]) -> QAction:
         action = QAction(words, self)

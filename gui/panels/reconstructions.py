@@ -20,7 +20,7 @@ from gui.panel import Panel
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
 from gui.theme import as_shown
-from gui.widgets.building import button, fill, in_row, label, split, tabs
+from gui.widgets.building import Hint, button, fill, in_row, label, split, tabs
 from gui.widgets.dialogues import Question, choose_path
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
@@ -90,8 +90,11 @@ class ReconstructionsPanel(Panel):
         self.place.setMinimumWidth(10)
         for hovered in (self.picture.hovered, self.volume.hovered):
             hovered.connect(self.place.setText)
-        empty = label("Open a result on the left, or reconstruct one.", "dim")
-        empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        empty = Hint(
+            "Nothing is open: choose a result on the left, or reconstruct a photograph.",
+            "Reconstruct…",
+            lambda: self.tabs.setCurrentWidget(self.form),
+        )
         self.viewers = QStackedWidget()
         for widget in (empty, self.picture, self.volume):
             self.viewers.addWidget(widget)

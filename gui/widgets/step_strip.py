@@ -72,6 +72,9 @@ class StepStrip(QFrame):
         if self.button.text() != self.step.answer:
             self.button.setText(self.step.answer)
         self.button.setVisible(bool(self.step.answer) and not running and not waits)
+        layout = self.layout()
+        assert layout is not None
+        layout.activate()  # never a word cut off for a moment
 
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
         """Show as much of the sentence as there is room for."""
