@@ -13,6 +13,7 @@ import numpy.typing as npt
 from PySide6.QtGui import QHideEvent
 from PySide6.QtWidgets import QComboBox, QWidget
 
+from drivers.frame import FrameMetadata
 from gui.background import LiveFollower, NewestOnly
 from gui.forms.options_form import FOLDED, OptionsForm
 from gui.jobs import Job, JobContext
@@ -24,6 +25,7 @@ from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.files.errors import BenchError, duration
+from instrument.live.light_log import NOTHING_LIT
 from instrument.live.live import LiveResult
 from instrument.reconstruction.job import find_calibration
 from recon.base.declare import Imports, expression, options_of
@@ -205,6 +207,7 @@ class LiveReconstructionPanel(Panel):
         job = self.session.jobs.compute("Preparing the preview", work)
         job.quiet = True
         self._loading = job
+        self._call_old("another preview is being prepared")
         job.succeeded.connect(lambda value: self._ready(job, value))
         job.failed.connect(lambda why: self._not_ready(job, why))
         job.ended.connect(lambda: self._not_loading(job))
@@ -284,14 +287,27 @@ class LiveReconstructionPanel(Panel):
         self._log_new(() if how is None else how.warnings)
         rate = "" if how is None or not how.pictures_per_s > 0 else f", {how.pictures_per_s:.1f} pictures/s"
         passed = "" if how is None else f", {how.passed_over} frames passed over"
-        self.view.caution_against(result.picture.doubt)
+        self.view.caution_against(self._doubt(result))
+        self.view.set_caption(self._caption(result.metadata))
         self.status.setText(f"latency {result.latency_ms:.0f} ms{rate}{passed}\n{result.picture.quality}")
 
     def _call_old(self, why: str) -> None:
         """Say over the picture that it stays while no other comes: of frames, or of the preview."""
         if self._shown is not None:
-            doubt = self._shown.picture.doubt
-            self.view.caution_against(". ".join(filter(None, (f"Old picture: {why}", doubt))))
+            doubt = self._doubt(self._shown)
+            self.view.caution_against(". ".join(filter(None, (f"Old picture: {why}", doubt))), old=True)
+
+    def _doubt(self, result: LiveResult) -> str:
+        """Return what is doubtful about a picture: by its pixels, and by what lit its frame."""
+        lit = self.session.lights.during(result.metadata)
+        if lit == NOTHING_LIT and not result.picture.doubt:
+            return "Its frame was taken with nothing lit"
+        return result.picture.doubt
+
+    def _caption(self, frame: FrameMetadata) -> str:
+        """Say of which frame a picture is, and with which calibration it was made."""
+        made = "" if self.loaded is None else f", calibration: {self.loaded.path.parent.name}"
+        return self.session.describe_frame(frame) + made
 
     def _log_new(self, warnings: tuple[str, ...]) -> None:
         """Write each warning into the log once."""
@@ -353,10 +369,14 @@ class LiveReconstructionPanel(Panel):
         job = self.session.jobs.compute("Refining the newest frame", work)
         self._refining = job
         self.refine_button.setText("■ End")
-        self.view.caution_against("" if self._shown is None else self._shown.picture.doubt)
+        self.view.caution_against(
+            f"In the making, from the frame of {frame.metadata.utc.astimezone():%H:%M:%S}"
+        )
+        self.view.set_caption(self._caption(frame.metadata))
         self.status.setText(f"Refining frame {frame.metadata.frame_id} …")
         job.progressed.connect(self._refined_so_far)
         job.succeeded.connect(self._refined)
+        job.succeeded.connect(lambda _: self.view.caution_against(self._refined_doubt(frame.metadata)))
         job.failed.connect(lambda why: self.refused(None, why))
         job.ended.connect(self._refining_ended)
 
@@ -374,6 +394,15 @@ class LiveReconstructionPanel(Panel):
             self.status,
             f"Refined: {result.solver} with {result.prior}, {len(result.history)} iterations, "
             f"{result.seconds:.1f} s, {result.stop_reason}. {' '.join(result.warnings)}",
+        )
+
+    def _refined_doubt(self, frame: FrameMetadata) -> str:
+        """Return what was doubtful about the frame that was refined, as its preview had it."""
+        shown = self._shown
+        if shown is not None and shown.metadata.frame_id == frame.frame_id:
+            return self._doubt(shown)
+        return (
+            "Its frame was taken with nothing lit" if self.session.lights.during(frame) == NOTHING_LIT else ""
         )
 
     def _refining_ended(self) -> None:

@@ -327,7 +327,12 @@ def _read_frame(run: Run, index: int) -> _Picture | str:
     except Exception as error:  # noqa: BLE001 - a damaged file is named, whatever it raises
         return str(error)
     low, high = usual_levels(image)
-    words = [f"Frame {index} of {run.n_frames}", f"{metadata.exposure_ms:.4g} ms", metadata.led_pattern or ""]
+    words = [
+        f"Frame {index} of {run.n_frames}",
+        f"{metadata.utc.astimezone():%Y-%m-%d %H:%M:%S}",
+        f"{metadata.exposure_ms:.4g} ms",
+        metadata.led_pattern or "",
+    ]
     place = ", ".join(_axis_words(axis, value) for axis, value in (metadata.stage_position or {}).items())
     return _Picture(
         image,

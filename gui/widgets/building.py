@@ -166,8 +166,9 @@ class Hint(QWidget):
         fill(self, None, *parts, None, margins=(16, 8, 16, 8), spacing=10)
 
     def say(self, words: str) -> None:
-        """Say something else."""
+        """Say something else, to which nothing is to be done here."""
         self.words.setText(words)
+        self.button.hide()
 
 
 def label(
