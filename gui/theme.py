@@ -227,6 +227,7 @@ QPushButton#primary:focus {{ border: 2px solid {c.text}; padding: 3px 12px; }}
 QPushButton#primary:disabled {{ background: {c.field}; color: {unused}; border-color: {c.line}; }}
 QLabel#simulated, QLabel#caution {{ background: {c.badge}; color: {c.badge_text}; font-weight: 800;
   border: 1px solid {c.warning}; padding: 3px 10px; border-radius: 4px; letter-spacing: 1px; }}
+QLabel#caption {{ background: {c.panel}; color: {c.text}; padding: 2px 8px; border-radius: 4px; }}
 QFrame#jog-pad {{ background: {c.field}; border: 1px dashed {c.border}; border-radius: 5px; }}
 QFrame#jog-pad[active="true"] {{ border: 2px solid {c.accent}; }}
 QFrame#strip {{ background: {c.panel}; border-bottom: 1px solid {c.line}; }}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from pathlib import Path
 
@@ -46,6 +47,26 @@ def test_it_opens_running_with_the_scene_lit(qtbot: QtBot, live: LivePanel) -> N
         lambda: "camera" in live.status.text() and "dropped 0" in live.status.text(), timeout=WAIT_MS
     )
     qtbot.waitUntil(lambda: float(live.picture.frame.image.mean()) > 50, timeout=WAIT_MS)  # type: ignore[union-attr]
+
+
+def test_the_picture_says_when_it_was_taken_in_what_light_and_when_it_is_old(
+    qtbot: QtBot, live: LivePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view = live.picture.view
+    qtbot.waitUntil(lambda: "light: scene" in view.caption, timeout=WAIT_MS)
+    assert view.caption.endswith("SIMULATED")
+    assert re.match(r"\d\d:\d\d:\d\d, 10 ms", view.caption)
+    live.switch_light(LightState.SOURCE)
+    qtbot.waitUntil(lambda: view.caption.endswith("light: point source, SIMULATED"), timeout=WAIT_MS)
+    monkeypatch.setattr("gui.panels.live._PATIENCE_S", 0.0)
+    live.toggle_live()
+    qtbot.waitUntil(lambda: view.caution.startswith("Held for"), timeout=WAIT_MS)
+    live.session.live_wanted = True  # as while the camera is lost
+    live.count()
+    assert view.caution.startswith("Old picture")
+    assert view.item.opacity() < 0.5
+    live.session.start_live()
+    qtbot.waitUntil(lambda: not view.caution and view.item.opacity() == 1.0, timeout=WAIT_MS)
 
 
 def test_exposure_typed_reaches_the_camera_and_is_read_back(qtbot: QtBot, live: LivePanel) -> None:
