@@ -15,7 +15,6 @@ from PySide6.QtWidgets import (
     QMenu,
     QMessageBox,
     QProgressBar,
-    QPushButton,
     QSizePolicy,
     QToolBar,
     QToolButton,
@@ -30,10 +29,12 @@ from gui.panels.unserved import UnservedPanel
 from gui.session import BenchSession
 from gui.session_news import OperatorRequest, name_of
 from gui.theme import THEMES, apply_theme, colours
+from gui.way_on import ReconnectButton
 from gui.widgets.building import PanelPlace, button, fill, label, tabs
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.plots import restyle_all
+from gui.widgets.step_strip import StepStrip
 from instrument.bench.config import BenchConfig
 
 _AREAS = {
@@ -59,12 +60,12 @@ class DeviceChips(QWidget):
         super().__init__(parent)
         self._session = session
         self.chips: dict[str, QToolButton] = {}
-        self.reconnect_buttons: dict[str, QPushButton] = {}
+        self.reconnect_buttons: dict[str, ReconnectButton] = {}
         for kind in session.kinds:
             chip = QToolButton()
             chip.setAutoRaise(True)
             chip.clicked.connect(partial(self._show_all, kind))
-            again = button("Reconnect", f"Open the {name_of(kind)} again", partial(session.reconnect, kind))
+            again = ReconnectButton(session, kind, self, "Reconnect")
             self.chips[kind], self.reconnect_buttons[kind] = chip, again
             self.show_state(kind)
         pairs = zip(self.chips.values(), self.reconnect_buttons.values(), strict=True)
@@ -82,7 +83,6 @@ class DeviceChips(QWidget):
         chip.setText(f"● {name_of(kind)}{word}")
         chip.setStyleSheet(f"color: {colour}; border: none; padding: 2px 4px;")
         chip.setToolTip(state.text or state.condition)
-        self.reconnect_buttons[kind].setVisible(state.condition == "failed")
 
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""
@@ -159,6 +159,13 @@ class MainWindow(QMainWindow):
     def _hand_on(self, name: str, what: object) -> None:
         """Show a panel, and have it work with what another one hands on; empty: nothing."""
         self.bring(name, lambda panel: panel.take(what) if what else None)
+
+    def _take_step(self, panel: str, what: object) -> None:
+        """Go where the next step is taken."""
+        if panel == "reconnect":
+            self.session.reconnect(what)  # type: ignore[arg-type]
+        else:
+            self._hand_on(panel, what)
 
     def panel(self, name: str) -> Panel:
         """Return a panel of the table, made now if it was not yet."""
@@ -256,6 +263,15 @@ class MainWindow(QMainWindow):
         bar.addWidget(self.stop_button)
         bar.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
         self.addToolBar(Qt.ToolBarArea.TopToolBarArea, bar)
+        self.strip = StepStrip(self.session)
+        self.strip.wanted.connect(self._take_step)
+        below = QToolBar("What comes next")
+        below.setObjectName("next-bar")
+        below.setMovable(False)
+        below.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
+        below.addWidget(self.strip)
+        self.addToolBarBreak(Qt.ToolBarArea.TopToolBarArea)
+        self.addToolBar(Qt.ToolBarArea.TopToolBarArea, below)
 
     def _make_status_bar(self) -> None:
         self.job_label = label("Ready")
@@ -273,7 +289,9 @@ class MainWindow(QMainWindow):
             action = self._add_action(view, entry.title, entry.shortcut, partial(self.bring, name))
             action.setToolTip(entry.tip)
         theme = self.menuBar().addMenu("&Theme")
-        for number, (name, words) in enumerate((("dark", "&Dark"), ("red", "&Red, for the dark room"))):
+        for number, (name, words) in enumerate(
+            (("dark", "&Dark"), ("red", "&Red, for the dark room"), ("light", "&Light"))
+        ):
             self._add_action(theme, words, f"Ctrl+Shift+{number + 1}", partial(self.set_theme, name))
         camera = self.menuBar().addMenu("&Camera")
         for words, keys, what in (

@@ -131,6 +131,7 @@ class BenchSession(QObject):
                 self._open_one(kind)
 
         job = self.jobs.exclusive("Opening the bench", work)
+        job.quiet = not self.kinds
         job.ended.connect(self._all_tried)
         return job
 

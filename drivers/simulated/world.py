@@ -104,6 +104,7 @@ Rgb = tuple[float, float, float]
 Image = npt.NDArray[np.float32]
 
 CACHE_BYTES = 256 << 20
+BAND_WEIGHTS: tuple[Rgb, Rgb, Rgb] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class SimulatedWorld(Surroundings):
@@ -224,7 +225,7 @@ class SimulatedWorld(Surroundings):
         """
         # A nanometre decides nothing; without rounding no two visits of a place would share their picture.
         source = (round(source_um[0], 3), round(source_um[1], 3), round(source_um[2], 3))
-        return self._cached(("psf", source, weights, binning), lambda: self._psf(source, weights, binning))
+        return self._mixed(("psf", source), weights, binning, lambda band: self._psf(source, band, binning))
 
     def _psf(self, source: Position, weights: Rgb, binning: int) -> Image:
         grid = self.sensor_grid(binning)
@@ -239,6 +240,19 @@ class SimulatedWorld(Surroundings):
         light *= response_on(grid, source, self.distance_um, self.fall_off)
         return light
 
+    def _mixed(
+        self, what: tuple[Any, ...], weights: Rgb, binning: int, make: Callable[[Rgb], Image]
+    ) -> Image:
+        """Return light in proportions of the bands; each band's is computed once, whichever pixel asks."""
+        total: Image | None = None
+        for band, weight in zip(BAND_WEIGHTS, weights, strict=True):
+            if weight:
+                light = self._cached((*what, band, binning), partial(make, band))
+                if weight != 1:
+                    light = light * np.float32(weight)
+                total = light if total is None else total + light
+        return np.zeros(self.sensor_grid(binning).shape, np.float32) if total is None else total
+
     def photons_per_s(self, weights: Rgb, binning: int = 1) -> Image | None:
         """Photons a second on every binned pixel now, or None when all is dark."""
         light = None
@@ -252,27 +266,30 @@ class SimulatedWorld(Surroundings):
         with self._lock:
             scene, number = self._scene, self._scene_number
         for shown in self._screen:
-            picture = self._cached(
-                ("screen", shown, weights, binning), partial(self._render, shown, weights, binning)
-            )
-            light = picture if light is None else light + picture
-        if self.scene_lit and scene is not None:
-            seen = product(self._glow(self.options.scene_rgb), weights)
-            if self.animal is not None:
-                picture = self._alive(self.animal, seen, binning)
-            else:
-                picture = self._cached(
-                    ("scene", number, seen, binning), lambda: self._render(scene, seen, binning)
-                )
+            picture = self._picture(("screen", shown), shown, None, weights, binning)
             light = picture if light is None else light + picture
         leds = self._scene_light
-        if leds is not None and scene is not None:
-            seen = product(self._glow(self.options.scene_rgb), weights)
-            picture = self._cached(
-                ("scene", number, seen, binning, leds), lambda: self._render(leds.on(scene), seen, binning)
-            )
-            light = picture if light is None else light + picture
+        for lit in ((None,) if self.scene_lit else ()) + (() if leds is None else (leds,)):
+            if scene is not None:
+                seen = product(self._glow(self.options.scene_rgb), weights)
+                if lit is None and self.animal is not None:
+                    picture = self._alive(self.animal, seen, binning)
+                else:
+                    picture = self._picture(("scene", number, lit), scene, lit, seen, binning)
+                light = picture if light is None else light + picture
         return light
+
+    def _picture(
+        self, what: tuple[Any, ...], scene: Scene, leds: SceneLight | None, weights: Rgb, binning: int
+    ) -> Image:
+        """Return light of a scene that glows, or is lit by LEDs: at once where all is grey, else by bands."""
+
+        def render_in(seen: Rgb) -> Image:
+            return self._render(scene if leds is None else leds.on(scene), seen, binning)
+
+        if scene.grey and (leds is None or leds.grey):
+            return self._cached((*what, weights, binning), lambda: render_in(weights))
+        return self._mixed(what, weights, binning, render_in)
 
     def _render(self, scene: Scene, weights: Rgb, binning: int) -> Image:
         return render(

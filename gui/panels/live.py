@@ -64,6 +64,7 @@ class LivePanel(Panel):
         self._shown_at: deque[float] = deque(maxlen=400)
         self._lay_out()
         session.device_changed.connect(self._device_changed)
+        self.offer_reconnect("camera")
         every(self, _LOOK_MS, self.look).setTimerType(Qt.TimerType.PreciseTimer)
         every(self, _STATISTICS_MS, self.count)
 

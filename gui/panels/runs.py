@@ -13,7 +13,7 @@ from PySide6.QtCore import QFileSystemWatcher, QSignalBlocker, Qt, QUrl
 from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import QSlider, QTableWidget, QWidget
 
-from calibration_routines.plan_procedures import ResumeProcedure, lacks_result
+from calibration_routines.plan_procedures import ResumeProcedure, can_go_on
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
 from gui.panel import Panel
@@ -94,6 +94,8 @@ class RunsPanel(Panel):
         self.run.succeeded.connect(
             lambda outcome: self.bar.show_end("; ".join(outcome.verdict), complete=outcome.good)
         )
+        for early in (self.run.ended_early, self.run.failed):
+            early.connect(lambda ended: self.bar.show_end(ended.words.splitlines()[0], complete=False))
         self.run.over.connect(self._over)
         self.read_folder()
 
@@ -120,7 +122,7 @@ class RunsPanel(Panel):
         if isinstance(opened, str):
             self._close_run(opened)
             return
-        run = self.opened = opened.run
+        self.opened = opened.run
         middle = len(opened.stored) // 2  # the first ones are dark
         with QSignalBlocker(self.slider):
             self.slider.setEnabled(len(opened.stored) > 1)
@@ -128,7 +130,7 @@ class RunsPanel(Panel):
             self.slider.setValue(middle)
         self._stored = opened.stored
         self.about.setPlainText("\n".join(opened.about))
-        self._can_resume = opened.can_resume and run.condition is not RunCondition.RUNNING
+        self._can_resume = opened.can_resume
         self.bar.set_startable("" if self._can_resume else "There is nothing to go on with.")
         self.folder_button.setEnabled(True)
         self.verify_button.setEnabled(True)
@@ -295,13 +297,12 @@ def _look_into(path: Path, *, read: bool = False, on_progress: Progress | None =
     try:
         run = Run.open(path)
         looked = verify(run, on_progress, read=read)
-        left = bool(looked.remedy()) or run.condition is RunCondition.CRASHED
-        whole = run.plan is None or run.condition is RunCondition.COMPLETED
-        can_resume = left or not whole or lacks_result(run.path)
         about = _about(run, looked)
         if read:
             about.insert(2, f"{looked.frames} frames read back: {'sound' if looked.is_sound else 'DAMAGED'}")
-        return _Opened(run, sorted(run.records), about, can_resume, (path / SWEEP.result).is_dir())
+        return _Opened(
+            run, sorted(run.records), about, can_go_on(run, looked), (path / SWEEP.result).is_dir()
+        )
     except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is shown
         return str(error)
 

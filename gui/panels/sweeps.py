@@ -115,6 +115,9 @@ class SweepsPanel(ProcedurePanel):
 
     def began(self) -> None:
         """Clear the last sweep."""
+        self._shown = None
+        self.frame.clear()
+        self.frame_words.setText("No frame yet.")
         self.psfs.clear()
         self.picture.clear()
         self._pictures = PsfPictures()

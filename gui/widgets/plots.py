@@ -57,9 +57,14 @@ def restyle_all(root: QWidget) -> None:
             widget.restyle()
 
 
+_DASHES = (Qt.PenStyle.SolidLine, Qt.PenStyle.DashLine, Qt.PenStyle.DotLine, Qt.PenStyle.DashDotLine)
+"""Tell curves apart where hues cannot."""
+
+
 def curve_pen(number: int = 0, width: float = 1.5) -> Any:
     """Return the pen of the ``number``-th curve of a plot."""
-    return pg.mkPen(curve_colour(number), width=width)
+    dash = _DASHES[number % len(_DASHES)] if colours().red_light_only else Qt.PenStyle.SolidLine
+    return pg.mkPen(curve_colour(number), width=width, style=dash)
 
 
 def curve_colour(number: int) -> str:

@@ -80,7 +80,7 @@ COMMANDS: Mapping[str, Command] = {
     "reconstruct": Command(
         RECONSTRUCTION, "reconstruct the scene from a PSF and a photograph", "reconstruct"
     ),
-    "activity": Command(RECONSTRUCTION, "fluorescence over time: dF/F, regions, traces", "activity"),
+    "activity": _task(RECONSTRUCTION, "activity"),
     "analyze": _task(ANALYSIS, "analyze"),
     "compare": _task(ANALYSIS, "compare"),
     "chart": Command(ANALYSIS, "time and memory against error, for every method", "chart"),
