@@ -141,10 +141,7 @@ def opened(path: Path) -> VideoPictures:
     """Open a video; FileError where it is something else."""
     try:
         video = VideoPictures(path)
-        if (
-            video.array.ndim not in (3, 4)
-            or video.attributes["ome"]["multiscales"][0]["axes"][0]["name"] != "t"
-        ):
+        if video.axes not in ("tyx", "tcyx", "tzyx", "tczyx"):
             raise KeyError("t")
     except (FileNotFoundError, KeyError, IndexError, ValueError, TypeError) as error:
         raise FileError(path, "is no video of 'reconstruct --video'.", "See docs/video.md.") from error
