@@ -87,14 +87,16 @@ class DemoSettings:
     average: int = option(2, least=1, help="Frames averaged for PSFs.", **_HIDDEN)
     photograph_average: int = option(8, least=1, help="The same of photographs.", **_HIDDEN)
     reconstruction_s: float = option(
-        12.0,
+        60.0,
         unit="s",
         least=0.1,
         flags=("--reconstruction-s",),
         metavar="S",
         help="Time for the picture, at most; half as much for the volume.",
     )
-    chart_s: float = option(5.0, unit="s", least=0.1, help="Time for the chart of methods.", **_HIDDEN)
+    chart_s: float = option(
+        12.0, unit="s", least=0.1, help="Time for the chart of methods, at most.", **_HIDDEN
+    )
     time_scale: float = option(
         0.1, least=0, help="Real seconds per simulated second of motion and exposure.", **_HIDDEN
     )

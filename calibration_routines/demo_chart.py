@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 SMALLER = 2
 """Pixels along each side of the picture that the chart has as one: every method in seconds."""
-COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 45, 70, 100)
+COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 45)
 PRIORS = ("tv", "nonnegative")
 
 

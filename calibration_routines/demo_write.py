@@ -84,7 +84,7 @@ def _figure(done: DemoResult, viewer: Viewer, picture: Float, truth: Float) -> F
     for column, panel in enumerate(_lights(done)):
         draw_panel(figure.add_subplot(depths[0, column]), panel)
     _draw_from_above(figure.add_subplot(depths[0, 4]), done)
-    bottom = outer[2].subgridspec(1, 3, width_ratios=[1.45, 0.7, 1.0])
+    bottom = outer[2].subgridspec(1, 3, width_ratios=[1.3, 0.72, 1.15])
     axes = figure.add_subplot(bottom[0, 0])
     draw_chart(axes, done.chart.points, SECONDS, done.chart.kind.scores[0], colours_of(done.chart))
     axes.set_title(
@@ -147,8 +147,8 @@ def _coloured(seen: Float) -> npt.NDArray[np.float64]:
     """Return a volume's brightest light over depth in colours of its depth, upright, points made visible."""
     from scipy.ndimage import maximum_filter
 
-    y, x = np.ogrid[-3:4, -3:4]
-    wide = maximum_filter(seen, footprint=(y**2 + x**2 <= 9)[None])[:, ::-1, ::-1]
+    y, x = np.ogrid[-2:3, -2:3]
+    wide = maximum_filter(seen, footprint=(y**2 + x**2 < 6)[None])[:, ::-1, ::-1]
     front = wide.max(axis=0)
     white = float(np.percentile(front, 99.7)) or 1.0
     return np.asarray(srgb(in_colour_of_depth(front, wide.argmax(axis=0), len(wide), white)))
@@ -186,5 +186,5 @@ def _facts(done: DemoResult, truth: Float) -> list[tuple[str, str]]:
             "volume",
             f"{volume.solver} + {volume.prior}, {size} x {len(volume.volume)}, {volume.seconds:.1f} s",
         ),
-        ("compared", "inside the screen, linear light, one factor"),
+        ("compared", "in the screen, linear light, one factor"),
     ]

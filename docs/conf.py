@@ -31,7 +31,10 @@ suppress_warnings = [
 exclude_patterns = ["conf.py"]
 
 CHAPTERS = {
-    "Begin": ("tutorials/own-files", "tutorials/first-picture", "tutorials/*", "gallery"),
+    "Begin": (
+        *(f"tutorials/{name}" for name in ("own-files", "first-picture", "calibrate-and-analyse", "volumes")),
+        *("tutorials/own-methods", "tutorials/*", "gallery"),
+    ),
     "How to": ("how-to/*", "how-to/devices/*"),
     "Subjects": ("*",),
     "Reference": ("reference/*",),

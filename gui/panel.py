@@ -8,13 +8,15 @@ from typing import Any, ClassVar, TypeVar
 
 from PySide6.QtCore import QTimer
 from PySide6.QtGui import QGuiApplication
-from PySide6.QtWidgets import QLabel, QSizePolicy, QWidget
+from PySide6.QtWidgets import QBoxLayout, QLabel, QSizePolicy, QWidget
 
 from gui.jobs import BusyError, Job, JobRunner, Work
 from gui.session import BenchSession
 from gui.session_news import name_of
+from gui.way_on import ReconnectButton
 from gui.widgets.building import after_rest, button, every, fill, in_row, label, mark
 from gui.widgets.dialogues import elided
+from instrument.bench.config import Kind
 from instrument.files.errors import BenchError
 from recon.base.declare import Imports
 from recon.errors import InputError
@@ -83,6 +85,12 @@ class Panel(QWidget):
         for timer in self.findChildren(QTimer):
             timer.stop()
 
+    def offer_reconnect(self, kind: Kind) -> None:
+        """Have a button in the panel that opens a device again, while it has failed."""
+        own = self.layout()
+        assert isinstance(own, QBoxLayout)
+        own.insertWidget(1, ReconnectButton(self.session, kind, self))
+
     # Telling the user ----------------------------------------------------------------------------
     def refused(self, field: QWidget | None, why: str) -> None:
         """Show why something was refused: at the field, and in the panel's last line."""
@@ -140,13 +148,14 @@ class DevicePanel(Panel):
     ``show_device``.
     """
 
-    kind: ClassVar[str]
+    kind: ClassVar[Kind]
     look_ms: ClassVar[int]
 
     def watch_device(self, state: QLabel) -> None:
         """Begin to look at the device; while it is not open, ``state`` has why."""
         self._state_label = state
         self.session.device_changed.connect(self._device_changed)
+        self.offer_reconnect(self.kind)
         every(self, self.look_ms, self.look)
         self._device_changed(self.kind)
 

@@ -10,15 +10,19 @@ from typing import Any, ClassVar
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QScrollArea, QStackedWidget, QWidget
 
+from calibration_routines.plan_procedures import ResumeProcedure, left_unfinished
 from calibration_routines.procedure import Outcome, Outlook, Procedure, Routine
+from gui.background import NewestOnly
 from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
+from gui.panels.unserved import why_not
 from gui.procedure_run import Ended, ProcedureRun, RunBar, Situation, script
 from gui.session import BenchSession
 from gui.session_news import name_of
+from gui.way_on import WayOn
 from gui.widgets.building import after_rest, button, choice, fill, label, mark, scrolled, split, text_view
-from instrument.bench.config_file import other_bench_for
+from instrument.bench.config_file import TEMPLATES
 from instrument.files.errors import BenchError, SettingsError, count, duration, size
 
 _CHECK_MS = 250
@@ -93,12 +97,14 @@ class ProcedurePanel(Panel):
         self.run_bar = RunBar(self.run, self._start_words)
         tip = "Take what was measured to where it is used"
         self.use_button = button(self.use_words, tip, self._use)
-        tip = "Open the run that ended early among the runs, where it is resumed"
-        self.go_on_button = button("Go on with it…", tip, self._go_on)
-        for after in (self.use_button, self.go_on_button):
-            after.hide()
+        self.use_button.hide()
+        tip = "A simulated bench that serves this routine, in the place of this one"
+        self.other_button = button("", tip, self._open_other)
+        self.other_button.hide()
+        self.way_on = WayOn(self.session, self)
+        self.way_on.go_on.connect(self.resume)
+        self._left = NewestOnly(self.jobs, "Looking for runs that did not end")
         self._result: Path | None = None
-        self._unfinished: Path | None = None
         yield
         left = fill(
             QWidget(),
@@ -108,7 +114,8 @@ class ProcedurePanel(Panel):
             self.verdict,
             self.run_bar,
             self.use_button,
-            self.go_on_button,
+            self.way_on,
+            self.other_button,
             margins=(0, 0, 6, 0),
         )
         yield
@@ -118,6 +125,8 @@ class ProcedurePanel(Panel):
         fill(self.body, split(left, self.right, sizes=sizes, stretch=1, firm=True))
         yield
         self._started: set[str] = set()
+        self._said_at_end = ""
+        """How the last procedure ended, as long as that is shown."""
         self._check_job: Job | None = None
         self._again = False
         self._unchecked = False
@@ -134,6 +143,7 @@ class ProcedurePanel(Panel):
         session.device_changed.connect(lambda _: self._rest.start())
         session.jobs.job_ended.connect(self._job_ended)
         self._chosen()
+        self._look_for_unfinished()
 
     # The form ------------------------------------------------------------------------------------
     @property
@@ -145,6 +155,11 @@ class ProcedurePanel(Panel):
     def view(self) -> OptionsForm:
         """The form that is shown, as a widget."""
         return self.views[self.routine.name]
+
+    def take(self, what: str) -> None:
+        """Choose a routine, by its name."""
+        self.choice.setCurrentIndex([routine.name for routine in self.routines].index(what))
+        self.run_bar.start_button.setFocus()
 
     def procedure(self) -> Procedure | None:
         """Return what the form asks for; None, and fields marked, where it makes no sense."""
@@ -174,14 +189,17 @@ class ProcedurePanel(Panel):
         self.outlook, self._unchecked = None, False
         needed = () if self._with_files else ("camera", *self.routine.needs)
         missing = [kind for kind in needed if not self.session.is_open(kind)]
+        unserved = why_not(self.session, self.routine.title, needed, self.routine.tried_on)
+        self.other_button.setVisible(bool(unserved))
+        if unserved:
+            self.other_button.setText(f"Open the simulated {TEMPLATES[self.routine.tried_on][0]}")
+            self._say(unserved, wrong=True)
+            self.run_bar.set_startable("It takes another bench.")
+            return
         if missing:
             names = " and ".join(map(name_of, missing))
-            self._say(f"The bench has no {names} that is open.", wrong=True)
+            self._say(f"The {names} of this bench must be open.", wrong=True)
             self.run_bar.set_startable("Not all devices are open.")
-            return
-        if needed and (wrong := other_bench_for(self.session.config, needed, self.routine.tried_on)):
-            self._say(wrong, wrong=True)
-            self.run_bar.set_startable("It takes another bench.")
             return
         bench, routine = self.session.bench, self.routine
         first = routine.start if routine.name not in self._started else None
@@ -249,7 +267,12 @@ class ProcedurePanel(Panel):
             return
         self.accepted()
         self.use_button.hide()
-        self.go_on_button.hide()
+        tip = "A simulated bench that serves this routine, in the place of this one"
+        self.other_button = button("", tip, self._open_other)
+        self.other_button.hide()
+        self.way_on.offer(None)
+        self._left.forget()
+        self._said_at_end = ""
         self._say(f"{title} goes on.", wrong=False)
         self.run_bar.set_running(True)
         self.stack.setEnabled(False)
@@ -285,6 +308,7 @@ class ProcedurePanel(Panel):
             return False
 
     def _typed(self) -> None:
+        self._said_at_end = ""
         if self.routine.files is not None:
             self.view.hide_fields(self.routine.useless(with_files=self._with_files))
         self.run_bar.set_startable("It is being checked.")
@@ -328,15 +352,29 @@ class ProcedurePanel(Panel):
         if self._unchecked and job.lanes:
             self._rest.start()
 
+    def _open_other(self) -> None:
+        self.session.handed_on.emit("start", self.routine.tried_on)
+
     def _use(self) -> None:
         self.session.handed_on.emit(self.handed_to, self._result)
 
-    def _go_on(self) -> None:
-        self.session.handed_on.emit("runs", self._unfinished)
+    def resume(self, run: Path) -> None:
+        """Go on with a run that did not end, here."""
+        if not self.run.is_running:
+            self.carry_out(f"Resuming {run.name}", ResumeProcedure(run))
+
+    def _look_for_unfinished(self) -> None:
+        """Offer the newest run of these routines where it did not end, of an earlier day as well."""
+        folder, names = self.session.runs_folder, [routine.name for routine in self.routines]
+        self._left.ask(lambda: left_unfinished(folder, names), self._offer_unfinished)
+
+    def _offer_unfinished(self, run: Path | None) -> None:
+        if run is not None and not self.run.is_running:
+            self.way_on.offer(run, f"Go on with {run.name}, which did not end")
 
     def _succeeded(self, outcome: Outcome) -> None:
         where = [str(path) for path in (*outcome.runs, outcome.calibration, *outcome.files) if path]
-        self._say("\n".join((*outcome.verdict, *where)), wrong=not outcome.good)
+        self._end_with("\n".join((*outcome.verdict, *where)), wrong=not outcome.good)
         pictures = [file for file in outcome.files if file.suffix == ".tif"]
         self._result = outcome.calibration or next(iter(pictures), None)
         self.use_button.setVisible(self._result is not None)
@@ -344,14 +382,20 @@ class ProcedurePanel(Panel):
         self.finished(outcome)
 
     def _ended_early(self, ended: Ended) -> None:
-        self._say(ended.words, wrong=True)
-        self._unfinished = ended.run
-        self.go_on_button.setVisible(ended.run is not None)
+        self._end_with(ended.words, wrong=False)
+        self.way_on.offer(ended.run)
         self.run_bar.show_end("Ended early; nothing moves, light off", complete=False)
 
-    def _failed(self, why: str) -> None:
-        self._say(why, wrong=True)
-        self.run_bar.show_end("Failed", complete=False)
+    def _failed(self, ended: Ended) -> None:
+        self._end_with(ended.words, wrong=True)
+        self.way_on.offer(ended.run)
+        self.run_bar.show_end("Failed; light off, nothing moves", complete=False)
+
+    def _end_with(self, words: str, *, wrong: bool) -> None:
+        """Say how it ended, until something else is asked for."""
+        self._said_at_end = ""
+        self._say(words, wrong=wrong)
+        self._said_at_end = words
 
     def _over(self) -> None:
         words = self.run_bar.words.text()
@@ -359,8 +403,11 @@ class ProcedurePanel(Panel):
         self.run_bar.words.setText(words)
         self.stack.setEnabled(True)
         self.choice.setEnabled(True)
-        self.run_bar.set_startable()
+        self.check()  # what was possible before may not be any more
 
     def _say(self, text: str, *, wrong: bool) -> None:
+        if self._said_at_end:  # it stays while nothing else is asked for
+            text = "\n".join([self._said_at_end, *([text] if wrong else [])])
+            wrong = wrong or bool(self.verdict.property("refused"))
         self.verdict.setPlainText(text)
         mark(self.verdict, "refused", wrong)

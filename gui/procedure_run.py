@@ -13,6 +13,7 @@ from PySide6.QtCore import QObject, Signal
 from PySide6.QtWidgets import QWidget
 
 from calibration_routines.display.display_io import SpotLook
+from calibration_routines.plan_procedures import unfinished
 from calibration_routines.procedure import Listener, Outcome, Procedure, RunEndedError, place_of
 from calibration_routines.psf.sweep_plan import SweepExposures
 from calibration_routines.psf.sweep_procedure import event_lines, exposure_lines
@@ -74,6 +75,8 @@ class _Mailbox(Listener):
         self._lines: list[str] = []
         self._events: list[SweepEvent] = []
         self._looks: list[SpotLook] = []
+        self.left: Path | None = None
+        """The run that can go on, of a procedure that a fault or STOP ended."""
 
     # In the job's thread -------------------------------------------------------------------------
     def step(self, words: str) -> None:
@@ -133,7 +136,7 @@ class _Mailbox(Listener):
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """A procedure that was aborted or stopped.
+    """A procedure that was aborted or stopped, or that a fault ended.
 
     Attributes
     ----------
@@ -159,7 +162,7 @@ class ProcedureRun(QObject):
     succeeded : Outcome
     ended_early : Ended
         Somebody aborted or stopped it.
-    failed : str
+    failed : Ended
     over
         After one of these three.
     """
@@ -169,7 +172,7 @@ class ProcedureRun(QObject):
     look = Signal(object)
     succeeded = Signal(object)
     ended_early = Signal(object)
-    failed = Signal(str)
+    failed = Signal(object)
     over = Signal()
 
     def __init__(self, session: BenchSession, parent: QObject | None = None) -> None:
@@ -198,9 +201,13 @@ class ProcedureRun(QObject):
             try:
                 return procedure.carry_out(bench, control=control, listener=mailbox)
             except RunEndedError as error:
-                return Ended(f"{error.words} It can go on: the panel Runs resumes it.", error.run.path)
+                return Ended(error.words, unfinished(error.run.path))
             except EndedEarlyError as error:
-                return Ended("\n".join([str(error), *getattr(error, "__notes__", ())]))
+                words = "\n".join([str(error), *getattr(error, "__notes__", ())])
+                return Ended(words, unfinished(control.run))
+            except BaseException:
+                mailbox.left = unfinished(control.run)
+                raise
 
         self._job = job = self._session.exclusive_job(title, work)
         self._control, self._mailbox = control, mailbox
@@ -245,8 +252,6 @@ class ProcedureRun(QObject):
             if self._job is not None:
                 self._job.became = "ended early"
             self._ended_early(result)
-            if result.run is not None:
-                self._session.run_finished.emit(result.run)
             return
         for path in dict.fromkeys((*result.runs, *([result.calibration] if result.calibration else []))):
             self._session.run_finished.emit(path)
@@ -255,16 +260,23 @@ class ProcedureRun(QObject):
         self.succeeded.emit(result)
 
     def _ended_early(self, ended: Ended) -> None:
-        self._session.log("warning", ended.words)
+        self._session.log("info", ended.words)
+        self._leave(ended)
         self.ended_early.emit(ended)
 
     def _failed(self, why: str) -> None:
         self._look()
-        self.failed.emit(why)
+        ended = Ended(why, self._mailbox.left)
+        self._leave(ended)
+        self.failed.emit(ended)
 
     def _cancelled(self, words: str) -> None:
         self._look()
-        self._ended_early(Ended(words))
+        self._ended_early(Ended(words, self._mailbox.left))
+
+    def _leave(self, ended: Ended) -> None:
+        if ended.run is not None:
+            self._session.run_finished.emit(ended.run)
 
     def _over(self) -> None:
         self._timer.stop()

@@ -95,6 +95,9 @@ class AlignmentPanel(ProcedurePanel):
         self._first = self._newest = None
         self._scores, self._brightest, self._tried = [], [], ""
         self.spots.clear()
+        self._rings.clear()
+        self.spot_words.setText("No picture yet.")
+        self.now_button.setChecked(True)
         self.before.clear()
         self.after.clear()
         self.pose.clear()

@@ -148,18 +148,20 @@ class TasksPanel(Panel):
 
     def _made(self, name: str, task: Task) -> _Page:
         options = [o for _, offered in task.parts.values() for o in offered]
-        form = OptionsForm(options, {o.name: _behaviour(o) for o in options if Path in (*o.kinds, o.item)})
+        special = {o.name: _behaviour(o, needed=o.name in task.needed) for o in options if _names_files(o)}
+        form = OptionsForm(options, special)
+        if task.subject:
+            form.show_for(task.subject)
         form.refused.connect(self.refused)
+        form.set_values({"bench": self.session.config.path})
         names = None
         out = next((o for o in options if o.name == "out"), None)
-        if out is not None and isinstance(out.default, Path):
-            suffix = "".join(out.default.suffixes).replace(
-                ".pdf", ".png"
-            )  # what can be shown beside the form
-            stem = out.default.name.removesuffix("".join(out.default.suffixes))
+        place = task.out or (None if out is None or not isinstance(out.default, Path) else out.default)
+        if place is not None:
+            suffix = "".join(place.suffixes).replace(".pdf", ".png")  # what can be shown beside the form
             names = SuggestedName(self.jobs, form, self.session.runs_folder / "results", suffix)
             form.set_values({"out": None})
-            names.suggest(stem)
+            names.suggest(place.name.partition(".")[0])
         return _Page(task, form, names)
 
     def objects(self) -> dict[str, object] | None:
@@ -310,12 +312,17 @@ class TasksPanel(Panel):
         self._reader.forget()
 
 
-def _behaviour(o: Option) -> Behaviour:
+def _names_files(o: Option) -> bool:
+    return Path in (o.item, *o.kinds) or o.declaration.metavar.endswith("FILE")
+
+
+def _behaviour(o: Option, *, needed: bool) -> Behaviour:
     """Return how a path is chosen: what is written by a new name, what is read by what is there."""
     folder = o.declaration.metavar.removesuffix("...") in _FOLDERS
     if o.name in WRITTEN:
         return Behaviour(browse="folder" if folder else "save")
-    return Behaviour(browse="folder" if folder else "open", must_exist=o.item is None)
+    exists = o.kinds == (Path,)
+    return Behaviour(browse="folder" if folder else "open", must_exist=exists, needed=needed)
 
 
 def _panel_for(path: Path) -> str:

@@ -66,6 +66,7 @@ COMMANDS: Mapping[str, Command] = {
         "bench:devices_app",
     ),
     "serve": Command(BENCH, "offer the devices to another computer, and a page in the browser", "serve"),
+    "test": Command(BENCH, "test this installation: files, cameras, solvers, simulated bench", "selftest"),
     "completion": Command(BENCH, "print completions for bash and zsh", "completion"),
     "calibrate": Command(BENCH, "measure PSFs, the sensor, the diffuser, or an SLM", "calibrate"),
     "snap": Command(BENCH, "take a photograph", "capture:snap_app"),
@@ -80,7 +81,7 @@ COMMANDS: Mapping[str, Command] = {
     "reconstruct": Command(
         RECONSTRUCTION, "reconstruct the scene from a PSF and a photograph", "reconstruct"
     ),
-    "activity": Command(RECONSTRUCTION, "fluorescence over time: dF/F, regions, traces", "activity"),
+    "activity": _task(RECONSTRUCTION, "activity"),
     "analyze": _task(ANALYSIS, "analyze"),
     "compare": _task(ANALYSIS, "compare"),
     "chart": Command(ANALYSIS, "time and memory against error, for every method", "chart"),

@@ -123,7 +123,7 @@ def write_volume_zarr(
         group.attrs["ome"] = ome_attributes(
             path.name,
             names,
-            _voxel_um(grid),
+            voxel_um(grid),
             levels=levels,
             origin=_origin_um(grid),
             more={"type": "local mean"},
@@ -153,7 +153,7 @@ def write_volume_tiff(
 
     colour = len(shape) == 4
     pages = (page for plane in planes for page in (np.moveaxis(plane, -1, 0) if colour else plane[None]))
-    sizes = {f"PhysicalSize{axis.upper()}": size for axis, size in _voxel_um(grid).items()}
+    sizes = {f"PhysicalSize{axis.upper()}": size for axis, size in voxel_um(grid).items()}
     metadata: dict[str, Any] = {"axes": "ZCYX" if colour else "ZYX", **sizes}
     metadata |= {f"{name}Unit": "µm" for name in sizes}
     n_pages = shape[0] * (shape[3] if colour else 1)
@@ -171,7 +171,7 @@ def write_volume_tiff(
         tiff.write(pages, shape=stored, dtype=np.float32, photometric="minisblack", metadata=metadata)
 
 
-def _voxel_um(grid: Grid) -> dict[str, float]:
+def voxel_um(grid: Grid) -> dict[str, float]:
     """Return the middle plane's voxel size; nothing where it is not known."""
     if not (np.isfinite(grid.pitch_um).all() and np.isfinite(grid.spacing_um).all()):
         return {}
@@ -181,7 +181,7 @@ def _voxel_um(grid: Grid) -> dict[str, float]:
 
 def _origin_um(grid: Grid) -> dict[str, float]:
     """Return where the first voxel's centre is: its depth, and from the axis; nothing where not known."""
-    voxel = _voxel_um(grid)
+    voxel = voxel_um(grid)
     if not voxel or (np.diff(grid.z_um) < 0).any():  # told by a step and a place, planes go away from it
         return {}
     row, column = grid.centre
@@ -204,7 +204,7 @@ def _of_voxels(grid: Grid) -> str:
     """Say what the one voxel size of an OME file stands for."""
     if grid.is_metric:
         return "All voxels have one size; rows and columns go with y and x; values are light a voxel."
-    if not _voxel_um(grid):
+    if not voxel_um(grid):
         return "The size of the voxels is not known."
     return (
         "Perspective grid: voxels of plane z are pitch_um[z] wide, and the scale is the middle plane's. The "

@@ -34,6 +34,8 @@ class TaskEntry(NamedTuple):
 
 RUNS = "Runs"
 CALIBRATIONS = "Calibrations"
+VIDEOS = "Recordings"
+DISPLAY = "Holographic display"
 
 TASKS: Mapping[str, TaskEntry] = {
     "verify": TaskEntry(RUNS, "Verify runs", "read every frame of a run and check it", "runs:verify"),
@@ -42,6 +44,24 @@ TASKS: Mapping[str, TaskEntry] = {
         "Export frames or a result",
         "write a run's frames as TIFF, HDF5, NumPy, PNG, MP4",
         "runs:export",
+    ),
+    "video": TaskEntry(
+        VIDEOS, "Reconstruct a recording", "every frame of a recording, to a video", "video:video"
+    ),
+    "activity": TaskEntry(
+        VIDEOS, "Find activity", "fluorescence over time: dF/F, regions, traces", "activity:activity"
+    ),
+    "patterned": TaskEntry(
+        VIDEOS,
+        "Reconstruct patterned light",
+        "one picture of a scene lit by patterns in turn",
+        "solving:patterned",
+    ),
+    "limit": TaskEntry(
+        DISPLAY, "Limit of the display", "what any number of frames could reach for a picture", "spots:limit"
+    ),
+    "spots": TaskEntry(
+        DISPLAY, "Hologram of spots", "spots as bright as asked for, at any places and depths", "spots:spots"
     ),
     "analyze": TaskEntry(
         CALIBRATIONS,
@@ -62,4 +82,4 @@ TASKS: Mapping[str, TaskEntry] = {
         "calibrations:refocus",
     ),
 }
-"""By the names of their commands."""
+"""By the names of their commands, or of what a command does besides."""

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from instrument.files.atomic import protecting
 from instrument.files.errors import BenchError
-from recon.base.declare import Option, changed, options_of
+from recon.base.declare import Option, changed, option, options_of
 
 
 class Advance(Protocol):
@@ -151,6 +151,19 @@ class Given:
             raise BenchError(f"With {title} these do not apply: {what}. Leave them out.")
 
 
+@dataclass(frozen=True, kw_only=True)
+class BenchFile:
+    """Which bench is meant."""
+
+    bench: Path | None = option(
+        None,
+        help="Bench configuration.",
+        default_words="bench.toml in this folder, else the built-in simulated bench",
+        flags=("--bench", "-b"),
+        group="Bench",
+    )
+
+
 Part = tuple[type, tuple[Option, ...]]
 """An options class that a function takes, and those of its options that are offered."""
 
@@ -175,6 +188,12 @@ class Task:
     do: Callable[..., Done]
     examples: tuple[str, ...]
     """Command lines."""
+    subject: str = ""
+    """Of the options that apply to some things only, those that apply to this are offered by forms."""
+    out: Path | None = None
+    """Where its result goes when nothing else is said, where the option ``out`` does not say it."""
+    needed: tuple[str, ...] = ()
+    """Options that must be given here, although their declarations let them be left out."""
 
     @property
     def hints(self) -> dict[str, Any]:
@@ -195,9 +214,11 @@ class Task:
             return self.do(desk, **objects, **given)
 
 
-def task(*examples: str) -> Callable[[Callable[..., Done]], Task]:
-    """Make a task of a function; ``examples`` are command lines."""
-    return lambda function: Task(function, examples)
+def task(
+    *examples: str, subject: str = "", out: Path | None = None, needed: tuple[str, ...] = ()
+) -> Callable[[Callable[..., Done]], Task]:
+    """Make a task of a function; ``examples`` are command lines, the others as :class:`Task` has them."""
+    return lambda function: Task(function, examples, subject, out, needed)
 
 
 # Files -------------------------------------------------------------------------------------------------
