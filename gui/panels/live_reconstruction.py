@@ -19,7 +19,7 @@ from gui.forms.options_form import FOLDED, OptionsForm
 from gui.jobs import Job, JobContext
 from gui.panel import Panel, on_bench
 from gui.session import BenchSession
-from gui.widgets.building import button, choice, every, fill, in_row, label, offer, scrolled
+from gui.widgets.building import Hint, button, choice, every, fill, in_row, label, offer, scrolled
 from gui.widgets.dialogues import elided, path_field
 from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
@@ -123,10 +123,15 @@ class LiveReconstructionPanel(Panel):
         self.options_button.toggled.connect(folded.setVisible)
         self.status = label(_NO_CALIBRATION, "dim", wraps=True)
         yield
+        self.hint = Hint(
+            "No calibration yet: with one, what the camera sees becomes a picture as it comes.",
+            "Calibrate…",
+            lambda: session.handed_on.emit("sweeps", ""),
+        )
         first = in_row((self.file, 1), self.browse_button, self.plane)
         switches = (self.run_button, self.refine_button, self.options_button)
         second = in_row(*switches, None, label("within"), self.budget)
-        fill(self.body, first, (self.view, 1), self.status, second, (folded, 1))
+        fill(self.body, first, (self.view, 1), (self.hint, 1), self.status, second, (folded, 1))
         yield
         session.run_finished.connect(self._run_finished)
         self._timer = every(self, _LOOK_MS, self.look)
@@ -265,6 +270,8 @@ class LiveReconstructionPanel(Panel):
     # Pictures ------------------------------------------------------------------------------------
     def look(self) -> None:
         """Show the newest picture, if it is another than the one shown."""
+        self.hint.setVisible(self.loaded is None)
+        self.view.setVisible(self.loaded is not None)
         runs = self.run_button.isChecked() and self._refining is None and self._loading is None
         if runs and self.isVisible():
             self.follower.follow()

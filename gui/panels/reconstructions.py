@@ -20,7 +20,7 @@ from gui.panel import Panel
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
 from gui.theme import as_shown
-from gui.widgets.building import button, fill, in_row, label, split, tabs
+from gui.widgets.building import Hint, button, fill, in_row, label, split, tabs
 from gui.widgets.dialogues import Question, choose_path
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
@@ -59,6 +59,7 @@ class ReconstructionsPanel(Panel):
         """Make the widgets."""
         session = self.session
         self.list = QListWidget()
+        self.list.setAccessibleName("Reconstructions")
         self.list.setToolTip("Reconstructions in the data folder, the newest first (Enter opens)")
         self.list.setAlternatingRowColors(True)
         self.list.itemActivated.connect(self._open_item)
@@ -89,8 +90,11 @@ class ReconstructionsPanel(Panel):
         self.place.setMinimumWidth(10)
         for hovered in (self.picture.hovered, self.volume.hovered):
             hovered.connect(self.place.setText)
-        self.empty = label("Open a result on the left, or reconstruct one.", "dim")
-        self.empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self.empty = Hint(
+            "Nothing is open: choose a result on the left, or reconstruct a photograph.",
+            "Reconstruct…",
+            lambda: self.tabs.setCurrentWidget(self.form),
+        )
         self.viewers = QStackedWidget()
         for widget in (self.empty, self.picture, self.volume):
             self.viewers.addWidget(widget)
@@ -312,7 +316,7 @@ class ReconstructionsPanel(Panel):
 
     def _show_nothing(self, words: str) -> None:
         """Take what was shown of another result away."""
-        self.empty.setText(words)
+        self.empty.say(words)
         self.viewers.setCurrentWidget(self.empty)
         self.place.clear()
         self.facts.show_facts([])

@@ -227,6 +227,7 @@ class RecordBar(QWidget):
         self.seconds.setFixedWidth(80)
         self.seconds.refused.connect(lambda why: panel.refused(None, why))
         self.label = QLineEdit("recording")
+        self.label.setAccessibleName("Name of the recording")
         self.label.setToolTip("Becomes part of the run folder's name")
         self.label.setFixedWidth(120)
         self.gauge = QProgressBar()
