@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,9 +18,10 @@ from calibration_routines.procedure import (
     routines,
 )
 from instrument.bench.bench import Bench
+from instrument.files.errors import BenchError
 from instrument.plan import Plan, check, estimate
 from instrument.runs.acquire import abilities_of, acquire, look, prepare_resume, settle
-from instrument.runs.inspection import Verification, verify
+from instrument.runs.inspection import Verification, run_paths, verify
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import discarded
@@ -122,6 +124,33 @@ def lacks_result(run: Path) -> bool:
     """Whether a run's frames are those of a routine, and its result is not there yet."""
     routine = routine_of(run)
     return routine is not None and routine.purpose is not None and routine.purpose.lacks_result(run)
+
+
+def can_go_on(run: Run, looked: Verification) -> bool:
+    """Whether resuming a run would do something: take frames, mend files, make its result."""
+    left = bool(looked.remedy()) or run.condition is RunCondition.CRASHED
+    whole = run.plan is None or run.condition is RunCondition.COMPLETED
+    return (left or not whole or lacks_result(run.path)) and run.condition is not RunCondition.RUNNING
+
+
+def unfinished(path: Path | None) -> Path | None:
+    """Return a run that can go on; None for every other, and for what cannot be read."""
+    if path is None:
+        return None
+    try:
+        run = Run.open(path)
+        return path if can_go_on(run, verify(run, read=False)) else None
+    except (BenchError, OSError):
+        return None
+
+
+def left_unfinished(folder: Path, names: Collection[str]) -> Path | None:
+    """Return a folder's newest run of some routines (``"plan"``: of none) if it did not end, else None."""
+    for path in reversed(run_paths(folder)):
+        routine = routine_of(path)
+        if (routine.name if routine else "plan") in names:
+            return unfinished(path)
+    return None
 
 
 def finished(run: Run, bench: Bench | None, control: RunControl, listener: Listener) -> Outcome | None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import json
+import re
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 project = "diffuserbench"
@@ -22,11 +26,15 @@ napoleon_google_docstring = False
 suppress_warnings = [
     "myst.xref_missing",  # to files of the repository beside this folder, which a reader on GitHub follows
     "misc.highlighting_failure",
+    "toc.no_title",  # a table that a benchmark writes
 ]
 exclude_patterns = ["conf.py"]
 
 CHAPTERS = {
-    "Begin": ("tutorials/*", "gallery"),
+    "Begin": (
+        *(f"tutorials/{name}" for name in ("own-files", "first-picture", "calibrate-and-analyse", "volumes")),
+        *("tutorials/own-methods", "tutorials/*", "gallery"),
+    ),
     "How to": ("how-to/*", "how-to/devices/*"),
     "Subjects": ("*",),
     "Reference": ("reference/*",),
@@ -63,8 +71,33 @@ def _directive(name: str) -> str:
     return f".. {'automodule' if isinstance(found, types.ModuleType) else 'autodata'}:: {home}\n"
 
 
-def on_source(_app: Any, docname: str, source: list[str]) -> None:
+def with_outputs(page: str, notebook: Path, images: Path) -> str:
+    """Return a tutorial with what its notebook says and shows after each block of Python."""
+    cells = json.loads(notebook.read_text("utf-8"))["cells"]
+    outputs = iter([cell["outputs"] for cell in cells if cell["cell_type"] == "code"])
+    images.mkdir(exist_ok=True)
+
+    def shown(output: dict[str, Any], name: str) -> str:
+        data = output.get("data", {"text/plain": output.get("text", "")})
+        if "image/png" in data:
+            (images / name).write_bytes(base64.b64decode(data["image/png"]))
+            return f"![What the block above draws](../{images.name}/{name})"
+        fence = "```{raw} html" if "text/html" in data else "```text"
+        return f"{fence}\n{next(iter(data.values())).rstrip()}\n```"
+
+    def after(block: re.Match[str]) -> str:
+        name = f"{notebook.stem}-{block.start()}"
+        told = [shown(output, f"{name}-{n}.png") for n, output in enumerate(next(outputs))]
+        return "\n\n".join([block[0], *told])
+
+    return re.sub(r"^```python\n.*?^```$", after, page, flags=re.M | re.S)
+
+
+def on_source(app: Any, docname: str, source: list[str]) -> None:
     """Add to a page what only the site has."""
+    if docname.startswith("tutorials/"):
+        folder = Path(app.srcdir)
+        source[0] = with_outputs(source[0], folder / f"{docname}.ipynb", folder / "_tutorials")
     if docname == root_doc:
         source[0] += contents()
     if docname == "reference/python":

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
 import traceback
+from pathlib import Path
 from types import FrameType, TracebackType
 
-from PySide6.QtCore import QCoreApplication, QSettings, QTimer
+from PySide6.QtCore import QCoreApplication, QSettings, QSize, QTimer
 from PySide6.QtWidgets import QApplication
 
 from gui.main_window import MainWindow, theme_of
@@ -16,18 +18,39 @@ from gui.session import BenchSession
 from gui.theme import apply_theme
 from gui.widgets.dialogues import TextWindow
 from instrument.bench.config import BenchConfig
+from instrument.bench.config_file import no_bench
 from instrument.files.errors import BenchError, in_words
 
+_FRAME = QSize(16, 40)
+"""What a window manager puts round a window, at most: the first window fits the screen with it."""
 _SIGNAL_CHECK_MS = 200
 """Python sees signals only while it runs: an idle event loop has to be woken for them."""
 
 
-def run(config: BenchConfig) -> int:
-    """Show the window for a bench until it is closed; returns the exit status."""
+def run(config: BenchConfig | None) -> int:
+    """Show the window for a bench, and for those that are opened from it, until it is closed.
+
+    Returns the exit status. None: no bench; the start page leads to one.
+    """
     require_screen()
     app = application()
     settings = QSettings("diffuserbench", "diffuserbench")
     apply_theme(app, theme_of(settings))
+    status = 0
+    wanted: BenchConfig | None = no_bench(working_folder()) if config is None else config
+    while wanted is not None:
+        status, wanted = _shown(app, wanted, settings)
+    return status
+
+
+def working_folder() -> Path:
+    """Return where work begins: this folder, else one in the home folder where nobody should write here."""
+    here = Path.cwd()
+    return here if os.access(here, os.W_OK) and here != Path(here.anchor) else Path.home() / "diffuserbench"
+
+
+def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple[int, BenchConfig | None]:
+    """Show the window for a bench until it is closed; returns the exit status, and which bench is next."""
     session = BenchSession(config)
     sys.excepthook = _ToLog(session)
     waker = QTimer()
@@ -47,17 +70,23 @@ def run(config: BenchConfig) -> int:
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
             before[number] = signal.signal(number, end)
     try:
-        window = MainWindow(session, settings, app.primaryScreen().availableSize())
+        window = MainWindow(session, settings, app.primaryScreen().availableSize() - _FRAME)
         window.show()
+        app.processEvents()  # the first sight of it, before there is anything to stop
+        # What stays is not looked through for garbage again and again, 0.1 s during which nothing answers.
+        session.opened.connect(gc.freeze)
+        window.maker.made.connect(gc.freeze)
         if not session.is_closing:
             session.open()
         status = app.exec()
         session.join()
     finally:
+        gc.unfreeze()  # of this window
         sys.excepthook = sys.__excepthook__
         for number, handler in before.items():
             signal.signal(number, handler)
-    return status
+    window.deleteLater()
+    return status, window.next_bench
 
 
 def show_mistake(error: BenchError) -> None:

@@ -15,23 +15,27 @@ from PySide6.QtWidgets import (
     QMenu,
     QMessageBox,
     QProgressBar,
-    QPushButton,
     QSizePolicy,
     QToolBar,
-    QToolButton,
     QWidget,
 )
 
-from gui.jobs import Job, words_for
+from gui.help import help_of
+from gui.jobs import Job
+from gui.making import PanelMaker
 from gui.panel import Panel
 from gui.panels import PANELS
+from gui.panels.unserved import UnservedPanel
 from gui.session import BenchSession
 from gui.session_news import OperatorRequest, name_of
-from gui.theme import THEMES, apply_theme, colours
-from gui.widgets.building import PanelPlace, button, fill, label, tabs, text_view
+from gui.theme import THEMES, apply_theme
+from gui.widgets.building import PanelPlace, button, label, tabs
+from gui.widgets.device_chips import DeviceChips
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.plots import restyle_all
+from gui.widgets.step_strip import StepStrip
+from instrument.bench.config import BenchConfig
 
 _AREAS = {
     "top right": Qt.DockWidgetArea.RightDockWidgetArea,
@@ -47,48 +51,6 @@ _ROOMY = QSize(1500, 860)
 _COMPACT_PX = 480
 """Width of the panels at the right of a small screen."""
 _BY_HAND, _BREAKS_OFF = QMessageBox.Icon.Information, QMessageBox.Icon.Warning
-
-
-class DeviceChips(QWidget):
-    """One chip a device; a click shows all about it, "Reconnect" appears where one has failed."""
-
-    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
-        super().__init__(parent)
-        self._session = session
-        self.chips: dict[str, QToolButton] = {}
-        self.reconnect_buttons: dict[str, QPushButton] = {}
-        for kind in session.kinds:
-            chip = QToolButton()
-            chip.setAutoRaise(True)
-            chip.clicked.connect(partial(self._show_all, kind))
-            again = button("Reconnect", f"Open the {name_of(kind)} again", partial(session.reconnect, kind))
-            self.chips[kind], self.reconnect_buttons[kind] = chip, again
-            self.show_state(kind)
-        pairs = zip(self.chips.values(), self.reconnect_buttons.values(), strict=True)
-        shown: list[QWidget] = [widget for pair in pairs for widget in pair]
-        fill(self, *(shown or [label("no devices")]), across=True, spacing=4)
-        session.device_changed.connect(self.show_state)
-
-    def show_state(self, kind: str) -> None:
-        """Show how a device is doing now."""
-        state = self._session.state(kind)
-        now = colours()
-        colour = {"open": now.ok, "failed": now.error, "opening": now.warning}.get(state.condition, now.dim)
-        chip = self.chips[kind]
-        word = {"open": "", "opening": " …", "failed": " failed", "closed": " closed"}[state.condition]
-        chip.setText(f"● {name_of(kind)}{word}")
-        chip.setStyleSheet(f"color: {colour}; border: none; padding: 2px 4px;")
-        chip.setToolTip(state.text or state.condition)
-        self.reconnect_buttons[kind].setVisible(state.condition == "failed")
-
-    def restyle(self) -> None:
-        """Take over the colours of the theme in use."""
-        for kind in self.chips:
-            self.show_state(kind)
-
-    def _show_all(self, kind: str) -> None:
-        state = self._session.state(kind)
-        TextWindow(name_of(kind), state.text or state.condition, self).show()
 
 
 class MainWindow(QMainWindow):
@@ -110,13 +72,16 @@ class MainWindow(QMainWindow):
         self._compact = size.width() < _ROOMY.width() or size.height() < _ROOMY.height()
         self.session = session
         self._settings = settings
-        self._panels: dict[str, Panel] = {}
         self._places: dict[str, PanelPlace] = {}
+        self.maker = PanelMaker(session, self._places, self)
+        self._panels = self.maker.panels
         self._docks: dict[str, QDockWidget] = {}
         self._may_close = False
         self.question: Question | None = None
         """The question that was asked last, while it is open."""
         self._closing_question: Question | None = None
+        self.next_bench: BenchConfig | None = None
+        """What is to be opened once this bench is closed."""
         self.setWindowTitle(f"diffuserbench – {session.config.label}")
         self.setDockOptions(
             QMainWindow.DockOption.AllowTabbedDocks
@@ -133,7 +98,8 @@ class MainWindow(QMainWindow):
         self._make_stop_keys()
         session.device_changed.connect(self._show_simulated)
         session.asked.connect(self._ask_operator)
-        session.handed_on.connect(lambda name, path: self.show_panel(name).take(path))
+        session.handed_on.connect(self._hand_on)
+        session.bench_wanted.connect(self.change_bench)
         session.closed.connect(self._close_now)
         session.jobs.job_started.connect(self._job_started)
         session.jobs.job_ended.connect(self._job_ended)
@@ -143,24 +109,46 @@ class MainWindow(QMainWindow):
         self.panel("log")  # from the first line on
         self._fill_current()
 
+    def change_bench(self, config: BenchConfig) -> None:
+        """Close this bench, after asking where something runs, so that another is opened in its place."""
+        self.next_bench = config
+        self.close()
+
     # Panels --------------------------------------------------------------------------------------
+    def _hand_on(self, name: str, what: object) -> None:
+        """Show a panel, and have it work with what another one hands on; empty: nothing."""
+        self.bring(name, lambda panel: panel.take(what) if what else None)
+
+    def _take_step(self, panel: str, what: object) -> None:
+        """Go where the next step is taken."""
+        if panel == "reconnect":
+            self.session.reconnect(what)  # type: ignore[arg-type]
+        else:
+            self._hand_on(panel, what)
+
     def panel(self, name: str) -> Panel:
         """Return a panel of the table, made now if it was not yet."""
-        if name not in self._panels:
-            self._panels[name] = panel = PANELS[name].made(self.session)
-            self._places[name].hold(panel)
-        return self._panels[name]
+        return self.maker.whole(name)
 
     def show_panel(self, name: str) -> Panel:
-        """Bring a panel to the front, with the keyboard in it."""
+        """Bring a panel to the front, with the keyboard in it, and return it, made now if it was not yet."""
         panel = self.panel(name)
+        self.bring(name)
+        return panel
+
+    def bring(self, name: str, then: Callable[[Panel], object] = lambda _: None) -> None:
+        """Bring a panel to the front, with the keyboard in it; then do something with it, once it is made."""
         if name in self._docks:
             self._docks[name].show()
             self._docks[name].raise_()
         else:
             self.tabs.setCurrentWidget(self._places[name])
-        panel.setFocus(Qt.FocusReason.ShortcutFocusReason)
-        return panel
+
+        def shown(panel: Panel) -> None:
+            panel.setFocus(Qt.FocusReason.ShortcutFocusReason)
+            then(panel)
+
+        self.maker.ask(name, shown)
 
     def _make_panels(self) -> None:
         first: dict[str, QDockWidget] = {}
@@ -182,8 +170,13 @@ class MainWindow(QMainWindow):
                 first[entry.area] = dock
             dock.visibilityChanged.connect(partial(self._dock_seen, name))
             self._docks[name] = dock
+        if self.session.kinds:  # else the start page
+            self.tabs.setCurrentWidget(self._places["live"])
         for dock in first.values():
             dock.raise_()
+        if not self.session.kinds:
+            for dock in self._docks.values():
+                dock.hide()
         if self._compact:
             for area in ("top right", "bottom"):
                 self.tabifyDockWidget(first["right"], first[area])
@@ -199,23 +192,13 @@ class MainWindow(QMainWindow):
 
     def _dock_seen(self, name: str, visible: bool) -> None:
         if visible:
-            self._try_to_fill(name)
+            self.maker.ask(name)
 
     def _fill_current(self, _index: int = 0) -> None:
         place = self.tabs.currentWidget()
         for name, widget in self._places.items():
             if widget is place:
-                self._try_to_fill(name)
-
-    def _try_to_fill(self, name: str) -> None:
-        """Make a panel; one that cannot be made says why in its place, and the others are not touched."""
-        try:
-            self.panel(name)
-        except Exception as error:  # noqa: BLE001 - a panel's failure must not end the window
-            text = words_for(error)
-            self.session.log("error", f"{PANELS[name].title}: {text}")
-            if self._places[name].content is None:
-                self._places[name].hold(text_view(text))
+                self.maker.ask(name)
 
     # Bars and menus ------------------------------------------------------------------------------
     def _make_top_bar(self) -> None:
@@ -229,9 +212,14 @@ class MainWindow(QMainWindow):
         self._simulated_action = bar.addWidget(self.simulated)
         self.chips = DeviceChips(self.session)
         bar.addWidget(self.chips)
-        stretch = QWidget()
-        stretch.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Preferred)
-        bar.addWidget(stretch)
+        self.strip = StepStrip(self.session)
+        self.strip.wanted.connect(self._take_step)
+        if self._compact:
+            bar.addWidget(self.strip)
+        else:
+            stretch = QWidget()
+            stretch.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Preferred)
+            bar.addWidget(stretch)
         tip = "Halt all motion, turn the light off, end what runs (Esc)"
         self.stop_button = button("STOP", tip, self.session.stop)
         self.stop_button.setObjectName("stop")
@@ -239,6 +227,15 @@ class MainWindow(QMainWindow):
         bar.addWidget(self.stop_button)
         bar.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
         self.addToolBar(Qt.ToolBarArea.TopToolBarArea, bar)
+        if self._compact:
+            return
+        below = QToolBar("What comes next")
+        below.setObjectName("next-bar")
+        below.setMovable(False)
+        below.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
+        below.addWidget(self.strip)
+        self.addToolBarBreak(Qt.ToolBarArea.TopToolBarArea)
+        self.addToolBar(Qt.ToolBarArea.TopToolBarArea, below)
 
     def _make_status_bar(self) -> None:
         self.job_label = label("Ready")
@@ -253,10 +250,12 @@ class MainWindow(QMainWindow):
     def _make_menus(self) -> None:
         view = self.menuBar().addMenu("&View")
         for name, entry in PANELS.items():
-            action = self._add_action(view, entry.title, entry.shortcut, partial(self.show_panel, name))
+            action = self._add_action(view, entry.title, entry.shortcut, partial(self.bring, name))
             action.setToolTip(entry.tip)
         theme = self.menuBar().addMenu("&Theme")
-        for number, (name, words) in enumerate((("dark", "&Dark"), ("red", "&Red, for the dark room"))):
+        for number, (name, words) in enumerate(
+            (("dark", "&Dark"), ("red", "&Red, for the dark room"), ("light", "&Light"))
+        ):
             self._add_action(theme, words, f"Ctrl+Shift+{number + 1}", partial(self.set_theme, name))
         camera = self.menuBar().addMenu("&Camera")
         for words, keys, what in (
@@ -266,11 +265,26 @@ class MainWindow(QMainWindow):
         ):
             self._add_action(camera, words, keys, partial(self._on_live_panel, what))
         bench = self.menuBar().addMenu("&Bench")
+        self._add_action(bench, "&Another bench …", "Ctrl+O", partial(self.bring, "start"))
         for kind in self.session.kinds:
             reconnect = partial(self.session.reconnect, kind)
             self._add_action(bench, f"Reconnect the {name_of(kind)}", "", reconnect)
         bench.addSeparator()
         self._add_action(bench, "&Quit", "Ctrl+Q", self.close)
+        about = self.menuBar().addMenu("&Help")
+        self._add_action(about, "&This panel, and all keys", "F1", self.show_help)
+
+    def show_help(self) -> TextWindow:
+        """Show what the panel that has the keyboard is for, and every key."""
+        focused = QApplication.focusWidget()
+        current = self.tabs.currentWidget()
+        shown = [name for name, panel in self._panels.items() if focused and panel.isAncestorOf(focused)]
+        shown += [name for name, place in self._places.items() if place is current and name in self._panels]
+        name = next(iter(shown), "start")
+        actions = [action for menu in self.menuBar().actions() for action in menu.menu().actions()]  # type: ignore[attr-defined]
+        window = TextWindow("Help", help_of(name, self.panel(name), focused, actions), self)
+        window.show()
+        return window
 
     def _add_action(self, menu: QMenu, words: str, keys: str, call: Callable[[], object]) -> QAction:
         action = QAction(words, self)
@@ -281,11 +295,17 @@ class MainWindow(QMainWindow):
 
     def _on_live_panel(self, what: str) -> None:
         """Do what the live view offers, whatever panel is in front, with what is being typed there."""
-        panel, typed = self.panel("live"), QApplication.focusWidget()
+        self.maker.ask("live", lambda panel: self._do_on(panel, what))
+
+    def _do_on(self, panel: Panel, what: str) -> None:
+        typed = QApplication.focusWidget()
         ends = what == "record" and getattr(panel, "is_recording", False)  # no number keeps it from ending
         if not ends and isinstance(typed, NumberEdit) and panel.isAncestorOf(typed) and not typed.submit():
             return  # refused where it stands
-        getattr(panel, what)()
+        if isinstance(panel, UnservedPanel):
+            self.bring("live")  # it says why
+        else:
+            getattr(panel, what)()
 
     def set_theme(self, name: str) -> None:
         """Change the looks of the whole program and remember it."""
@@ -396,6 +416,8 @@ class MainWindow(QMainWindow):
         self._closing_question = None
         if agreed:
             self._end()
+        else:
+            self.next_bench = None
 
     def _end(self) -> None:
         self.job_label.setText("Closing: light off, motion stopped …")
@@ -409,13 +431,15 @@ class MainWindow(QMainWindow):
         self.close()
 
     def _keep_layout(self) -> None:
+        if not self.session.kinds:
+            return  # a page to start from is no layout for a bench
         self._settings.setValue("docks", sorted(self._docks))
         self._settings.setValue("geometry", self.saveGeometry())
         self._settings.setValue("state", self.saveState())
         self._settings.sync()
 
     def _restore_layout(self) -> None:
-        if self._settings.value("docks") != sorted(self._docks):
+        if not self.session.kinds or self._settings.value("docks") != sorted(self._docks):
             return  # kept by a program with other panels: their docks would land anywhere
         geometry, state = self._settings.value("geometry"), self._settings.value("state")
         if geometry is not None:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from PySide6.QtCore import QTimer
 from PySide6.QtGui import QGuiApplication
-from PySide6.QtWidgets import QLabel, QSizePolicy, QWidget
+from PySide6.QtWidgets import QBoxLayout, QLabel, QSizePolicy, QWidget
 
 from gui.jobs import BusyError, Job, JobRunner, Work
 from gui.session import BenchSession
 from gui.session_news import name_of
+from gui.way_on import ReconnectButton
 from gui.widgets.building import after_rest, button, every, fill, in_row, label, mark
 from gui.widgets.dialogues import elided
+from instrument.bench.config import Kind
 from instrument.files.errors import BenchError
 from recon.base.declare import Imports
 from recon.errors import InputError
@@ -25,6 +27,8 @@ _T = TypeVar("_T")
 
 class Panel(QWidget):
     """A part of the window. Subclasses fill ``body`` and say ``as_python``.
+
+    One with many widgets makes them in ``parts``, so that STOP is heard in between.
 
     Parameters
     ----------
@@ -50,6 +54,14 @@ class Panel(QWidget):
         self._fade = after_rest(self, _REFUSAL_MS, self.accepted)
         fill(self, (self.body, 1), in_row((self._note, 1), self.copy_button), margins=(8, 8, 8, 4), spacing=4)
 
+    @classmethod
+    def prepare(cls) -> None:
+        """Import and compile what the panel needs first; in any thread, before one is made."""
+
+    def parts(self) -> Iterator[None]:
+        """Make the panel's widgets, with a ``yield`` at least every 20 ms of processor time."""
+        yield
+
     @property
     def jobs(self) -> JobRunner:
         """Where the panel's work is done."""
@@ -64,14 +76,20 @@ class Panel(QWidget):
         QGuiApplication.clipboard().setText(self.as_python())
         self.session.log("info", f"{self.title}: copied as Python.")
 
-    def take(self, path: Path) -> None:
-        """Work with a file or folder that another panel hands on; for panels that can."""
+    def take(self, what: Any) -> None:
+        """Work with what another panel hands on: mostly the path of a file or folder; for panels that can."""
         raise NotImplementedError
 
     def shutdown(self) -> None:
         """End the timers in the panel, and in subclasses its work; called before the window closes."""
         for timer in self.findChildren(QTimer):
             timer.stop()
+
+    def offer_reconnect(self, kind: Kind) -> None:
+        """Have a button in the panel that opens a device again, while it has failed."""
+        own = self.layout()
+        assert isinstance(own, QBoxLayout)
+        own.insertWidget(1, ReconnectButton(self.session, kind, self))
 
     # Telling the user ----------------------------------------------------------------------------
     def refused(self, field: QWidget | None, why: str) -> None:
@@ -113,6 +131,16 @@ class Panel(QWidget):
             return None
 
 
+_P = TypeVar("_P", bound=Panel)
+
+
+def whole(panel: _P) -> _P:
+    """Return a panel with all its parts made, at once."""
+    for _ in panel.parts():
+        pass
+    return panel
+
+
 class DevicePanel(Panel):
     """A panel of one kind of device, which looks at it again and again while it is seen.
 
@@ -120,13 +148,14 @@ class DevicePanel(Panel):
     ``show_device``.
     """
 
-    kind: ClassVar[str]
+    kind: ClassVar[Kind]
     look_ms: ClassVar[int]
 
     def watch_device(self, state: QLabel) -> None:
         """Begin to look at the device; while it is not open, ``state`` has why."""
         self._state_label = state
         self.session.device_changed.connect(self._device_changed)
+        self.offer_reconnect(self.kind)
         every(self, self.look_ms, self.look)
         self._device_changed(self.kind)
 

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QStackedWidget, QWidget
+from PySide6.QtWidgets import QScrollArea, QStackedWidget, QWidget
 
+from calibration_routines.plan_procedures import ResumeProcedure, left_unfinished
 from calibration_routines.procedure import Outcome, Outlook, Procedure, Routine
+from gui.background import NewestOnly
 from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
+from gui.panels.unserved import why_not
 from gui.procedure_run import Ended, ProcedureRun, RunBar, Situation, script
 from gui.session import BenchSession
 from gui.session_news import name_of
+from gui.way_on import WayOn
 from gui.widgets.building import after_rest, button, choice, fill, label, mark, scrolled, split, text_view
-from instrument.bench.config_file import other_bench_for
+from instrument.bench.config_file import TEMPLATES
 from instrument.files.errors import BenchError, SettingsError, count, duration, size
 
 _CHECK_MS = 250
@@ -26,6 +30,27 @@ _CHECK_MS = 250
 _SLOW_MS = 700
 """A check that takes longer than this is shown to go on: what was said of other values must not stay."""
 _FORM_WIDTH_PX = 400
+
+
+class _Forms(dict[str, OptionsForm]):
+    """The forms of routines by their names, each made when it is first asked for.
+
+    Attributes
+    ----------
+    pages : dict
+        Where those that were shown stand.
+    """
+
+    def __init__(self, routines: Sequence[Routine], changed: Callable[[], object]) -> None:
+        super().__init__()
+        self._routines = {routine.name: routine for routine in routines}
+        self._changed = changed
+        self.pages: dict[str, QScrollArea] = {}
+
+    def __missing__(self, name: str) -> OptionsForm:
+        self[name] = form = OptionsForm(self._routines[name].declared)
+        form.changed.connect(self._changed)
+        return form
 
 
 class ProcedurePanel(Panel):
@@ -52,29 +77,35 @@ class ProcedurePanel(Panel):
         self.run = ProcedureRun(session, self)
         self.outlook: Outlook | None = None
         """Of the form as it stands, once it was checked."""
-        self.views = {routine.name: OptionsForm(routine.declared) for routine in self.routines}
+        self._start_words = words
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
+        session = self.session
         self.choice = choice([routine.title for routine in self.routines], "What to do")
         self.choice.setAccessibleName("Routine")
         self.stack = QStackedWidget()
         for number, routine in enumerate(self.routines):
             self.choice.setItemData(number, routine.help, Qt.ItemDataRole.ToolTipRole)
-            self.stack.addWidget(scrolled(self.views[routine.name]))
-            self.views[routine.name].changed.connect(self._typed)
+        self.views = _Forms(self.routines, self._typed)
         if len(self.routines) == 1:
             self.choice.hide()
         self.about = label(role="dim", wraps=True)
         tip = "What will be done and why, or what stands against it; can be copied"
         self.verdict = text_view(tip=tip)
         self.verdict.setMaximumHeight(150)
-        self.run_bar = RunBar(self.run, words)
+        self.run_bar = RunBar(self.run, self._start_words)
         tip = "Take what was measured to where it is used"
         self.use_button = button(self.use_words, tip, self._use)
-        tip = "Open the run that ended early among the runs, where it is resumed"
-        self.go_on_button = button("Go on with it…", tip, self._go_on)
-        for after in (self.use_button, self.go_on_button):
-            after.hide()
+        self.use_button.hide()
+        tip = "A simulated bench that serves this routine, in the place of this one"
+        self.other_button = button("", tip, self._open_other)
+        self.other_button.hide()
+        self.way_on = WayOn(self.session, self)
+        self.way_on.go_on.connect(self.resume)
+        self._left = NewestOnly(self.jobs, "Looking for runs that did not end")
         self._result: Path | None = None
-        self._unfinished: Path | None = None
+        yield
         left = fill(
             QWidget(),
             self.choice,
@@ -83,15 +114,19 @@ class ProcedurePanel(Panel):
             self.verdict,
             self.run_bar,
             self.use_button,
-            self.go_on_button,
+            self.way_on,
+            self.other_button,
             margins=(0, 0, 6, 0),
         )
+        yield
         self.right = QWidget()
         """For the subclass."""
         sizes = [_FORM_WIDTH_PX, 3 * _FORM_WIDTH_PX]
         fill(self.body, split(left, self.right, sizes=sizes, stretch=1, firm=True))
-
+        yield
         self._started: set[str] = set()
+        self._said_at_end = ""
+        """How the last procedure ended, as long as that is shown."""
         self._check_job: Job | None = None
         self._again = False
         self._unchecked = False
@@ -108,6 +143,7 @@ class ProcedurePanel(Panel):
         session.device_changed.connect(lambda _: self._rest.start())
         session.jobs.job_ended.connect(self._job_ended)
         self._chosen()
+        self._look_for_unfinished()
 
     # The form ------------------------------------------------------------------------------------
     @property
@@ -119,6 +155,11 @@ class ProcedurePanel(Panel):
     def view(self) -> OptionsForm:
         """The form that is shown, as a widget."""
         return self.views[self.routine.name]
+
+    def take(self, what: str) -> None:
+        """Choose a routine, by its name."""
+        self.choice.setCurrentIndex([routine.name for routine in self.routines].index(what))
+        self.run_bar.start_button.setFocus()
 
     def procedure(self) -> Procedure | None:
         """Return what the form asks for; None, and fields marked, where it makes no sense."""
@@ -148,14 +189,17 @@ class ProcedurePanel(Panel):
         self.outlook, self._unchecked = None, False
         needed = () if self._with_files else ("camera", *self.routine.needs)
         missing = [kind for kind in needed if not self.session.is_open(kind)]
+        unserved = why_not(self.session, self.routine.title, needed, self.routine.tried_on)
+        self.other_button.setVisible(bool(unserved))
+        if unserved:
+            self.other_button.setText(f"Open the simulated {TEMPLATES[self.routine.tried_on][0]}")
+            self._say(unserved, wrong=True)
+            self.run_bar.set_startable("It takes another bench.")
+            return
         if missing:
             names = " and ".join(map(name_of, missing))
-            self._say(f"The bench has no {names} that is open.", wrong=True)
+            self._say(f"The {names} of this bench must be open.", wrong=True)
             self.run_bar.set_startable("Not all devices are open.")
-            return
-        if needed and (wrong := other_bench_for(self.session.config, needed, self.routine.tried_on)):
-            self._say(wrong, wrong=True)
-            self.run_bar.set_startable("It takes another bench.")
             return
         bench, routine = self.session.bench, self.routine
         first = routine.start if routine.name not in self._started else None
@@ -185,6 +229,7 @@ class ProcedurePanel(Panel):
         self._slow.start()
         self._check_job.succeeded.connect(partial(self._checked, routine))
         self._check_job.failed.connect(self._check_failed)
+        self._check_job.cancelled.connect(lambda _: self._check_stopped())
         self._check_job.ended.connect(self._check_ended)
 
     def show_problem(self, error: BenchError) -> None:
@@ -222,7 +267,12 @@ class ProcedurePanel(Panel):
             return
         self.accepted()
         self.use_button.hide()
-        self.go_on_button.hide()
+        tip = "A simulated bench that serves this routine, in the place of this one"
+        self.other_button = button("", tip, self._open_other)
+        self.other_button.hide()
+        self.way_on.offer(None)
+        self._left.forget()
+        self._said_at_end = ""
         self._say(f"{title} goes on.", wrong=False)
         self.run_bar.set_running(True)
         self.stack.setEnabled(False)
@@ -240,7 +290,11 @@ class ProcedurePanel(Panel):
 
     # Inside --------------------------------------------------------------------------------------
     def _chosen(self) -> None:
-        self.stack.setCurrentIndex(self.choice.currentIndex())
+        page = self.views.pages.get(self.routine.name)
+        if page is None:
+            page = self.views.pages[self.routine.name] = scrolled(self.view)
+            self.stack.addWidget(page)
+        self.stack.setCurrentWidget(page)
         self.about.setText(f"{self.routine.help.removesuffix('.')}.")
         self._typed()
 
@@ -254,6 +308,7 @@ class ProcedurePanel(Panel):
             return False
 
     def _typed(self) -> None:
+        self._said_at_end = ""
         if self.routine.files is not None:
             self.view.hide_fields(self.routine.useless(with_files=self._with_files))
         self.run_bar.set_startable("It is being checked.")
@@ -279,6 +334,13 @@ class ProcedurePanel(Panel):
         self._say(why, wrong=True)
         self.run_bar.set_startable("It cannot be checked; see below the form.")
 
+    def _check_stopped(self) -> None:
+        """Have what STOP broke off checked anew, once the bench is free."""
+        self._again, self._unchecked = False, True
+        self._say(
+            "STOP ended the check of this form. It is checked again when the bench is safe.", wrong=False
+        )
+
     def _check_ended(self) -> None:
         self._check_job = None
         self._slow.stop()
@@ -290,15 +352,29 @@ class ProcedurePanel(Panel):
         if self._unchecked and job.lanes:
             self._rest.start()
 
+    def _open_other(self) -> None:
+        self.session.handed_on.emit("start", self.routine.tried_on)
+
     def _use(self) -> None:
         self.session.handed_on.emit(self.handed_to, self._result)
 
-    def _go_on(self) -> None:
-        self.session.handed_on.emit("runs", self._unfinished)
+    def resume(self, run: Path) -> None:
+        """Go on with a run that did not end, here."""
+        if not self.run.is_running:
+            self.carry_out(f"Resuming {run.name}", ResumeProcedure(run))
+
+    def _look_for_unfinished(self) -> None:
+        """Offer the newest run of these routines where it did not end, of an earlier day as well."""
+        folder, names = self.session.runs_folder, [routine.name for routine in self.routines]
+        self._left.ask(lambda: left_unfinished(folder, names), self._offer_unfinished)
+
+    def _offer_unfinished(self, run: Path | None) -> None:
+        if run is not None and not self.run.is_running:
+            self.way_on.offer(run, f"Go on with {run.name}, which did not end")
 
     def _succeeded(self, outcome: Outcome) -> None:
         where = [str(path) for path in (*outcome.runs, outcome.calibration, *outcome.files) if path]
-        self._say("\n".join((*outcome.verdict, *where)), wrong=not outcome.good)
+        self._end_with("\n".join((*outcome.verdict, *where)), wrong=not outcome.good)
         pictures = [file for file in outcome.files if file.suffix == ".tif"]
         self._result = outcome.calibration or next(iter(pictures), None)
         self.use_button.setVisible(self._result is not None)
@@ -306,14 +382,20 @@ class ProcedurePanel(Panel):
         self.finished(outcome)
 
     def _ended_early(self, ended: Ended) -> None:
-        self._say(ended.words, wrong=True)
-        self._unfinished = ended.run
-        self.go_on_button.setVisible(ended.run is not None)
+        self._end_with(ended.words, wrong=False)
+        self.way_on.offer(ended.run)
         self.run_bar.show_end("Ended early; nothing moves, light off", complete=False)
 
-    def _failed(self, why: str) -> None:
-        self._say(why, wrong=True)
-        self.run_bar.show_end("Failed", complete=False)
+    def _failed(self, ended: Ended) -> None:
+        self._end_with(ended.words, wrong=True)
+        self.way_on.offer(ended.run)
+        self.run_bar.show_end("Failed; light off, nothing moves", complete=False)
+
+    def _end_with(self, words: str, *, wrong: bool) -> None:
+        """Say how it ended, until something else is asked for."""
+        self._said_at_end = ""
+        self._say(words, wrong=wrong)
+        self._said_at_end = words
 
     def _over(self) -> None:
         words = self.run_bar.words.text()
@@ -321,8 +403,11 @@ class ProcedurePanel(Panel):
         self.run_bar.words.setText(words)
         self.stack.setEnabled(True)
         self.choice.setEnabled(True)
-        self.run_bar.set_startable()
+        self.check()  # what was possible before may not be any more
 
     def _say(self, text: str, *, wrong: bool) -> None:
+        if self._said_at_end:  # it stays while nothing else is asked for
+            text = "\n".join([self._said_at_end, *([text] if wrong else [])])
+            wrong = wrong or bool(self.verdict.property("refused"))
         self.verdict.setPlainText(text)
         mark(self.verdict, "refused", wrong)

@@ -7,11 +7,13 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Protocol
 
 from PySide6.QtCore import QObject, Signal
 from PySide6.QtWidgets import QWidget
 
 from calibration_routines.display.display_io import SpotLook
+from calibration_routines.plan_procedures import unfinished
 from calibration_routines.procedure import Listener, Outcome, Procedure, RunEndedError, place_of
 from calibration_routines.psf.sweep_plan import SweepExposures
 from calibration_routines.psf.sweep_procedure import event_lines, exposure_lines
@@ -73,6 +75,8 @@ class _Mailbox(Listener):
         self._lines: list[str] = []
         self._events: list[SweepEvent] = []
         self._looks: list[SpotLook] = []
+        self.left: Path | None = None
+        """The run that can go on, of a procedure that a fault or STOP ended."""
 
     # In the job's thread -------------------------------------------------------------------------
     def step(self, words: str) -> None:
@@ -132,7 +136,7 @@ class _Mailbox(Listener):
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """A procedure that was aborted or stopped.
+    """A procedure that was aborted or stopped, or that a fault ended.
 
     Attributes
     ----------
@@ -158,7 +162,7 @@ class ProcedureRun(QObject):
     succeeded : Outcome
     ended_early : Ended
         Somebody aborted or stopped it.
-    failed : str
+    failed : Ended
     over
         After one of these three.
     """
@@ -168,7 +172,7 @@ class ProcedureRun(QObject):
     look = Signal(object)
     succeeded = Signal(object)
     ended_early = Signal(object)
-    failed = Signal(str)
+    failed = Signal(object)
     over = Signal()
 
     def __init__(self, session: BenchSession, parent: QObject | None = None) -> None:
@@ -197,9 +201,13 @@ class ProcedureRun(QObject):
             try:
                 return procedure.carry_out(bench, control=control, listener=mailbox)
             except RunEndedError as error:
-                return Ended(f"{error.words} It can go on: the panel Runs resumes it.", error.run.path)
+                return Ended(error.words, unfinished(error.run.path))
             except EndedEarlyError as error:
-                return Ended("\n".join([str(error), *getattr(error, "__notes__", ())]))
+                words = "\n".join([str(error), *getattr(error, "__notes__", ())])
+                return Ended(words, unfinished(control.run))
+            except BaseException:
+                mailbox.left = unfinished(control.run)
+                raise
 
         self._job = job = self._session.exclusive_job(title, work)
         self._control, self._mailbox = control, mailbox
@@ -244,8 +252,6 @@ class ProcedureRun(QObject):
             if self._job is not None:
                 self._job.became = "ended early"
             self._ended_early(result)
-            if result.run is not None:
-                self._session.run_finished.emit(result.run)
             return
         for path in dict.fromkeys((*result.runs, *([result.calibration] if result.calibration else []))):
             self._session.run_finished.emit(path)
@@ -254,16 +260,23 @@ class ProcedureRun(QObject):
         self.succeeded.emit(result)
 
     def _ended_early(self, ended: Ended) -> None:
-        self._session.log("warning", ended.words)
+        self._session.log("info", ended.words)
+        self._leave(ended)
         self.ended_early.emit(ended)
 
     def _failed(self, why: str) -> None:
         self._look()
-        self.failed.emit(why)
+        ended = Ended(why, self._mailbox.left)
+        self._leave(ended)
+        self.failed.emit(ended)
 
     def _cancelled(self, words: str) -> None:
         self._look()
-        self._ended_early(Ended(words))
+        self._ended_early(Ended(words, self._mailbox.left))
+
+    def _leave(self, ended: Ended) -> None:
+        if ended.run is not None:
+            self._session.run_finished.emit(ended.run)
 
     def _over(self) -> None:
         self._timer.stop()
@@ -272,6 +285,25 @@ class ProcedureRun(QObject):
 
 
 _STEPS = 1000
+_TIPS = (
+    "Wait before the next frame, light off; press again to go on",
+    "End before the next frame; what was taken is kept and can be resumed",
+)
+
+
+class Pausable(Protocol):
+    """What is carried out, as far as its buttons see it."""
+
+    looked: Any
+
+    def pause(self) -> None:
+        """Wait at the next step."""
+
+    def resume(self) -> None:
+        """Go on."""
+
+    def abort(self) -> None:
+        """End."""
 
 
 class RunBar(QWidget):
@@ -284,28 +316,29 @@ class RunBar(QWidget):
 
     Parameters
     ----------
-    run : ProcedureRun
+    run : ProcedureRun or TaskRun
         Is paused and aborted by the buttons, and shown.
     words : str
         On the start button.
+    tips : (str, str)
+        Of the buttons that pause and abort.
     """
 
     start = Signal()
 
-    def __init__(self, run: ProcedureRun, words: str) -> None:
+    def __init__(self, run: Pausable, words: str, tips: tuple[str, str] = _TIPS) -> None:
         super().__init__()
         self.start_button = button(words, clicked=self.start, shortcut="Ctrl+Return", primary=True)
-        tip = "Wait before the next frame, light off; press again to go on"
-        self.pause_button = button("Pause", tip, checkable=True)
+        self.pause_button = button("Pause", tips[0], checkable=True)
         self.pause_button.clicked.connect(lambda on: run.pause() if on else run.resume())
-        tip = "End before the next frame; what was taken is kept and can be resumed"
-        self.abort_button = button("Abort", tip, run.abort)
+        self.abort_button = button("Abort", tips[1], run.abort)
         self.bar = share_bar(_STEPS)
         self.words = label(role="dim", wraps=True, yields=True)
         buttons = in_row((self.start_button, 2), self.pause_button, self.abort_button)
         fill(self, buttons, self.bar, self.words, margins=(0, 4, 0, 0))
         run.looked.connect(self.show_situation)
         self._why_not = ""
+        self._when_paused = ", light off" if tips is _TIPS else ""
         self.set_running(False)
 
     def set_startable(self, why_not: str = "") -> None:
@@ -334,7 +367,7 @@ class RunBar(QWidget):
         elif now.total:
             words.append(f"{now.done / now.total:.0%}")
         if now.paused:
-            words.append("PAUSED, light off")
+            words.append(f"PAUSED{self._when_paused}")
         elif now.seconds_left is not None:
             words.append(f"{'at most ' if now.at_most else ''}{duration(now.seconds_left)} left")
         self.words.setText(", ".join(words))

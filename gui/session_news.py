@@ -7,6 +7,7 @@ import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from drivers.device import Device
@@ -37,6 +38,15 @@ class OperatorRequest:
         self._done.wait()
         if self._refused:
             raise KeyboardInterrupt
+
+
+@dataclass(frozen=True, slots=True)
+class OwnFiles:
+    """Files from anywhere to be worked with: a photograph and its PSF, or a result."""
+
+    photograph: Path | None = None
+    psf: Path | None = None
+    result: Path | None = None
 
 
 DeviceCondition = Literal["closed", "opening", "open", "failed"]

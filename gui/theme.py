@@ -1,4 +1,4 @@
-"""Looks for a dark room: a dark theme, a red one that spares night vision, and colour maps of images."""
+"""Looks: a dark theme, a light one, a red one that spares night vision, and colour maps of images."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ from instrument.live.frame_view import SATURATED
 
 @dataclass(frozen=True, slots=True)
 class Colours:
-    """The colours of a theme, as ``#rrggbb``."""
+    """The colours of a theme, as ``#rrggbb``; contrasts are those of WCAG 2.1 AA."""
 
     window: str
     panel: str
     field: str
     line: str
+    """Between parts; says nothing."""
+    border: str
+    """Round what takes keys and clicks."""
     text: str
     dim: str
     accent: str
@@ -29,13 +32,19 @@ class Colours:
     warning: str
     error: str
     stop: str
+    """Of no other area is the contrast with the window as great."""
     stop_text: str
+    primary: str
+    """Fills the button that a panel is there for, what is switched on, what is chosen."""
+    primary_text: str
+    badge: str
+    badge_text: str
     curves: tuple[str, ...]
     """For plots, in turn."""
-    colour_map: str
+    colour_map: str = "grey"
     """The images' colour map to begin with: a name of ``gui.theme``."""
     red_light_only: bool = False
-    """Whether hues cannot distinguish things: brightness has to."""
+    """Whether hues cannot distinguish things: brightness, dashes and words have to."""
 
 
 DARK = Colours(
@@ -43,36 +52,68 @@ DARK = Colours(
     panel="#1b1f26",
     field="#242a33",
     line="#343c48",
+    border="#6c7889",
     text="#d7dde6",
-    dim="#8792a2",
-    accent="#4aa3df",
+    dim="#98a3b3",
+    accent="#5fb0e8",
     ok="#58c08a",
     warning="#e5b454",
-    error="#f0716b",
-    stop="#d5322d",
+    error="#f58079",
+    stop="#ff5247",
+    stop_text="#1a0000",
+    primary="#1f5f8b",
+    primary_text="#ffffff",
+    badge="#6b4e00",
+    badge_text="#ffe0a0",
+    curves=("#5fb0e8", "#e5b454", "#58c08a", "#c58af0", "#f58079", "#7fd3d6"),
+)
+LIGHT = Colours(
+    window="#f1f3f6",
+    panel="#f8f9fb",
+    field="#ffffff",
+    line="#cfd5dd",
+    border="#7d8794",
+    text="#1b1f26",
+    dim="#535c69",
+    accent="#0a64a4",
+    ok="#176c3c",
+    warning="#855400",
+    error="#b3261e",
+    stop="#c8000f",
     stop_text="#ffffff",
-    curves=("#4aa3df", "#e5b454", "#58c08a", "#c58af0", "#f0716b", "#7fd3d6"),
-    colour_map="grey",
+    primary="#c9e1f4",
+    primary_text="#0b3d63",
+    badge="#ffe1a3",
+    badge_text="#4d3500",
+    curves=("#0a64a4", "#a05a00", "#176c3c", "#7a3fb0", "#b3261e", "#00707a"),
 )
 RED = Colours(
     window="#0a0000",
     panel="#120202",
     field="#1d0404",
     line="#3f0b0b",
-    text="#d83a30",
-    dim="#94241f",
-    accent="#ff4a3d",
-    ok="#b5322a",
-    warning="#ff5c4d",
-    error="#ff2a1c",
-    stop="#a80f08",
+    border="#c0302a",
+    text="#ff7a6e",
+    dim="#e8493d",
+    accent="#ff8278",
+    ok="#f0564a",
+    warning="#ff8278",
+    error="#ff5c4d",
+    stop="#ff4a3d",
     stop_text="#000000",
-    curves=("#ff4a3d", "#a82a22", "#ff8074", "#7a1a14", "#d83a30", "#ff2a1c"),
+    primary="#6e1610",
+    primary_text="#ff8278",
+    badge="#4a0e0a",
+    badge_text="#ff8278",
+    curves=("#ff8278", "#ff4a3d", "#c2251c", "#ff6a5e", "#e2473b", "#d9362c"),
     colour_map="red",
     red_light_only=True,
 )
 """Only red light: no channel but red above a few levels."""
-THEMES = {"dark": DARK, "red": RED}
+THEMES = {"dark": DARK, "light": LIGHT, "red": RED}
+
+SMALL_PT, BODY_PT, LARGE_PT, TITLE_PT = 9, 10, 12, 16
+"""The type scale: reasons and headings, everything else, hints, what a page is called."""
 
 _now = [DARK]
 
@@ -83,7 +124,7 @@ def colours() -> Colours:
 
 
 def apply_theme(app: QApplication, name: str) -> None:
-    """Give the whole program the looks of a theme, ``"dark"`` or ``"red"``."""
+    """Give the whole program the looks of a theme, one of :data:`THEMES`."""
     theme = THEMES[name]
     _now[0] = theme
     app.setStyle("Fusion")
@@ -99,16 +140,17 @@ def apply_theme(app: QApplication, name: str) -> None:
         role.Button: theme.field,
         role.ButtonText: theme.text,
         role.BrightText: theme.warning,
-        role.Highlight: theme.accent,
-        role.HighlightedText: theme.window,
+        role.Highlight: theme.primary,
+        role.HighlightedText: theme.primary_text,
         role.ToolTipBase: theme.field,
         role.ToolTipText: theme.text,
         role.Link: theme.accent,
         role.Light: theme.line,
         role.Midlight: theme.line,
-        role.Mid: theme.line,
-        role.Dark: theme.window,
+        role.Mid: theme.border,
+        role.Dark: theme.border,
         role.Shadow: theme.window,
+        role.Accent: theme.accent,
     }.items():
         palette.setColor(what, QColor(colour))
     for what in (role.WindowText, role.Text, role.ButtonText):
@@ -117,67 +159,107 @@ def apply_theme(app: QApplication, name: str) -> None:
     app.setStyleSheet(_style(theme))
 
 
+def contrast(one: str, other: str) -> float:
+    """Return the contrast of two colours, 1 to 21 (WCAG 2.1, "contrast ratio")."""
+    high, low = sorted((luminance(one), luminance(other)), reverse=True)
+    return (high + 0.05) / (low + 0.05)
+
+
+def luminance(colour: str) -> float:
+    """Return the relative luminance of ``#rrggbb``, 0 to 1 (WCAG 2.1, from sRGB)."""
+    levels = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    linear = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
 def _style(c: Colours) -> str:
-    faint = QColor(c.dim).darker(150).name()
-    filled = QColor(c.accent).darker(220).name()  # text over it stays readable
+    faint = QColor(c.dim)
+    faint.setAlpha(130)
+    unused = faint.name(QColor.NameFormat.HexArgb)
+    side = f"4px solid {c.field}"
+    arrow = f"image: none; width: 0; height: 0; border-left: {side}; border-right: {side};"
     return f"""
-QWidget {{ font-size: 10pt; }}
-QToolTip {{ background: {c.field}; color: {c.text}; border: 1px solid {c.line}; padding: 3px; }}
-QLineEdit, QPlainTextEdit, QTextEdit, QSpinBox, QDoubleSpinBox, QListView, QTreeView, QTableView {{
-  background: {c.field}; border: 1px solid {c.line}; border-radius: 4px; padding: 3px 5px;
-  selection-background-color: {c.accent}; selection-color: {c.window}; }}
-QLineEdit:focus, QPlainTextEdit:focus, QListView:focus, QTableView:focus {{ border-color: {c.accent}; }}
+QWidget {{ font-size: {BODY_PT}pt; }}
+QToolTip {{ background: {c.field}; color: {c.text}; border: 1px solid {c.border}; padding: 3px; }}
+QLineEdit, QPlainTextEdit, QTextEdit, QListView, QTreeView, QTableView, QComboBox {{
+  background: {c.field}; color: {c.text}; border: 1px solid {c.border}; border-radius: 4px; padding: 3px 5px;
+  selection-background-color: {c.primary}; selection-color: {c.primary_text}; }}
+QLineEdit:focus, QPlainTextEdit:focus, QListView:focus, QTableView:focus, QComboBox:focus, QComboBox:on {{
+  border: 2px solid {c.accent}; padding: 2px 4px; }}
+QLineEdit {{ placeholder-text-color: {c.dim}; }}
+QLineEdit:read-only {{ background: {c.panel}; }}
+QLineEdit:disabled, QComboBox:disabled {{ color: {unused}; border-color: {c.line}; }}
+QComboBox::drop-down {{ border: none; width: 16px; }}
+QComboBox::down-arrow {{ {arrow} border-top: 5px solid {c.dim}; }}
+QComboBox::down-arrow:disabled {{ border-top-color: {c.line}; }}
+QComboBox QAbstractItemView {{ border: 1px solid {c.border}; padding: 0; }}
 QGraphicsView {{ border: 1px solid transparent; }}
 QGraphicsView:focus {{ border: 1px solid {c.accent}; }}
-QLineEdit:read-only {{ background: {c.panel}; }}
 *[refused="true"] {{ border: 2px solid {c.error}; color: {c.error}; font-weight: 700; }}
-QLabel#reason {{ color: {c.error}; font-size: 9pt; }}
+QLabel[warns="warning"] {{ color: {c.warning}; font-weight: 700; }}
+QLabel[warns="error"] {{ color: {c.error}; font-weight: 700; }}
+QLabel#reason {{ color: {c.error}; font-size: {SMALL_PT}pt; }}
 QLabel#refusal {{ color: {c.warning}; }}
 QLabel#dim, QLabel[role="dim"] {{ color: {c.dim}; }}
 QLabel[role="value"] {{ color: {c.text}; font-weight: 600; }}
-QLabel[role="heading"] {{ color: {c.dim}; font-size: 9pt; font-weight: 600; }}
-QPushButton, QToolButton {{ background: {c.field}; border: 1px solid {c.line}; border-radius: 4px;
-  padding: 4px 10px; }}
-QPushButton:hover, QToolButton:hover {{ border-color: {c.accent}; }}
-QPushButton:focus, QToolButton:focus {{ border-color: {c.accent}; }}
-QPushButton:pressed, QPushButton:checked, QToolButton:checked {{ background: {c.accent}; color: {c.window}; }}
-QPushButton:disabled, QToolButton:disabled {{ color: {faint}; }}
-QPushButton:flat {{ background: transparent; border: none; color: {c.dim}; padding: 2px 6px; }}
-QPushButton:flat:hover, QPushButton:flat:focus {{ color: {c.accent}; }}
-QPushButton#stop {{ background: {c.stop}; color: {c.stop_text}; border: none; border-radius: 5px;
-  font-size: 14pt; font-weight: 800; padding: 6px 26px; letter-spacing: 2px; }}
-QPushButton#stop:hover, QPushButton#stop:focus {{ border: 2px solid {c.text}; padding: 4px 24px; }}
-QPushButton#primary {{ background: {c.accent}; color: {c.window}; border: none; font-weight: 600;
-  padding: 5px 14px; }}
-QPushButton#primary:disabled {{ background: {c.field}; color: {c.dim}; }}
-QLabel#simulated, QLabel#caution {{ background: {c.warning}; color: {c.window}; font-weight: 800;
-  padding: 3px 10px;
-  border-radius: 4px; letter-spacing: 1px; }}
-QFrame#jog-pad {{ background: {c.field}; border: 1px dashed {c.line}; border-radius: 5px; }}
+QLabel[role="title"] {{ color: {c.text}; font-size: {TITLE_PT}pt; font-weight: 600; }}
+QLabel[role="hint"] {{ color: {c.dim}; font-size: {LARGE_PT}pt; }}
+QLabel[role="heading"] {{ color: {c.dim}; font-size: {SMALL_PT}pt; font-weight: 600; }}
+QPushButton, QToolButton, QCommandLinkButton {{ background: {c.field}; color: {c.text};
+  border: 1px solid {c.border}; border-radius: 4px; padding: 4px 10px; }}
+QPushButton:hover, QToolButton:hover, QCommandLinkButton:hover {{ border-color: {c.accent}; }}
+QPushButton:focus, QToolButton:focus, QCommandLinkButton:focus {{
+  border: 2px solid {c.accent}; padding: 3px 9px; outline: none; }}
+QPushButton:pressed, QPushButton:checked, QToolButton:checked {{
+  background: {c.primary}; color: {c.primary_text}; }}
+QPushButton:disabled, QToolButton:disabled {{ color: {unused}; border-color: {c.line}; }}
+QPushButton:flat, QToolButton[autoRaise="true"] {{ background: transparent; border: 1px solid transparent;
+  color: {c.dim}; padding: 2px 6px; }}
+QPushButton:flat:hover, QPushButton:flat:focus, QToolButton[autoRaise="true"]:hover,
+QToolButton[autoRaise="true"]:focus {{ color: {c.accent}; border-color: {c.accent}; }}
+QCommandLinkButton {{ border-radius: 6px; padding: 8px; text-align: left; }}
+QCommandLinkButton:focus {{ padding: 7px; }}
+QPushButton#stop {{ background: {c.stop}; color: {c.stop_text}; border: 2px solid {c.stop};
+  border-radius: 5px;
+  font-size: {LARGE_PT + 2}pt; font-weight: 800; padding: 4px 24px; letter-spacing: 2px; }}
+QPushButton#stop:hover, QPushButton#stop:focus {{ border-color: {c.text}; }}
+QPushButton#primary {{ background: {c.primary}; color: {c.primary_text}; border: 1px solid {c.accent};
+  font-weight: 600; padding: 4px 13px; }}
+QPushButton#primary:focus {{ border: 2px solid {c.text}; padding: 3px 12px; }}
+QPushButton#primary:disabled {{ background: {c.field}; color: {unused}; border-color: {c.line}; }}
+QLabel#simulated, QLabel#caution {{ background: {c.badge}; color: {c.badge_text}; font-weight: 800;
+  border: 1px solid {c.warning}; padding: 3px 10px; border-radius: 4px; letter-spacing: 1px; }}
+QLabel#caption {{ background: {c.panel}; color: {c.text}; padding: 2px 8px; border-radius: 4px; }}
+QFrame#jog-pad {{ background: {c.field}; border: 1px dashed {c.border}; border-radius: 5px; }}
 QFrame#jog-pad[active="true"] {{ border: 2px solid {c.accent}; }}
 QFrame#strip {{ background: {c.panel}; border-bottom: 1px solid {c.line}; }}
 QGroupBox {{ border: 1px solid {c.line}; border-radius: 5px; margin-top: 10px; padding-top: 6px; }}
 QGroupBox::title {{ subcontrol-origin: margin; left: 8px; padding: 0 4px; color: {c.dim}; }}
+QTabBar {{ qproperty-drawBase: 0; }}
 QTabWidget::pane {{ border: 1px solid {c.line}; }}
 QTabBar::tab {{ background: {c.panel}; color: {c.dim}; border: 1px solid {c.line}; border-bottom: none;
   padding: 5px 12px; margin-right: 1px; }}
 QTabBar::tab:selected {{ background: {c.field}; color: {c.text}; border-top: 2px solid {c.accent}; }}
 QTabBar::tab:hover {{ color: {c.text}; }}
+QTabBar::tab:selected:focus {{ color: {c.accent}; border: 2px solid {c.accent}; }}
 QDockWidget {{ color: {c.dim}; }}
 QDockWidget::title {{ background: {c.panel}; padding: 4px 8px; }}
 QMainWindow::separator {{ background: {c.line}; width: 3px; height: 3px; }}
 QSplitter::handle {{ background: {c.line}; }}
-QProgressBar {{ background: {c.field}; border: 1px solid {c.line}; border-radius: 4px; text-align: center; }}
-QProgressBar::chunk {{ background: {filled}; border-radius: 3px; }}
+QProgressBar {{ background: {c.field}; color: {c.text}; border: 1px solid {c.line}; border-radius: 4px;
+  text-align: center; }}
+QProgressBar::chunk {{ background: {c.primary}; border-radius: 3px; }}
+QHeaderView::section {{ background: {c.panel}; color: {c.dim}; border: none;
+  border-bottom: 1px solid {c.line}; padding: 3px 6px; }}
 QScrollBar:vertical {{ background: {c.window}; width: 10px; }}
 QScrollBar:horizontal {{ background: {c.window}; height: 10px; }}
-QScrollBar::handle {{ background: {c.line}; border-radius: 4px; min-height: 24px; min-width: 24px; }}
+QScrollBar::handle {{ background: {c.border}; border-radius: 4px; min-height: 24px; min-width: 24px; }}
 QScrollBar::add-line, QScrollBar::sub-line {{ width: 0; height: 0; }}
 QStatusBar {{ background: {c.panel}; color: {c.dim}; }}
 QToolBar {{ border: none; border-bottom: 1px solid {c.line}; }}
 QMenuBar {{ border: none; }}
-QMenuBar, QMenu {{ background: {c.panel}; }}
-QMenu::item:selected, QMenuBar::item:selected {{ background: {c.accent}; color: {c.window}; }}
+QMenuBar, QMenu {{ background: {c.panel}; color: {c.text}; }}
+QMenu::item:selected, QMenuBar::item:selected {{ background: {c.primary}; color: {c.primary_text}; }}
 """
 
 

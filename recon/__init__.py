@@ -1,12 +1,13 @@
 """Numbers only: optics, operators, priors, solvers, analysis. Knows no device, no file format, no window."""
 
 from recon.base.noise import NoiseModel
+from recon.camera.grid import Grid
 from recon.errors import InputError
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import Options, ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import judged, reconstruct
-from recon.reconstruction.result import Grid, Reconstruction
+from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solve import solve
 from recon.types import Calibration, Geometry

@@ -195,6 +195,7 @@ class SimulatedCamera(SimulatedCameraSettings):
                     continue
                 rate = self.options.frames_per_s or self._spec.frames_per_s
                 period = max(1 / rate, self._exposure_ms * 1e-3) * self.world.clock.time_scale
+                self.world.clock.skip(1 / rate - self._exposure_ms * 1e-3)
                 # A camera's clock does not wait for a busy host: what was late is made up for, up to a point.
                 due = max(due + period, time.monotonic() - _MOST_LATE_FRAMES * period)
                 self._abort.wait(due - time.monotonic())
@@ -266,7 +267,7 @@ class SimulatedCamera(SimulatedCameraSettings):
             light = disturbed(light, faults, (faults.seed, frame_id), self.world.clock.now_s, self._binning)
         if not self.world.clock.wait(half, self._abort):
             raise StoppedError(self.name, "the exposure was stopped.")
-        ended_ns = time.monotonic_ns() if pulse is None else pulse.time_ns + round(1e6 * exposure_ms)
+        ended_ns = self.world.clock.ticks_ns if pulse is None else pulse.time_ns + round(1e6 * exposure_ms)
         image, saturated_fraction = self._read_out(light, exposure_ms, gain, frame_id)
         return Frame(
             image,

@@ -76,6 +76,12 @@ class DisplayOptions(CommonOptions):
     dc_phase_rad: float = Field(0.6, description="Its phase.")
     fill: float = Field(0.93, gt=0, le=1, description="Modulating part of an SLM pixel's area.")
     flatness_rad: float = Field(0.0, ge=0, description="Peak of the SLM's flatness error.")
+    amplitude_swing: float = Field(
+        0.0, ge=0, lt=1, description="Part of the amplitude that the SLM loses at a phase of pi; none at 0."
+    )
+    mirrors: bool = Field(
+        False, description="Mirrors in the SLM's place: levels are amplitudes, 0 is dark, 255 is 1."
+    )
     crosstalk_px: float = Field(
         0.0, ge=0, le=2, description="Width of what smooths the phase across pixel borders, SLM pixels."
     )
@@ -154,13 +160,21 @@ class DisplayWorld(Surroundings):
         with self._lock:
             key = self.light_key()
             if self._image is None or self._image[0] != key:
-                phase, amplitude = self._slm.phase_rad, self._slm.amplitude
+                phase, amplitude = self._modulation(self._slm)
                 optics = self._scattering_display(phase.shape)
                 light = optics.irradiance(phase + self._flatness_map(phase.shape), self.pose(), amplitude)
                 light *= np.float32(self.options.light)
                 self._image = (key, light)
             image = self._image[1]
         return image if binning == 1 else block_sum(image, binning)
+
+    def _modulation(self, slm: DisplaySlm) -> tuple[Image, Image]:
+        """Return the phase that light gains at each pixel, and the part of its amplitude that returns."""
+        if self.options.mirrors:
+            return np.zeros(slm.shape, np.float32), slm.displayed / np.float32(255)
+        phase = slm.phase_rad
+        lost = self.options.amplitude_swing * np.sin(phase / 2) ** 2
+        return phase, (1 - lost).astype(np.float32)
 
     def light_key(self) -> tuple[Any, ...]:
         """Return something that changes whenever :meth:`photons_per_s` does."""

@@ -203,8 +203,12 @@ class WorldOptions(CommonOptions):
         (), description='For fall_off = "table": pairs of angle in degrees, ascending from 0, and response.'
     )
 
-    scene: Literal["none", "picture", "color_picture", "bars", "tilted_bars", "beads", "sheet"] = Field(
-        "picture", description="What stands in front of the camera; a sheet is plain, evenly white."
+    scene: Literal["none", "picture", "color_picture", "bars", "tilted_bars", "beads", "sheet", "animal"] = (
+        Field(
+            "picture",
+            description="What stands in front of the camera; a sheet is plain, evenly white; an animal "
+            "moves and flashes (preset 'microscope', camera binned 4 x).",
+        )
     )
     scene_distance_mm: Positive | None = Field(
         None, description="From the diffuser to it, or to its middle; left out: where the stage homes."

@@ -41,6 +41,11 @@ class SceneLight:
     lamps: tuple[Lamp, ...]
     distance_um: float
 
+    @property
+    def grey(self) -> bool:
+        """Whether every lamp is as bright in all bands."""
+        return all(len(set(lamp.rgb)) == 1 for lamp in self.lamps)
+
     def at(self, x_um: npt.ArrayLike, y_um: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """Return the light on places across the axis, (..., 3), relative to one LED right opposite.
 

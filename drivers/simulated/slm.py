@@ -39,12 +39,6 @@ class SlmOptions(PanelOptions):
     lut_gamma: float = Field(
         1.0, gt=0, description="Phase follows (level / 255)^gamma; 1: linear, as it should be."
     )
-    amplitude_swing: float = Field(
-        0.0, ge=0, lt=1, description="Part of the amplitude that is lost at a phase of pi; none at 0."
-    )
-    mirrors: bool = Field(
-        False, description="Mirrors instead of liquid crystal: levels are amplitudes, 0 is dark, 255 is 1."
-    )
 
 
 class SimulatedPanel(SimulatedDevice, Slm):
@@ -175,18 +169,5 @@ class SimulatedSlm(SimulatedPanel):
     @property
     def phase_rad(self) -> npt.NDArray[np.float32]:
         """The phase that light truly gains at each pixel now; what no real SLM would tell."""
-        if self.options.mirrors:
-            return np.zeros(self.shape, np.float32)
-        return self._phases()[self._displayed]
-
-    @property
-    def amplitude(self) -> npt.NDArray[np.float32]:
-        """The part of the amplitude that each pixel truly returns now."""
-        table = np.arange(256) / 255
-        if not self.options.mirrors:
-            table = 1 - self.options.amplitude_swing * np.sin(self._phases() / 2) ** 2
-        return table.astype(np.float32)[self._displayed]
-
-    def _phases(self) -> npt.NDArray[np.float32]:
         table = self.options.phase_at_full_level_rad * (np.arange(256) / 255) ** self.options.lut_gamma
-        return table.astype(np.float32)
+        return table.astype(np.float32)[self._displayed]

@@ -24,7 +24,6 @@ class Clock:
 
     def __init__(self, time_scale: float) -> None:
         self.time_scale = time_scale
-
         self._began, self._began_utc = time.monotonic(), datetime.now(UTC)
         self._skipped_s = 0.0
 
@@ -34,6 +33,13 @@ class Clock:
         if self.time_scale == 0:
             return self._skipped_s
         return (time.monotonic() - self._began) / self.time_scale
+
+    @property
+    def ticks_ns(self) -> int:
+        """The clock of the devices: nanoseconds, those that nobody waited for included."""
+        if self.time_scale:
+            return time.monotonic_ns()
+        return round(1e9 * (self._began + self._skipped_s))
 
     @property
     def utc(self) -> datetime:

@@ -13,9 +13,11 @@ import numpy.typing as npt
 from matplotlib import cbook
 
 from drivers.device import DriverOptions
+from drivers.simulated.living import POWER, LivingLight
 from drivers.simulated.options import PRESETS, Preset, WorldOptions
 from drivers.simulated.scene_light import SceneLight
 from drivers.simulated.surroundings import Surroundings
+from recon.optics.animal import Animal, draw_animal
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.fall_off import (
     FallOff,
@@ -102,6 +104,7 @@ Rgb = tuple[float, float, float]
 Image = npt.NDArray[np.float32]
 
 CACHE_BYTES = 256 << 20
+BAND_WEIGHTS: tuple[Rgb, Rgb, Rgb] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class SimulatedWorld(Surroundings):
@@ -134,7 +137,14 @@ class SimulatedWorld(Surroundings):
         self._cache: OrderedDict[Any, Image] = OrderedDict()
         self._emission: Rgb = (0.0, 0.0, 0.0)
         self._carrier: Callable[[], Position] = lambda: (0.0, 0.0, 1e3 * preset.source_distance_mm)
-        self._scene = make_scene(options, preset, self.distance_um)
+        self.animal: Animal | None = None
+        """What lives, where the scene does."""
+        if options.scene == "animal":
+            self.animal = draw_animal(*_place(options, preset, self.distance_um), options.seed)
+        self._living: dict[tuple[Rgb, int], LivingLight] = {}
+        self._born_s: float | None = None
+        alive = self.animal
+        self._scene = alive.scene(POWER) if alive else make_scene(options, preset, self.distance_um)
         self._scene_number = 0
         self._scene_light: SceneLight | None = None
         self._screen: tuple[Scene, ...] = ()
@@ -215,7 +225,7 @@ class SimulatedWorld(Surroundings):
         """
         # A nanometre decides nothing; without rounding no two visits of a place would share their picture.
         source = (round(source_um[0], 3), round(source_um[1], 3), round(source_um[2], 3))
-        return self._cached(("psf", source, weights, binning), lambda: self._psf(source, weights, binning))
+        return self._mixed(("psf", source), weights, binning, lambda band: self._psf(source, band, binning))
 
     def _psf(self, source: Position, weights: Rgb, binning: int) -> Image:
         grid = self.sensor_grid(binning)
@@ -230,6 +240,19 @@ class SimulatedWorld(Surroundings):
         light *= response_on(grid, source, self.distance_um, self.fall_off)
         return light
 
+    def _mixed(
+        self, what: tuple[Any, ...], weights: Rgb, binning: int, make: Callable[[Rgb], Image]
+    ) -> Image:
+        """Return light in proportions of the bands; each band's is computed once, whichever pixel asks."""
+        total: Image | None = None
+        for band, weight in zip(BAND_WEIGHTS, weights, strict=True):
+            if weight:
+                light = self._cached((*what, band, binning), partial(make, band))
+                if weight != 1:
+                    light = light * np.float32(weight)
+                total = light if total is None else total + light
+        return np.zeros(self.sensor_grid(binning).shape, np.float32) if total is None else total
+
     def photons_per_s(self, weights: Rgb, binning: int = 1) -> Image | None:
         """Photons a second on every binned pixel now, or None when all is dark."""
         light = None
@@ -243,24 +266,30 @@ class SimulatedWorld(Surroundings):
         with self._lock:
             scene, number = self._scene, self._scene_number
         for shown in self._screen:
-            picture = self._cached(
-                ("screen", shown, weights, binning), partial(self._render, shown, weights, binning)
-            )
-            light = picture if light is None else light + picture
-        if self.scene_lit and scene is not None:
-            seen = product(self._glow(self.options.scene_rgb), weights)
-            picture = self._cached(
-                ("scene", number, seen, binning), lambda: self._render(scene, seen, binning)
-            )
+            picture = self._picture(("screen", shown), shown, None, weights, binning)
             light = picture if light is None else light + picture
         leds = self._scene_light
-        if leds is not None and scene is not None:
-            seen = product(self._glow(self.options.scene_rgb), weights)
-            picture = self._cached(
-                ("scene", number, seen, binning, leds), lambda: self._render(leds.on(scene), seen, binning)
-            )
-            light = picture if light is None else light + picture
+        for lit in ((None,) if self.scene_lit else ()) + (() if leds is None else (leds,)):
+            if scene is not None:
+                seen = product(self._glow(self.options.scene_rgb), weights)
+                if lit is None and self.animal is not None:
+                    picture = self._alive(self.animal, seen, binning)
+                else:
+                    picture = self._picture(("scene", number, lit), scene, lit, seen, binning)
+                light = picture if light is None else light + picture
         return light
+
+    def _picture(
+        self, what: tuple[Any, ...], scene: Scene, leds: SceneLight | None, weights: Rgb, binning: int
+    ) -> Image:
+        """Return light of a scene that glows, or is lit by LEDs: at once where all is grey, else by bands."""
+
+        def render_in(seen: Rgb) -> Image:
+            return self._render(scene if leds is None else leds.on(scene), seen, binning)
+
+        if scene.grey and (leds is None or leds.grey):
+            return self._cached((*what, weights, binning), lambda: render_in(weights))
+        return self._mixed(what, weights, binning, render_in)
 
     def _render(self, scene: Scene, weights: Rgb, binning: int) -> Image:
         return render(
@@ -274,6 +303,19 @@ class SimulatedWorld(Surroundings):
             settings=RenderSettings(spectral_samples=self.options.spectral_samples),
         )
 
+    def _alive(self, animal: Animal, seen: Rgb, binning: int) -> Image:
+        with self._lock:
+            if (seen, binning) not in self._living:
+                self._living[seen, binning] = LivingLight(self, animal, seen, binning)
+            return self._living[seen, binning].at(self.alive_s)
+
+    @property
+    def alive_s(self) -> float:
+        """Simulated seconds since the animal was first seen."""
+        if self._born_s is None:
+            self._born_s = self.clock.now_s
+        return self.clock.now_s - self._born_s
+
     def light_key(self) -> tuple[Any, ...]:
         """Something that changes whenever :meth:`photons_per_s` does."""
         glow = self.emission
@@ -282,6 +324,8 @@ class SimulatedWorld(Surroundings):
         key: tuple[Any, ...] = (place, glow, self._scene_number if self.scene_lit else None)
         if self._screen:
             key = (*key, "screen", *self._screen)
+        if self.scene_lit and self.animal is not None:
+            key = (*key, self.alive_s)
         return key if self._scene_light is None else (*key, self._scene_number, self._scene_light)
 
     # The scene and the truth about it ---
@@ -293,7 +337,7 @@ class SimulatedWorld(Surroundings):
     def set_scene(self, scene: Scene | None) -> None:
         """Put another scene in front of the camera (None: nothing)."""
         with self._lock:
-            self._scene = scene
+            self._scene, self.animal = scene, None
             self._scene_number += 1
             for key in [key for key in self._cache if key[0] == "scene"]:
                 del self._cache[key]

@@ -13,7 +13,7 @@ from PySide6.QtCore import QObject, QSignalBlocker, Qt, Signal
 from PySide6.QtGui import QFontDatabase
 from PySide6.QtWidgets import QCheckBox, QComboBox, QPlainTextEdit, QWidget
 
-from gui.widgets.building import narrow
+from gui.widgets.building import fill, narrow
 from gui.widgets.dialogues import Browse
 from gui.widgets.entry import Entry, NumberEdit, PathEntry, existing_path
 from instrument.files.errors import BenchError
@@ -52,6 +52,8 @@ class Behaviour:
     enabled_when : callable, optional
         Called with what is chosen and ticked in the form, by name; returns why the field does not apply,
         empty where it does. One that does not apply has its default.
+    beside : callable, optional
+        Makes what stands beside a number: a button that finds it.
     """
 
     browse: Browse = "open"
@@ -63,6 +65,7 @@ class Behaviour:
     help_of: Callable[[str], str] | None = None
     offers: Callable[[], Sequence[str]] | None = None
     enabled_when: Callable[[dict[str, Any]], str] | None = None
+    beside: Callable[[], QWidget] | None = None
 
 
 class OptionField(QObject):
@@ -173,7 +176,10 @@ class NumberField(OptionField):
             empty += f" ({self.unit})" if self.unit else ""
         self.widget: NumberEdit = NumberEdit(self.unit, integer=option.is_whole, tip=self.tip, empty=empty)
         self.widget.check = lambda number: self.problem(self._in_own_unit(number))
-        self.whole = self.widget
+        beside = behaviour.beside
+        self.whole = (
+            self.widget if beside is None else fill(QWidget(), (self.widget, 1), beside(), across=True)
+        )
         self.widget.textChanged.connect(self.edited)
         self.widget.refused.connect(self.refused)
         self.widget.submitted.connect(self.settled)
@@ -294,7 +300,7 @@ class EntryField(OptionField):
         empty = default_shown(option) or ("none" if optional else "")
         self.widget: Entry = Entry(self._understood, self.tip, empty)
         self.whole = self.widget
-        if option.kinds == (Path,):
+        if Path in (option.item, *option.kinds[:1]) and len(option.kinds) == 1:
             browse = "folder" if option.declaration.metavar == "FOLDER" else behaviour.browse
             self.whole = path = PathEntry(self.widget, browse, behaviour.filters)
             path.button.setAccessibleName(f"Choose {self.bare_label}")
@@ -324,6 +330,8 @@ class EntryField(OptionField):
         said = self.option.declaration
         if said.parse_all is not None:
             return re.split(r"[,;]?\s+", text)
+        if self.option.item is Path:
+            return [part.strip() for part in text.split(";") if part.strip()]
         if said.parse is None:
             has_parts = self.option.item is not None or isinstance(self.option.default, tuple)
             return text.replace(",", " ").split() if has_parts else text
@@ -346,7 +354,10 @@ class EntryField(OptionField):
         return self.widget.text()
 
     def _set(self, value: Any) -> None:
-        self.widget.setText("" if value is None else shown(self.option, value))
+        if self.option.item is Path:
+            self.widget.setText("; ".join(map(str, value or ())))
+        else:
+            self.widget.setText("" if value is None else shown(self.option, value))
 
 
 class LinesField(OptionField):

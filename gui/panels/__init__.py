@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from importlib import import_module
 from typing import Literal, NamedTuple
 
+from PySide6.QtWidgets import QWidget
+
 from gui.panel import Panel
+from gui.panels.unserved import UnservedPanel, why_not
 from gui.session import BenchSession
 
 Area = Literal["centre", "top right", "right", "bottom"]
@@ -24,23 +27,53 @@ class PanelEntry(NamedTuple):
     shortcut: str
     """Keys that bring it to the front."""
     tip: str
+    needs: tuple[str, ...] = ()
+    """Kinds of devices without which it can do nothing."""
+    tried_on: str = ""
+    """Of simulated benches the only one that serves it, of ``instrument.bench.config_file.TEMPLATES``."""
 
-    def made(self, session: BenchSession) -> Panel:
-        """Import the panel's class and return one of it."""
+    def load(self) -> type[Panel]:
+        """Return the panel's class, with all that it needs imported and compiled; for any thread."""
         module, _, name = self.place.partition(":")
-        panel: Panel = getattr(import_module(module), name)(session)
+        kind: type[Panel] = getattr(import_module(module), name)
+        kind.prepare()
+        return kind
+
+    def slices(self, session: BenchSession) -> Generator[None, None, Panel]:
+        """Make the panel, with a ``yield`` after each of its parts, and return it."""
+        panel: Panel
+        if why := why_not(session, self.title, self.needs, self.tried_on):
+            panel = UnservedPanel(session, self.title, why, self.tried_on)
+        else:
+            panel = self.load()(session)
         panel.title = self.title
+        yield
+        yield from panel.parts()
+        for part in panel.findChildren(QWidget):  # what showing it first would do in one go
+            part.ensurePolished()
+            yield
         return panel
 
 
+_CAMERA = ("camera",)
 PANELS: Mapping[str, PanelEntry] = {
-    "live": PanelEntry("Live view", "gui.panels.live:LivePanel", "centre", "Ctrl+1", "The camera, running"),
+    "start": PanelEntry(
+        "Start",
+        "gui.panels.start:StartPanel",
+        "centre",
+        "Alt+Home",
+        "Try a simulated bench, open yours, or work with files",
+    ),
+    "live": PanelEntry(
+        "Live view", "gui.panels.live:LivePanel", "centre", "Ctrl+1", "The camera, running", _CAMERA
+    ),
     "sweeps": PanelEntry(
         "Sweeps",
         "gui.panels.sweeps:SweepsPanel",
         "centre",
         "Ctrl+4",
         "Calibration routines and plans: plan, carry out, judge",
+        _CAMERA,
     ),
     "runs": PanelEntry(
         "Runs", "gui.panels.runs:RunsPanel", "centre", "Ctrl+5", "Past runs: look at them, or go on"
@@ -51,6 +84,8 @@ PANELS: Mapping[str, PanelEntry] = {
         "centre",
         "Ctrl+Shift+A",
         "Find the scattering mask and bring it to its place",
+        ("camera", "slm"),
+        "display",
     ),
     "reconstructions": PanelEntry(
         "Reconstructions",
@@ -66,6 +101,13 @@ PANELS: Mapping[str, PanelEntry] = {
         "Ctrl+Shift+H",
         "Compute a hologram, show it, photograph it",
     ),
+    "tasks": PanelEntry(
+        "Files",
+        "gui.panels.tasks:TasksPanel",
+        "centre",
+        "Ctrl+Shift+F",
+        "All that is done with files: verify, export, analyse, compare, videos, activity, charts, maps",
+    ),
     "charts": PanelEntry(
         "Charts", "gui.panels.charts:ChartsPanel", "centre", "Ctrl+Shift+C", "Where methods fail"
     ),
@@ -75,13 +117,19 @@ PANELS: Mapping[str, PanelEntry] = {
         "top right",
         "Ctrl+2",
         "What the newest frame shows, with its latency",
+        _CAMERA,
     ),
     "stage": PanelEntry(
-        "Stage", "gui.panels.stage:StagePanel", "right", "Ctrl+7", "Position, targets, jog, home"
+        "Stage", "gui.panels.stage:StagePanel", "right", "Ctrl+7", "Position, targets, jog, home", ("stage",)
     ),
     "led_array": PanelEntry(
-        "LED array", "gui.panels.led_array:LedPanel", "right", "Ctrl+8", "Which LEDs are lit"
+        "LED array",
+        "gui.panels.led_array:LedPanel",
+        "right",
+        "Ctrl+8",
+        "Which LEDs are lit",
+        ("led_array",),
     ),
-    "slm": PanelEntry("SLM", "gui.panels.slm:SlmPanel", "right", "Ctrl+9", "What is on the SLM"),
+    "slm": PanelEntry("SLM", "gui.panels.slm:SlmPanel", "right", "Ctrl+9", "What is on the SLM", ("slm",)),
     "log": PanelEntry("Log", "gui.panels.log:LogPanel", "bottom", "Ctrl+0", "What happened, with filters"),
 }

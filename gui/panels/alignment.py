@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -36,16 +37,29 @@ class AlignmentPanel(ProcedurePanel):
     handed_to = "holograms"
     use_words = "Compute holograms with it…"
 
+    @classmethod
+    def prepare(cls) -> None:
+        """Import the routines."""
+        list(routines.values())
+
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
+        own = [routine for routine in routines.values() if routine.command == "align"]
+        super().__init__(session, own, "Align", parent)
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
         self.spots = ImageView()
         self.spot_words = label("No picture yet.", "dim", yields=True)
         self.score: Any = plot_widget("hypothesis", "spot / ideal")
+        yield
         self.progress: Any = plot_widget("frames with spots", "brightest spot / ideal")
+        yield
         self.before = DisplacementPlot("Before")
+        yield
         self.after = DisplacementPlot("After")
+        yield
         self.pose = PoseView()
-        own = [routine for routine in routines.values() if routine.command == "align"]
-        super().__init__(session, own, "Align", parent)
+        yield from super().parts()
         self._older: Any = self.score.plot([], [])
         self._points: Any = self.score.plot([], [])
         self._best: Any = self.progress.plot([], [])
@@ -62,9 +76,12 @@ class AlignmentPanel(ProcedurePanel):
         foot = in_row((self.spot_words, 1), self.before_button, self.now_button)
         picture = fill(QWidget(), (self.spots, 1), foot)
         search = split(picture, split(self.score, self.progress), sizes=[340, 240], down=True, firm=True)
+        yield
         fields = split(self.before.plot, self.after.plot, down=True)
         self.tabs = tabs({"Spots and scores": search, "Displacement": fields, "Pose": self.pose})
+        yield
         fill(self.right, self.tabs)
+        yield
         self._first: SpotLook | None = None
         self._newest: SpotLook | None = None
         self._tried = ""
@@ -78,6 +95,9 @@ class AlignmentPanel(ProcedurePanel):
         self._first = self._newest = None
         self._scores, self._brightest, self._tried = [], [], ""
         self.spots.clear()
+        self._rings.clear()
+        self.spot_words.setText("No picture yet.")
+        self.now_button.setChecked(True)
         self.before.clear()
         self.after.clear()
         self.pose.clear()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +38,13 @@ class ChartsPanel(Panel):
         super().__init__(session, parent)
         self.maps_path = SHIPPED
         self.chart_path: Path | None = None
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
         self.stability = StabilityView()
+        yield
         self.chart = ChartView()
+        yield
         tip = "A stability.json or chart.json, made by the commands of those names"
         self.open_button = button("Open…", tip, self._choose)
         tip = "The maps that come with the program, by which verdicts are made"
@@ -51,6 +56,7 @@ class ChartsPanel(Panel):
         self.tabs.currentChanged.connect(lambda _: self._show_heading())
         top = in_row((self.heading, 1), self.open_button, self.shipped_button)
         fill(self.body, top, (self.tabs, 1))
+        yield
         self.open(self.maps_path)
 
     def open(self, path: Path) -> Job:

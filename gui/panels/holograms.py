@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -73,9 +73,15 @@ class HologramsPanel(Panel):
         self._reader = NewestOnly(session.jobs, "Reading the picture")
         self._target_shown: object = None
         """Which picture is shown, when it was changed last, and how it fills the field."""
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
+        session = self.session
         self.form = self._make_form()
+        yield
         self._names = SuggestedName(self.jobs, self.form, session.runs_folder / "holograms", ".png")
         self.views = HologramViews()
+        yield
         self.target = self.views.target
         tip = "Take off all that was painted (left button paints, right button rubs out)"
         self.clear = button("Clear what was painted", tip, self.target.clear_strokes)
@@ -95,6 +101,7 @@ class HologramsPanel(Panel):
         tip = "Show it, register the camera by the mask's speckle, photograph, compare with the target"
         self.capture_button = button("Show and photograph", tip, self.photograph)
         self.progress = share_bar()
+        yield
         left = fill(
             QWidget(),
             (scrolled(self.form), 1),
@@ -104,7 +111,9 @@ class HologramsPanel(Panel):
             in_row(self.preview_button, self.compute_button, self.stop_button),
             in_row(self.show_button, self.capture_button),
         )
+        yield
         fill(self.body, split(left, self.views, sizes=[330, 850], stretch=1))
+        yield
         self.form.refused.connect(self.refused)
         self.form.settled.connect(self._settled)
         self._show_mode()
@@ -218,6 +227,9 @@ class HologramsPanel(Panel):
             return compute(order, config, size, context, write=not preview)
 
         job = self._started(self.follow(self.jobs.compute(title, work)))
+        self.views.begin()
+        for early in (job.failed, job.cancelled):
+            early.connect(lambda _: self.views.go_back())
         job.progressed.connect(self._progressed)
         job.succeeded.connect(self._computed)
         return job

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -17,8 +18,9 @@ from gui.forms.reconstruct import CALIBRATION, PSF, ReconstructForm, SoFar, Writ
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.session import BenchSession
+from gui.session_news import OwnFiles
 from gui.theme import as_shown
-from gui.widgets.building import button, fill, in_row, label, split, tabs
+from gui.widgets.building import Hint, button, fill, in_row, label, split, tabs
 from gui.widgets.dialogues import Question, choose_path
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
@@ -52,7 +54,12 @@ class ReconstructionsPanel(Panel):
         self._explaining: Job | None = None
         self._opening: Job | None = None
         self._first_picture = True
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
+        session = self.session
         self.list = QListWidget()
+        self.list.setAccessibleName("Reconstructions")
         self.list.setToolTip("Reconstructions in the data folder, the newest first (Enter opens)")
         self.list.setAlternatingRowColors(True)
         self.list.itemActivated.connect(self._open_item)
@@ -62,28 +69,36 @@ class ReconstructionsPanel(Panel):
         self.refresh_button = button("Refresh", "Look into the data folder again", self.refresh)
         tip = "Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)"
         self.export_button = button("Export…", tip, self._choose_export, enabled=False)
+        yield
         self.form = ReconstructForm()
         self.form.asked.connect(self.reconstruct)
         self.form.questioned.connect(self.explain)
         self.form.stopped.connect(self._stop)
         self.form.refused.connect(self.refused)
+        yield
         self.picture = PictureView()
+        yield
         self.volume = VolumeView(self.jobs)
         self.volume.failed.connect(lambda why: self.refused(None, why))
+        yield
         self.facts = FactsView()
         self.convergence = ConvergenceView()
+        yield
         self.heading = label(selectable=True)
         self.place = label(role="dim")
         self.place.setAlignment(Qt.AlignmentFlag.AlignRight)
         self.place.setMinimumWidth(10)
         for hovered in (self.picture.hovered, self.volume.hovered):
             hovered.connect(self.place.setText)
-        empty = label("Open a result on the left, or reconstruct one.", "dim")
-        empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self.empty = Hint(
+            "Nothing is open: choose a result on the left, or reconstruct a photograph.",
+            "Reconstruct…",
+            lambda: self.tabs.setCurrentWidget(self.form),
+        )
         self.viewers = QStackedWidget()
-        for widget in (empty, self.picture, self.volume):
+        for widget in (self.empty, self.picture, self.volume):
             self.viewers.addWidget(widget)
-        self._arrange()
+        yield from self._arrange()
         session.run_finished.connect(lambda _: self.refresh())
         folder = self.session.runs_folder / "reconstructions"
         self._names = SuggestedName(self.jobs, self.form.options, folder, ".tif")
@@ -93,12 +108,15 @@ class ReconstructionsPanel(Panel):
         self.form.options.settled.connect(self._settled)
         self.refresh()
 
-    def _arrange(self) -> None:
+    def _arrange(self) -> Iterator[None]:
         buttons = in_row(self.open_button, self.refresh_button, self.export_button)
         results = fill(QWidget(), (self.list, 1), buttons, margins=(0, 6, 0, 0))
         self.tabs = tabs({"Results": results, "Reconstruct": self.form})
+        yield
         below = split(self.facts, self.convergence, sizes=[330, 330])
+        yield
         top = fill(QWidget(), in_row(self.heading, (self.place, 1)), (self.viewers, 1))
+        yield
         right = split(top, below, sizes=[520, 170], down=True, stretch=1)
         right.setStretchFactor(0, 3)
         fill(self.body, split(self.tabs, right, sizes=[330, 840], stretch=1))
@@ -287,11 +305,29 @@ class ReconstructionsPanel(Panel):
         self.job = job = self.jobs.compute(f"Reconstructing {request.image.name}", do)
         self._begun(job, "Reading …")
         self._close_result()
+        self._show_nothing(f"{request.image.name} is being read …")
         self._opening, self._first_picture = None, True
         self.heading.setText(f"<b>{request.image.name}</b>: in the making")
         job.progressed.connect(lambda so_far: self._progressed(so_far, volume=volume))
         job.succeeded.connect(self._reconstructed)
+        for ended, words in ((job.failed, "failed"), (job.cancelled, "stopped")):
+            ended.connect(lambda _, words=words: self._not_reconstructed(request.image.name, words))
         return job
+
+    def _show_nothing(self, words: str) -> None:
+        """Take what was shown of another result away."""
+        self.empty.say(words)
+        self.viewers.setCurrentWidget(self.empty)
+        self.place.clear()
+        self.facts.show_facts([])
+        self.convergence.show_histories((), None)
+
+    def _not_reconstructed(self, name: str, words: str) -> None:
+        """Say over what there is that it did not become a result."""
+        if self.result is None and self._opening is None:
+            self.heading.setText(f"<b>{name}</b>: {words}, nothing was written")
+            if self.viewers.currentWidget() is self.empty:
+                self._show_nothing(f"{name}: {words}. The form says why.")
 
     def explain(self) -> Job | None:
         """Say what the model ``auto`` would choose for the form, and why; nothing is reconstructed."""
@@ -369,8 +405,12 @@ class ReconstructionsPanel(Panel):
         self.refresh()
 
     # The panel -----------------------------------------------------------------------------------
-    def take(self, path: Path) -> None:
-        """Put a calibration's folder, or a photograph, into the form."""
+    def take(self, what: Path | OwnFiles) -> None:
+        """Put a calibration's folder, a photograph, or one with its PSF into the form; open a result."""
+        if isinstance(what, OwnFiles):
+            self._take_own(what)
+            return
+        path = what
         self.tabs.setCurrentWidget(self.form)
         form = self.form
         if path.is_dir() and form.kind == PSF:
@@ -379,6 +419,15 @@ class ReconstructionsPanel(Panel):
         if not path.is_dir() and not form.text(form.source) and form.kind != PSF:
             folder = self.session.runs_folder
             self._newest.ask(lambda: newest_calibration(folder), self._offer_calibration)
+
+    def _take_own(self, files: OwnFiles) -> None:
+        if files.result is not None:
+            self.open(files.result)
+            return
+        self.tabs.setCurrentWidget(self.form)
+        self.form.options.set_values({"kind": PSF})
+        self.form.options.set_values({"psf": files.psf, "image": files.photograph})
+        self.form.start.setFocus()
 
     def _offer_calibration(self, newest: Path | None) -> None:
         """Begin with the newest calibration where none was named."""

@@ -13,13 +13,14 @@ from PySide6.QtCore import QFileSystemWatcher, QSignalBlocker, Qt, QUrl
 from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import QSlider, QTableWidget, QWidget
 
-from calibration_routines.plan_procedures import ResumeProcedure, lacks_result
+from calibration_routines.plan_procedures import ResumeProcedure, can_go_on
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
 from gui.panel import Panel
 from gui.procedure_run import ProcedureRun, RunBar, script
 from gui.session import BenchSession
 from gui.widgets.building import (
+    Hint,
     after_rest,
     button,
     cell,
@@ -33,6 +34,7 @@ from gui.widgets.building import (
 )
 from gui.widgets.image_view import ImageView, usual_levels
 from instrument.bench.photograph import Progress
+from instrument.files.errors import count
 from instrument.runs.inspection import RunSummary, Verification, run_paths, summary, verify
 from instrument.runs.run import Run, RunCondition
 from recon.base.declare import Imports, expression
@@ -81,7 +83,7 @@ class RunsPanel(Panel):
         self._wanted: Path | None = None
         self._make_list()
         self._make_details()
-        left = fill(QWidget(), self.where, (self.table, 1), margins=(0, 0, 6, 0))
+        left = fill(QWidget(), self.where, (self.table, 1), (self.hint, 1), margins=(0, 0, 6, 0))
         foot = in_row((self.bar, 1), in_column(self.use_button, self.verify_button, self.folder_button, None))
         top = fill(QWidget(), (self.view, 1), self.slider, self.frame_words, margins=(6, 0, 0, 0))
         below = fill(QWidget(), (self.about, 1), foot, margins=(6, 0, 0, 0))
@@ -94,6 +96,8 @@ class RunsPanel(Panel):
         self.run.succeeded.connect(
             lambda outcome: self.bar.show_end("; ".join(outcome.verdict), complete=outcome.good)
         )
+        for early in (self.run.ended_early, self.run.failed):
+            early.connect(lambda ended: self.bar.show_end(ended.words.splitlines()[0], complete=False))
         self.run.over.connect(self._over)
         self.read_folder()
 
@@ -120,7 +124,7 @@ class RunsPanel(Panel):
         if isinstance(opened, str):
             self._close_run(opened)
             return
-        run = self.opened = opened.run
+        self.opened = opened.run
         middle = len(opened.stored) // 2  # the first ones are dark
         with QSignalBlocker(self.slider):
             self.slider.setEnabled(len(opened.stored) > 1)
@@ -128,7 +132,7 @@ class RunsPanel(Panel):
             self.slider.setValue(middle)
         self._stored = opened.stored
         self.about.setPlainText("\n".join(opened.about))
-        self._can_resume = opened.can_resume and run.condition is not RunCondition.RUNNING
+        self._can_resume = opened.can_resume
         self.bar.set_startable("" if self._can_resume else "There is nothing to go on with.")
         self.folder_button.setEnabled(True)
         self.verify_button.setEnabled(True)
@@ -176,7 +180,13 @@ class RunsPanel(Panel):
         self.table.setTextElideMode(Qt.TextElideMode.ElideMiddle)
         self.table.verticalHeader().hide()
         self.table.currentCellChanged.connect(lambda row, *_: self._row_chosen(row))
-        self.where = label(role="dim", selectable=True, wraps=True)
+        self.where = label(role="dim", selectable=True, yields=True)
+        self.hint = Hint(
+            "No run yet: each calibration, plan and recording becomes one.",
+            "Calibrate…",
+            lambda: self.session.handed_on.emit("sweeps", ""),
+        )
+        self.hint.hide()
 
     def _make_details(self) -> None:
         self.view = ImageView()
@@ -186,6 +196,7 @@ class RunsPanel(Panel):
         self.slider.valueChanged.connect(self._show_frame)
         self.frame_words = label(role="dim", yields=True)
         self.about = text_view("Click a run to open it.")
+        self.about.setAccessibleName("About the run")
         self.bar = RunBar(self.run, "Resume")
         self.bar.set_startable("No run is open.")
         self.bar.start.connect(self.resume)
@@ -200,7 +211,11 @@ class RunsPanel(Panel):
     def _show_list(self, summaries: list[RunSummary]) -> None:
         wanted = self._wanted or self._opening or (self.opened and self.opened.path)
         self.summaries = summaries
-        self.where.setText(f"{self.session.runs_folder}: {len(summaries)} runs")
+        folder = self.session.runs_folder
+        self.where.setText(f"{count(len(summaries), 'run')} in {folder.name} of {folder.parent.name}")
+        self.where.setToolTip(str(folder))
+        self.hint.setVisible(not summaries)
+        self.table.setVisible(bool(summaries))
         paths = [listed.path for listed in summaries]
         chosen = paths.index(wanted) if wanted in paths else -1
         with QSignalBlocker(self.table):
@@ -295,13 +310,12 @@ def _look_into(path: Path, *, read: bool = False, on_progress: Progress | None =
     try:
         run = Run.open(path)
         looked = verify(run, on_progress, read=read)
-        left = bool(looked.remedy()) or run.condition is RunCondition.CRASHED
-        whole = run.plan is None or run.condition is RunCondition.COMPLETED
-        can_resume = left or not whole or lacks_result(run.path)
         about = _about(run, looked)
         if read:
             about.insert(2, f"{looked.frames} frames read back: {'sound' if looked.is_sound else 'DAMAGED'}")
-        return _Opened(run, sorted(run.records), about, can_resume, (path / SWEEP.result).is_dir())
+        return _Opened(
+            run, sorted(run.records), about, can_go_on(run, looked), (path / SWEEP.result).is_dir()
+        )
     except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is shown
         return str(error)
 
@@ -313,7 +327,12 @@ def _read_frame(run: Run, index: int) -> _Picture | str:
     except Exception as error:  # noqa: BLE001 - a damaged file is named, whatever it raises
         return str(error)
     low, high = usual_levels(image)
-    words = [f"Frame {index} of {run.n_frames}", f"{metadata.exposure_ms:.4g} ms", metadata.led_pattern or ""]
+    words = [
+        f"Frame {index} of {run.n_frames}",
+        f"{metadata.utc.astimezone():%Y-%m-%d %H:%M:%S}",
+        f"{metadata.exposure_ms:.4g} ms",
+        metadata.led_pattern or "",
+    ]
     place = ", ".join(_axis_words(axis, value) for axis, value in (metadata.stage_position or {}).items())
     return _Picture(
         image,

@@ -93,7 +93,7 @@ class StagePanel(DevicePanel):
         self.state = label(wraps=True)
         self.pad = JogPad(self)
         self.setFocusProxy(self.pad)
-        tip = "Find the reference of every axis: the stage moves; asks first"
+        tip = "Find the reference of every axis: the stage moves; asks first, and reconnects after a fault"
         self.home_button = button("Home …", tip, self.ask_home)
         self._grid = QGridLayout()
         self._grid.setHorizontalSpacing(6)
@@ -113,8 +113,9 @@ class StagePanel(DevicePanel):
     def show_device(self, is_open: bool) -> None:
         """Let the stage be moved, or not; its axes have rows from when it is first open."""
         edited = [widget for row in self.rows.values() for widget in (row.target, *row.buttons)]
-        for widget in (self.pad, self.home_button, *edited):
+        for widget in (self.pad, *edited):
             widget.setEnabled(is_open)
+        self.home_button.setEnabled(is_open or self.session.state(self.kind).condition == "failed")
         if is_open and not self.rows and self.session.bench.stage is not None:
             self._make_rows(self.session.bench.stage.axes)
 
@@ -241,6 +242,8 @@ class StagePanel(DevicePanel):
         self.question = None
         stage = self.session.bench.stage
         if agreed and stage is not None:
+            if not self.session.is_open(self.kind):
+                self.session.reconnect(self.kind)  # homing waits for it
             self.command("Homing the stage", lambda _: stage.home())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -70,24 +71,36 @@ PLAN = Routine(
 class SweepsPanel(ProcedurePanel):
     """Sweeps and plans."""
 
+    @classmethod
+    def prepare(cls) -> None:
+        """Import the routines."""
+        list(routines.values())
+
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
+        own = [routine for routine in routines.values() if routine.command == "calibrate"]
+        super().__init__(session, [*own, PLAN], "Start", parent)
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
         self.path = PathPlot()
         self.frame = ImageView()
+        yield
         self.frame_words = label("No frame yet.", "dim", yields=True)
         self.psfs = PsfTable()
         self.picture = Picture()
-        own = [routine for routine in routines.values() if routine.command == "calibrate"]
-        super().__init__(session, [*own, PLAN], "Start", parent)
+        yield from super().parts()
         shown = fill(QWidget(), (self.frame, 1), self.frame_words)
         self.tabs = tabs({"Quality of PSFs": self.psfs, "Result": self.picture})
         above = split(self.path, shown, sizes=[560, 420], firm=True)
+        yield
         fill(self.right, split(above, self.tabs, sizes=[360, 400], down=True, firm=True))
+        yield
         self._shown: Snapshot | None = None
         self._pictures = PsfPictures()
         self.run.judged.connect(self._judged)
         self.psfs.chosen.connect(self._show_psf)
         self.views["plan"].settled.connect(lambda name: self._read_plan() if name == "file" else None)
-        self._reader = NewestOnly(session.jobs, "Reading")
+        self._reader = NewestOnly(self.jobs, "Reading")
         self._plan_file: Path | None = None
 
     def show_outlook(self, outlook: Outlook) -> None:
@@ -102,6 +115,9 @@ class SweepsPanel(ProcedurePanel):
 
     def began(self) -> None:
         """Clear the last sweep."""
+        self._shown = None
+        self.frame.clear()
+        self.frame_words.setText("No frame yet.")
         self.psfs.clear()
         self.picture.clear()
         self._pictures = PsfPictures()
@@ -150,7 +166,7 @@ class SweepsPanel(ProcedurePanel):
         metadata = newest.metadata
         full_scale = (1 << metadata.significant_bits) - 1
         self._show_image(newest.image, full_scale)
-        words = [f"Last frame: {metadata.exposure_ms:.4g} ms", f"light {metadata.led_pattern or 'unknown'}"]
+        words = [f"Last frame: {self.session.describe_frame(metadata)}"]
         if metadata.saturated_fraction:
             pixels = round(metadata.saturated_fraction * newest.image.size)
             words.append(f"SATURATED: {count(max(pixels, 1), 'pixel')}")

@@ -134,10 +134,47 @@ def button(
     return made
 
 
+class Hint(QWidget):
+    """What stands where there is nothing to be seen yet: one sentence, and one button for what comes next.
+
+    Parameters
+    ----------
+    words : str
+    answer : str
+        On the button.
+    clicked : callable
+    other : (str, callable), optional
+        A second, quiet button.
+    """
+
+    def __init__(
+        self,
+        words: str,
+        answer: str,
+        clicked: Callable[[], object],
+        other: tuple[str, Callable[[], object]] | None = None,
+    ) -> None:
+        super().__init__()
+        self.words = label(words, "hint", wraps=True)
+        self.words.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self.button = button(answer, "", lambda: clicked())
+        parts: list[Part] = [self.words, in_row(None, self.button, None)]
+        if other is not None:
+            quiet = button(other[0], "", lambda: other[1]())
+            quiet.setFlat(True)
+            parts.append(in_row(None, quiet, None))
+        fill(self, None, *parts, None, margins=(16, 8, 16, 8), spacing=10)
+
+    def say(self, words: str) -> None:
+        """Say something else, to which nothing is to be done here."""
+        self.words.setText(words)
+        self.button.hide()
+
+
 def label(
     words: str = "", role: str = "", *, selectable: bool = False, wraps: bool = False, yields: bool = False
 ) -> QLabel:
-    """Return a label. ``role``: ``"dim"``, ``"value"``, ``"heading"``; one that ``yields`` widens nothing."""
+    """Return a label. ``role``: dim, value, heading, title, hint; one that ``yields`` widens nothing."""
     made = QLabel(words)
     made.setWordWrap(wraps)
     if role:
@@ -156,6 +193,7 @@ def choice(
     made = QComboBox()
     made.addItems(list(words))
     made.setToolTip(tip)
+    made.setAccessibleName(tip)
     if chosen is not None:
         made.currentIndexChanged.connect(chosen)
     return made
@@ -189,10 +227,11 @@ def text_view(text: str = "", tip: str = "") -> QPlainTextEdit:
     made = QPlainTextEdit(text)
     made.setReadOnly(True)
     made.setToolTip(tip)
+    made.setAccessibleName(tip or "Text")
     return made
 
 
-def mark(widget: QWidget, name: str, on: bool) -> None:
+def mark(widget: QWidget, name: str, on: bool | str) -> None:
     """Set a property that the style sheet looks at, such as ``refused``."""
     widget.setProperty(name, on)
     widget.style().unpolish(widget)
@@ -209,7 +248,9 @@ def table(
     made.setEditTriggers(QTableWidget.EditTrigger.NoEditTriggers)
     made.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
     made.setTabKeyNavigation(False)
+    made.setCornerButtonEnabled(False)
     made.setToolTip(tip)
+    made.setAccessibleName(tip or ", ".join(columns))
     made.verticalHeader().setDefaultSectionSize(row_px)
     header = made.horizontalHeader()
     header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)

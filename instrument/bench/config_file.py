@@ -12,20 +12,22 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from drivers.device import Device, SharedPart
+from drivers.device import Device, FoundDevice, SharedPart
 from drivers.errors import DeviceError
 from drivers.registry.registry import driver_names, load_driver, registration_mistakes
 from instrument.bench.config import (
     DEVICE_TABLES,
     PLAIN_TABLES,
     BenchConfig,
+    BenchTable,
     DeviceConfig,
     Kind,
     SharedConfig,
     Table,
 )
 from instrument.bench.config_mistakes import Mistakes, key_lines, nearest, nearest_name
-from instrument.files.errors import ConfigError, ConfigProblem, FileError
+from instrument.files.atomic import write_text
+from instrument.files.errors import BenchError, ConfigError, ConfigProblem, FileError
 from instrument.files.reading import parse_toml, read_bytes
 
 DEFAULT_NAME = "bench.toml"
@@ -48,8 +50,64 @@ def template(name: str = "default") -> str:
     return resources.files("instrument.bench").joinpath(f"{name}_bench.toml").read_text("utf-8")
 
 
+def no_bench(folder: Path) -> BenchConfig:
+    """Return a bench without devices, for work on files alone; results go into ``folder``/runs."""
+    tables: dict[str, Any] = {name: model() for name, model in PLAIN_TABLES.items()}
+    tables["bench"] = BenchTable(name="no bench", data_folder=str(folder / "runs"))
+    return BenchConfig(path=None, text="", devices={}, **tables)
+
+
+def tried_bench(name: str, folder: Path) -> BenchConfig:
+    """Return a simulated bench, one of :data:`TEMPLATES`, in a folder of its own, written if need be.
+
+    Raises FileError when it cannot be written or read; ConfigError when it was changed and is wrong now.
+    """
+    file = folder / f"simulated-{name.replace('_', '-')}" / DEFAULT_NAME
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_text(file, template(name))
+    return load_config(file)
+
+
+def connected_bench(devices: Iterable[FoundDevice], name: str) -> str:
+    """Return the ``bench.toml`` that uses devices which are connected, light and stage by hand as needed.
+
+    Raises BenchError where no driver knows one of them, two are of the same kind, or none is a camera.
+    """
+    tables: dict[str, str] = {}
+    for device in devices:
+        lines, kind = device.bench_lines(), str(device.kind)
+        if not lines:
+            raise BenchError(f"{device.description} at {device.address}: no driver knows it.")
+        if kind in tables:
+            raise BenchError(f"Two devices are a {kind}: a bench has one. Choose one of them.")
+        tables[kind] = lines
+    if "camera" not in tables:
+        raise BenchError("No camera is chosen: a bench needs one.")
+    bench = f'[bench]\nname = {json.dumps(name)}\ndata_folder = "runs"'
+    scene = '[scene]\ncontrol = "operator"          # a person is asked to light and darken the scene'
+    head = "# All keys of all drivers: docs/reference/bench-toml.md"
+    return "\n\n".join([head, bench, *(tables[kind] for kind in DEVICE_TABLES if kind in tables), scene, ""])
+
+
 def other_bench_for(config: BenchConfig, kinds: Iterable[str], name: str) -> str | None:
     """Say that a simulated bench is not the one that something can be tried on, and how to get that one.
+
+    The sentence is for the terminal; errors and parameters as :func:`not_tried_on`. None where it is.
+    """
+    wrong = not_tried_on(config, kinds, name)
+    if not wrong:
+        return None
+    what, flag = TEMPLATES[name]
+    write = " ".join(filter(None, ("diffuserbench new", f"{name}.toml", flag)))
+    return (
+        f"This cannot be tried on {config.label}, whose {' and '.join(wrong)} would see nothing of it: it "
+        f"takes a simulated {what}. Write one with {write}, then give the same command --bench {name}.toml."
+    )
+
+
+def not_tried_on(config: BenchConfig, kinds: Iterable[str], name: str) -> list[str]:
+    """Return the devices of a simulated bench that would see nothing of what is tried on another one.
 
     Parameters
     ----------
@@ -61,20 +119,13 @@ def other_bench_for(config: BenchConfig, kinds: Iterable[str], name: str) -> str
 
     Returns
     -------
-    str or None
-        None where the devices are that bench's, or some of them are no simulated ones.
+    list of str
+        Empty where the devices are that bench's, or some of them are no simulated ones.
     """
     present = {kind: device.driver_name for kind, device in config.devices.items() if kind in set(kinds)}
     tables = tomllib.loads(template(name))
-    wrong = [kind for kind, driver in present.items() if tables.get(kind, {}).get("driver") != driver]
-    if not wrong or not all(driver.startswith("simulated") for driver in present.values()):
-        return None
-    what, flag = TEMPLATES[name]
-    write = " ".join(filter(None, ("diffuserbench new", f"{name}.toml", flag)))
-    return (
-        f"This cannot be tried on {config.label}, whose {' and '.join(wrong)} would see nothing of it: it "
-        f"takes a simulated {what}. Write one with {write}, then give the same command --bench {name}.toml."
-    )
+    wrong: list[str] = [k for k, driver in present.items() if tables.get(k, {}).get("driver") != driver]
+    return wrong if all(driver.startswith("simulated") for driver in present.values()) else []
 
 
 def load_config(path: Path | str | None = None) -> BenchConfig:

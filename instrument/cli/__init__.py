@@ -1,7 +1,7 @@
 """The command line: the table of commands, and what runs them.
 
-Nothing but the standard library is imported until a command is chosen. A new command is one row of the table
-and one :class:`~instrument.cli.app.App`: ``app`` of its module, or ``module:name``.
+Nothing but the standard library and the table of tasks is imported until a command is chosen. A new command
+is one row of the table and one :class:`~instrument.cli.app.App`: ``app`` of its module, or ``module:name``.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
+
+from instrument.tasks import TASKS
 
 if TYPE_CHECKING:
     from instrument.cli.app import App
@@ -41,6 +43,11 @@ class Command(NamedTuple):
         return app
 
 
+def _task(group: str, name: str) -> Command:
+    """Return the row of a task: the window offers it, too."""
+    return Command(group, TASKS[name].help, f"tasks:{name}")
+
+
 BENCH = "The bench"
 ACQUISITION = "Acquisition"
 RECONSTRUCTION = "Reconstruction"
@@ -59,6 +66,7 @@ COMMANDS: Mapping[str, Command] = {
         "bench:devices_app",
     ),
     "serve": Command(BENCH, "offer the devices to another computer, and a page in the browser", "serve"),
+    "test": Command(BENCH, "test this installation: files, cameras, solvers, simulated bench", "selftest"),
     "completion": Command(BENCH, "print completions for bash and zsh", "completion"),
     "calibrate": Command(BENCH, "measure PSFs, the sensor, the diffuser, or an SLM", "calibrate"),
     "snap": Command(BENCH, "take a photograph", "capture:snap_app"),
@@ -68,23 +76,17 @@ COMMANDS: Mapping[str, Command] = {
     "record": Command(ACQUISITION, "record video at full camera rate", "capture:record_app"),
     "list": Command(ACQUISITION, "list the runs in a folder", "runs:list_app"),
     "show": Command(ACQUISITION, "say what is in a run; or show a hologram on the SLM", "show"),
-    "verify": Command(ACQUISITION, "read every frame of a run and check it", "runs:verify_app"),
-    "export": Command(ACQUISITION, "write a run's frames as TIFF, HDF5, NumPy, PNG, MP4", "runs:export_app"),
+    "verify": _task(ACQUISITION, "verify"),
+    "export": _task(ACQUISITION, "export"),
     "reconstruct": Command(
         RECONSTRUCTION, "reconstruct the scene from a PSF and a photograph", "reconstruct"
     ),
-    "activity": Command(RECONSTRUCTION, "fluorescence over time: dF/F, regions, traces", "activity"),
-    "analyze": Command(
-        ANALYSIS,
-        "what a calibration's optics can do: one page and JSON",
-        "calibrations:analyze_app",
-    ),
-    "compare": Command(
-        ANALYSIS, "two calibrations: what moved, is a new one due", "calibrations:compare_app"
-    ),
+    "activity": _task(RECONSTRUCTION, "activity"),
+    "analyze": _task(ANALYSIS, "analyze"),
+    "compare": _task(ANALYSIS, "compare"),
     "chart": Command(ANALYSIS, "time and memory against error, for every method", "chart"),
     "stability": Command(ANALYSIS, "map where methods fail, against pairs of stresses", "stability"),
-    "refocus": Command(ANALYSIS, "bring a calibrated PSF to another depth", "calibrations:refocus_app"),
+    "refocus": _task(ANALYSIS, "refocus"),
     "hologram": Command(
         DISPLAY, "compute the SLM phase that shows a picture through the mask", "display:hologram_app"
     ),

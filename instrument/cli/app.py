@@ -135,22 +135,6 @@ def naming_as_is() -> Iterator[None]:
         ) from None
 
 
-@contextmanager
-def saying_what_is_left(*files: Path) -> Iterator[None]:
-    """Let an interruption (Ctrl-C, SIGTERM) say which of the files to be written are there."""
-    before = {file: _changed_ns(file) for file in files}
-    try:
-        yield
-    except (KeyboardInterrupt, SystemExit) as interruption:
-        written = [str(file) for file in files if _changed_ns(file) != before[file]]
-        interruption.add_note(f"Written: {', '.join(written)}." if written else "Nothing was written.")
-        raise
-
-
-def _changed_ns(file: Path) -> int | None:
-    return file.stat().st_mtime_ns if file.exists() else None
-
-
 DEBUG_VARIABLE = "DIFFUSERBENCH_DEBUG"
 INTERRUPTED = 130
 
@@ -165,6 +149,8 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
     logging.basicConfig(
         level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
     )
+    for chatty in ("numba", "numcodecs", "matplotlib", "asyncio"):  # numba prints 30,000 lines a kernel
+        logging.getLogger(chatty).setLevel(logging.WARNING)
     _end_on_signals()
     try:
         # Not through typer's own main, which would answer Ctrl-C itself before a word is said about it.

@@ -376,7 +376,7 @@ def gui(
         Path | None,
         typer.Argument(
             metavar="[BENCH.TOML]",
-            help="Bench configuration. Default: bench.toml here, else the built-in simulated bench.",
+            help="Bench configuration. Default: bench.toml here, else a page to start from.",
             show_default=False,
         ),
     ] = None,
@@ -385,8 +385,10 @@ def gui(
 
     Closing the window, Ctrl-C and SIGTERM end it safely: light off, motion stopped, runs closed.
     """
+    from instrument.bench.config_file import DEFAULT_NAME
+
     try:
-        config = load_and_say(bench)
+        config = load_and_say(bench) if bench is not None or Path(DEFAULT_NAME).exists() else None
     except BenchError as error:
         _show_too(error)
         raise

@@ -43,7 +43,6 @@ from instrument.bench.bench import Bench
 from instrument.bench.config_file import other_bench_for
 from instrument.bench.safety import StepsFailedError
 from instrument.cli.app import App, BenchOption, examples, load_and_say, open_and_say
-from instrument.cli.options import Given
 from instrument.cli.progress import keys, progress_bar
 from instrument.files.errors import BenchError, duration, size
 from instrument.files.images import read_image
@@ -51,6 +50,7 @@ from instrument.runs.acquire import free_bytes
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import RunState, RunStatus
+from instrument.tasks.task import Given
 from recon.base.declare import options_of
 from recon.types import Geometry
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
-from instrument.cli.options import Given, Only
+from instrument.cli.app import App, BenchOption, examples, load_and_say
 from instrument.cli.progress import progress_bar
 from instrument.files.errors import BenchError
 from instrument.reconstruction.options import InputOptions, SourceOptions
+from instrument.tasks.task import Given, Only, saying_what_is_left
 from recon.base.declare import option
 from recon.base.option_text import size as size_of
 

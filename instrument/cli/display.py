@@ -13,10 +13,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
-from instrument.cli.options import Given
+from instrument.cli.app import App, BenchOption, examples, load_and_say
 from instrument.cli.progress import first_interrupt_cancels, one_task, progress_bar
-from instrument.cli.spots import say_limit, say_spots
+from instrument.cli.tasks import Terminal, finish
 from instrument.display.hologram import (
     HologramResult,
     bench_display,
@@ -32,6 +31,8 @@ from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image, read_stack
 from instrument.files.sample_images import DEFAULT_SAMPLES, SAMPLES, load_sample
+from instrument.tasks.spots import HologramInputs, make_spots, tell_limit
+from instrument.tasks.task import Given, saying_what_is_left
 from recon.base.declare import option
 from recon.base.option_text import size
 from recon.holography import (
@@ -225,72 +226,6 @@ def _print_table(cells: list[Cell], note: str) -> None:
         console.print(shown)
 
 
-_OF_PICTURES = ("picture",)
-
-
-@dataclass(frozen=True, kw_only=True)
-class HologramInputs:
-    """What is shown, for which display, and where the pattern goes."""
-
-    spots: str | None = option(
-        None,
-        help="Spots instead of a picture: an even array, 10x10, or a CSV file with columns y, x (fractions "
-        "of the field from the top left), and where wanted intensity, z_mm.",
-        metavar="ROWSxCOLUMNS|FILE",
-        group="Files",
-        applies=("spots",),
-    )
-    limit: bool = option(
-        False,
-        help="Compute no pattern: say what any number of frames could reach for this picture, mask and SLM.",
-        group="What counts",
-        applies=("limit",),
-    )
-    z_mm: tuple[float, ...] = option(
-        (),
-        help="Depth of each target behind the focal plane; once a target.",
-        default_words="0",
-        unit="mm",
-        group="Files",
-        applies=("picture", "limit"),
-    )
-    video: bool = option(
-        False,
-        help="TARGET is a folder or stack; each frame starts from the last.",
-        group="Files",
-        applies=_OF_PICTURES,
-    )
-    color: bool = option(
-        False, help="Field-sequential colour: one pattern a channel.", group="Files", applies=_OF_PICTURES
-    )
-    wavelengths: tuple[float, float, float] = option(
-        (638.0, 520.0, 450.0),
-        help="With --color, nm.",
-        above=0,
-        metavar="R G B",
-        group="Files",
-        applies=_OF_PICTURES,
-    )
-    weights: Path | None = option(
-        None, help="A weight image instead of the fovea.", group="What counts", applies=_OF_PICTURES
-    )
-    alignment: Path | None = option(None, help="From align mask.", group="Display")
-    out: Path = option(
-        Path("slm.png"),
-        help="8-bit phase, 256 levels a turn (--complex: .npy); .json and a preview.",
-        flags=("--out", "-o"),
-        group="Files",
-    )
-    force: bool = option(False, help="Overwrite files that exist.", group="Files")
-
-    def depths(self, count: int) -> list[float]:
-        """Return the depth of each of ``count`` targets; BenchError where they do not fit."""
-        depths = list(self.z_mm) or [0.0] * count
-        if len(depths) != count or (count > 1 and not self.z_mm):
-            raise BenchError(f"Give --z-mm once for each of the {count} targets (found {len(self.z_mm)}).")
-        return depths
-
-
 @hologram_app.command(
     epilog=examples(
         "diffuserbench hologram picture.png --out slm.png",
@@ -326,7 +261,7 @@ def hologram(
     size = slm_size(config)
     if inputs.spots is not None:
         given.refuse("--spots", "spots")
-        say_spots(inputs.spots, inputs.out, options, (config, size, inputs.alignment), overwrite=inputs.force)
+        finish(make_spots(Terminal(), inputs, options, (config, size)))
         return
     assert target is not None
     if inputs.weights is not None:
@@ -347,7 +282,7 @@ def hologram(
         given.refuse("--limit", "limit")
         if len(target) > 1:
             raise BenchError("--limit is for one picture in one plane.")
-        say_limit(pictures[0][0], displays[0], options, depths[0])
+        tell_limit(Terminal(), pictures[0][0], displays[0], options, depths[0])
         return
     frames = len(pictures) if inputs.video else 0
     writer = HologramFiles(inputs.out, config.display.slm_binning, options, displays, video=frames)

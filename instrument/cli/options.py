@@ -1,7 +1,8 @@
 """Command functions take options objects: their flags, help and refusals come from the declarations.
 
 A command is a function whose parameters are options classes (frozen dataclasses with declared fields, see
-:mod:`recon.base.declare`), :class:`Given`, and as many ordinary parameters of typer as it needs::
+:mod:`recon.base.declare`), :class:`~instrument.tasks.task.Given`, and as many ordinary parameters of typer as
+it needs::
 
     @app.command()
     def snap(options: SnapOptions, bench: BenchOption = None) -> None: ...
@@ -11,17 +12,17 @@ from __future__ import annotations
 
 import inspect
 import typing
-from collections.abc import Callable, Container, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Container, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import typer
 from typer.core import TyperCommand
 
-from instrument.files.atomic import protecting
 from instrument.files.errors import BenchError
-from recon.base.declare import RARE, Option, options_of
+from instrument.tasks.task import Given, guarded, part_of
+from recon.base.declare import RARE, Option
 from recon.base.option_text import help_text, metavar, read
 from recon.errors import InputError
 
@@ -32,43 +33,6 @@ _WORDS = "words that were typed"
 _WIDEST_FLAG = 30
 _MANY = 30
 """Options, above which help does without empty lines between the groups."""
-
-
-@dataclass(frozen=True)
-class Only:
-    """Beside an options class (``Annotated[InputOptions, Only("dark", "crop")]``): the fields offered."""
-
-    names: tuple[str, ...]
-
-    def __init__(self, *names: str) -> None:
-        object.__setattr__(self, "names", names)
-
-
-@dataclass(frozen=True)
-class Given:
-    """The declared options that a command was given, by the names of their fields, and as they were typed."""
-
-    options: Mapping[str, Option]
-    typed: Mapping[str, str]
-
-    def __contains__(self, name: str) -> bool:
-        """Whether an option was typed, be it with its default value."""
-        return name in self.options
-
-    def flags(self, *names: str) -> list[str]:
-        """Return the flags of the options among ``names`` (none: of all) that were given."""
-        return [flag for name, flag in self.typed.items() if not names or name in names]
-
-    def refuse(self, title: str, *subjects: str) -> None:
-        """Refuse what was given and applies to none of these subjects, as the options declare it.
-
-        Raises BenchError: which options, with the title ("--video"), and what they are for.
-        """
-        applies = {name: o.declaration.applies for name, o in self.options.items()}
-        wrong = [name for name, about in applies.items() if about and not set(about) & set(subjects)]
-        if wrong:
-            what = "; ".join(f"{self.typed[name]} (for a {' or a '.join(applies[name])})" for name in wrong)
-            raise BenchError(f"With {title} these do not apply: {what}. Leave them out.")
 
 
 class GroupedCommand(TyperCommand):
@@ -140,6 +104,8 @@ class GroupedCommand(TyperCommand):
 
 def _row(o: Option) -> tuple[str, str]:
     """Return flags and help; of the long flags the first is shown, the others are old names."""
+    if o.declaration.positional:
+        return metavar(o), help_text(o)
     short = [flag for flag in o.flags if not flag.startswith("--")]
     names = ", ".join([*short, next(flag for flag in o.flags if flag.startswith("--"))])
     if bool in o.kinds:
@@ -160,9 +126,12 @@ def flat(function: Callable[..., None]) -> Callable[..., None]:
         hint = hints[parameter.name]
         if hint is Given:
             wants_given = parameter.name
-        elif (found := _options_class(hint)) is not None:
+        elif (found := part_of(hint)) is not None:
             cls, options = found
-            objects[parameter.name] = cls, {f"{parameter.name}__{o.name}": o for o in options if o.flags}
+            objects[parameter.name] = (
+                cls,
+                {f"{parameter.name}__{o.name}": o for o in options if o.flags or o.declaration.positional},
+            )
             declared |= objects[parameter.name][1]
             parameters += [_parameter(key, o) for key, o in objects[parameter.name][1].items()]
         else:
@@ -182,12 +151,7 @@ def flat(function: Callable[..., None]) -> Callable[..., None]:
                 {named[key].name: named[key] for key in given},
                 {named[key].name: _as_typed(named[key], value) for key, value in given.items()},
             )
-        if outputs := _outputs(values):
-            from instrument.runs.run import refuse_own_files
-
-            for output in outputs:
-                refuse_own_files(output)
-        with protecting(_inputs(values)):
+        with guarded(values):
             function(**values)
 
     run.__name__, run.__doc__, run.__module__ = function.__name__, function.__doc__, function.__module__
@@ -198,34 +162,6 @@ def flat(function: Callable[..., None]) -> Callable[..., None]:
     run.declared = declared  # type: ignore[attr-defined]
     run.options_classes = [cls for cls, _ in objects.values()]  # type: ignore[attr-defined]
     return run
-
-
-_WRITTEN = ("out", "figure", "checkpoint", "capture", "picture")
-"""Parameters that name what a command writes; every other path is an input."""
-
-
-def _inputs(values: Mapping[str, object]) -> list[Path]:
-    """Return the paths in a command's parameters, in options objects and lists too, but those it writes."""
-    return [path for name, path in _paths(values) if name not in _WRITTEN]
-
-
-def _outputs(values: Mapping[str, object]) -> list[Path]:
-    """Return the paths in a command's parameters that it writes."""
-    return [path for name, path in _paths(values) if name in _WRITTEN]
-
-
-def _paths(values: object, called: str = "") -> Iterator[tuple[str, Path]]:
-    """Give every path in a command's parameters with the parameter's name."""
-    if isinstance(values, Path):
-        yield called, values
-    elif isinstance(values, list | tuple):
-        for entry in values:
-            yield from _paths(entry, called)
-    else:  # an options object may have slots
-        declared = () if isinstance(values, Given) else getattr(type(values), "__dataclass_fields__", ())
-        named = values if isinstance(values, dict) else {name: getattr(values, name) for name in declared}
-        for name, value in named.items():
-            yield from _paths(value, name)
 
 
 def _as_named(o: Option, words: Container[str]) -> Option:
@@ -241,18 +177,6 @@ def _as_typed(o: Option, value: Any) -> str:
     return switch.partition("/")[2] if value is False else o.flag
 
 
-def _options_class(hint: Any) -> tuple[type, tuple[Option, ...]] | None:
-    cls, *extras = typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint,)
-    if not (isinstance(cls, type) and hasattr(cls, "__dataclass_fields__")):
-        return None
-    options = options_of(cls)
-    for extra in extras:
-        if isinstance(extra, Only):
-            known = {o.name: o for o in options}
-            options = tuple(known[name] for name in extra.names)
-    return cls, options
-
-
 def _parameter(key: str, o: Option) -> inspect.Parameter:
     """Return a parameter that is None unless it was typed; text is read later, with all mistakes at once."""
     kind: Any = str
@@ -264,8 +188,14 @@ def _parameter(key: str, o: Option) -> inspect.Parameter:
         in_one = o.declaration.parse is not None or "," in o.declaration.metavar
         several = [k for k in o.kinds if typing.get_origin(k) is tuple and not in_one]
         kind = tuple[tuple(str for _ in typing.get_args(several[0]))] if several else kind  # type: ignore[misc]
-    annotation = typing.Annotated[kind | None, typer.Option(*o.flags, show_default=False, metavar=metavar(o))]
-    return inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+    how: Any = typer.Option(*o.flags, show_default=False, metavar=metavar(o))
+    default: Any = None
+    if o.declaration.positional:
+        how = typer.Argument(show_default=False, metavar=metavar(o), help=o.declaration.help)
+        default = inspect.Parameter.empty if o.is_required else None
+    wanted: Any = kind if default is inspect.Parameter.empty else kind | None
+    annotation = typing.Annotated[wanted, how]
+    return inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
 def _read(declared: Mapping[str, Option], given: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,6 @@ import tty
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
-from typing import Protocol
 
 from rich.console import Console
 from rich.progress import (
@@ -23,6 +22,8 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+from instrument.tasks.task import Advance
 
 
 def progress_bar() -> Progress:
@@ -57,13 +58,6 @@ def first_interrupt_cancels() -> Iterator[threading.Event]:
         yield cancel
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-class Advance(Protocol):
-    """Advances a bar."""
-
-    def __call__(self, done: float, total: float | None = None, *, note: str | None = None) -> None:
-        """Show how much is done, how much there is to do, and a word beside it; None leaves it as it was."""
 
 
 @contextmanager

@@ -9,11 +9,12 @@ from typing import Annotated
 import typer
 
 from instrument.cli.app import App, examples
-from instrument.cli.options import Given
+from instrument.cli.tasks import Terminal, finish
 from instrument.files.errors import BenchError
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.request import VolumeRequest, request_of
 from instrument.reconstruction.result_file import Outputs
+from instrument.tasks.task import Given
 from recon.reconstruction.options import ReconstructionOptions
 
 app = App()
@@ -70,7 +71,7 @@ def reconstruct(
     if options.choose is not None and options.choose.precision is not None and "precision" in given:
         raise BenchError("--precision and --choose precision=... say the same twice: leave one of them out.")
     if source.patterned is not None:
-        _patterned(asked, run, source.patterned)
+        _patterned(asked, run)
     elif source.video:
         _video(asked, run)
     elif run is not None:
@@ -83,7 +84,7 @@ def reconstruct(
 
 
 def _photograph(asked: _Asked) -> None:
-    from instrument.cli.solving import reconstruct_photograph
+    from instrument.tasks.solving import reconstruct_photograph
 
     given, source, output = asked.given, asked.source, asked.output
     request = request_of(source, asked.inputs, asked.options)
@@ -100,12 +101,12 @@ def _photograph(asked: _Asked) -> None:
     outputs = Outputs.named(
         output.out or _PICTURE, output.figure, volume=is_volume, uncertainty=asked.options.uncertainty
     )
-    reconstruct_photograph(request, outputs, output)
+    finish(reconstruct_photograph(Terminal(), request, outputs, output))
 
 
 def _video(asked: _Asked, run: Path | None) -> None:
-    from instrument.cli.solving import reconstruct_to_video
-    from instrument.reconstruction.video import VideoRequest
+    from instrument.tasks.video import Recording
+    from instrument.tasks.video import video as task
 
     source, output, video = asked.source, asked.output, asked.video
     asked.given.refuse("--video", "video")
@@ -115,35 +116,20 @@ def _video(asked: _Asked, run: Path | None) -> None:
         raise BenchError("--warm does not apply with --over-time: frames are solved together.")
     if run is None:
         raise BenchError("--video needs a recording: diffuserbench reconstruct RUN --video ...")
-    request = VideoRequest(
-        run=run,
-        out=output.out or Path("video.ome.zarr"),
-        psf=source.psf,
-        calibration=source.calibration,
-        inputs=asked.inputs,
-        options=asked.options,
-        video=video,
-        rotate_deg=int(output.rotate_deg),
-    )
-    reconstruct_to_video(request, force=output.force)
+    finish(task.do(Terminal(), Recording(run=run), source, output, video, asked.inputs, asked.options))
 
 
-def _patterned(asked: _Asked, run: Path | None, sheet: Path) -> None:
-    source, output = asked.source, asked.output
+def _patterned(asked: _Asked, run: Path | None) -> None:
     asked.given.refuse("--patterned", "patterned picture")
-    if run is None or source.calibration is None:
+    if run is None:
         raise BenchError(
             "--patterned needs a run and a calibration: "
             "diffuserbench reconstruct RUN --patterned SHEET --calibration FOLDER"
         )
-    from instrument.cli.solving import reconstruct_patterns
-    from instrument.reconstruction.patterned import PatternedRequest
+    from instrument.tasks.solving import PatternedRuns, patterned
 
-    request = PatternedRequest(
-        run=run,
-        sheet=sheet,
-        calibration=source.calibration,
-        binning=asked.inputs.binning or 1,
-        options=asked.options,
+    finish(
+        patterned.do(
+            Terminal(), PatternedRuns(run=run), asked.source, asked.inputs, asked.options, asked.output
+        )
     )
-    reconstruct_patterns(request, Outputs.named(output.out or _PICTURE), output)

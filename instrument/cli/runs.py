@@ -1,9 +1,7 @@
-"""Runs: carried out and gone on with (``run``, ``resume``); on disk (``list``, ``verify``, ``export``)."""
+"""Runs: carried out and gone on with (``run``, ``resume``), and what there is on disk (``list``)."""
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -13,20 +11,14 @@ from rich.table import Table
 
 from instrument.bench.config_file import load_config
 from instrument.cli.app import App, BenchOption, RunFolder, examples, open_and_say
-from instrument.cli.options import Given
-from instrument.cli.progress import one_task
 from instrument.files.errors import FileError
-from instrument.files.volumes import is_zarr_name, uneven_steps
 from instrument.plan.model import load_plan
-from instrument.runs.export import export as export_run
 from instrument.runs.inspection import run_paths, summary
-from instrument.runs.inspection import verify as verify_run
 from instrument.runs.run import Run
 from instrument.runs.run_files import BENCH_TOML
 from instrument.runs.writer import RunWriter
-from recon.base.declare import option
 
-run_app, resume_app, list_app, verify_app, export_app = App(), App(), App(), App(), App()
+run_app, resume_app, list_app = App(), App(), App()
 
 
 @list_app.command(name="list", epilog=examples("diffuserbench list", "diffuserbench list /data/monday"))
@@ -60,127 +52,6 @@ def list_runs(
         mark = "SIMULATED" if found.is_simulated else ""
         table.add_row(path.name, found.became, f"{found.stored} of {found.frames}", kind, mark)
     Console(width=None if Console().is_terminal else 160).print(table, markup=False)
-
-
-@verify_app.command(
-    epilog=examples(
-        "diffuserbench verify runs/2026-11-21_14-03-22_axial-sweep", "diffuserbench verify runs/*"
-    )
-)
-def verify(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="The runs' folders.")],
-) -> None:
-    """Read every frame and its metadata and hold them against the log's checksums. Changes nothing.
-
-    Exit status 1 when anything is not as it was written. A run that ended early is sound, only not complete.
-    """
-    sound = True
-    for path in runs:
-        run = Run.open(path)
-        with one_task(path.name) as advance:
-            found = verify_run(run, advance)
-        for line in found.lines():
-            typer.echo(f"{path}: {line}", err=True)
-        if remedy := found.remedy():
-            typer.echo(f"{path}: {remedy}", err=not found.is_sound)
-        sound = sound and found.is_sound
-        verdict = "sound" if found.is_sound else "DAMAGED"
-        typer.echo(f"{path}: {verdict}, {run.condition}, {found.frames} of {run.n_frames} frames read back.")
-    if not sound:
-        raise typer.Exit(1)
-
-
-def _slice(text: str) -> slice:
-    if not re.fullmatch(r"-?\d+|-?\d*:-?\d*(:-?[1-9]\d*)?", text):
-        raise ValueError("give A:B, e.g. 0:100, or one number.")
-    numbers = [int(part) if part else None for part in text.split(":")]
-    if len(numbers) == 1 and numbers[0] is not None:
-        return slice(numbers[0], numbers[0] + 1)
-    return slice(*numbers)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportOptions:
-    """Which frames of a run are written, and how fast a film of them plays."""
-
-    label: str | None = option(None, help="Only steps of this label.", applies=("run",))
-    frames: slice | None = option(
-        None,
-        help="Only frames A to B - 1; A:B:C every C-th.",
-        metavar="A:B",
-        applies=("run",),
-        parse=_slice,
-    )
-    frames_per_s: float | None = option(
-        None,
-        help="Frames a second of an MP4.",
-        least=0.1,
-        flags=("--fps",),
-        applies=("run",),
-    )
-
-
-@export_app.command(
-    epilog=examples(
-        "diffuserbench export RUN psfs.ome.tif --label psf",
-        "diffuserbench export RUN video.mp4",
-        "diffuserbench export RUN frames/ --frames 0:100",
-        "diffuserbench export volume.tif volume.ome.zarr",
-    )
-)
-def export(
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN|RESULT", help="The run's folder; or a reconstruction's file.")
-    ],
-    out: Annotated[
-        Path,
-        typer.Argument(
-            metavar="TARGET",
-            help="File ending in .ome.tif, .tif, .h5, .npy or .mp4, or a folder for PNG files. "
-            "A picture: .tif, .npy, .png; a volume: .tif, .npy, .ome.zarr.",
-        ),
-    ],
-    options: ExportOptions,
-    given: Given,
-) -> None:
-    """Write a run's stored frames, or a reconstruction, for other programs; what is there stays as it is.
-
-    Frames that are not there (gaps of a recording, steps not done) are left out, and said.
-    """
-    if _is_result(run):
-        given.refuse("a reconstruction", "reconstruction")
-        _export_result(run, out)
-        return
-    found = Run.open(run)
-    wanted = set(range(found.n_frames)[options.frames or slice(None)])
-    if options.label is not None:
-        wanted &= {step.index for step in found.steps(options.label)}
-    indices = [index for index in sorted(found.records) if index in wanted]
-    with one_task("Frames") as advance:
-        export_run(found, out, indices, frames_per_s=options.frames_per_s, on_progress=advance)
-    typer.echo(f"Wrote {len(indices)} frames: {out}")
-    if absent := len(wanted) - len(indices):
-        typer.echo(f"Warning: {absent} frames that are not in the run were left out.", err=True)
-
-
-def _is_result(path: Path) -> bool:
-    """Whether a path is a picture's or volume's: a file, or a Zarr folder, which no run is."""
-    return path.is_file() or is_zarr_name(path)
-
-
-def _export_result(path: Path, target: Path) -> None:
-    from instrument.reconstruction.stored_result import export_result, open_result
-
-    result = open_result(path)
-    try:
-        with one_task("Planes") as advance:
-            export_result(result, target, advance=advance)
-        steps = "" if result.planes_um is None else uneven_steps(result.planes_um[0])
-    finally:
-        result.close()
-    typer.echo(f"Wrote {target}")
-    if steps and target.suffix.lower() != ".npy":
-        typer.echo(f"{'Planes':<12}{steps}")
 
 
 @run_app.command(

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say
-from instrument.cli.options import Given
 from instrument.display.hologram import HOLOGRAM, PHOTOGRAPHED, CaptureOptions
 from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError, FileError
+from instrument.tasks.task import Given
 from recon.base.declare import option
 
 if TYPE_CHECKING:

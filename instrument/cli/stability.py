@@ -9,9 +9,10 @@ from typing import Annotated, Literal
 
 import typer
 
-from instrument.cli.app import App, examples, saying_what_is_left
+from instrument.cli.app import App, examples
 from instrument.cli.progress import progress_bar
 from instrument.files.errors import BenchError, FileError
+from instrument.tasks.task import saying_what_is_left
 from recon.base.declare import option
 
 app = App()

@@ -1,20 +1,21 @@
-"""A chart of cost against accuracy as a picture and as a page that answers the mouse; a map's picture."""
+"""A chart of cost against accuracy as a page that answers the mouse, and all its files; a map's picture."""
 
 from __future__ import annotations
 
 import html
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from instrument.evaluation.chart import ChartData, colours_of, in_words, title_of
+from instrument.evaluation.chart import ChartData, colours_of, title_of
+from instrument.evaluation.chart_figure import chart_figure
 from instrument.files.atomic import write_text
 from instrument.files.figures import ACCENT, INK, save_figure
-from recon.evaluation.scored import MEMORY, Axis, Kind, Point, is_known, pareto
+from recon.evaluation.scored import is_known
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -140,16 +141,6 @@ group.onchange = xs.onchange = ys.onchange = draw; draw();
 """
 
 
-_LEAST = {"seconds": 1e-4, "peak_mib": 0.1}
-"""Smaller ones are drawn here: what costs next to nothing has no place on a logarithmic axis."""
-_NARROW = 3.0
-"""Times the least value up to which an axis is linear, whatever it should be."""
-_MOST_NAMES = 12
-"""Names of a front that fit beside a panel; of more, the cheapest are left out."""
-_SAME_PLACE = (0.02, 0.03)
-"""Parts of a panel's width and height within which two labels would cover each other."""
-
-
 def write_charts(folder: Path, data: ChartData) -> tuple[Path, ...]:
     """Write chart.png, chart.html and chart.csv into a folder; return their paths."""
     picture, page, table = (folder / f"chart.{kind}" for kind in ("png", "html", "csv"))
@@ -157,129 +148,6 @@ def write_charts(folder: Path, data: ChartData) -> tuple[Path, ...]:
     write_text(page, chart_page(data))
     write_text(table, data.to_csv())
     return picture, page, table
-
-
-def chart_figure(data: ChartData) -> Figure:
-    """Draw a row of two panels for each group; the fronts as lines, their settings by number and name."""
-    from matplotlib.figure import Figure
-
-    groups = list(dict.fromkeys(p.group for p in data.points))
-    colours = colours_of(data)
-    views = _views(data)
-    figure = Figure(figsize=(13.5, 1.0 + 4.1 * len(groups)), layout="constrained")
-    grid = figure.subplots(len(groups), 3, squeeze=False, width_ratios=(1.35, 1.0, 0.6))
-    for row, group in zip(grid, groups, strict=True):
-        own = [p for p in data.points if p.group == group]
-        text = row[2]
-        text.set_axis_off()
-        blocks = []
-        for place, (axes, (cost, score)) in enumerate(zip(row, views, strict=False)):
-            front = _draw(axes, own, cost, score, colours)
-            heading = f"{group}: {score.words.split(' (')[0]}" if group else ""
-            axes.set_title(heading, fontsize=9, loc="left")
-            blocks.append(_named(front, f"Front, {'left' if place == 0 else 'right'}"))
-        text.text(0.0, 1.0, "\n\n".join(blocks), fontsize=8.5, va="top", transform=text.transAxes)
-    handles, labels = grid[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, fontsize=8, loc="outside lower center", ncols=5, frameon=False)
-    kind = "SIMULATED " if data.about.get("simulated") else ""
-    figure.suptitle(f"{kind}{title_of(data)}", fontsize=11, x=0.01, ha="left")
-    return figure
-
-
-def _views(data: ChartData) -> tuple[tuple[Axis, Axis], tuple[Axis, Axis]]:
-    """Return cost and score of the two panels."""
-    kind: Kind = data.kind
-    cost, score = kind.costs[0], kind.score_of(data.points)
-    if kind.name == "hologram":
-        return (cost, score), (cost, kind.scores[1])
-    other = kind.costs[1]
-    known = any(is_known(p, other.key) for p in data.points)
-    return (cost, score), (other if known or other is not MEMORY else cost, score)
-
-
-def _draw(
-    axes: Axes, points: Sequence[Point], cost: Axis, score: Axis, colours: Mapping[str, str]
-) -> list[Point]:
-    """Draw every setting's curve and the front; return the front's settings, as they are numbered."""
-    known = [p for p in points if is_known(p, cost.key) and is_known(p, score.key)]
-    for family, colour in colours.items():
-        mine = [p for p in known if p.family == family]
-        for number, name in enumerate(dict.fromkeys(p.setting for p in mine)):
-            run = [p for p in mine if p.setting == name]
-            axes.plot(
-                [_x(p, cost) for p in run],
-                [getattr(p, score.key) for p in run],
-                "o-",
-                ms=3 if len(run) > 1 else 5,
-                lw=0.6,
-                alpha=0.6,
-                color=colour,
-                label=None if number else family,
-            )
-    front = pareto(points, score, cost)
-    axes.plot(
-        [_x(p, cost) for p in front],
-        [getattr(p, score.key) for p in front],
-        "-",
-        drawstyle="steps-post",  # between two points of the front the cheaper one is all there is
-        color="black",
-        lw=1.4,
-        label="Pareto front",
-    )
-    axes.set(xlabel=cost.words, ylabel=score.words)
-    if cost.logarithmic and _is_wide([_x(p, cost) for p in known]):
-        axes.set_xscale("log")
-    if score.logarithmic and _is_wide([float(getattr(p, score.key)) for p in known]):
-        axes.set_yscale("log")
-    axes.grid(alpha=0.25)
-    axes.margins(0.07, 0.1)
-    # Each setting is named at its best point on the front.
-    named = sorted({p.setting: p for p in front}.values(), key=lambda p: _x(p, cost))[-_MOST_NAMES:]
-    places = [(_x(p, cost), float(getattr(p, score.key))) for p in named]
-    up = 1 if score.more_is_better else -1
-    for turn, (first, last) in enumerate(_together(axes, places)):
-        axes.annotate(
-            str(first + 1) if first == last else f"{first + 1}-{last + 1}",
-            places[last],
-            # In turns on the front's outer and inner side: neighbours do not cover each other.
-            xytext=(10, -9 * up) if turn % 2 else (-9, 9 * up),
-            textcoords="offset points",
-            fontsize=8,
-            fontweight="bold",
-            ha="center",
-            va="center",
-            bbox={"boxstyle": "round,pad=0.1", "color": "white", "alpha": 0.8},
-            arrowprops={"arrowstyle": "-", "lw": 0.5, "shrinkA": 0, "shrinkB": 2},
-        )
-    return named
-
-
-def _together(axes: Axes, places: Sequence[tuple[float, float]]) -> list[tuple[int, int]]:
-    """Return the first and last of neighbours for which one label must do: they lie on top of each other."""
-    runs: list[tuple[int, int]] = []
-    before = None
-    for number, place in enumerate(places):
-        at = axes.transLimits.transform(axes.transScale.transform(place))  # in fractions of the panel
-        if before is not None and all(abs(at - before) < _SAME_PLACE):
-            runs[-1] = (runs[-1][0], number)
-        else:
-            runs.append((number, number))
-        before = at
-    return runs
-
-
-def _is_wide(values: Sequence[float]) -> bool:
-    """Tell whether a logarithmic axis has ticks to show: over a narrow range it has hardly any."""
-    return bool(values) and max(values) > _NARROW * min(values)
-
-
-def _x(point: Point, cost: Axis) -> float:
-    return max(float(getattr(point, cost.key)), _LEAST.get(cost.key, 0.0))
-
-
-def _named(front: Sequence[Point], heading: str) -> str:
-    lines = [f"{number}  {in_words(p)}" for number, p in enumerate(front, start=1)]
-    return "\n".join([heading, *lines]) if lines else f"{heading}: nothing known"
 
 
 # Stability maps -------------------------------------------------------------------------------------

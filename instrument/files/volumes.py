@@ -19,7 +19,7 @@ from instrument.files.errors import FileError
 from instrument.files.reading import folder_bytes, require_file, require_plausible
 
 if TYPE_CHECKING:
-    from recon.reconstruction.result import Grid
+    from recon.camera.grid import Grid
 
 EVEN = 0.01
 """Steps that differ by less than this part of the smallest are taken for even."""
@@ -66,9 +66,15 @@ def stem_of(path: Path) -> str:
 
 
 def write_volume_zarr(
-    path: Path, volume: npt.NDArray[np.float32], grid: Grid, attributes: dict[str, Any]
+    path: Path,
+    planes: Iterable[npt.NDArray[np.float32]],
+    shape: tuple[int, ...],
+    grid: Grid,
+    attributes: dict[str, Any],
 ) -> None:
-    """Write a volume as OME-Zarr 0.5, whole or not at all; a folder of that name is replaced.
+    """Write a volume as OME-Zarr 0.5, whole or not at all, with one plane in memory.
+
+    A folder of that name is replaced.
 
     Raises OSError when the disk is full or not writable; what was there before stays as it was.
 
@@ -76,55 +82,61 @@ def write_volume_zarr(
     ----------
     path : Path
         The folder to be.
-    volume : ndarray, float32, (n_z, height, width) or (n_z, height, width, n_channels)
-        Stored as ``z, y, x`` or, in OME-Zarr's order, ``c, z, y, x``.
+    planes : iterable of ndarray, float32
+        (height, width) or (height, width, n_channels).
+    shape : tuple of int
+        That of all, with n_z in front. Stored as ``z, y, x`` or, in OME-Zarr's order, ``c, z, y, x``.
     grid : Grid
         OME-Zarr knows one voxel size for all planes: that of the middle one is written where it is known, and
-        every plane's own ``z_um`` and ``pitch_um`` beside it in the group's attribute ``diffuserbench``.
+        what :func:`grid_facts` says beside it in the group's attribute ``diffuserbench``.
     attributes : dict
         JSON-compatible; what else shall stand in the attribute ``diffuserbench``.
     """
     import zarr
 
-    data = volume[None] if volume.ndim == 3 else np.moveaxis(volume, -1, 0)
-    colour = volume.ndim == 4
+    colour = len(shape) == 4
+    channels = shape[3:]
     with whole_folder(path) as draft:
         group = zarr.open_group(draft, mode="w", zarr_format=3)
         names = ["c", "z", "y", "x"] if colour else ["z", "y", "x"]
-        levels = []
-        for level, step, pixels in _levels(data):
-            pixels = pixels if colour else pixels[0]
-            group.create_array(
-                str(level),
-                data=np.ascontiguousarray(pixels),
-                chunks=(1,) * (pixels.ndim - 2) + pixels.shape[-2:],
+        levels = [1]
+        arrays: list[Any] = []
+        height, width = shape[1:3]
+        while True:
+            array = group.create_array(
+                str(len(arrays)),
+                shape=(*channels, shape[0], height, width),
+                dtype=np.float32,
+                chunks=(1,) * (1 + len(channels)) + (height, width),
                 dimension_names=names,
             )
-            levels.append(step)
+            arrays.append(array)
+            if max(height, width) <= _SMALLEST_LEVEL or min(height, width) < 2:
+                break
+            height, width = height // 2, width // 2
+            levels.append(2 * levels[-1])
+        for z, plane in enumerate(planes):
+            pixels = np.moveaxis(plane, -1, 0) if colour else plane
+            for array in arrays:
+                array[..., z, :, :] = pixels
+                pixels = _halved(pixels)
         group.attrs["ome"] = ome_attributes(
             path.name,
             names,
-            _voxel_um(grid),
+            voxel_um(grid),
             levels=levels,
             origin=_origin_um(grid),
             more={"type": "local mean"},
         )
-        planes = {"z_um": known(grid.z_um), "pitch_um": known(grid.pitch_um)}
-        group.attrs["diffuserbench"] = attributes | planes
+        group.attrs["diffuserbench"] = attributes | {"words": _of_voxels(grid)} | grid_facts(grid)
 
 
-def _levels(
-    data: npt.NDArray[np.float32],
-) -> Sequence[tuple[int, int, npt.NDArray[np.float32]]]:
-    """Return (level, lateral step, pixels), each level the mean of 2 x 2 pixels of the one before."""
-    levels, step = [(0, 1, data)], 1
-    while max(data.shape[-2:]) > _SMALLEST_LEVEL and min(data.shape[-2:]) >= 2:
-        height, width = (n // 2 * 2 for n in data.shape[-2:])
-        blocks = data[..., :height, :width].reshape(*data.shape[:-2], height // 2, 2, width // 2, 2)
-        data = blocks.mean(axis=(-3, -1), dtype=np.float32)
-        step *= 2
-        levels.append((len(levels), step, data))
-    return levels
+def _halved(pixels: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Return the mean of 2 x 2 pixels."""
+    height, width = (n // 2 for n in pixels.shape[-2:])
+    blocks = pixels[..., : 2 * height, : 2 * width].reshape(*pixels.shape[:-2], height, 2, width, 2)
+    means: npt.NDArray[np.float32] = blocks.mean(axis=(-3, -1), dtype=np.float32)
+    return means
 
 
 def write_volume_tiff(
@@ -141,7 +153,7 @@ def write_volume_tiff(
 
     colour = len(shape) == 4
     pages = (page for plane in planes for page in (np.moveaxis(plane, -1, 0) if colour else plane[None]))
-    sizes = {f"PhysicalSize{axis.upper()}": size for axis, size in _voxel_um(grid).items()}
+    sizes = {f"PhysicalSize{axis.upper()}": size for axis, size in voxel_um(grid).items()}
     metadata: dict[str, Any] = {"axes": "ZCYX" if colour else "ZYX", **sizes}
     metadata |= {f"{name}Unit": "µm" for name in sizes}
     n_pages = shape[0] * (shape[3] if colour else 1)
@@ -159,7 +171,7 @@ def write_volume_tiff(
         tiff.write(pages, shape=stored, dtype=np.float32, photometric="minisblack", metadata=metadata)
 
 
-def _voxel_um(grid: Grid) -> dict[str, float]:
+def voxel_um(grid: Grid) -> dict[str, float]:
     """Return the middle plane's voxel size; nothing where it is not known."""
     if not (np.isfinite(grid.pitch_um).all() and np.isfinite(grid.spacing_um).all()):
         return {}
@@ -169,11 +181,82 @@ def _voxel_um(grid: Grid) -> dict[str, float]:
 
 def _origin_um(grid: Grid) -> dict[str, float]:
     """Return where the first voxel's centre is: its depth, and from the axis; nothing where not known."""
-    voxel = _voxel_um(grid)
+    voxel = voxel_um(grid)
     if not voxel or (np.diff(grid.z_um) < 0).any():  # told by a step and a place, planes go away from it
         return {}
     row, column = grid.centre
     return {"z": float(grid.z_um[0]), "y": -row * voxel["y"], "x": -column * voxel["x"]}
+
+
+def grid_facts(grid: Grid) -> dict[str, Any]:
+    """Return where a volume's voxels lie, JSON-compatible: None for what is not known."""
+    return {
+        "shape": list(grid.shape),
+        "centre": list(grid.centre),
+        "z_um": known(grid.z_um),
+        "pitch_um": known(grid.pitch_um),
+        "axis_um": None if grid.axis_um is None else grid.axis_um.tolist(),
+        "upright": grid.upright,
+    }
+
+
+def _of_voxels(grid: Grid) -> str:
+    """Say what the one voxel size of an OME file stands for."""
+    if grid.is_metric:
+        return "All voxels have one size; rows and columns go with y and x; values are light a voxel."
+    if not voxel_um(grid):
+        return "The size of the voxels is not known."
+    return (
+        "Perspective grid: voxels of plane z are pitch_um[z] wide, and the scale is the middle plane's. The "
+        "planes stand upside down: rows and columns go against the scene's y and x. diffuserbench export "
+        "--metric makes voxels of one size of it."
+    )
+
+
+def grid_of(facts: Mapping[str, Any], shape: tuple[int, int, int]) -> Grid:
+    """Return the grid that :func:`grid_facts` told of, NaN for what it did not; of a volume of this shape."""
+    from recon.camera.grid import Grid
+
+    n_z, *size = shape
+    z_um, pitch_um = (_numbers(facts.get(name), (n_z,)) for name in ("z_um", "pitch_um"))
+    if z_um is None or pitch_um is None:
+        z_um = pitch_um = np.full(n_z, np.nan)
+    centre = _numbers(facts.get("centre"), (2,))
+    row, column = (n // 2 for n in size) if centre is None else centre.astype(int).tolist()
+    axis_um = _numbers(facts.get("axis_um"), (n_z, 2))
+    return Grid(shape, (row, column), z_um, pitch_um, None, axis_um, facts.get("upright") is True)
+
+
+def _numbers(value: Any, shape: tuple[int, ...]) -> npt.NDArray[np.float64] | None:
+    """Return finite numbers of a shape; None where a record has something else."""
+    try:
+        numbers = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        return None
+    return numbers if numbers.shape == shape and np.isfinite(numbers).all() else None
+
+
+def metric_source(source: VolumeSource, grid: Grid, voxel_um: float | None = None) -> VolumeSource:
+    """Return a volume on voxels of equal size; its planes are made when they are looked at.
+
+    ``grid`` is that of ``source``, ``voxel_um`` the edge of a cube (default: see
+    :func:`recon.camera.grid.metric_grid`). Closing the one closes the other.
+
+    Raises InputError where the grid is not known or has one plane.
+    """
+    from recon.camera.grid import metric_grid, metric_planes
+
+    metric = metric_grid(grid, voxel_um)
+    made = metric_planes(source.plane, grid, metric)
+
+    def read(z: Any, y: Any, x: Any) -> npt.NDArray[Any]:
+        if isinstance(z, int):
+            plane: npt.NDArray[Any] = made(z)
+            return plane[y, x] if plane.ndim == 3 else plane[y, x, None]
+        return np.stack([read(k, y, x) for k in range(*z.indices(metric.shape[0]))])
+
+    facts = grid_facts(metric)
+    return VolumeSource(source.path, [read], [metric.shape], source.n_channels, source.close, facts)
 
 
 def known(values: npt.NDArray[np.float64]) -> list[float] | None:
@@ -253,6 +336,11 @@ class VolumeSource:
         ``read(z, y, x)`` takes slices or numbers and returns (..., n_channels); the finest level first.
     shapes : sequence of (int, int, int)
         ``(n_z, height, width)`` of each level.
+    n_channels : int
+    close : callable, optional
+        Closes the files.
+    facts : mapping
+        What its file tells of its grid, as :func:`grid_facts` has it.
     """
 
     def __init__(
@@ -262,8 +350,10 @@ class VolumeSource:
         shapes: list[tuple[int, int, int]],
         n_channels: int,
         close: Callable[[], object] | None = None,
+        facts: Mapping[str, Any] | None = None,
     ) -> None:
         self.path = path
+        self.facts = facts or {}
         self.shape = shapes[0]
         self.n_channels = n_channels
         self._levels = levels
@@ -363,6 +453,7 @@ def _open_zarr(path: Path) -> VolumeSource:
         group: Any = zarr.open_group(path, mode="r")
         multiscale = group.attrs["ome"]["multiscales"][0]
         names = [axis["name"] for axis in multiscale["axes"]]
+        facts = group.attrs.get("diffuserbench")
         arrays = [group[dataset["path"]] for dataset in multiscale["datasets"]]
         for array in arrays:
             require_plausible(path, array.nbytes, folder_bytes(path), small=_SPARSE_BYTES)
@@ -382,7 +473,8 @@ def _open_zarr(path: Path) -> VolumeSource:
 
     shapes = [(a.shape[-3], a.shape[-2], a.shape[-1]) for a in arrays]
     n_channels = 1 if len(names) == 3 else int(arrays[0].shape[0])
-    return VolumeSource(path, [reader(a) for a in arrays], shapes, n_channels)
+    facts = facts if isinstance(facts, Mapping) else None
+    return VolumeSource(path, [reader(a) for a in arrays], shapes, n_channels, facts=facts)
 
 
 def _open_npy(path: Path) -> VolumeSource:

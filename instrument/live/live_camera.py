@@ -38,8 +38,9 @@ class LiveCamera:
     Callable from any thread; ``start``, ``stop`` and ``paused`` talk to the camera and block.
     """
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera | None) -> None:
         self._camera = camera
+        """None: a bench without one, whose view is never started."""
         self._changing = threading.RLock()
         self._stream: FrameStream | None = None
         self._acquired_before = self._dropped_before = 0
@@ -55,6 +56,7 @@ class LiveCamera:
             if self.is_running:
                 return
             self.stop()
+            assert self._camera is not None
             stream = FrameStream(self._camera, _BUFFERS)
             stream.start()
             self._stream = stream

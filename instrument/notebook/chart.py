@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from instrument.evaluation.chart import ChartData, make_chart, title_of
+from instrument.evaluation.chart_figure import chart_figure
 from instrument.evaluation.chart_problems import problem_of_job, problem_of_scene
-from instrument.evaluation.figures import chart_figure, write_charts
+from instrument.evaluation.figures import write_charts
 from instrument.files.atomic import write_json
 from instrument.files.errors import BenchError
 from instrument.notebook.result import Result, show_figure

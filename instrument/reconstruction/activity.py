@@ -113,8 +113,8 @@ def find_activity(
 ) -> Activity:
     """Look for activity in a reconstructed video.
 
-    ``video``: colour is averaged. ``free_bytes``: memory that may be taken; refused where the video needs
-    more.
+    ``video``: colour is averaged, the light of all depths added up. ``free_bytes``: memory that may be
+    taken; refused where the video needs more.
 
     Raises BenchError, FileError or InputError when the video is too short, too large, or dark.
     """
@@ -126,7 +126,7 @@ def find_activity(
             f"has {len(indices)} pictures; activity is looked for in {LEAST_FRAMES} at least.",
             "In fewer nothing tells it from noise: record for longer.",
         )
-    height, width = video.read(indices[0]).shape[:2]
+    height, width = video.flat(indices[0]).shape[:2]
     need = COPIES * len(indices) * height * width * 4
     if free_bytes is not None and need > free_bytes:
         raise BenchError(
@@ -135,7 +135,7 @@ def find_activity(
         )
     frames = np.empty((len(indices), height, width), np.float32)
     for place, index in enumerate(indices):
-        picture = video.read(index)
+        picture = video.flat(index)
         frames[place] = picture.mean(axis=2) if picture.ndim == 3 else picture
     found = motion(frames)
     still_moving_px = 0.0
@@ -199,7 +199,7 @@ def write_activity(
         len(video),
         activity.dff.shape[1:],
         period_s=video.period_s,
-        pitch_um=None,
+        grid=None,
         attributes={"quantity": "dF/F", "of": str(video.path.resolve()), "simulated": simulated},
     )
     stack = VideoPictures(made[3], write=True)

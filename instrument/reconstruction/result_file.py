@@ -17,16 +17,17 @@ from instrument.files.images import write_image
 from instrument.files.record import plain
 from instrument.files.seen import as_seen, levels_of
 from instrument.files.volumes import (
+    grid_facts,
     is_zarr_name,
-    known,
     stem_of,
     uneven_steps,
     write_volume_tiff,
     write_volume_zarr,
 )
 from instrument.reconstruction.job import Job
+from recon.camera.grid import Grid
 from recon.reconstruction.point_errors import PointErrors
-from recon.reconstruction.result import Grid, Reconstruction
+from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.uncertainty import Uncertainty
 
 
@@ -243,12 +244,7 @@ def _of_volume(result: Reconstruction) -> dict[str, Any]:
     return {
         "stop_reasons": [str(reason) for reason in result.stop_reasons],
         "uneven_steps": uneven_steps(grid.z_um),
-        "grid": {
-            "shape": grid.shape,
-            "centre": grid.centre,
-            "z_um": known(grid.z_um),
-            "pitch_um": known(grid.pitch_um),
-        },
+        "grid": grid_facts(grid),
         "histories": [[asdict(entry) for entry in history] for history in result.histories],
     }
 
@@ -265,7 +261,7 @@ def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
 
     if is_zarr_name(outputs.image):
         about = {"simulated": job.simulated, "record": outputs.record.name}
-        write_volume_zarr(outputs.image, result.volume, result.grid, about)
+        write_volume_zarr(outputs.image, result.volume, result.volume.shape, result.grid, about)
     else:
         write_volume_tiff(outputs.image, result.volume, result.volume.shape, result.grid)
     page = volume_figure(result, simulated=job.simulated)

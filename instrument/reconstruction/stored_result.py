@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +12,22 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.atomic import refuse_input, whole_file
-from instrument.files.errors import FileError
+from instrument.files.errors import FileError, size
 from instrument.files.images import read_image, write_image
 from instrument.files.reading import parse_json, read_bytes, require_file
 from instrument.files.seen import as_seen
 from instrument.files.volumes import (
     VolumeSource,
+    grid_of,
     is_zarr_name,
+    metric_source,
     open_volume,
     stem_of,
     write_volume_tiff,
     write_volume_zarr,
 )
-from recon.reconstruction.result import Grid
+from recon.camera.grid import Grid
+from recon.errors import InputError
 from recon.solvers.base import IterationRecord
 from recon.verdict.judge import Region
 
@@ -95,12 +98,47 @@ class StoredResult:
     @property
     def planes_um(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None:
         """Depth and lateral pitch of each plane of a volume, micrometres; None where not known."""
-        z_um, pitch_um = self._grid("z_um"), self._grid("pitch_um")
-        if self.volume is None or not isinstance(z_um, list) or not isinstance(pitch_um, list):
+        grid = self.grid
+        known = grid is not None and np.isfinite(grid.z_um).all() and np.isfinite(grid.pitch_um).all()
+        return (grid.z_um, grid.pitch_um) if grid is not None and known else None
+
+    @property
+    def grid(self) -> Grid | None:
+        """Where a volume's voxels lie, NaN for what is not known; None for a picture."""
+        if self.volume is None:
             return None
-        if len(z_um) != self.volume.shape[0] or len(pitch_um) != len(z_um):
-            return None
-        return np.array(z_um, float), np.array(pitch_um, float)
+        return grid_of({**self.record.get("grid", {}), **self.volume.facts}, self.volume.shape)
+
+    def metric(self, voxel_um: float | None = None) -> StoredResult:
+        """Return the volume on voxels of equal size, upright; made plane by plane as it is looked at.
+
+        ``voxel_um`` is the edge of a cube, by default as wide as the middle plane's pixels and as deep as
+        the step beside it.
+
+        Raises FileError where this is a picture, or where its planes lie is not known.
+        """
+        grid = self.grid
+        if self.volume is None or grid is None:
+            raise FileError(self.path, "is a picture, whose pixels are of equal size already.")
+        try:
+            volume = metric_source(self.volume, grid, voxel_um)
+        except InputError as error:
+            raise FileError(self.path, str(error)) from error
+        return replace(self, volume=volume)
+
+    def voxels_in_words(self) -> str:
+        """Say where a volume's voxels lie that are all of one size, and how much they take."""
+        grid = self.grid
+        assert grid is not None
+        assert grid.is_metric
+        n_z, height, width = grid.shape
+        (x, y, z), (x_end, y_end, z_end) = grid.place_um(0, 0, 0), grid.place_um(-1, height - 1, width - 1)
+        pitch, deep = grid.pitch_um[0], grid.spacing_um[0]
+        return (
+            f"{n_z} x {height} x {width} of {deep:.4g} x {pitch:.4g} x {pitch:.4g} um (z, y, x); "
+            f"z {z / 1e3:.5g} to {z_end / 1e3:.5g}, y {y / 1e3:.4g} to {y_end / 1e3:.4g}, "
+            f"x {x / 1e3:.4g} to {x_end / 1e3:.4g} mm; {size(4 * int(np.prod(grid.shape)))}"
+        )
 
     def facts(self) -> list[tuple[str, str]]:
         """Return what is known of it as names and values, to be shown; verdict and model first."""
@@ -343,7 +381,7 @@ def export_result(
     ----------
     target : Path
         A picture: ``.tif`` and ``.npy`` (float32) or ``.png`` (8 bit, as the preview). A volume: ``.tif``
-        (OME-TIFF), ``.npy``, both plane by plane, or ``.ome.zarr``, for which it must fit into memory.
+        (OME-TIFF), ``.npy`` or ``.ome.zarr``, all plane by plane.
     rotate_deg : int
         A multiple of 90 by which a picture is turned counter-clockwise.
     advance : callable, optional
@@ -364,14 +402,16 @@ def export_result(
         assert result.image is not None
         image = np.ascontiguousarray(np.rot90(result.image, rotate_deg // 90))
         write_image(target, as_seen(image) if target.suffix.lower() == ".png" else image)
+        return
+    source, grid = result.volume, result.grid
+    assert grid is not None
+    planes, shape = _planes(source, advance), _full_shape(source)
+    if target.suffix.lower() == ".npy":
+        _write_npy(target, planes, shape)
     elif is_zarr_name(target):
-        _to_zarr(result, result.volume, target, advance)
-    elif target.suffix.lower() == ".npy":
-        _to_npy(result.volume, target, advance)
+        write_volume_zarr(target, planes, shape, grid, {"simulated": result.simulated})
     else:
-        source = result.volume
-        planes = _planes(source, advance)
-        write_volume_tiff(target, planes, _full_shape(source), _grid_of(result, source))
+        write_volume_tiff(target, planes, shape, grid)
 
 
 def _planes(source: VolumeSource, advance: Advance | None) -> Iterator[npt.NDArray[np.float32]]:
@@ -386,24 +426,9 @@ def _full_shape(source: VolumeSource) -> tuple[int, ...]:
     return source.shape if source.n_channels == 1 else (*source.shape, source.n_channels)
 
 
-def _to_npy(source: VolumeSource, target: Path, advance: Advance | None) -> None:
+def _write_npy(target: Path, planes: Iterator[npt.NDArray[np.float32]], shape: tuple[int, ...]) -> None:
     with whole_file(target) as temporary:
-        voxels = np.lib.format.open_memmap(
-            temporary, mode="w+", dtype=np.dtype(np.float32), shape=_full_shape(source)
-        )
-        for z, plane in enumerate(_planes(source, advance)):
+        voxels = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.dtype(np.float32), shape=shape)
+        for z, plane in enumerate(planes):
             voxels[z] = plane
         voxels.flush()
-
-
-def _to_zarr(result: StoredResult, source: VolumeSource, target: Path, advance: Advance | None) -> None:
-    voxels = np.empty(_full_shape(source), np.float32)
-    for z, plane in enumerate(_planes(source, advance)):
-        voxels[z] = plane
-    write_volume_zarr(target, voxels, _grid_of(result, source), {"simulated": result.simulated})
-
-
-def _grid_of(result: StoredResult, source: VolumeSource) -> Grid:
-    unknown = np.full(source.shape[0], np.nan)
-    z_um, pitch_um = result.planes_um or (unknown, unknown)
-    return Grid(source.shape, (source.shape[1] // 2, source.shape[2] // 2), z_um, pitch_um)

@@ -35,12 +35,12 @@ from instrument.reconstruction.video_job import VideoJob, VideoPlan
 from instrument.reconstruction.video_work import BlockReport, CancelledError, cluster, in_process, on_cluster
 from instrument.runs.run import Run
 from recon.base.declare import inapplicable
-from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.measurement import Floats, Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, require_joint
 from recon.streams.stillness import has_light
-from recon.streams.video import BLOCK, COLD_ITERATIONS, VideoSolver, stream_problem
+from recon.streams.video import BLOCK, COLD_ITERATIONS, LOOKED_AT, VideoSolver, stream_problem
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,6 +108,10 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
     picture = _first_picture(request, run, frames[0])
     assert picture.reduction is not None
     inputs, options = request.inputs, request.options
+    others: list[Floats] = []
+    if options.model == "auto" and request.video.over_time is None:
+        at = np.unique(np.linspace(0, len(frames) - 1, LOOKED_AT).round().astype(int))[1:]
+        others = [picture.reduction.apply(run.frame(frames[i])) for i in at]
     problem = stream_problem(
         Measurement(
             picture.measurement,
@@ -117,11 +121,10 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         picture.calibration,
         replace(options, iterations=None),
         choosing=request.video.over_time is None,
+        others=others,
     )
     if request.video.over_time is not None:
         require_joint(problem)
-    if problem.n_planes > 1:
-        raise BenchError("A video's file holds pictures: say which depth with --z-mm.")
     reduction = picture.reduction
     if reduction.crop is not None:  # settled, so that a window is the same for every frame
         rows, columns = reduction.crop.slices(_binned_shape(run, frames[0], reduction.first_binning))
@@ -137,12 +140,12 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         warm_iterations=request.video.warm_iterations,
         over_time=request.video.over_time,
         rotate_deg=request.rotate_deg,
-        picture_shape=picture.measurement.shape,
+        picture_shape=(*problem.grid.shape[problem.n_planes == 1 :], *picture.measurement.shape[2:]),
         settings=_settings(request, picture, problem, reduction),
     )
     job, resumed = _job(request, plan, force)
     if job is None:
-        _create(request, run, plan, picture)
+        _create(request, run, plan, problem)
         job = VideoJob.create(request.out, plan, problem, reduction)
     saturated = sum(record.metadata.saturated_fraction > 0 for record in run.records.values())
     warnings = list(dict.fromkeys((*picture.warnings, *problem.warnings)))
@@ -153,6 +156,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
     if missing := run.n_frames - len(frames):
         warnings.append(f"{missing} of {run.n_frames} frames were lost when recording: they stay NaN.")
     notes = {**picture.notes, "Image": f"{run.path}: {len(frames)} frames"}
+    notes["Model"] = f"{problem.model}: {problem.reason}" if problem.reason else problem.model
     return PreparedVideo(job, request, notes, tuple(warnings), resumed)
 
 
@@ -195,9 +199,9 @@ def finish_video(prepared: PreparedVideo) -> list[Path]:
     written = [request.out]
     if request.video.film:
         chosen = np.unique(np.linspace(0, len(plan.frames) - 1, SAMPLES).round().astype(int))
-        black, white = levels_of(pictures.read(plan.frames[i]) for i in chosen)
+        black, white = levels_of(pictures.flat(plan.frames[i]) for i in chosen)
         fps = request.video.fps or (1 / pictures.period_s if pictures.period_s else DEFAULT_FPS)
-        shown = (as_shown(pictures.read(index), black, white) for index in plan.frames)
+        shown = (as_shown(pictures.flat(index), black, white) for index in plan.frames)
         write_mp4(request.film_path, shown, fps)
         written.append(request.film_path)
     unlit = prepared.job.unlit()
@@ -259,6 +263,7 @@ def _settings(request: VideoRequest, picture: Job, problem: Problem, reduction: 
             "prior": str(request.options.prior or "tv"),
             "solver": problem.solver.name,
             "model": problem.model,
+            "model_reason": problem.reason,
             "background_estimated": problem.smooth,
             "weight": max(VideoSolver(problem).weights),
             "noise_deviation": problem.noise,
@@ -337,23 +342,16 @@ def _difference(plan: VideoPlan, begun: VideoPlan) -> str:
     return ", ".join(names) or "settings"
 
 
-def _create(request: VideoRequest, run: Run, plan: VideoPlan, picture: Job) -> None:
-    geometry = picture.calibration.geometry
-    height, width = plan.picture_shape[:2]
-    z = picture.calibration.source_positions_um[:, 2]
-    asked_um = request.options.z_um
-    z_um = asked_um if asked_um is not None else (float(z[0]) if np.isfinite(z[0]) else None)
-    pitch = None
-    if geometry.pixel_pitch_um and geometry.diffuser_distance_mm and z_um:
-        pitch = geometry.pixel_pitch_um * z_um / (1000 * geometry.diffuser_distance_mm)
+def _create(request: VideoRequest, run: Run, plan: VideoPlan, problem: Problem) -> None:
+    *depths, height, width = plan.picture_shape[: 2 + (problem.n_planes > 1)]
     turned = request.rotate_deg % 180 != 0
     shape = (width, height) if turned else (height, width)
     create_output(
         request.out,
         plan.n_frames,
-        (*shape, *plan.picture_shape[2:]),
+        (*depths, *shape, *plan.picture_shape[len(depths) + 2 :]),
         period_s=run.frame_period_s,
-        pitch_um=pitch,
+        grid=problem.grid,
         attributes={
             **plan.settings,
             "run": plan.run,

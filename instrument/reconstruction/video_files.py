@@ -13,7 +13,7 @@ import numpy.typing as npt
 from drivers.frame import FrameMetadata
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import FileError
-from instrument.files.volumes import ome_attributes
+from instrument.files.volumes import grid_facts, ome_attributes, voxel_um
 from instrument.runs.run import Run
 
 STILL = {"um": 0.5, "mrad": 0.02}
@@ -77,6 +77,8 @@ def _stands(positions: Sequence[Mapping[str, float]]) -> bool:
 if TYPE_CHECKING:
     import zarr
 
+    from recon.camera.grid import Grid
+
 Floats = npt.NDArray[np.float32]
 
 
@@ -86,7 +88,7 @@ def create_output(
     picture_shape: tuple[int, ...],
     *,
     period_s: float | None,
-    pitch_um: float | None,
+    grid: Grid | None,
     attributes: dict[str, Any],
 ) -> None:
     """Make the folder of a video whose pictures are still to come; they read as NaN until then.
@@ -94,19 +96,22 @@ def create_output(
     Parameters
     ----------
     picture_shape : tuple of int
-        ``(height, width)`` or ``(height, width, 3)``; stored as ``t, y, x`` or ``t, c, y, x``.
+        ``([n_z,] height, width[, 3])``; stored as ``t, [c,] [z,] y, x``.
     period_s : float, optional
         From frame to frame.
-    pitch_um : float, optional
-        Of the picture's pixels in the object.
+    grid : Grid, optional
+        Where the pixels lie in the object. One voxel size holds for all planes: the middle one's, as of a
+        volume; what :func:`~instrument.files.volumes.grid_facts` says stands in
+        the attribute ``diffuserbench``.
     attributes : dict
         JSON-compatible, for the attribute ``diffuserbench``.
     """
     import zarr
 
-    colour = len(picture_shape) == 3
-    shape = (picture_shape[2], *picture_shape[:2]) if colour else picture_shape
-    names = ["t", "c", "y", "x"] if colour else ["t", "y", "x"]
+    deep = grid is not None and grid.shape[0] > 1
+    colour = len(picture_shape) == 3 + deep
+    shape = (picture_shape[-1], *picture_shape[:-1]) if colour else picture_shape
+    names = ["t", *(["c"] if colour else []), *(["z"] if deep else []), "y", "x"]
     group = zarr.open_group(path, mode="w", zarr_format=3)
     group.create_array(
         "0",
@@ -116,12 +121,17 @@ def create_output(
         fill_value=np.nan,
         dimension_names=names,
     )
-    group.attrs["ome"] = ome_attributes(path.name, names, {"t": period_s, "y": pitch_um, "x": pitch_um})
+    steps: dict[str, float | None] = {"t": period_s}
+    if grid is not None:
+        attributes = attributes | grid_facts(grid)
+        pitch = float(grid.pitch_um[0])
+        steps |= voxel_um(grid) if deep else dict.fromkeys("yx", pitch if np.isfinite(pitch) else None)
+    group.attrs["ome"] = ome_attributes(path.name, names, steps)
     group.attrs["diffuserbench"] = attributes
 
 
 class VideoPictures:
-    """The pictures of a video, to be read and written one by one.
+    """The pictures or volumes of a video, to be read and written one by one.
 
     ``path``: the OME-Zarr folder.
     """
@@ -132,6 +142,11 @@ class VideoPictures:
         self.path = path
         self.array: zarr.Array[Any] = zarr.open_array(path / "0", mode="r+" if write else "r", zarr_format=3)
         self.attributes: dict[str, Any] = dict(zarr.open_group(path, mode="r").attrs)
+
+    @property
+    def axes(self) -> str:
+        """Names of the array's axes, such as ``"tyx"`` or ``"tczyx"``."""
+        return "".join(axis["name"] for axis in self.attributes["ome"]["multiscales"][0]["axes"])
 
     @property
     def period_s(self) -> float | None:
@@ -145,9 +160,14 @@ class VideoPictures:
         return int(self.array.shape[0])
 
     def read(self, index: int) -> Floats:
-        """Return one picture, (height, width[, 3]); NaN where there is none."""
+        """Return one picture or volume, ([n_z,] height, width[, 3]); NaN where there is none."""
         picture = np.asarray(self.array[index], np.float32)
-        return picture if picture.ndim == 2 else np.ascontiguousarray(np.moveaxis(picture, 0, 2))
+        return np.ascontiguousarray(np.moveaxis(picture, 0, -1)) if "c" in self.axes else picture
+
+    def flat(self, index: int) -> Floats:
+        """Return one picture, (height, width[, 3]); of a volume each pixel's light of all depths."""
+        picture = self.read(index)
+        return picture.sum(axis=0) if "z" in self.axes else picture
 
     def is_written(self, index: int) -> bool:
         """Whether a picture is on the disk."""
@@ -155,7 +175,7 @@ class VideoPictures:
 
     def write(self, index: int, picture: Floats) -> None:
         """Put a picture on the disk, whole or not at all."""
-        self.array[index] = picture if picture.ndim == 2 else np.moveaxis(picture, 2, 0)
+        self.array[index] = np.moveaxis(picture, -1, 0) if "c" in self.axes else picture
         with self._file(index).open("rb") as written:
             os.fsync(written.fileno())
 

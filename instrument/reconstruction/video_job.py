@@ -32,6 +32,7 @@ from instrument.reconstruction.job import Reduction
 from instrument.reconstruction.preparation import Crop
 from recon.base.declare import record
 from recon.base.noise import NoiseModel
+from recon.camera.camera_model import Extent
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
@@ -64,7 +65,7 @@ class VideoPlan:
     rotate_deg: int
     """By how much pictures are turned, counter-clockwise."""
     picture_shape: tuple[int, ...]
-    """``(height, width)`` or ``(height, width, 3)``, before turning."""
+    """``([n_z,] height, width[, 3])``, before turning; without depths where there is one."""
     settings: dict[str, Any]
     """Everything that was chosen for preparation and prior, JSON-compatible."""
 
@@ -155,7 +156,12 @@ class VideoJob:
         )
         pitch_um, distance_mm = (None if np.isnan(v) else float(v) for v in a["geometry"])
         calibration = Calibration(a["psfs"], a["positions"], geometry=Geometry(pitch_um, distance_mm))
-        return stream_problem(measurement, calibration, ReconstructionOptions(**asked), choosing=False)
+        extent = None
+        if a["extent"].size:
+            height, width, reach = a["extent"].tolist()
+            extent = Extent((int(height), int(width)), None if np.isnan(reach) else reach)
+        options = ReconstructionOptions(**asked)
+        return stream_problem(measurement, calibration, options, choosing=False, extent=extent)
 
     @property
     def reduction(self) -> Reduction:
@@ -174,6 +180,8 @@ def _problem_arrays(problem: Problem) -> dict[str, Any]:
     known = [] if noise is None else [noise] if isinstance(noise, float | int) else asdict(noise).values()
     asked = {name: value for name, value in record(problem.options).items() if value is not None}
     optics = (geometry.pixel_pitch_um, geometry.diffuser_distance_mm)
+    window, reach = problem.extent.psf_window, problem.extent.acceptance_px
+    extent = [] if window is None else [*window, np.nan if reach is None else reach]
     return {
         "frame": np.asarray(measurement.image),
         "noise": np.array(list(known), float),
@@ -182,6 +190,7 @@ def _problem_arrays(problem: Problem) -> dict[str, Any]:
         "positions": problem.calibration.source_positions_um,
         "geometry": np.array([np.nan if value is None else value for value in optics]),
         "options": np.array(json.dumps(asked)),
+        "extent": np.array(extent, float),
     }
 
 

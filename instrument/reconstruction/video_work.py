@@ -119,7 +119,9 @@ def solve_block(
         if picture is None:
             raise CancelledError
         if not pictures.is_written(index):
-            pictures.write(index, np.ascontiguousarray(np.rot90(picture, plan.rotate_deg // 90)))
+            rows = int(job.problem.n_planes > 1)
+            turned = np.rot90(picture, plan.rotate_deg // 90, (rows, rows + 1))
+            pictures.write(index, np.ascontiguousarray(turned))
             written += 1
     job.mark_done(number, unlit)
     return BlockReport(number, len(block), written, time.perf_counter() - began_s, unlit)

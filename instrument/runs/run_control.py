@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from instrument.bench.bench import Bench
 from instrument.bench.safety import StepsFailedError, stop_until
@@ -32,6 +33,8 @@ class RunControl:
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
+        self.run: Path | None = None
+        """The run that goes on or went last; None before the first."""
         self._runner: Runner | None = None
         self._bench: Bench | None = None
         self._idle = threading.Event()
@@ -108,7 +111,7 @@ class RunControl:
     def follow(self, runner: Runner) -> None:
         """Let a runner of the procedure be paused, aborted and stopped."""
         with self._condition:
-            self._runner = runner
+            self._runner, self.run = runner, runner.path
             if self._pausing:
                 runner.pause()
             if self._ending is FinishReason.ABORTED:

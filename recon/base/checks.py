@@ -145,7 +145,8 @@ def require_photograph(
     seen = np.where(valid, data, [[[np.median(d[v])]] for d, v in zip(data, valid, strict=True)])
     middle = psfs[len(psfs) // 2]
     (of_data, fine_data), (of_psf, fine_psf) = (_details(image.mean(axis=0)) for image in (seen, middle))
-    if of_data > SHARPER * of_psf and fine_data > 0.5 * fine_psf:
+    # A PSF whose details are no more than its noise tells nothing.
+    if of_psf > 0 and of_data > SHARPER * of_psf and fine_data > 0.5 * fine_psf:
         raise InputError(
             "PSF and photograph seem to be swapped: beside its light the photograph's details are "
             f"{of_data / of_psf:.3g} times as strong as the PSF's, and no scene makes them stronger. "

@@ -69,6 +69,8 @@ class Declaration:
         Returns words that it could be once, and what replaces each, as a sentence.
     none_word : str
         What people type for None ("auto", say); empty: None cannot be typed.
+    positional : bool
+        Whether the command line takes it without a flag, as what the command is about.
     """
 
     help: str
@@ -92,6 +94,7 @@ class Declaration:
     parse_all: Callable[[Sequence[str]], Any] | None = None
     replaced: Callable[[], Mapping[str, str]] = dict
     none_word: str = ""
+    positional: bool = False
 
     def words(self) -> tuple[str, ...]:
         """Return the words that it is declared to be; empty where it is no choice of words."""
@@ -143,7 +146,7 @@ class Option:
     @property
     def flags(self) -> tuple[str, ...]:
         """Its names on the command line, with both of a switch as ``--on/--off``; empty: not offered."""
-        if self.declaration.flags:
+        if self.declaration.flags or self.declaration.positional:
             return tuple(flag for flag in self.declaration.flags if flag)
         said, name = self.declaration, self.name
         if said.shown_unit and name.endswith(f"_{said.unit}"):
@@ -156,7 +159,8 @@ class Option:
     @property
     def flag(self) -> str:
         """The name that people are told: the first long one, of a switch what turns it on."""
-        return next((flag.partition("/")[0] for flag in self.flags if flag.startswith("--")), self.name)
+        bare = self.declaration.metavar if self.declaration.positional else self.name
+        return next((flag.partition("/")[0] for flag in self.flags if flag.startswith("--")), bare)
 
     @property
     def label(self) -> str:

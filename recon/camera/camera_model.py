@@ -14,7 +14,7 @@ from recon.base.checks import select_psf
 from recon.base.registry import Registry
 from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution, field_of
-from recon.camera.field_registration import remembered_field, shown
+from recon.camera.field_registration import NOT_ON_AXIS, remembered_field, shown
 from recon.camera.registration import moved
 from recon.camera.varying_psfs import FieldOfPsfs, interpolation_weights, principal_psfs
 from recon.errors import InputError
@@ -71,12 +71,16 @@ class Depths:
     warnings : tuple of str
         Which PSFs could not be registered by their images, and were by their sources' places; depths
         without one near the axis.
+    axis_um : ndarray, (n_z, 2), or None
+        ``(x, y)`` that the middle of a picture looks at: where the central PSF's source was; 0 where that is
+        not known.
     """
 
     z_um: npt.NDArray[np.float64]
     central: npt.NDArray[np.float32]
     fields: list[FieldOfPsfs]
     warnings: tuple[str, ...] = ()
+    axis_um: npt.NDArray[np.float64] | None = None
 
     @property
     def varies(self) -> bool:
@@ -124,13 +128,16 @@ def sort_by_depth(calibration: Calibration) -> Depths:
         raise InputError("The calibration holds no PSF: a volume needs at least one depth.")
     members = members_of_depths(positions)
     z_um = np.array([float(np.mean(positions[group, 2])) for group in members])
-    central, fields, warnings = [], [], []
+    central, fields, warnings, axis_um = [], [], [], []
     for group in members:
         on_axis, field, trouble = remembered_field(calibration, group)
         central.append(on_axis)
         fields.append(field)
         warnings += trouble
-    return Depths(z_um, np.stack(central), fields, tuple(dict.fromkeys(warnings)))
+        nearest = positions[calibration.nearest_to_axis(group), :2]
+        axis_um.append(np.zeros(2) if NOT_ON_AXIS in trouble else np.nan_to_num(nearest))
+    words = tuple(dict.fromkeys(warnings))
+    return Depths(z_um, np.stack(central), fields, words, np.array(axis_um))
 
 
 def members_of_depths(positions_um: npt.NDArray[np.float64]) -> list[npt.NDArray[np.intp]]:

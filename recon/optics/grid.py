@@ -109,6 +109,7 @@ def resample_energy(
     x_edges: FloatArray,
     target_y_edges: FloatArray,
     target_x_edges: FloatArray,
+    shifts: FloatArray | None = None,
 ) -> npt.NDArray[np.float32]:
     """Move the content of one rectangular grid's cells into another's by overlapping area.
 
@@ -118,16 +119,27 @@ def resample_energy(
         Content of the source cells, spread evenly over each.
     y_edges, x_edges, target_y_edges, target_x_edges : ndarray, float64
         Cell borders of both grids in common coordinates.
+    shifts : ndarray, float64, optional
+        Displacements along both axes over whose pairs the mean is taken.
 
     Returns
     -------
     ndarray, float32, (H, W)
         What falls outside the target is lost; inside, the sum is kept.
     """
-    rows = overlap_matrix(y_edges, target_y_edges)
-    columns = overlap_matrix(x_edges, target_x_edges)
+    rows, columns = (
+        _mean_overlap(edges, target, np.zeros(1) if shifts is None else shifts)
+        for edges, target in ((y_edges, target_y_edges), (x_edges, target_x_edges))
+    )
     down = rows @ energy
     return np.ascontiguousarray((columns @ down.T).T)
+
+
+def _mean_overlap(edges: FloatArray, target_edges: FloatArray, shifts: FloatArray) -> sparse.csr_array:
+    total = overlap_matrix(edges, target_edges - shifts[0])
+    for shift in shifts[1:]:
+        total += overlap_matrix(edges, target_edges - shift)
+    return total if len(shifts) == 1 else total * np.float32(1 / len(shifts))
 
 
 Spectrum = tuple[tuple[float, float], ...]

@@ -1,21 +1,25 @@
 """What a scene throws onto the sensor, with the optics' true field dependence.
 
-Beads get a point spread function each, computed at their own place. A picture is cut into cells on a grid
-finer than the sensor's pixels; each cell is a point source whose point spread function is interpolated
-linearly between wave-optical ones on a grid of nodes in the field, after registration to their straight rays.
+Beads get a point spread function each, computed at their own place. A picture is cut into cells: what one
+pixel looks at, where the picture's own pixels are no finer, else half of that in either direction. The point
+spread function of a cell is interpolated linearly between wave-optical ones on a grid of nodes in the field,
+after registration to their straight rays.
 Nodes lie as densely as the optics demand, which tests hold against point spread functions computed at every
 place. The sums run as one linear convolution per node over the cells in its neighbourhood.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
+from recon.base.threads import get_threads
 from recon.optics.fall_off import FallOff, response_on
 from recon.optics.grid import PixelGrid, mixed_spectrum
 from recon.optics.scene import Layer, Scene
@@ -23,15 +27,14 @@ from recon.optics.wave import WavePropagator
 
 Image = npt.NDArray[np.float32]
 Weights = tuple[float, float, float]
-FFT_WORKERS = 2
 
 
 @dataclass(frozen=True, slots=True)
 class RenderSettings:
     """How finely a scene is rendered."""
 
-    oversampling: int = 2
-    """Cells of a picture along each pixel of the sensor."""
+    oversampling: int | None = None
+    """Cells of a picture along each pixel of the sensor, 1 or more; None: 1 or 2, as the picture needs."""
     node_tolerance: float = 1.0
     """Pixels by which the light's displacement by the relief may differ between neighbouring nodes."""
     widest_spacing: float = 0.2
@@ -85,6 +88,8 @@ def render(
     for place, power, diameter in scene.points():
         source = (float(place[0]), float(place[1]), float(place[2]))
         spectrum = mixed_spectrum(product(weights, power), settings.spectral_samples)
+        if not spectrum:
+            continue
         light = propagator.psf(source, grid, spectrum, diameter_um=diameter, emission="isotropic")
         light *= response_on(grid, source, propagator.distance_um, fall_off)
         image += np.float32(bead_photons) * light
@@ -140,8 +145,9 @@ class _LayerRenderer:
         self.fall_off = fall_off
         self.settings = settings
         self.spectrum = mixed_spectrum(spectral_weights, settings.spectral_samples)
-        self.fine = grid.refined(settings.oversampling)
         self.magnification = propagator.distance_um / layer.z_um
+        self.oversampling = settings.oversampling or (2 if _finer(layer, grid, self.magnification) else 1)
+        self.fine = grid.refined(self.oversampling)
         self.half_kernel = propagator.half_extent_um(layer.z_um)
         self.cells_y = self._cells(0, layer.y_edges_um)
         self.cells_x = self._cells(1, layer.x_edges_um)
@@ -152,10 +158,13 @@ class _LayerRenderer:
         if self.flux.any():
             nodes_y, nodes_x = self._nodes()
             self.flux *= self._vignetting_ratio(nodes_y, nodes_x)
-            for j in range(len(nodes_y)):
-                for i in range(len(nodes_x)):
-                    self._add_node(image, nodes_y, j, nodes_x, i)
-        factor = self.settings.oversampling
+            indices = itertools.product(range(len(nodes_y)), range(len(nodes_x)))
+            with ThreadPoolExecutor(get_threads(), "render") as pool:
+                # Added up in their order, whoever is done first: the sum is the same to the last bit.
+                for part in pool.map(lambda at: self._node(nodes_y, at[0], nodes_x, at[1]), indices):
+                    if part is not None:
+                        _add_clipped(image, *part)
+        factor = self.oversampling
         height, width = self.fine.shape
         tiles = image.reshape(height // factor, factor, width // factor, factor)
         return np.asarray(tiles.sum(axis=(1, 3)), np.float32)
@@ -185,7 +194,7 @@ class _LayerRenderer:
         pitch = self.fine.pitch_um
         # Off axis the way to the sensor grows by (1 + t^2)^(3/2), and with it what the relief displaces.
         stretch = 3.3 * self.propagator.displacement_um(self.layer.z_um)
-        tolerance = settings.node_tolerance * pitch * settings.oversampling / stretch
+        tolerance = settings.node_tolerance * pitch * self.oversampling / stretch
         widest = min(settings.widest_spacing, _fall_off_spacing(self.fall_off, settings.fall_off_tolerance))
         while True:
             spans = [
@@ -216,36 +225,28 @@ class _LayerRenderer:
             np.where(interpolated > 1e-6, exact / np.maximum(interpolated, 1e-6), 1.0), np.float32
         )
 
-    def _add_node(
-        self,
-        image: Image,
-        nodes_y: npt.NDArray[np.float64],
-        j: int,
-        nodes_x: npt.NDArray[np.float64],
-        i: int,
-    ) -> None:
+    def _node(
+        self, nodes_y: npt.NDArray[np.float64], j: int, nodes_x: npt.NDArray[np.float64], i: int
+    ) -> tuple[Image, int, int] | None:
+        """Return the light of the cells around a node, and where it lies on the fine pixels."""
         weight_y, first_y = _hat(nodes_y, j, self.cells_y)
         weight_x, first_x = _hat(nodes_x, i, self.cells_x)
         rows = slice(first_y - self.cells_y.start, first_y - self.cells_y.start + len(weight_y))
         columns = slice(first_x - self.cells_x.start, first_x - self.cells_x.start + len(weight_x))
         patch = self.flux[rows, columns] * weight_y[:, None] * weight_x
         if not patch.any():
-            return
+            return None
         kernel = self._kernel(nodes_y[j], nodes_x[i])
-        shape = tuple(
-            fft.next_fast_len(a + b - 1, real=True) for a, b in zip(patch.shape, kernel.shape, strict=True)
-        )
-        workers = FFT_WORKERS
-        spectrum = fft.rfft2(kernel, shape, workers=workers)
-        spectrum *= fft.rfft2(patch, shape, workers=workers)
-        light = fft.irfft2(spectrum, shape, workers=workers, overwrite_x=True)
+        used = tuple(a + b - 1 for a, b in zip(patch.shape, kernel.shape, strict=True))
+        shape = tuple(fft.next_fast_len(side, real=True) for side in used)
+        spectrum = fft.rfft2(kernel, shape)
+        spectrum *= fft.rfft2(patch, shape)
+        light = fft.irfft2(spectrum, shape, overwrite_x=True)[: used[0], : used[1]]
         # Kernel pixel k lies at (k - (n - 1) / 2) from the straight ray, fine pixel p at (p - (N - 1) / 2)
         # from the centre: n and N are both even or both odd.
         top = first_y + (self.fine.shape[0] - kernel.shape[0]) // 2
         left = first_x + (self.fine.shape[1] - kernel.shape[1]) // 2
-        _add_clipped(
-            image, light, top, left, (len(weight_y) + kernel.shape[0], len(weight_x) + kernel.shape[1])
-        )
+        return light, top, left
 
     def _kernel(self, node_y: float, node_x: float) -> Image:
         """Point spread function of a node on fine pixels about its straight ray."""
@@ -258,9 +259,15 @@ class _LayerRenderer:
         z = self.layer.z_um
         source = (-center[0] / self.magnification, -center[1] / self.magnification, z)
         grid = PixelGrid((shape[0], shape[1]), pitch, center)
-        kernel = self.propagator.psf(source, grid, self.spectrum)
+        kernel = self.propagator.psf(source, grid, self.spectrum, cell=self.oversampling == 1)
         kernel *= response_on(grid, source, self.propagator.distance_um, self.fall_off)
         return kernel
+
+
+def _finer(layer: Layer, grid: PixelGrid, magnification: float) -> bool:
+    """Whether a picture's pixels, or all of it, are smaller than what one pixel of the sensor looks at."""
+    sides = zip(layer.size_um, layer.radiance.shape[:2], strict=True)
+    return any(size / count * magnification < grid.pitch_um for size, count in sides)
 
 
 def _fall_off_spacing(fall_off: FallOff, tolerance: float) -> float:
@@ -305,9 +312,9 @@ def _hat(nodes: npt.NDArray[np.float64], index: int, cells: range) -> tuple[Imag
     return weights[used[0] : used[-1] + 1].astype(np.float32), cells.start + int(used[0])
 
 
-def _add_clipped(image: Image, light: Image, top: int, left: int, used: tuple[int, int]) -> None:
-    """Add the used part of ``light`` to ``image`` at a place that may stick out."""
-    height, width = (min(n, u) for n, u in zip(light.shape, used, strict=True))
+def _add_clipped(image: Image, light: Image, top: int, left: int) -> None:
+    """Add ``light`` to ``image`` at a place that may stick out."""
+    height, width = light.shape
     first_row, first_column = max(0, -top), max(0, -left)
     last_row, last_column = min(height, image.shape[0] - top), min(width, image.shape[1] - left)
     if last_row > first_row and last_column > first_column:

@@ -190,6 +190,12 @@ class Scene:
                 )
         return image
 
+    @property
+    def grey(self) -> bool:
+        """Whether it has the same brightness in all bands everywhere."""
+        parts = [layer.radiance for layer in self.layers] + [beads.powers for beads in self.beads]
+        return all(bool((part == part[..., :1]).all()) for part in parts)
+
     def points(self) -> Iterator[tuple[FloatArray, FloatArray, float]]:
         """Position (3,), powers (3,) and diameter of every bead."""
         for beads in self.beads:

@@ -45,7 +45,9 @@ def check_source(source_um: Source) -> None:
 # (some tens of micrometres) is wrong by at most this fraction: well below a pixel.
 TILE_TOLERANCE = 0.04
 MOST_TILES = 256
-KEPT_BYTES = 128 << 20
+CELL_POINTS: FloatArray = np.array([-0.375, -0.125, 0.125, 0.375])
+"""Places along each side of a square cell, in its sides, whose light is summed for the cell's."""
+KEPT_BYTES = 192 << 20
 """Of the newest point spread functions: another picture in the place of one needs the same."""
 
 
@@ -65,10 +67,14 @@ class Caustic:
     y_edges_um: FloatArray
     x_edges_um: FloatArray
 
-    def on(self, grid: PixelGrid) -> npt.NDArray[np.float32]:
-        """Integrate over the pixels of a sensor grid; ``grid.shape``, float32."""
+    def on(self, grid: PixelGrid, *, cell: bool = False) -> npt.NDArray[np.float32]:
+        """Integrate over the pixels of a sensor grid; ``grid.shape``, float32.
+
+        ``cell``: of the square that one pixel looks at, evenly bright, together as bright as the point.
+        """
+        shifts = grid.pitch_um * CELL_POINTS if cell else np.zeros(1)
         return resample_energy(
-            self.energy, self.y_edges_um, self.x_edges_um, grid.y_edges_um, grid.x_edges_um
+            self.energy, self.y_edges_um, self.x_edges_um, grid.y_edges_um, grid.x_edges_um, shifts
         )
 
 
@@ -116,8 +122,9 @@ class WavePropagator:
         *,
         diameter_um: float = 0.0,
         emission: Emission = "lambertian",
+        cell: bool = False,
     ) -> npt.NDArray[np.float32]:
-        """Light of a point source (or small disc) on the pixels of a sensor grid.
+        """Light of a point source (or small disc, or square cell) on the pixels of a sensor grid.
 
         Parameters
         ----------
@@ -131,6 +138,8 @@ class WavePropagator:
             Diameter of a uniformly bright disc parallel to the sensor (0: a point).
         emission : {"lambertian", "isotropic"}
             A pinhole or screen that faces the sensor, or a fluorescent bead.
+        cell : bool
+            Spread over the square that one pixel looks at.
 
         Returns
         -------
@@ -139,12 +148,13 @@ class WavePropagator:
             source): multiplied by the source's intensity along the axis, the light on the pixel. The angular
             response of the pixels is not included (:mod:`recon.optics.fall_off`).
         """
-        key = (source_um, grid, spectrum, diameter_um, emission)
+        key = (source_um, grid, spectrum, diameter_um, emission, cell)
         with self._lock:
             if key in self._kept:
                 self._kept.move_to_end(key)
                 return self._kept[key].copy()
-        light = self.caustic(source_um, grid, spectrum, diameter_um=diameter_um, emission=emission).on(grid)
+        caustic = self.caustic(source_um, grid, spectrum, diameter_um=diameter_um, emission=emission)
+        light = caustic.on(grid, cell=cell)
         with self._lock:
             self._kept[key] = light.copy()
             while sum(kept.nbytes for kept in self._kept.values()) > KEPT_BYTES:

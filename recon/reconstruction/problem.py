@@ -13,6 +13,7 @@ import numpy.typing as npt
 from recon.base.checks import as_channels, check_psf
 from recon.base.declare import settled
 from recon.camera.camera_model import Depths, Extent, ModelName, choose_model, energies, levelled
+from recon.camera.grid import Grid
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (
@@ -23,7 +24,7 @@ from recon.reconstruction.measurement import (
     require_same_pixels,
 )
 from recon.reconstruction.options import Precision, ReconstructionOptions
-from recon.reconstruction.result import Grid, Reconstruction, window_of
+from recon.reconstruction.result import Reconstruction, window_of
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver, solver_for
 from recon.reconstruction.weights import CameraClass, name_of, require_prior
 from recon.types import Calibration
@@ -340,7 +341,7 @@ class Problem:
         if pitch is not None and distance:
             pitches = pitch * z_um / (1000 * distance)
         shape = (len(z_um), rows.stop - rows.start, columns.stop - columns.start)
-        return Grid(shape, centre, z_um, pitches, pitch)
+        return Grid(shape, centre, z_um, pitches, pitch, self.depths.axis_um)
 
     @property
     def axis_weights(self) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera.convolution import field_of
+from recon.camera.grid import Grid
 from recon.reconstruction.options import Field
 from recon.solvers.base import IterationRecord, StopReason
 from recon.solvers.douglas_rachford import EmptyPlanes
@@ -20,55 +21,6 @@ if TYPE_CHECKING:
     from recon.reconstruction.problem import Problem
     from recon.reconstruction.psf_refinement import Refinement
     from recon.reconstruction.uncertainty import Uncertainty
-
-
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """Where the voxels of a reconstruction lie: every depth has its own lateral pitch (Kuo 2020, sec. 4.4).
-
-    Attributes
-    ----------
-    shape : (int, int, int)
-        ``(n_z, height, width)``.
-    centre : (int, int)
-        ``(row, column)`` of the pixel on the axis.
-    z_um : ndarray, (n_z,)
-        Depth of each plane in front of the diffuser; NaN where not known.
-    pitch_um : ndarray, (n_z,)
-        Lateral pitch of each plane, ``sensor pitch * z / d`` (Eq. 3.1); NaN where not known.
-    sensor_pitch_um : float or None
-        Pixel pitch of the sensor: one pixel is what shifts the PSF by one sensor pixel.
-    """
-
-    shape: tuple[int, int, int]
-    centre: tuple[int, int]
-    z_um: npt.NDArray[np.float64]
-    pitch_um: npt.NDArray[np.float64]
-    sensor_pitch_um: float | None = None
-
-    @property
-    def spacing_um(self) -> npt.NDArray[np.float64]:
-        """Distance from each plane to the next, positive; the last one's is that of the plane before it."""
-        if len(self.z_um) < 2:
-            return np.full(len(self.z_um), np.nan)
-        steps = np.abs(np.diff(self.z_um))
-        return np.append(steps, steps[-1])
-
-    def axis_weights(self) -> npt.NDArray[np.float64]:
-        """Weights (n_z, 3) of the z, y and x differences for total variation in space instead of in voxels.
-
-        A step between neighbours counts by the area of the face between their voxels; the x face of a plane
-        is ``pitch * spacing``, the z face ``pitch^2``, so relative to x a z difference weighs ``pitch /
-        spacing``. One throughout where the geometry is not known; nothing along z where there is one plane.
-        """
-        weights = np.ones((len(self.z_um), 3))
-        if len(self.z_um) == 1:
-            weights[:, 0] = 0.0
-            return weights
-        ratio = self.pitch_um / self.spacing_um
-        if np.isfinite(ratio).all():
-            weights[:, 0] = ratio
-        return weights
 
 
 def window_of(

@@ -9,21 +9,22 @@ adds up (1e-6 of the brightest pixel).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.camera_model import choose_model
+from recon.camera.camera_model import Extent, choose_model
 from recon.errors import InputError
 from recon.reconstruction.first_look import look_at
 from recon.reconstruction.measurement import Floats, Measurement, depths_of
-from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import given, require_two_images
-from recon.reconstruction.selection import with_background
+from recon.reconstruction.selection import choice_for, with_background
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver
 from recon.solvers.base import Solver, StoppingRules
 from recon.solvers.sensor_admm import SensorAdmm
@@ -38,12 +39,18 @@ SETTLED = 2e-4
 """Change an iteration below which a video's frame is done before its iterations are."""
 
 
+LOOKED_AT = 5
+"""Frames of a film, evenly over it, whose mean ``auto`` chooses by."""
+
+
 def stream_problem(
     frame: Measurement | npt.ArrayLike,
     calibration: Calibration | npt.ArrayLike,
     options: ReconstructionOptions | None = None,
     *,
     choosing: bool = True,
+    others: Sequence[Floats] = (),
+    extent: Extent | None = None,
     **overrides: Any,
 ) -> Problem:
     """Settle noise, scales and camera from one frame, for all frames of a video.
@@ -55,31 +62,69 @@ def stream_problem(
     frame : Measurement or array, (height, width[, n_channels])
         Background subtracted. A bright one, where the video has brighter and darker ones.
     options : ReconstructionOptions, optional
-        Any camera model, prior, background and depths; ``"auto"`` is one PSF a depth here, as the quickest
-        (the problem's warnings say where PSFs differ over the field), and the exact-data ADMM where that has
-        a way.
+        Any camera model, prior, background and depths. ``"auto"`` is the model that the frames' mean asks
+        for; without ``choosing`` one PSF a depth, as the quickest (the problem's warnings say where PSFs
+        differ over the field). The exact-data ADMM is taken where that has a way.
     choosing : bool
-        Whether a smooth background is estimated where a photograph would have one, unless the options say.
+        Whether a camera model, and a smooth background where a photograph would have one, are chosen unless
+        the options say.
+    others : sequence of ndarray, as ``frame``
+        More frames of the video for ``auto`` to look at.
+    extent : Extent, optional
+        How much of PSFs and field is modelled, where that was chosen before.
     **overrides
         Single options, and facts about the frame, by their names, as of :func:`recon.reconstruct`.
     """
     known, options = given(overrides, options)
     measurement = frame if isinstance(frame, Measurement) else Measurement(frame)
-    doubt = ""
+    measurement = replace(measurement, **known)
+    doubt, reason = "", ""
     if options.model == "auto":
         doubt = _by_one_psf(calibration, options)
-        options = replace(options, model="convolution")
-    problem = Problem.of(replace(measurement, **known), calibration, options)
-    if choosing:
+        if doubt and choosing and isinstance(calibration, Calibration):
+            options, extent, reason, doubt = _chosen(measurement, others, calibration, options)
+        else:
+            options = replace(options, model="convolution")
+    problem = Problem.of(measurement, calibration, options, extent=extent)
+    if choosing and not reason:
         require_two_images(problem)
-    if choosing and isinstance(calibration, Calibration):
-        problem = with_background(problem, calibration)
+        if isinstance(calibration, Calibration):
+            problem = with_background(problem, calibration)
     if doubt:
         problem = replace(problem, warnings=(*problem.warnings, doubt))
+    if reason:
+        problem = replace(problem, reason=reason)
     if options.solver == "auto" and SOLVERS["admm-sensor"].accepts(problem) is None:
         problem = replace(problem, options=replace(options, solver="admm-sensor"))
     problem.solver  # noqa: B018 - refuses at once what it has no way for
     return problem
+
+
+def _chosen(
+    frame: Measurement, others: Sequence[Floats], calibration: Calibration, options: ReconstructionOptions
+) -> tuple[ReconstructionOptions, Extent | None, str, str]:
+    """Choose camera model, background and field for a film by the mean of several of its frames.
+
+    Depths, pixels and channels stay: something may come to be where nothing is in these frames. Returns the
+    options, the extent, why that model, and what else is to be said.
+    """
+    mean = replace(frame, image=np.mean([np.asarray(frame.image), *others], axis=0, dtype=np.float32))
+    if mean.noise is None and mean.flat:  # as noisy as one frame: that is what is solved
+        mean = replace(mean, noise=float(frame.deviations(frame.counts())[0]))
+    asked = Overrides(planes="all", between=False, beyond=False, binning=1, channels="all")
+    posed = Problem.of(mean, calibration, replace(options, choose=asked))
+    require_two_images(posed)
+    choice = choice_for(posed)
+    extent = None
+    if choice.model != "convolution":
+        extent = Extent(choice.psf_window, choice.acceptance_px)
+    why = {d.name: d.why for d in choice.decisions}
+    reason = f"by the mean of {len(others) + 1} frames: {why['model']}"
+    said = ""
+    if choice.background and options.estimate_background is None:
+        said = f"A smooth background is estimated as well: {why['background']}."
+    settled = replace(options, model=choice.model, estimate_background=choice.background, choose=None)
+    return settled, extent, reason, said
 
 
 def _by_one_psf(calibration: Calibration | npt.ArrayLike, options: ReconstructionOptions) -> str:

@@ -11,6 +11,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
+from gui.panel import whole
 from gui.panels.charts import ChartsPanel, describe
 from instrument.evaluation.chart import read_chart
 from instrument.files.errors import FileError
@@ -23,7 +24,7 @@ WAIT_MS = 60_000
 
 @pytest.fixture
 def panel(qtbot: QtBot, make_session) -> ChartsPanel:
-    panel = ChartsPanel(make_session())
+    panel = whole(ChartsPanel(make_session()))
     panel.resize(900, 600)
     qtbot.addWidget(panel)
     panel.show()

@@ -17,6 +17,7 @@ from pytestqt.qtbot import QtBot
 import gui.panels.holograms as holograms
 import instrument
 from gui.jobs import JobState
+from gui.panel import whole
 from gui.panels.holograms import HologramsPanel
 from gui.session import BenchSession
 from gui.widgets.result_views import best_columns
@@ -71,7 +72,7 @@ def panel(qtbot: QtBot, make_session: Callable[[], BenchSession], tmp_path: Path
     y, x = np.mgrid[:80, :120]
     picture = np.where((y - 40) ** 2 + (x - 60) ** 2 < 500, 220, 60 + x // 2)
     write_image(tmp_path / "picture.png", picture.astype(np.uint8))
-    panel = HologramsPanel(session)
+    panel = whole(HologramsPanel(session))
     panel.resize(1000, 700)
     qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
     panel.show()
@@ -442,7 +443,7 @@ def test_a_registered_loss_can_be_chosen(qtbot: QtBot, make_session, monkeypatch
 
     monkeypatch.setattr(LOSSES, "_foreign", dict(LOSSES._foreign))
     LOSSES.register(Own())
-    panel = HologramsPanel(make_session())
+    panel = whole(HologramsPanel(make_session()))
     qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
     loss = panel.form.widgets["loss"]
     assert loss.itemData(loss.findText("own"), Qt.ItemDataRole.ToolTipRole) == Own.help

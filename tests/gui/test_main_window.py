@@ -12,13 +12,18 @@ from PySide6.QtCore import QSettings, Qt
 from PySide6.QtWidgets import QApplication, QMessageBox
 from pytestqt.qtbot import QtBot
 
+from calibration_routines.procedure import Outlook, Procedure
 from gui.jobs import JobContext, JobState
 from gui.main_window import MainWindow
 from gui.panels import PANELS
+from gui.procedure_panel import ProcedurePanel
 from gui.session import BenchSession
 from gui.theme import THEMES
+from gui.widgets.building import every
 from gui.widgets.dialogues import TextWindow, choose_path
+from instrument.bench.bench import Bench
 from instrument.bench.photograph import LightState
+from tests.gui.looks import faults
 
 WAIT_MS = 60_000
 
@@ -31,14 +36,53 @@ def test_a_simulated_bench_says_so(window: MainWindow) -> None:
 
 def test_every_panel_opens_and_copies_python(qtbot: QtBot, window: MainWindow) -> None:
     for name, entry in PANELS.items():
-        panel = window.show_panel(name)
+        window.bring(name)
+        qtbot.waitUntil(lambda name=name: name in window.maker.panels, timeout=WAIT_MS)
+        panel = window.panel(name)
         assert panel.title == entry.title
         qtbot.waitUntil(panel.isVisible, timeout=WAIT_MS)
         panel.copy_button.click()
         code = QApplication.clipboard().text()
         compile(code, name, "exec")
+        assert not faults(window), name
     shortcuts = [entry.shortcut for entry in PANELS.values()]
     assert len(set(shortcuts)) == len(shortcuts)
+
+
+def test_stop_is_heard_while_a_panel_is_made_and_breaks_off_no_check_for_good(
+    qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gui.making._SLICE_S", -1.0)  # each part is a slice
+    turns: list[bool] = []
+    timer = every(window, 0, lambda: turns.append("sweeps" in window.maker.panels))
+    qtbot.waitUntil(lambda: len(turns) > 3, timeout=WAIT_MS)
+    turns.clear()
+    with qtbot.waitSignal(window.maker.made, timeout=WAIT_MS):
+        window.bring("sweeps")
+        qtbot.waitUntil(lambda: "sweeps" in window.maker._slices, timeout=WAIT_MS)
+        with qtbot.waitSignal(window.session.stop_pressed, timeout=WAIT_MS):
+            qtbot.mouseClick(window.stop_button, Qt.MouseButton.LeftButton)
+        assert "sweeps" not in window.maker.panels
+    timer.stop()
+    assert turns.count(False) > 10
+    panel = window.panel("sweeps")
+    assert isinstance(panel, ProcedurePanel)
+    qtbot.waitUntil(lambda: panel.outlook is not None, timeout=WAIT_MS)
+    began, go_on = threading.Event(), threading.Event()
+    outlook = type(panel.procedure()).outlook
+
+    def slow(procedure: Procedure, bench: Bench) -> Outlook:
+        began.set()
+        go_on.wait(WAIT_MS / 1e3)
+        return outlook(procedure, bench)
+
+    monkeypatch.setattr(type(panel.procedure()), "outlook", slow)
+    panel.check()
+    qtbot.waitUntil(began.is_set, timeout=WAIT_MS)
+    window.session.stop()
+    assert not panel.run_bar.start_button.isEnabled()
+    go_on.set()
+    qtbot.waitUntil(panel.run_bar.start_button.isEnabled, timeout=WAIT_MS)
 
 
 def test_escape_stops_a_move_and_turns_the_light_off(qtbot: QtBot, window: MainWindow) -> None:

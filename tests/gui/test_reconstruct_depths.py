@@ -12,6 +12,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QFileDialog
 from pytestqt.qtbot import QtBot
 
+from gui.panel import whole
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
 from gui.widgets.entry import PathEntry
@@ -39,7 +40,7 @@ def _calibration(folder: Path, depths_um: tuple[float, ...]) -> Path:
 @pytest.fixture
 def panel(qtbot: QtBot, make_session) -> ReconstructionsPanel:
     session: BenchSession = make_session()
-    panel = ReconstructionsPanel(session)
+    panel = whole(ReconstructionsPanel(session))
     panel.resize(1000, 800)
     qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
     panel.show()

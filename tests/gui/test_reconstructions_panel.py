@@ -15,6 +15,7 @@ from pytestqt.qtbot import QtBot
 
 from gui.forms.reconstruct import PSF, VOLUME
 from gui.jobs import JobState
+from gui.panel import whole
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
 from gui.theme import apply_theme
@@ -56,7 +57,7 @@ def files(tmp_path: Path) -> Path:
 @pytest.fixture
 def panel(qtbot: QtBot, make_session) -> ReconstructionsPanel:
     session: BenchSession = make_session()  # its devices stay closed: none is needed
-    panel = ReconstructionsPanel(session)
+    panel = whole(ReconstructionsPanel(session))
     panel.resize(1000, 700)
     qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
     panel.show()

@@ -210,14 +210,47 @@ def test_abort_keeps_what_was_taken(qtbot: QtBot, window: MainWindow, panel: Swe
     assert "diffuserbench resume" not in words, "the operator has no terminal"
     qtbot.waitUntil(lambda: window.job_label.text() != "Axial sweep …", timeout=WAIT_MS)
     assert window.job_label.text() == "Axial sweep: ended early"
-    press(qtbot, panel.go_on_button)
+    assert not panel.verdict.property("refused"), "what was asked for is no error"
+    press(qtbot, panel.way_on.go_on_button)
+    assert panel.frame_words.text() == "No frame yet.", "nothing of the run before"
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        pass
+    assert run_of(window.session.runs_folder).condition is RunCondition.COMPLETED
+    assert not panel.way_on.go_on_button.isVisible()
+    window.session.handed_on.emit("runs", run.path)
     runs = window.show_panel("runs")
     assert isinstance(runs, RunsPanel)
     qtbot.waitUntil(lambda: runs.opened is not None and runs.opened.path == run.path, timeout=WAIT_MS)
     assert runs.table.currentRow() == 0
-    assert runs.bar.start_button.isEnabled()
     qtbot.waitUntil(lambda: "µm" in runs.frame_words.text(), timeout=WAIT_MS)
     assert "_um" not in runs.frame_words.text()
+
+
+def test_after_a_fault_the_way_on_is_a_button_where_it_happened(
+    qtbot: QtBot, window: MainWindow, panel: SweepsPanel
+) -> None:
+    session = window.session
+    world: Any = session.bench.shared["simulated"]
+    enter(qtbot, panel, z_min_um="60", z_max_um="150", planes="4", average="2")
+    press(qtbot, panel.run_bar.start_button)
+    qtbot.waitUntil(lambda: len(panel.psfs.qualities) >= 1, timeout=WAIT_MS)
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        world.unplug("camera")
+    assert "camera" in panel.verdict.toPlainText()
+    assert panel.verdict.property("refused")
+    assert "left" not in panel.run_bar.words.text()
+    qtbot.waitUntil(lambda: not panel.run_bar.start_button.isEnabled(), timeout=WAIT_MS)
+    again = panel.way_on.reconnect["camera"]
+    qtbot.waitUntil(again.isVisible, timeout=WAIT_MS)
+    world.plug_in("camera")
+    press(qtbot, again)
+    qtbot.waitUntil(lambda: session.is_open("camera") and not again.isVisible(), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not session.jobs.is_busy("camera"), timeout=WAIT_MS)
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        press(qtbot, panel.way_on.go_on_button)
+    run = run_of(session.runs_folder)
+    assert run.condition is RunCondition.COMPLETED
+    assert (run.path / "calibration" / "calibration.json").is_file()
 
 
 def answer(question: QMessageBox | None, words: str) -> Any:

@@ -199,7 +199,7 @@ def test_a_digest_tells_arrays_apart():
 
 
 def test_a_checkpoint_outlives_a_result_that_cannot_be_written(files, run, monkeypatch):
-    import instrument.cli.solving as module
+    import instrument.tasks.solving as module
 
     def full(*_args, **_kwargs):
         raise FileError(files / "a.tif", "cannot be written: the disk is full.", "Make room.")

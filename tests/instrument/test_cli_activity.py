@@ -29,7 +29,7 @@ def course() -> np.ndarray:
 @pytest.fixture
 def film(tmp_path: Path) -> Path:
     path = tmp_path / "film.ome.zarr"
-    create_output(path, COUNT, SHAPE, period_s=0.1, pitch_um=None, attributes={"simulated": True})
+    create_output(path, COUNT, SHAPE, period_s=0.1, grid=None, attributes={"simulated": True})
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     spot = np.exp(-((y - 12) ** 2 + (x - 25) ** 2) / 8)
     rng = np.random.default_rng(0)
@@ -95,7 +95,7 @@ def test_results_are_not_replaced_and_mistakes_are_said(
 
 def static_point(path: Path, frames: int) -> Path:
     """A point on black that does not change: noise on it, zeros nearly everywhere else."""
-    create_output(path, frames, SHAPE, period_s=None, pitch_um=None, attributes={})
+    create_output(path, frames, SHAPE, period_s=None, grid=None, attributes={})
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     spot = 1000 * np.exp(-((y - 12) ** 2 + (x - 20) ** 2) / 2)
     rng, pictures = np.random.default_rng(0), VideoPictures(path, write=True)
@@ -125,7 +125,7 @@ def test_too_large_for_the_memory_is_refused(film: Path) -> None:
 
 def test_alignment_is_offered_where_frames_move(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "moving.ome.zarr"
-    create_output(path, 40, SHAPE, period_s=None, pitch_um=None, attributes={})
+    create_output(path, 40, SHAPE, period_s=None, grid=None, attributes={})
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     pictures = VideoPictures(path, write=True)
     for index in range(40):
@@ -140,7 +140,7 @@ def test_memory_is_not_more_than_is_said_before(film: Path, tmp_path: Path, alig
     settings = ActivitySettings(align=align)
     find_activity(VideoPictures(film), settings)  # what is imported and compiled is not the video's
     path, shape, count = tmp_path / "larger.ome.zarr", (80, 96), 60
-    create_output(path, count, shape, period_s=None, pitch_um=None, attributes={})
+    create_output(path, count, shape, period_s=None, grid=None, attributes={})
     video = VideoPictures(path, write=True)
     rng = np.random.default_rng(0)
     for index in range(count):

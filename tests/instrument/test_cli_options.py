@@ -11,8 +11,8 @@ import pytest
 import typer
 
 from instrument.cli.app import App
-from instrument.cli.options import Given, Only
 from instrument.files.errors import BenchError
+from instrument.tasks.task import Given, Only
 from recon.base.declare import RARE, identity, option, require, with_overrides
 from recon.errors import InputError
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+import zarr
 
 from instrument.cli import main
 from instrument.files.errors import FileError
@@ -14,7 +15,7 @@ from instrument.files.images import write_image
 from instrument.files.volumes import open_volume, volume_in_memory, write_volume_zarr
 from instrument.reconstruction.result_figures import in_colour_of_depth, project
 from instrument.reconstruction.stored_result import find_results, free_result, open_result, record_file
-from recon.reconstruction.result import Grid
+from recon.camera.grid import Grid
 
 SHAPE = (5, 40, 30)
 UNKNOWN = Grid(SHAPE, (20, 15), np.full(5, np.nan), np.full(5, np.nan))
@@ -28,7 +29,7 @@ def volume():
 def _write(kind, folder, voxels):
     if kind == "zarr":
         path = folder / "v.ome.zarr"
-        write_volume_zarr(path, voxels, UNKNOWN, {})
+        write_volume_zarr(path, voxels, voxels.shape, UNKNOWN, {})
         return path
     if kind == "npy":
         np.save(folder / "v.npy", voxels)
@@ -65,7 +66,7 @@ def test_a_tiff_in_one_piece_is_mapped_not_read(tmp_path, volume, monkeypatch):
 def test_side_views_of_large_planes_come_from_a_coarser_level(tmp_path, monkeypatch):
     monkeypatch.setattr("instrument.files.volumes._SIDE_PIXELS", 128 * 128)
     voxels = np.random.default_rng(1).random((2, 256, 256), np.float32)
-    write_volume_zarr(tmp_path / "v.ome.zarr", voxels, UNKNOWN, {})
+    write_volume_zarr(tmp_path / "v.ome.zarr", voxels, voxels.shape, UNKNOWN, {})
     source = open_volume(tmp_path / "v.ome.zarr")
     assert source.plane(0).shape == (256, 256)
     expected = voxels[:, 200:202].reshape(2, 2, 128, 2).mean(axis=(1, 3))
@@ -202,6 +203,37 @@ def test_export_command_takes_results_too(tmp_path, volume, capsys):
     assert "a volume is exported as .tif" in said
     assert "exists already" in said
     assert "--label (for a run)" in said
+
+
+def test_export_brings_a_volume_to_voxels_of_one_size(tmp_path, capsys):
+    """A bead is where it was: read by tifffile and zarr, whose scales and origins are the scene's."""
+    z_um = np.array([9000.0, 10000.0, 11200.0])
+    grid = Grid((3, 40, 30), (18, 16), z_um, 2e-3 * z_um, None, np.full((3, 2), 40.0))
+    voxels = np.zeros(grid.shape, np.float32)
+    voxels[2, 8, 25] = 1
+    write_volume_zarr(tmp_path / "v.ome.zarr", voxels, voxels.shape, grid, {})
+    for name in ("m.ome.zarr", "m.tif"):
+        assert main(["export", str(tmp_path / "v.ome.zarr"), str(tmp_path / name), "--metric"]) == 0
+    group = zarr.open_group(tmp_path / "m.ome.zarr", mode="r")
+    first, second = group.attrs["ome"]["multiscales"][0]["datasets"][0]["coordinateTransformations"]
+    scale, shift = first["scale"], second["translation"]
+    stored = group["0"][...]
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "m.tif"), stored)
+    x, y, z = grid.place_um(2, 8, 25)
+    found = np.array(shift) + np.array(scale) * np.unravel_index(stored.argmax(), stored.shape)
+    assert (np.abs(found - [z, y, x]) <= np.array(scale) / 2).all()
+    assert open_result(tmp_path / "m.ome.zarr").grid.is_metric
+    assert "voxels of plane z" not in str(group.attrs["diffuserbench"])
+    source = open_result(tmp_path / "v.ome.zarr").metric().volume
+    row = int(stored.max(axis=(0, 2)).argmax())
+    np.testing.assert_array_equal(source.across_y(row), stored[:, row])
+    np.save(tmp_path / "n.npy", voxels)
+    for arguments in (["n.npy", "--metric"], ["v.ome.zarr", "--voxel-um", "5"]):
+        assert main(["export", str(tmp_path / arguments[0]), str(tmp_path / "o.tif"), *arguments[1:]]) == 2
+    told = capsys.readouterr()
+    assert "z 8.95 to 11.35, y" in told.out
+    assert "are not known" in told.err
+    assert "give --metric too" in told.err
 
 
 def test_results_of_a_folder_are_listed_newest_first(tmp_path):

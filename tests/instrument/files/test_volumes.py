@@ -11,7 +11,7 @@ from instrument.files.volumes import write_volume_tiff, write_volume_zarr
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.result_file import Outputs, write_reconstruction
 from recon import Calibration, Options, Problem, solve
-from recon.reconstruction.result import Grid
+from recon.camera.grid import Grid
 
 Z_UM = np.array([9000.0, 10000.0, 11500.0])
 GRID = Grid((3, 300, 200), (150, 100), Z_UM, 2e-3 * Z_UM)
@@ -25,7 +25,7 @@ def volume():
 
 def test_levels_scales_and_every_planes_own_size(tmp_path, volume):
     path = tmp_path / "v.ome.zarr"
-    write_volume_zarr(path, volume, GRID, {"simulated": True})
+    write_volume_zarr(path, volume, volume.shape, GRID, {"simulated": True})
     group = zarr.open_group(path, mode="r")
     model = Image.from_zarr(group)
     np.testing.assert_array_equal(group["0"][...], volume)
@@ -54,7 +54,8 @@ def test_an_ome_tiff_says_where_its_planes_lie(tmp_path, volume):
 
 def test_colour_goes_first_and_unknown_sizes_have_no_unit(tmp_path, volume):
     path = tmp_path / "v.ome.zarr"
-    write_volume_zarr(path, np.stack([volume, 2 * volume, 3 * volume], -1), UNKNOWN, {})
+    colour = np.stack([volume, 2 * volume, 3 * volume], -1)
+    write_volume_zarr(path, colour, colour.shape, UNKNOWN, {})
     group = zarr.open_group(path, mode="r")
     axes = Image.from_zarr(group).ome_attributes.multiscales[0].axes
     assert [a.name for a in axes] == ["c", "z", "y", "x"]
@@ -65,18 +66,18 @@ def test_colour_goes_first_and_unknown_sizes_have_no_unit(tmp_path, volume):
 
 def test_a_volume_there_before_survives_a_failure(tmp_path, volume, monkeypatch):
     path = tmp_path / "v.ome.zarr"
-    write_volume_zarr(path, volume, GRID, {})
+    write_volume_zarr(path, volume, volume.shape, GRID, {})
 
     def full(*_args, **_options):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("instrument.files.atomic.sync_folder", full)
     with pytest.raises(OSError, match="No space"):
-        write_volume_zarr(path, 2 * volume, GRID, {})
+        write_volume_zarr(path, 2 * volume, volume.shape, GRID, {})
     np.testing.assert_array_equal(zarr.open_group(path, mode="r")["0"][...], volume)
     assert [p.name for p in tmp_path.iterdir()] == ["v.ome.zarr"]
     monkeypatch.undo()
-    write_volume_zarr(path, 2 * volume, GRID, {})
+    write_volume_zarr(path, 2 * volume, volume.shape, GRID, {})
     np.testing.assert_array_equal(zarr.open_group(path, mode="r")["0"][...], 2 * volume)
     assert [p.name for p in tmp_path.iterdir()] == ["v.ome.zarr"]
 

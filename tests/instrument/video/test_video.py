@@ -21,6 +21,7 @@ import zarr
 from ome_zarr_models.v05 import Image
 
 from instrument.cli import main
+from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.films import as_shown
 from instrument.plan import Part, Plan
@@ -34,13 +35,16 @@ from instrument.reconstruction.video import (
     solve_video,
 )
 from instrument.reconstruction.video_files import VideoPictures, levels_of, require_video
+from instrument.reconstruction.video_job import VideoJob
 from instrument.reconstruction.video_work import BlockReport, cluster, on_cluster
 from instrument.runs.run import Run
 from recon import reconstruct
 from recon.base.metrics import psnr
 from recon.errors import InputError
+from recon.evaluation.scene import make_scene
 from recon.reconstruction.options import ReconstructionOptions
 from recon.streams.stillness import has_light
+from recon.streams.video import VideoSolver
 from tests.mocks.recordings import write_recording
 
 SHAPE = (40, 52)
@@ -544,3 +548,36 @@ def test_prepared_is_what_the_window_shows(recording: Path, tmp_path: Path) -> N
     assert prepared.left == [0, 1, 2]
     assert any("1 of 11 frames were lost" in warning for warning in prepared.warnings)
     assert prepared.notes["Dark"].startswith("20 counts")
+
+
+def test_auto_takes_the_model_that_the_film_asks_for_and_depths_become_volumes(tmp_path: Path) -> None:
+    """Whoever makes the job again has the same model and the same part of the field; volumes are stored."""
+    seen = make_scene("beads", size=48, grid=3, depths=2, aberration=4.0, photons=2e4, density=0.4)
+    calibration = tmp_path / "calibration"
+    save_calibration(seen.calibration, calibration)
+    top = float(np.max(seen.measurement))
+    counts = np.clip(3000 * seen.measurement / top + 20, 0, 4095).astype(np.uint16)
+    run = write_recording(tmp_path, dict.fromkeys(range(4), counts))
+    wanted = VideoRequest(
+        run=run,
+        out=tmp_path / "v.ome.zarr",
+        calibration=calibration,
+        inputs=InputOptions(dark=20.0, binning=1),
+        options=ReconstructionOptions(iterations=6, prior="l1"),
+        video=VideoOptions(warm_iterations=1, film=False),
+        rotate_deg=90,
+    )
+    prepared = prepare_video(wanted)
+    assert prepared.notes["Model"].startswith(("local: by the mean of 4 frames", "lowrank: by the mean of 4"))
+    again = VideoJob(prepared.job.folder).problem
+    assert again.extent.psf_window is not None
+    assert solve_video(prepared, lambda _: None, threading.Event())
+    finish_video(prepared)
+    video = VideoPictures(wanted.out)
+    assert video.axes == "tzyx"
+    assert video.read(3).shape == (2, 48, 48)
+    np.testing.assert_array_equal(video.flat(3), video.read(3).sum(axis=0))
+    upright = np.rot90(video.read(0), -1, (1, 2))
+    direct = VideoSolver(again, cold_iterations=6).next(counts.astype(np.float32) - 20)
+    np.testing.assert_allclose(upright, direct, rtol=0, atol=1e-4 * direct.max())
+    Image.from_zarr(zarr.open_group(wanted.out, mode="r"))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter
 
 from recon.optics.diffuser import smooth_diffuser
 from recon.optics.fall_off import gaussian_fall_off, no_fall_off, response_on
 from recon.optics.grid import PixelGrid, mixed_spectrum
-from recon.optics.render import render
+from recon.optics.render import RenderSettings, render
 from recon.optics.scene import Beads, Layer, Scene, TruthGrid
 from recon.optics.wave import WavePropagator
 
@@ -51,6 +52,32 @@ def test_picture_equals_the_sum_of_its_points(propagator: WavePropagator, fall_o
     error = np.linalg.norm(rendered - exact) / np.linalg.norm(exact)
     assert error < 0.02
     assert rendered.sum() == pytest.approx(exact.sum(), rel=5e-3)
+
+
+def test_a_picture_of_pixels_no_finer_than_the_sensors_is_as_exact_in_whole_cells(
+    propagator: WavePropagator,
+) -> None:
+    cell_um = 3.4 * GRID.pitch_um * Z_UM / DISTANCE_UM
+    radiance = np.random.default_rng(3).random((30, 35, 1)).astype(np.float32)
+    layer = Layer(np.repeat(radiance, 3, 2), Z_UM, (30 * cell_um, 35 * cell_um))
+
+    def seen(oversampling: int | None) -> np.ndarray:
+        return render(
+            Scene("noise", layers=(layer,)),
+            GREEN_ONLY,
+            GRID,
+            propagator,
+            no_fall_off,
+            layer_photons=1.0,
+            bead_photons=1.0,
+            settings=RenderSettings(oversampling=oversampling),
+        )
+
+    fine, chosen = seen(3), seen(None)
+    assert np.array_equal(chosen, seen(1))  # to the last bit, whichever thread was done first
+    structure = fine - uniform_filter(fine, 9)
+    assert np.linalg.norm(chosen - fine) < 0.2 * np.linalg.norm(structure)
+    assert np.linalg.norm(chosen - fine) < 5e-3 * np.linalg.norm(fine)
 
 
 def test_bead_and_tiny_picture_shine_in_the_same_place(propagator: WavePropagator) -> None:

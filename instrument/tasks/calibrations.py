@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from instrument.cli.app import App, examples, saying_what_is_left
-from instrument.cli.options import Given
-from instrument.cli.progress import one_task
 from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError, FileError
+from instrument.tasks.task import Desk, Done, Given, saying_what_is_left, task
 from recon.analysis import AnalysisSettings, Noise
 from recon.base.declare import option
 from recon.types import Calibration
 
-analyze_app, compare_app, refocus_app = App(), App(), App()
-CalibrationArgument = Annotated[
-    Path, typer.Argument(metavar="CALIBRATION", help="A calibration, or a run with one.")
-]
 _PAGES = (".pdf", ".png", ".svg")
 
 
 @dataclass(frozen=True, kw_only=True)
 class AnalysisFiles:
-    """What an analysis reads besides the calibration, and what it writes."""
+    """What an analysis reads, and what it writes."""
 
+    calibration: Path = option(
+        help="A calibration, or a run with one.", metavar="CALIBRATION", positional=True, group="Files"
+    )
     out: Path = option(
         Path("analysis.pdf"),
         help="The page (.pdf, .png, .svg); JSON beside.",
@@ -44,8 +39,11 @@ class AnalysisFiles:
 
 @dataclass(frozen=True, kw_only=True)
 class RefocusOptions:
-    """To which depths a PSF is brought."""
+    """Which PSFs are brought to which depths, and over the field."""
 
+    calibration: Path = option(
+        help="A calibration, or a run with one.", metavar="CALIBRATION", positional=True
+    )
     z_um: tuple[float, ...] = option(
         help="Depth wanted; repeatable.", unit="um", shown_unit="mm", shown_factor=1000.0, above=0
     )
@@ -53,24 +51,33 @@ class RefocusOptions:
     deflection_deg: float = option(
         0.25, help="How far the diffuser typically bends light.", unit="deg", above=0
     )
+    response: Path | None = option(
+        None,
+        help="Make PSFs over the field of the one on the axis: angular_response.json of calibrate angular.",
+    )
+    points: int = option(3, help="Places a side, with --response.", least=1)
     force: bool = option(False, help="Replace a calibration that exists.")
 
 
-@analyze_app.command(
-    epilog=examples(
-        "diffuserbench analyze runs/2026-11-21-axial",
-        "diffuserbench analyze calibration --cutoff-deg 41.5,30 --out supplement.pdf",
-        "diffuserbench analyze calibration --z-mm 2.5 --fall-off-deg 13 --lenslet-um 250 --wavelength-nm 520",
-        "diffuserbench analyze calibration --no-points          without reconstructions: seconds",
+@dataclass(frozen=True, kw_only=True)
+class CompareOptions:
+    """Which calibrations are compared."""
+
+    old: Path = option(help="A calibration, or a run with one.", metavar="OLD", positional=True)
+    new: Path = option(help="A later one of the same camera.", metavar="NEW", positional=True)
+    out: Path | None = option(
+        None, help="Write the figures as JSON.", metavar="FILE", flags=("--out", "-o"), label="Figures"
     )
+    force: bool = option(False, help="Overwrite a file that exists.")
+
+
+@task(
+    "diffuserbench analyze runs/2026-11-21-axial",
+    "diffuserbench analyze calibration --cutoff-deg 41.5,30 --out supplement.pdf",
+    "diffuserbench analyze calibration --z-mm 2.5 --fall-off-deg 13 --lenslet-um 250 --wavelength-nm 520",
+    "diffuserbench analyze calibration --no-points          without reconstructions: seconds",
 )
-def analyze(
-    calibration: CalibrationArgument,
-    files: AnalysisFiles,
-    settings: AnalysisSettings,
-    noise: Noise,
-    given: Given,
-) -> None:
+def analyze(desk: Desk, files: AnalysisFiles, settings: AnalysisSettings, noise: Noise, given: Given) -> Done:
     """Resolution, depth of field, field of view, conditioning, point tests and a voxel grid, on one page.
 
     Everything follows from the calibration's PSFs and its geometry; what they cannot tell (the sensor's
@@ -93,9 +100,9 @@ def analyze(
     if files.response is not None and (instead := given.flags("cutoff_deg", "fall_off_deg")):
         raise BenchError(f"--response says what {' and '.join(instead)} would: give one of them.")
     measured_response = None if files.response is None else load_response(files.response)
-    folder = find_calibration(calibration)
-    if folder != calibration:
-        typer.echo(f"{'Analyses':<28}{folder}")
+    folder = find_calibration(files.calibration)
+    if folder != files.calibration:
+        desk.say(f"{'Analyses':<28}{folder}")
     measured = load_calibration(folder)
     settings = replace(settings, noise=noise)
     if measured_response is not None:
@@ -103,7 +110,7 @@ def analyze(
         settings = replace(settings, cutoff_deg=cutoff, fall_off=measured_response.fall_off())
     simulated = bool(measured.provenance.get("simulated"))
     with saying_what_is_left(out, record):
-        with one_task("analyze") as advance:
+        with desk.step("analyze") as advance:
             analysis = analyse(measured, settings, on_progress=lambda _what, share: advance(share * 100, 100))
         title, subtitle = _titles(measured, folder)
         figure = draw_analysis(analysis, title, subtitle, simulated=simulated)
@@ -116,12 +123,12 @@ def analyze(
         }
         write_json(record, described)
     if simulated:
-        typer.echo("SIMULATED: the calibration comes from the simulated bench")
+        desk.say("SIMULATED: the calibration comes from the simulated bench")
     for name, value in facts(analysis):
-        typer.echo(f"{name:<28}{value}")
+        desk.say(f"{name:<28}{value}")
     for note in analysis.notes:
-        typer.echo(f"Note: {note}", err=True)
-    typer.echo(f"Wrote {out}, {record}")
+        desk.warn(f"Note: {note}")
+    return Done((out, record))
 
 
 def _titles(calibration: Calibration, folder: Path) -> tuple[str, str]:
@@ -142,42 +149,28 @@ def _titles(calibration: Calibration, folder: Path) -> tuple[str, str]:
     return f"Optical characterisation{f': {bench}' if bench else ''}", "; ".join(facts)
 
 
-@compare_app.command(
-    epilog=examples(
-        "diffuserbench compare runs/last-week runs/today",
-        "diffuserbench compare before after --out bump.json",
-    )
+@task(
+    "diffuserbench compare runs/last-week runs/today",
+    "diffuserbench compare before after --out bump.json",
 )
-def compare(
-    old: Annotated[Path, typer.Argument(metavar="OLD", help="A calibration, or a run with one.")],
-    new: Annotated[Path, typer.Argument(metavar="NEW", help="A later one of the same camera.")],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="FILE", help="Write the figures as JSON.", show_default=False),
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite a file that exists.")] = False,
-) -> None:
+def compare(desk: Desk, options: CompareOptions) -> Done:
     """Say what moved between two calibrations: shift, scale, rotation, likeness, brightness.
 
     Ends with status 1 when a recalibration is due (the new calibration should replace the old one), else 0.
     """
-    from dataclasses import asdict
-
-    from rich.console import Console
-    from rich.table import Table
-
     from instrument.files.atomic import write_json
     from instrument.files.calibration_file import load_calibration
     from instrument.files.record import plain
     from instrument.reconstruction.job import find_calibration
     from recon.analysis.compare import compare as compare_calibrations
 
+    out = options.out
     if out is not None:
-        require_new(out, overwrite=force)
-    folders = [find_calibration(folder) for folder in (old, new)]
+        require_new(out, overwrite=options.force)
+    folders = [find_calibration(folder) for folder in (options.old, options.new)]
     first, second = (load_calibration(folder) for folder in folders)
     for name, folder, calibration in (("Old", folders[0], first), ("New", folders[1], second)):
-        typer.echo(f"{name:<5}{folder}")
+        desk.say(f"{name:<5}{folder}")
         if source := calibration.provenance.get("refocused_from"):
             raise FileError(
                 folder,
@@ -185,63 +178,60 @@ def compare(
                 "Compare the calibrations that were measured.",
             )
     found = compare_calibrations(first, second)
-    table = Table()
-    for heading in ("z, mm", "shift, px (x, y)", "scale", "rotation", "alike", "aligned", "spot", "light"):
-        table.add_column(heading, justify="right")
+    rows: list[Sequence[str]] = []
     for c in found.changes:
         turned = "?" if c.rotation_deg is None else f"{c.rotation_deg:+.3f}°"
-        table.add_row(
-            f"{c.z_um / 1e3:.4g}",
-            f"{c.columns:+.2f}, {c.rows:+.2f}",
-            f"{c.scale:.5f}",
-            turned,
-            f"{c.as_is:.3f}",
-            f"{c.aligned:.3f}",
-            f"{c.spot:.2f}",
-            f"{c.brightness:.2f}",
-        )
-    Console().print(table)
-    typer.echo("RECALIBRATE" if found.due else "No recalibration is due")
+        figures = (f"{c.scale:.5f}", turned, f"{c.as_is:.3f}", f"{c.aligned:.3f}", f"{c.spot:.2f}")
+        moved = f"{c.columns:+.2f}, {c.rows:+.2f}"
+        rows.append((f"{c.z_um / 1e3:.4g}", moved, *figures, f"{c.brightness:.2f}"))
+    desk.table(("z, mm", "shift, px (x, y)", "scale", "rotation", "alike", "aligned", "spot", "light"), rows)
+    desk.say("RECALIBRATE" if found.due else "No recalibration is due")
     for reason in found.reasons:
-        typer.echo(f"  {reason}")
+        desk.say(f"  {reason}")
     if first.provenance.get("simulated") or second.provenance.get("simulated"):
-        typer.echo("SIMULATED: a calibration comes from the simulated bench")
+        desk.say("SIMULATED: a calibration comes from the simulated bench")
     if out is not None:
         record = {"old": str(folders[0].resolve()), "new": str(folders[1].resolve()), **asdict(found)}
         write_json(out, plain(record))
-        typer.echo(f"Wrote {out}")
-    if found.due:
-        raise typer.Exit(1)
+    return Done(() if out is None else (out,), good=not found.due)
 
 
-@refocus_app.command(
-    epilog=examples(
-        "diffuserbench refocus runs/axial --z-mm 27.5 --out calibration-27.5",
-        "diffuserbench refocus calibration --z-mm 12 --z-mm 14 --z-mm 16 --out near",
-    )
+@task(
+    "diffuserbench refocus runs/axial --z-mm 27.5 --out calibration-27.5",
+    "diffuserbench refocus calibration --z-mm 12 --z-mm 14 --z-mm 16 --out near",
+    "diffuserbench refocus calibration --z-mm 2 --response angular_response.json --points 5 --out field",
 )
-def refocus(calibration: CalibrationArgument, options: RefocusOptions) -> None:
-    """Bring a calibration's PSF to other depths by paraxial scaling, with the error to expect.
+def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
+    """Bring a calibration's PSFs to other depths by paraxial scaling, with the error to expect.
 
-    Between two calibrated depths both neighbours are scaled, registered and mixed (Kuo 2020, Eq. 5.2).
-    `reconstruct --calibration FOLDER --z-mm Z` does the same by itself.
+    Between two calibrated depths both neighbours are scaled, registered and mixed, at every place of the
+    field that was calibrated (Kuo 2020, Eqs. 5.2, 5.3). `reconstruct --calibration FOLDER --z-mm Z` does the
+    same by itself. With --response PSFs over the field are made of the one on the axis (Eq. 5.1).
     """
     import numpy as np
 
+    from calibration_routines.optics.angular_response import load_response
     from instrument.files.calibration_file import load_calibration, save_calibration
     from instrument.reconstruction.job import find_calibration
-    from recon.camera.refocus import central_places
     from recon.camera.refocus import refocus as refocused
+    from recon.camera.refocus import refocus_field
+    from recon.camera.two_part import two_part
 
     if len(set(options.z_um)) < len(options.z_um):
         raise BenchError("--z-mm: a depth is asked for twice.")
-    folder = find_calibration(calibration)
+    if "points" in given and options.response is None:
+        raise BenchError("--points is how many places --response makes: give --response too.")
+    folder = find_calibration(options.calibration)
     measured = load_calibration(folder)
     made = [refocused(measured, z, deflection_deg=options.deflection_deg) for z in options.z_um]
+    fields = [refocus_field(measured, one.z_um) for one in made]
+    if options.response is not None:
+        response = load_response(options.response).fall_off()
+        fields = [two_part(field, response, points=options.points) for field in fields]
     new = replace(
-        measured,
-        psfs=np.stack([one.psf for one in made]),
-        source_positions_um=np.array([(*one.source_um, one.z_um) for one in made]),
+        fields[0],
+        psfs=np.concatenate([field.psfs for field in fields]),
+        source_positions_um=np.concatenate([field.source_positions_um for field in fields]),
         quality={
             "refocused": [
                 {
@@ -253,25 +243,19 @@ def refocus(calibration: CalibrationArgument, options: RefocusOptions) -> None:
                 for one in made
             ]
         },
-        provenance={**measured.provenance, "refocused_from": str(folder.resolve())},
+        provenance={**fields[0].provenance, "refocused_from": str(folder.resolve())},
     )
     path = save_calibration(new, options.out, overwrite=options.force)
     if measured.provenance.get("simulated"):
-        typer.echo("SIMULATED: the calibration comes from the simulated bench")
-    for one in made:
-        typer.echo(f"{one.z_um / 1e3:g} mm: {one}")
+        desk.say("SIMULATED: the calibration comes from the simulated bench")
+    for one, field in zip(made, fields, strict=True):
+        places = f" ({len(field.psfs)} places of the field)" if len(field.psfs) > 1 else ""
+        desk.say(f"{one.z_um / 1e3:g} mm{places}: {one}")
         if one.extrapolated:
             near, far = (v / 1e3 for v in one.calibrated_um)
-            typer.echo(
+            desk.warn(
                 f"Warning: {one.z_um / 1e3:g} mm lies outside the calibrated "
                 f"{f'{near:.4g} to {far:.4g} mm' if far > near else f'depth, {near:.4g} mm'}: the pattern is "
-                "extrapolated, by scaling alone. Measure a PSF there where it matters.",
-                err=True,
+                "extrapolated, by scaling alone. Measure a PSF there where it matters."
             )
-    if len(measured.psfs) > len(central_places(measured)):
-        typer.echo(
-            "Note: the calibration has several places at a depth; the one nearest to the axis was taken, how "
-            "PSFs vary over the field is lost. reconstruct --model local uses all of them.",
-            err=True,
-        )
-    typer.echo(f"Wrote {path}")
+    return Done((path,))

@@ -1,0 +1,114 @@
+"""Panels are made a slice at a time: imported in a job, then built so that the window answers in between."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Mapping
+from functools import partial
+
+from PySide6.QtCore import QObject, Qt, QTimer, Signal
+
+from gui.jobs import words_for
+from gui.panel import Panel
+from gui.panels import PANELS
+from gui.session import BenchSession
+from gui.widgets.building import PanelPlace, label, text_view
+
+_SLICE_S = 0.015
+"""Of the window's thread at once; a part that takes longer is the only one of its slice."""
+
+
+class PanelMaker(QObject):
+    """Makes the panels of a window when they are first asked for.
+
+    Attributes
+    ----------
+    panels : dict
+        Those that are made, by name.
+
+    Signals
+    -------
+    made
+        There is another panel.
+
+    Parameters
+    ----------
+    session : BenchSession
+    places : mapping
+        Where each panel stands, by name; says meanwhile that it is being opened, or why it cannot be.
+    """
+
+    made = Signal()
+
+    def __init__(self, session: BenchSession, places: Mapping[str, PanelPlace], parent: QObject) -> None:
+        super().__init__(parent)
+        self._session = session
+        self._places = places
+        self.panels: dict[str, Panel] = {}
+        self._slices: dict[str, Generator[None, None, Panel]] = {}
+        self._then: dict[str, list[Callable[[Panel], object]]] = {}
+        """What is done with each panel that was asked for, once it is made."""
+
+    def whole(self, name: str) -> Panel:
+        """Return a panel, made now, or to its end, if it was not yet."""
+        if name not in self.panels:
+            slices = self._slices.pop(name, None) or PANELS[name].slices(self._session)
+            try:
+                while True:
+                    next(slices)
+            except StopIteration as made:
+                self._finish(name, made.value)
+        return self.panels[name]
+
+    def ask(self, name: str, then: Callable[[Panel], object] = lambda _: None) -> None:
+        """Have a panel made in slices, if it was not yet, and then something done with it."""
+        if name in self.panels:
+            then(self.panels[name])
+            return
+        if name in self._then:
+            self._then[name].append(then)
+            return
+        self._then[name] = [then]
+        waits = label("Opening …", "dim")
+        waits.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self._places[name].hold(waits)
+        job = self._session.jobs.watch(f"Opening {PANELS[name].title}", lambda _: PANELS[name].load())
+        job.succeeded.connect(lambda _: self._begin(name))
+        job.failed.connect(lambda why: self._failed(name, why))
+
+    def _begin(self, name: str) -> None:
+        if name not in self.panels:
+            self._slices[name] = PANELS[name].slices(self._session)
+            self._go_on(name)
+
+    def _go_on(self, name: str) -> None:
+        """Make parts for as long as a slice may take; one that fails says why in the panel's place."""
+        slices = self._slices.get(name)
+        if slices is None or self._session.is_closing:
+            return  # made at once meanwhile, or not wanted any more
+        end_s = time.thread_time() + _SLICE_S
+        try:
+            while True:
+                next(slices)
+                if time.thread_time() > end_s:
+                    QTimer.singleShot(0, self, partial(self._go_on, name))
+                    return
+        except StopIteration as made:
+            self._finish(name, made.value)
+        except Exception as error:  # noqa: BLE001 - a panel's failure must not end the window
+            self._failed(name, words_for(error))
+
+    def _finish(self, name: str, panel: Panel) -> None:
+        self._slices.pop(name, None)
+        self.panels[name] = panel
+        self._places[name].hold(panel)
+        self.made.emit()
+        for then in self._then.pop(name, ()):
+            then(panel)
+
+    def _failed(self, name: str, why: str) -> None:
+        self._slices.pop(name, None)
+        self._then.pop(name, None)
+        if name not in self.panels:
+            self._session.log("error", f"{PANELS[name].title}: {why}")
+            self._places[name].hold(text_view(why))

@@ -1,0 +1,332 @@
+"""What is done with files: every task that the terminal has, its form, its progress, its results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from PySide6.QtCore import Qt, QUrl
+from PySide6.QtGui import QDesktopServices, QFontDatabase, QImage, QPixmap
+from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QVBoxLayout, QWidget
+
+from gui.background import NewestOnly
+from gui.forms.fields import Behaviour
+from gui.forms.options_form import OptionsForm, SuggestedName
+from gui.panel import Panel
+from gui.procedure_run import RunBar
+from gui.session import BenchSession
+from gui.task_run import TaskRun, Told
+from gui.widgets.building import (
+    button,
+    cell,
+    choice,
+    fill,
+    in_row,
+    label,
+    mark,
+    scrolled,
+    split,
+    table,
+    tabs,
+    text_view,
+)
+from gui.widgets.sweep_views import Picture
+from instrument.tasks import TASKS
+from instrument.tasks.task import WRITTEN, Desk, Done, Task
+from recon.base.declare import Imports, Option, expression
+
+_FOLDERS = ("FOLDER", "RUN", "CALIBRATION", "OLD", "NEW", "VIDEO|RUN", "SHEET")
+"""What an option is called that names a folder."""
+_PICTURES = (".png", ".jpg", ".svg")
+_ROW_PX = 26
+
+
+class _Page(NamedTuple):
+    """A task with its form."""
+
+    task: Task
+    form: OptionsForm
+    names: SuggestedName | None
+
+
+class TasksPanel(Panel):
+    """One task at a time: chosen, filled in, carried out, its results beside the form."""
+
+    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
+        super().__init__(session, parent)
+        self.run = TaskRun(session.jobs, self)
+        self._pages: dict[str, _Page] = {}
+        self._loader = NewestOnly(session.jobs, "Preparing a form", lambda why: self.refused(None, why))
+        self._reader = NewestOnly(session.jobs, "Reading a picture")
+        self._given: dict[str, Path] = {}
+        self.files: tuple[Path, ...] = ()
+        self.choice = choice((), "What to do")
+        self.choice.setAccessibleName("Task")
+        for name, entry in TASKS.items():
+            self.choice.addItem(f"{entry.title}", name)
+            tip = f"{entry.help}\ndiffuserbench {name}"
+            self.choice.setItemData(self.choice.count() - 1, tip, Qt.ItemDataRole.ToolTipRole)
+        self.about = label(role="dim", wraps=True)
+        self.stack = QStackedWidget()
+        tip = "Wait where it next tells how far it is; press again to go on"
+        end = "End as soon as possible; what can be kept is kept"
+        self.run_bar = RunBar(self.run, "Start", tips=(tip, end))
+        left = fill(QWidget(), self.choice, self.about, (self.stack, 1), self.run_bar, margins=(0, 0, 6, 0))
+        fill(self.body, split(left, self._make_results(), sizes=[430, 800], stretch=1, firm=True))
+        self.choice.currentIndexChanged.connect(self._chosen)
+        self.run_bar.start.connect(self.start)
+        self.run.told.connect(self._told)
+        self.run.succeeded.connect(self._succeeded)
+        self.run.ended_early.connect(lambda words: self._ended(words, wrong=True))
+        self.run.failed.connect(lambda why: self._ended(self._in_form_words(why), wrong=True))
+        self.run.over.connect(self._over)
+        self._chosen()
+
+    def _make_results(self) -> QWidget:
+        self.words = text_view("What it finds stands here.", "Can be copied")
+        self.words.setFont(QFontDatabase.systemFont(QFontDatabase.SystemFont.FixedFont))
+        self.tables = QWidget()
+        self._tables = QVBoxLayout(self.tables)
+        self._tables.setContentsMargins(0, 0, 0, 0)
+        self.tables.hide()
+        self.picture = Picture()
+        self.list = QListWidget()
+        self.list.setAccessibleName("Files that were written")
+        self.list.setToolTip("What was written; a click shows a picture, a double click opens a file")
+        self.list.itemClicked.connect(lambda item: self._show(item.data(Qt.ItemDataRole.UserRole)))
+        self.list.itemActivated.connect(lambda item: self._open(item.data(Qt.ItemDataRole.UserRole)))
+        self.folder_button = button("Open folder", "Show it in the file manager", self._open_folder)
+        self.use_button = button(
+            "Go on with it…", "Take the result to the panel that works with it", self._use
+        )
+        told = fill(QWidget(), (self.words, 1), (self.tables, 1), margins=(6, 0, 0, 0))
+        self.results = tabs({"What was found": told, "Picture": self.picture})
+        foot = in_row((self.list, 1), fill(QWidget(), self.use_button, self.folder_button, None))
+        below = QWidget()
+        fill(below, foot, margins=(6, 0, 0, 0))
+        self._clear()
+        return split(self.results, below, sizes=[560, 130], down=True, firm=True)
+
+    # The form ------------------------------------------------------------------------------------
+    @property
+    def name(self) -> str:
+        """The task that is chosen."""
+        return str(self.choice.currentData())
+
+    def choose(self, name: str, **values: Any) -> None:
+        """Choose a task and fill in some of its options, as soon as its form is there."""
+        self._given = values
+        self.choice.setCurrentIndex(self.choice.findData(name))
+        self._chosen()
+
+    def take(self, path: Path) -> None:
+        """Verify a run that another panel hands on."""
+        self.choose("verify", runs=(path,))
+
+    def _chosen(self) -> None:
+        name, entry = self.name, TASKS[self.name]
+        self.about.setText(f"{entry.help[:1].upper()}{entry.help[1:]}.")
+        if name in self._pages:
+            self._show_form(name, self._pages[name].task)
+            return
+        self.run_bar.set_startable("Its form is being prepared.")
+        self._loader.ask(entry.load, lambda task: self._show_form(name, task), name)
+
+    def _show_form(self, name: str, task: Task) -> None:
+        if name not in self._pages:
+            self._pages[name] = self._made(name, task)
+            self.stack.addWidget(scrolled(self._pages[name].form))
+        if name != self.name:
+            return
+        self.stack.setCurrentIndex(list(self._pages).index(name))
+        page = self._pages[name]
+        if self._given:
+            page.form.set_values(self._given)
+            self._given = {}
+        if not self.run.is_running:
+            self.run_bar.set_startable()
+
+    def _made(self, name: str, task: Task) -> _Page:
+        options = [o for _, offered in task.parts.values() for o in offered]
+        special = {o.name: _behaviour(o, needed=o.name in task.needed) for o in options if _names_files(o)}
+        form = OptionsForm(options, special)
+        if task.subject:
+            form.show_for(task.subject)
+        form.refused.connect(self.refused)
+        form.set_values({"bench": self.session.config.path})
+        names = None
+        out = next((o for o in options if o.name == "out"), None)
+        place = task.out or (None if out is None or not isinstance(out.default, Path) else out.default)
+        if place is not None:
+            suffix = "".join(place.suffixes).replace(".pdf", ".png")  # what can be shown beside the form
+            names = SuggestedName(self.jobs, form, self.session.runs_folder / "results", suffix)
+            form.set_values({"out": None})
+            names.suggest(place.name.partition(".")[0])
+        return _Page(task, form, names)
+
+    def objects(self) -> dict[str, object] | None:
+        """Return the options objects that the form asks for; None, and fields marked, where it cannot be."""
+        page = self._pages.get(self.name)
+        if page is None or not page.form.check():
+            return None
+
+        def made() -> dict[str, object]:
+            return {
+                parameter: cls(**{o.name: page.form.value(o.name) for o in offered})
+                for parameter, (cls, offered) in page.task.parts.items()
+            }
+
+        return self.asked(made)
+
+    def _in_form_words(self, text: str) -> str:
+        """Return a message with the fields' labels where the terminal's has flags."""
+        page = self._pages[self.name]
+        for field in sorted(page.form.fields.values(), key=lambda f: -len(f.option.flag)):
+            if field.option.flag.startswith("--"):
+                text = text.replace(field.option.flag, f"“{field.bare_label}”")
+        return text
+
+    def as_python(self) -> str:
+        """Return lines that carry out the task as the form stands."""
+        objects = self.objects()
+        if objects is None:
+            return f"# {self.title}: the form has mistakes.\n"
+        module, _, function = TASKS[self.name].place.partition(":")
+        imports = Imports({(f"instrument.tasks.{module}", function), ("instrument.tasks.task", "Printed")})
+        given = "".join(f", {name}={expression(value, imports)}" for name, value in objects.items())
+        return "\n".join([*imports.lines(), "", f"print({function}.carry_out(Printed(){given}))", ""])
+
+    # Carrying out --------------------------------------------------------------------------------
+    def start(self) -> None:
+        """Carry out what the form asks for."""
+        if self.run.is_running:
+            return
+        objects = self.objects()
+        if objects is None:
+            return
+        page = self._pages[self.name]
+        out = page.form.value("out") if page.names is not None else None
+
+        def do(desk: Desk) -> Done:
+            if page.names is not None and out is not None:
+                page.names.make_room(out)
+            return page.task.carry_out(desk, **objects)
+
+        self._clear()
+        self.run_bar.set_running(True)
+        self.stack.setEnabled(False)
+        self.choice.setEnabled(False)
+        self.run.start(TASKS[self.name].title, do)
+
+    def _clear(self) -> None:
+        self.words.setPlainText("")
+        mark(self.words, "refused", False)
+        while (item := self._tables.takeAt(0)) is not None:
+            if (widget := item.widget()) is not None:
+                widget.deleteLater()
+        self.tables.hide()
+        self.picture.clear()
+        self.list.clear()
+        self.files = ()
+        self.folder_button.setEnabled(False)
+        self.use_button.setEnabled(False)
+
+    def _told(self, told: Told) -> None:
+        text = self._in_form_words(told.text)
+        if told.kind == "table":
+            made = table(told.headings, text, row_px=_ROW_PX)
+            made.setRowCount(len(told.rows))
+            for row, texts in enumerate(told.rows):
+                for column, shown in enumerate(texts):
+                    made.setItem(row, column, cell(shown, number=True))
+            made.verticalHeader().hide()
+            self._tables.addWidget(made)
+            self.tables.show()
+            return
+        if told.kind == "warn":
+            self.session.log("warning", text)
+            text = f"⚠ {text}"
+        self.words.appendPlainText(text)
+
+    def _succeeded(self, done: Done) -> None:
+        self.files = done.files
+        for path in done.files:
+            item = QListWidgetItem(path.name)
+            item.setToolTip(str(path))
+            item.setData(Qt.ItemDataRole.UserRole, path)
+            self.list.addItem(item)
+            self.session.log("info", f"Wrote {path}")
+        if done.kept:
+            self._told(Told("warn", done.kept))
+        elif not done.good:
+            mark(self.words, "refused", True)
+        self.folder_button.setEnabled(bool(done.files))
+        self.use_button.setEnabled(any(map(_panel_for, done.files)))
+        self.run_bar.show_end("Ended early" if done.kept else "Done", complete=not done.kept)
+        pictures = [path for path in done.files if path.suffix in _PICTURES]
+        if pictures:
+            self._show(pictures[0])
+
+    def _ended(self, words: str, *, wrong: bool) -> None:
+        self.words.appendPlainText(words)
+        mark(self.words, "refused", wrong)
+        self.run_bar.show_end(words.splitlines()[0], complete=False)
+
+    def _over(self) -> None:
+        words = self.run_bar.words.text()
+        self.run_bar.set_running(False)
+        self.run_bar.words.setText(words)
+        self.stack.setEnabled(True)
+        self.choice.setEnabled(True)
+        page = self._pages[self.name]
+        if page.names is not None:
+            page.names.suggest(page.form.value("out").name.partition(".")[0].rstrip("-0123456789"))
+
+    # Results -------------------------------------------------------------------------------------
+    def _show(self, path: Path) -> None:
+        if path.suffix in _PICTURES:
+            self._reader.ask(lambda: QImage(str(path)), self._show_picture)
+
+    def _show_picture(self, picture: QImage) -> None:
+        self.picture.show_pixmap(QPixmap.fromImage(picture))
+        self.results.setCurrentWidget(self.picture)
+
+    def _open(self, path: Path) -> None:
+        QDesktopServices.openUrl(QUrl.fromLocalFile(str(path)))
+
+    def _open_folder(self) -> None:
+        if self.files:
+            self._open(self.files[0].parent)
+
+    def _use(self) -> None:
+        for path in self.files:
+            if panel := _panel_for(path):
+                self.session.handed_on.emit(panel, path)
+                return
+
+    def shutdown(self) -> None:
+        """End the task."""
+        super().shutdown()
+        self.run.abort()
+        self._loader.forget()
+        self._reader.forget()
+
+
+def _names_files(o: Option) -> bool:
+    return Path in (o.item, *o.kinds) or o.declaration.metavar.endswith("FILE")
+
+
+def _behaviour(o: Option, *, needed: bool) -> Behaviour:
+    """Return how a path is chosen: what is written by a new name, what is read by what is there."""
+    folder = o.declaration.metavar.removesuffix("...") in _FOLDERS
+    if o.name in WRITTEN:
+        return Behaviour(browse="folder" if folder else "save")
+    exists = o.kinds == (Path,)
+    return Behaviour(browse="folder" if folder else "open", must_exist=exists, needed=needed)
+
+
+def _panel_for(path: Path) -> str:
+    """Return the name of the panel that works with a result; empty where there is none."""
+    if path.name in ("chart.json", "stability.json"):
+        return "charts"
+    return "reconstructions" if (path / "calibration.json").is_file() else ""

@@ -1,0 +1,149 @@
+"""Runs on disk: every frame verified, frames or results exported."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from instrument.files.errors import BenchError
+from instrument.files.volumes import is_zarr_name, uneven_steps
+from instrument.runs.export import export as export_run
+from instrument.runs.inspection import verify as verify_run
+from instrument.runs.run import Run
+from instrument.tasks.task import Desk, Done, Given, task
+from recon.base.declare import option
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifyOptions:
+    """Which runs are read."""
+
+    runs: tuple[Path, ...] = option(help="The runs' folders.", metavar="RUN...", positional=True)
+
+
+@task("diffuserbench verify runs/2026-11-21_14-03-22_axial-sweep", "diffuserbench verify runs/*")
+def verify(desk: Desk, options: VerifyOptions) -> Done:
+    """Read every frame and its metadata and hold them against the log's checksums. Changes nothing.
+
+    Exit status 1 when anything is not as it was written. A run that ended early is sound, only not complete.
+    """
+    sound = True
+    for path in options.runs:
+        run = Run.open(path)
+        with desk.step(path.name) as advance:
+            found = verify_run(run, advance)
+        for line in found.lines():
+            desk.warn(f"{path}: {line}")
+        if remedy := found.remedy():
+            (desk.say if found.is_sound else desk.warn)(f"{path}: {remedy}")
+        sound = sound and found.is_sound
+        verdict = "sound" if found.is_sound else "DAMAGED"
+        desk.say(f"{path}: {verdict}, {run.condition}, {found.frames} of {run.n_frames} frames read back.")
+    return Done(good=sound)
+
+
+def _slice(text: str) -> slice:
+    if not re.fullmatch(r"-?\d+|-?\d*:-?\d*(:-?[1-9]\d*)?", text):
+        raise ValueError("give A:B, e.g. 0:100, or one number.")
+    numbers = [int(part) if part else None for part in text.split(":")]
+    if len(numbers) == 1 and numbers[0] is not None:
+        return slice(numbers[0], numbers[0] + 1)
+    return slice(*numbers)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """What is written where, how fast a film plays, and on which voxels a volume lies."""
+
+    run: Path = option(
+        help="The run's folder; or a reconstruction's file.", metavar="RUN|RESULT", positional=True
+    )
+    out: Path = option(
+        help="File ending in .ome.tif, .tif, .h5, .npy or .mp4, or a folder for PNG files. "
+        "A picture: .tif, .npy, .png; a volume: .tif, .npy, .ome.zarr.",
+        metavar="TARGET",
+        positional=True,
+    )
+    label: str | None = option(None, help="Only steps of this label.", applies=("run",))
+    frames: slice | None = option(
+        None,
+        help="Only frames A to B - 1; A:B:C every C-th.",
+        metavar="A:B",
+        applies=("run",),
+        parse=_slice,
+    )
+    frames_per_s: float | None = option(
+        None,
+        help="Frames a second of an MP4.",
+        least=0.1,
+        flags=("--fps",),
+        applies=("run",),
+    )
+    metric: bool = option(
+        False,
+        help="On voxels of one size, upright: each plane of a reconstruction has a pitch of its own.",
+        applies=("volume",),
+    )
+    voxel_um: float | None = option(
+        None,
+        help="Edge of the voxels, cubes, with --metric.",
+        default_words="the middle plane's pixels and the step beside it",
+        unit="um",
+        above=0,
+        applies=("volume",),
+    )
+
+
+@task(
+    "diffuserbench export RUN psfs.ome.tif --label psf",
+    "diffuserbench export RUN video.mp4",
+    "diffuserbench export RUN frames/ --frames 0:100",
+    "diffuserbench export volume.tif volume.ome.zarr --metric",
+)
+def export(desk: Desk, options: ExportOptions, given: Given) -> Done:
+    """Write a run's stored frames, or a reconstruction, for other programs; what is there stays as it is.
+
+    Frames that are not there (gaps of a recording, steps not done) are left out, and said.
+    """
+    if _is_result(options.run):
+        return _export_result(desk, options, given)
+    given.refuse("a run", "run")
+    found, out = Run.open(options.run), options.out
+    wanted = set(range(found.n_frames)[options.frames or slice(None)])
+    if options.label is not None:
+        wanted &= {step.index for step in found.steps(options.label)}
+    indices = [index for index in sorted(found.records) if index in wanted]
+    with desk.step("Frames") as advance:
+        export_run(found, out, indices, frames_per_s=options.frames_per_s, on_progress=advance)
+    desk.say(f"Wrote {len(indices)} frames.")
+    if absent := len(wanted) - len(indices):
+        desk.warn(f"Warning: {absent} frames that are not in the run were left out.")
+    return Done((out,))
+
+
+def _is_result(path: Path) -> bool:
+    """Whether a path is a picture's or volume's: a file, or a Zarr folder, which no run is."""
+    return path.is_file() or is_zarr_name(path)
+
+
+def _export_result(desk: Desk, options: ExportOptions, given: Given) -> Done:
+    from instrument.reconstruction.stored_result import export_result, open_result
+
+    result, target = open_result(options.run), options.out
+    try:
+        kind = "picture" if result.volume is None else "volume"
+        given.refuse(f"a {kind}", kind)
+        if options.voxel_um is not None and not options.metric:
+            raise BenchError("--voxel-um is the size of --metric's voxels: give --metric too.")
+        if options.metric:
+            result = result.metric(options.voxel_um)
+            desk.fact("Voxels", result.voxels_in_words())
+        with desk.step("Planes") as advance:
+            export_result(result, target, advance=advance)
+        steps = "" if result.planes_um is None else uneven_steps(result.planes_um[0])
+    finally:
+        result.close()
+    if steps and target.suffix.lower() != ".npy":
+        desk.fact("Planes", steps)
+    return Done((target,))

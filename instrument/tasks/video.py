@@ -1,0 +1,114 @@
+"""A recording reconstructed frame by frame."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from instrument.files.errors import duration
+from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions, VideoOptions
+from instrument.reconstruction.video import (
+    PreparedVideo,
+    VideoRequest,
+    finish_video,
+    prepare_video,
+    solve_video,
+)
+from instrument.reconstruction.video_work import BlockReport, require_crew
+from instrument.tasks.task import Desk, Done, Only, task
+from recon.base.declare import option
+from recon.reconstruction.options import ReconstructionOptions
+
+VIDEO = Path("video.ome.zarr")
+"""Where a video goes when nothing else is said."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """What is reconstructed."""
+
+    run: Path = option(help="The recording's folder.", metavar="RUN", positional=True, group="Input")
+
+
+@task(subject="video", out=VIDEO)
+def video(
+    desk: Desk,
+    recording: Recording,
+    source: Annotated[SourceOptions, Only("calibration", "psf")],
+    output: Annotated[OutputOptions, Only("out", "rotate_deg", "force")],
+    video: VideoOptions,
+    inputs: InputOptions,
+    options: ReconstructionOptions,
+) -> Done:
+    """Reconstruct every frame of a recording; one that was interrupted is taken up again."""
+    request = VideoRequest(
+        run=recording.run,
+        out=output.out or VIDEO,
+        psf=source.psf,
+        calibration=source.calibration,
+        inputs=inputs,
+        options=options,
+        video=video,
+        rotate_deg=int(output.rotate_deg),
+    )
+    return make_video(desk, request, force=output.force)
+
+
+def make_video(desk: Desk, request: VideoRequest, *, force: bool) -> Done:
+    """Prepare or take up again, solve, finish."""
+    video = request.video
+    # Before anything is written:
+    require_crew(workers=video.workers, scheduler=video.scheduler, owner=video.scheduler_owner)
+    prepared = prepare_video(request, force=force)
+    for name, text in prepared.notes.items():
+        desk.fact(name, text)
+    plan = prepared.job.plan
+    if plan.settings["simulated"]:
+        desk.say("SIMULATED   recording or PSF come from the simulated bench")
+    how = (
+        f"{plan.cold_iterations} iterations for the first of a block, {plan.warm_iterations} for the others"
+        if plan.over_time is None
+        else f"{plan.cold_iterations} iterations, prior over time {plan.over_time}"
+    )
+    blocks = f"{len(prepared.job.blocks)} blocks of {plan.block}"
+    desk.fact("Video", f"{len(plan.frames)} frames in {blocks}: {how}")
+    for warning in prepared.warnings:
+        desk.warn(f"Warning: {warning}")
+    if prepared.resumed:
+        desk.fact("Resumed", f"{_frames_done(prepared)} frames are done already")
+    began_s, before = time.monotonic(), _frames_done(prepared)
+    complete = _solve(desk, prepared)
+    seconds, done = time.monotonic() - began_s, _frames_done(prepared)
+    if done > before:
+        rate = (done - before) / seconds
+        desk.fact("Done", f"{done - before} frames in {duration(seconds)}: {rate:.1f} frames/s")
+    if not complete:
+        kept = f"Interrupted: {done} of {len(plan.frames)} frames are in {request.out}. "
+        return Done(kept=f"{kept}The same command goes on with the rest.")
+    if unlit := prepared.job.unlit():
+        share = f"{unlit} of {len(plan.frames)} frames"
+        desk.warn(f"Warning: {share} hold nothing but noise: was the scene lit?")
+    return Done(tuple(finish_video(prepared)))
+
+
+def _solve(desk: Desk, prepared: PreparedVideo) -> bool:
+    total = len(prepared.job.plan.frames)
+    before = _frames_done(prepared)
+    began_s = time.monotonic()
+    with desk.interruptible() as cancel, desk.step("frames", total, done=before) as advance:
+        done = before
+
+        def on_progress(report: BlockReport) -> None:
+            nonlocal done
+            done += len(prepared.job.blocks[report.block])
+            rate = (done - before) / max(time.monotonic() - began_s, 1e-9)
+            advance(done, note=f"{rate:.1f} frames/s")
+
+        return solve_video(prepared, on_progress, cancel)
+
+
+def _frames_done(prepared: PreparedVideo) -> int:
+    blocks = prepared.job.blocks
+    return sum(len(blocks[number]) for number in prepared.job.done())

@@ -1,0 +1,267 @@
+"""Where the voxels of a reconstruction lie, and volumes brought from there to voxels of equal size.
+
+A camera without a lens divides directions, not space: voxels of one plane are as wide as that plane is far
+away (Kuo 2020, sec. 4.4). :func:`metric_grid` and :func:`metric_planes` make volumes of them that can be
+measured, turned and shown without a thought of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+Floats = npt.NDArray[np.float64]
+Plane = npt.NDArray[np.float32]
+
+SAME = 1e-3
+"""Sizes that differ by less than this part of the smallest are taken for equal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Where the voxels of a reconstruction lie: every depth has its own lateral pitch (Kuo 2020, sec. 4.4).
+
+    Attributes
+    ----------
+    shape : (int, int, int)
+        ``(n_z, height, width)``.
+    centre : (int, int)
+        ``(row, column)`` of the pixel on the axis.
+    z_um : ndarray, (n_z,)
+        Depth of each plane in front of the diffuser; NaN where not known.
+    pitch_um : ndarray, (n_z,)
+        Lateral pitch of each plane, ``sensor pitch * z / d`` (Eq. 3.1); NaN where not known.
+    sensor_pitch_um : float or None
+        Pixel pitch of the sensor: one pixel is what shifts the PSF by one sensor pixel.
+    axis_um : ndarray, (n_z, 2), or None
+        ``(x, y)`` that the pixel on the axis looks at, plane by plane: where the source of its PSF was. None:
+        0 throughout.
+    upright : bool
+        Whether rows and columns go with y and x. On the sensor's grid they go against them: the picture
+        stands upside down (:mod:`recon.types`).
+    """
+
+    shape: tuple[int, int, int]
+    centre: tuple[int, int]
+    z_um: Floats
+    pitch_um: Floats
+    sensor_pitch_um: float | None = None
+    axis_um: Floats | None = None
+    upright: bool = False
+
+    @property
+    def spacing_um(self) -> Floats:
+        """Distance from each plane to the next, positive; the last one's is that of the plane before it."""
+        if len(self.z_um) < 2:
+            return np.full(len(self.z_um), np.nan)
+        steps = np.abs(np.diff(self.z_um))
+        return np.append(steps, steps[-1])
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether all voxels have one size."""
+        sizes = np.stack([self.pitch_um, self.spacing_um])
+        return bool(np.isfinite(sizes).all() and (np.ptp(sizes, axis=1) <= SAME * sizes.min(axis=1)).all())
+
+    def place_um(self, z: int, row: float, column: float) -> tuple[float, float, float]:
+        """Return ``(x, y, z)`` of a voxel in the scene; NaN where it is not known."""
+        sign = 1 if self.upright else -1
+        x, y = (0.0, 0.0) if self.axis_um is None else self.axis_um[z]
+        pitch = sign * self.pitch_um[z]
+        return (
+            float(x + (column - self.centre[1]) * pitch),
+            float(y + (row - self.centre[0]) * pitch),
+            float(self.z_um[z]),
+        )
+
+    def axis_weights(self) -> Floats:
+        """Weights (n_z, 3) of the z, y and x differences for total variation in space instead of in voxels.
+
+        A step between neighbours counts by the area of the face between their voxels; the x face of a plane
+        is ``pitch * spacing``, the z face ``pitch^2``, so relative to x a z difference weighs ``pitch /
+        spacing``. One throughout where the geometry is not known; nothing along z where there is one plane.
+        """
+        weights = np.ones((len(self.z_um), 3))
+        if len(self.z_um) == 1:
+            weights[:, 0] = 0.0
+            return weights
+        ratio = self.pitch_um / self.spacing_um
+        if np.isfinite(ratio).all():
+            weights[:, 0] = ratio
+        return weights
+
+
+def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
+    """Return a grid of equal voxels that holds all planes of another, upright.
+
+    Parameters
+    ----------
+    grid : Grid
+    voxel_um : float, optional
+        Edge of a cube. Default: as wide as the middle plane's pixels, as deep as the step beside it.
+
+    Raises InputError where depths or pitches are not known, there is one plane, or planes share a depth.
+    """
+    n_z, height, width = grid.shape
+    if n_z < 2:
+        raise InputError("A picture has one plane, whose pixels are of equal size already.")
+    if not (np.isfinite(grid.z_um).all() and np.isfinite(grid.pitch_um).all()):
+        raise InputError(
+            "The depths of the planes or their pixels' sizes are not known, so voxels cannot be brought to "
+            "equal micrometres. Reconstruct with a calibration that says the depths, the pixel pitch and "
+            "the distance from diffuser to sensor."
+        )
+    order = np.argsort(grid.z_um)
+    z = grid.z_um[order]
+    steps = np.diff(z)
+    if (steps <= 0).any():
+        raise InputError(f"Two planes lie at the same depth, {z[int(np.argmin(steps))]:g} um.")
+    if voxel_um is not None and not 0 < voxel_um < np.inf:
+        raise InputError(f"A voxel's edge is above 0 um, not {voxel_um:g}.")
+    middle = min(n_z // 2, n_z - 2)
+    across = float(grid.pitch_um[order][n_z // 2]) if voxel_um is None else voxel_um
+    deep = float(steps[middle]) if voxel_um is None else voxel_um
+    first, span = z[0] - steps[0] / 2, z[-1] - z[0] + (steps[0] + steps[-1]) / 2
+    count = max(round(span / deep), 1)
+    places = first + (span - count * deep) / 2 + (np.arange(count) + 0.5) * deep
+    sides = []
+    for axis, n in ((1, height), (0, width)):  # of axis_um and of rows and columns
+        middles, centre = _axis(grid)[:, axis], grid.centre[1 - axis]
+        behind, before = centre + 0.5, n - centre - 0.5  # pixels on either side of the axis
+        if grid.upright:
+            behind, before = before, behind
+        low = float((middles - before * grid.pitch_um).min())
+        high = float((middles + behind * grid.pitch_um).max())
+        start = int(np.ceil(low / across - 1e-6))
+        sides.append((start, int(np.floor(high / across + 1e-6)) - start + 1))
+    (top, rows), (left, columns) = sides
+    return Grid(
+        (count, rows, columns),
+        (-top, -left),
+        places,
+        np.full(count, across),
+        grid.sensor_pitch_um,
+        None,
+        True,
+    )
+
+
+def metric_planes(plane: Callable[[int], Plane], grid: Grid, metric: Grid) -> Callable[[int], Plane]:
+    """Bring a volume to a metric grid: return what makes its planes.
+
+    Values are light a voxel: what all voxels of a bead add up to stays, to a few per cent. Between planes the
+    mean goes along the rays through the diffuser, pixel by pixel. Where no pixel looks there is 0. Smaller
+    voxels than pixels are interpolated linearly; larger ones are triangular means.
+
+    Parameters
+    ----------
+    plane : callable
+        ``plane(z)`` returns (height, width) or (height, width, n_channels).
+    grid : Grid
+        Of the volume.
+    metric : Grid
+        As :func:`metric_grid` returns it.
+
+    Returns
+    -------
+    callable
+        ``made(z)`` returns (metric height, metric width[, n_channels]), float32; 0 is the nearest.
+    """
+    order = np.argsort(grid.z_um)
+    nodes, pitches = grid.z_um[order], grid.pitch_um[order]
+    steps = np.diff(nodes)
+    thickness = (np.append(steps[0], steps) + np.append(steps, steps[-1])) / 2
+    axis = _axis(grid)[order]
+    deep, across = float(metric.spacing_um[0]), float(metric.pitch_um[0])
+    kept = lru_cache(maxsize=4)(plane)  # neighbours in the result come from the same planes
+    between = _between(nodes, metric.z_um, deep)
+
+    def made(number: int) -> Plane:
+        z, weights = metric.z_um[number], between[number]
+        pitch = float(np.interp(z, nodes, pitches))
+        mixed: Any = 0
+        for k in np.flatnonzero(weights):
+            # Mixed by direction, and by how much light there is in a micrometre of depth.
+            mixed = mixed + np.float32(weights[k] * deep / thickness[k]) * kept(int(order[k]))
+        x, y = (float(np.interp(z, nodes, axis[:, i])) for i in (0, 1))
+        rows, columns = (
+            _seen_by(n, centre, grid.upright, (places - off) / pitch, across / pitch)
+            for n, centre, off, places in zip(
+                grid.shape[1:], grid.centre, (y, x), _places(metric), strict=True
+            )
+        )
+        channels = mixed[..., None] if mixed.ndim == 2 else mixed
+        moved = [(columns @ (rows @ channels[..., c]).T).T for c in range(channels.shape[2])]
+        result = np.stack(moved, axis=-1) * np.float32((across / pitch) ** 2)
+        return np.ascontiguousarray(result[..., 0] if mixed.ndim == 2 else result)
+
+    return made
+
+
+def metric_volume(
+    volume: npt.NDArray[np.float32], grid: Grid, voxel_um: float | None = None
+) -> tuple[npt.NDArray[np.float32], Grid]:
+    """Return a volume (n_z, height, width[, n_channels]) on voxels of equal size, and their grid.
+
+    Parameters and errors as :func:`metric_grid`, values as :func:`metric_planes`.
+    """
+    metric = metric_grid(grid, voxel_um)
+    made = metric_planes(volume.__getitem__, grid, metric)
+    return np.stack([made(z) for z in range(metric.shape[0])]), metric
+
+
+def _axis(grid: Grid) -> Floats:
+    return np.zeros((len(grid.z_um), 2)) if grid.axis_um is None else np.asarray(grid.axis_um, np.float64)
+
+
+def _places(metric: Grid) -> tuple[Floats, Floats]:
+    """Return y of the rows and x of the columns of a metric grid."""
+    rows, columns = (
+        (np.arange(n) - c) * metric.pitch_um[0] for n, c in zip(metric.shape[1:], metric.centre, strict=True)
+    )
+    return rows, columns
+
+
+def _between(nodes: Floats, places: Floats, step: float) -> Floats:
+    """Weights (n_places, n_nodes) of linear interpolation; of its triangular mean where the steps are larger.
+
+    Constant beyond the ends.
+    """
+    least = float(np.diff(nodes).min())
+    parts = np.zeros(1)
+    if step > (1 + SAME) * least:
+        n = 2 * int(np.ceil(step / least))
+        parts = np.arange(1 - n, n) / n
+    shares = 1 - np.abs(parts)
+    unit = np.eye(len(nodes))
+    total = np.zeros((len(places), len(nodes)))
+    for part, share in zip(parts, shares / shares.sum(), strict=True):
+        total += share * np.stack([np.interp(places + part * step, nodes, row) for row in unit], axis=1)
+    return total
+
+
+def _seen_by(n: int, centre: int, upright: bool, offsets: Floats, step: float) -> sparse.csr_array:
+    """Return the matrix (n_places, n) that takes pixels to places.
+
+    ``offsets`` are the places from the axis and ``step`` that from one to the next, both in pixels.
+    """
+    from scipy import sparse  # late: importing recon stays light
+
+    at = centre + (offsets if upright else -offsets)
+    reach = max(1.0, step)
+    near = np.floor(at)[:, None].astype(int) + np.arange(-int(np.ceil(reach)), int(np.ceil(reach)) + 2)
+    weights = np.maximum(1 - np.abs(at[:, None] - near) / reach, 0)
+    weights /= weights.sum(axis=1, keepdims=True)
+    used = (weights > 0) & (near >= 0) & (near < n)
+    rows = np.broadcast_to(np.arange(len(at))[:, None], near.shape)
+    return sparse.csr_array((weights[used].astype(np.float32), (rows[used], near[used])), shape=(len(at), n))

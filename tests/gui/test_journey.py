@@ -1,0 +1,101 @@
+"""The strip: what is done and what comes next, on every kind of bench."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from PySide6.QtCore import Qt
+from pytestqt.qtbot import QtBot
+
+from gui.journey import Facts, Made, after_all, light_of, made_in, next_of, steps_of
+from gui.main_window import MainWindow
+from gui.panels import PANELS
+from gui.panels.sweeps import SweepsPanel
+from instrument.bench.config_file import TEMPLATES, no_bench, parse_config, template
+
+WAIT_MS = 60_000
+GOOD = Facts(light="good")
+WAYS = {
+    "default": ["Connect", "Expose", "Calibrate", "Photograph", "Reconstruct"],
+    "display": ["Connect", "Align", "Compute", "Show"],
+    "led_microscope": ["Connect", "Expose", "Measure"],
+    "screen": ["Connect", "Expose", "Calibrate", "Photograph", "Reconstruct"],
+}
+
+
+@pytest.mark.parametrize("name", TEMPLATES)
+def test_every_bench_has_a_way_whose_steps_lead_somewhere(name: str) -> None:
+    config = parse_config(template(name), None)
+    steps = steps_of(config, GOOD)
+    assert [step.name for step in steps] == WAYS[name]
+    assert all(step.panel in PANELS for step in steps[1:])
+    first = next_of(steps)
+    assert first is not None
+    assert first.words.endswith(".")
+    assert first.answer
+    assert first.name == WAYS[name][1 if name == "display" else 2]
+
+
+def test_the_way_of_a_camera_is_gone_step_by_step(tmp_path: Path) -> None:
+    config = parse_config(template(), None)
+
+    def step(facts: Facts) -> str:
+        following = next_of(steps_of(config, facts))
+        return "" if following is None else following.name
+
+    assert step(Facts(opening=True)) == "Connect"
+    assert step(Facts(failed=("stage",))) == "Connect"
+    assert step(Facts()) == step(Facts(light="dark")) == step(Facts(light="saturated")) == "Expose"
+    assert step(GOOD) == "Calibrate"
+    paths = [tmp_path / name for name in ("calibration", "photo.tif", "result.json")]
+    for number, path in enumerate(paths):
+        path.write_text("")
+        os.utime(path, (100 + number, 100 + number))
+    made = Made(calibration=paths[0])
+    assert step(replace(GOOD, made=made)) == step(Facts(light="dark", made=made)) == "Photograph"
+    made = replace(made, photograph=paths[1])
+    assert step(replace(GOOD, made=made)) == "Reconstruct"
+    made = replace(made, result=paths[2])
+    done = replace(GOOD, made=made)
+    assert step(done) == ""
+    assert "result.json" in after_all(config, done).words
+    os.utime(paths[1], (200, 200))  # another photograph
+    assert step(done) == "Reconstruct"
+    assert next_of(steps_of(no_bench(tmp_path), Facts())).panel == "start"  # type: ignore[union-attr]
+
+
+def test_what_lies_in_a_folder_is_found(tmp_path: Path) -> None:
+    assert made_in(tmp_path / "nothing") == Made()
+    for name in ("photographs/a.tif", "x_photograph/photograph.tif", "mask_alignment.json", "y_dpc/dpc.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("")
+    os.utime(tmp_path / "photographs/a.tif", (100, 100))
+    made = made_in(tmp_path)
+    assert made.photograph == tmp_path / "x_photograph/photograph.tif"
+    assert made.alignment == tmp_path / "mask_alignment.json"
+    assert made.surface == tmp_path / "y_dpc/dpc.json"
+
+
+def test_the_strip_names_the_next_step_and_leads_there(qtbot: QtBot, window: MainWindow) -> None:
+    strip = window.strip
+    assert light_of(window.session.live.newest()) in ("good", "dark", "saturated")
+    strip.show_facts(GOOD)
+    assert "▸&nbsp;Calibrate" in strip.marks.text()
+    assert "✓&nbsp;Connect" in strip.marks.text()
+    qtbot.mouseClick(strip.button, Qt.MouseButton.LeftButton)
+    sweeps = window.panel("sweeps")
+    assert isinstance(sweeps, SweepsPanel)
+    assert window.tabs.currentWidget() is window._places["sweeps"]
+    assert sweeps.routine.name == "axial"
+    strip.show_facts(replace(GOOD, made=Made(calibration=Path("c"))))
+    strip._go()
+    assert sweeps.routine.name == "photograph"
+    job = window.session.exclusive_job("A run", lambda context: context.cancel.wait(WAIT_MS / 1000))
+    strip.look()
+    assert strip.words.toolTip() == "A run is under way …"
+    assert not strip.button.isVisible()
+    job.cancel()
+    qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)

@@ -1,0 +1,110 @@
+"""What is done with files: every task has its form, its progress and its results in the window."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pytestqt.qtbot import QtBot
+
+from gui.jobs import JobCancelledError
+from gui.panels.tasks import TasksPanel
+from gui.session import BenchSession
+from instrument.files.calibration_file import save_calibration
+from instrument.tasks import TASKS
+from instrument.tasks.task import Desk, Done
+from recon.types import Calibration, Geometry
+from tests.gui.conftest import WAIT_MS
+
+
+@pytest.fixture
+def panel(qtbot: QtBot, make_session: Callable[[], BenchSession]) -> TasksPanel:
+    """The panel without a bench that is open."""
+    panel = TasksPanel(make_session())
+    qtbot.addWidget(panel)
+    return panel
+
+
+def shown(qtbot: QtBot, panel: TasksPanel, name: str, **values: object) -> None:
+    """Choose a task and wait for its form."""
+    panel.choose(name, **values)
+    qtbot.waitUntil(lambda: name in panel._pages and not panel._given, timeout=WAIT_MS)
+
+
+def calibration(folder: Path, seed: int) -> Path:
+    """Save a calibration of one PSF; another seed is another diffuser's."""
+    psf = np.random.default_rng(seed).random((1, 1, 48, 48), np.float32) ** 8
+    geometry = Geometry(pixel_pitch_um=10.0, diffuser_distance_mm=5.0)
+    return save_calibration(Calibration(psf, np.array([(0.0, 0.0, 2e4)]), geometry=geometry), folder)
+
+
+def test_every_task_has_a_form_of_its_own_declarations(qtbot: QtBot, panel: TasksPanel) -> None:
+    for name in TASKS:
+        shown(qtbot, panel, name)
+        form = panel._pages[name].form
+        offered = {o.name for _, options in panel._pages[name].task.parts.values() for o in options}
+        assert {n for n in offered if n in form.fields} == set(form.fields)
+        assert all(field.tip for field in form.fields.values())
+        needed = panel._pages[name].task.needed
+        required = [n for n, field in form.fields.items() if field.option.is_required or n in needed]
+        assert panel.objects() is None if required else panel.objects() is not None
+        assert panel.as_python().startswith("#") == bool(required)
+
+
+def test_two_calibrations_are_compared_with_table_and_python_beside_the_form(
+    qtbot: QtBot, panel: TasksPanel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, new = calibration(tmp_path / "old", 0), calibration(tmp_path / "new", 1)
+    shown(qtbot, panel, "compare", old=old, new=new, out=tmp_path / "found.json")
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        panel.start()
+    assert "RECALIBRATE" in panel.words.toPlainText()
+    assert panel.words.property("refused")  # seen without being read
+    assert panel._tables.count() == 1
+    assert panel.files == (tmp_path / "found.json",)
+    exec(panel.as_python().replace("found.json", "again.json"), {})
+    assert (tmp_path / "again.json").read_bytes() == (tmp_path / "found.json").read_bytes()
+    assert "RECALIBRATE" in capsys.readouterr().out
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        panel.start()  # the file is there now
+    assert "exists" in panel.words.toPlainText()
+    assert not panel.files
+
+
+def test_a_task_waits_ends_and_keeps_what_it_can(qtbot: QtBot, panel: TasksPanel) -> None:
+    counted, go = [0], threading.Event()
+
+    def counts(desk: Desk) -> Done:
+        with desk.interruptible() as cancel, desk.step("counting", 10) as advance:
+            go.wait(WAIT_MS / 1e3)
+            while not cancel.is_set():
+                counted[0] += 1
+                advance(counted[0])
+        return Done(kept="ended: kept")
+
+    run = panel.run
+    run.start("Counting", counts)
+    qtbot.waitUntil(lambda: run._desk is not None, timeout=WAIT_MS)
+    run.pause()
+    go.set()
+    qtbot.waitUntil(lambda: counted[0] == 1, timeout=WAIT_MS)
+    with qtbot.waitSignal(run.looked, check_params_cb=lambda now: now.paused, timeout=WAIT_MS):
+        pass
+    assert counted[0] == 1
+    with qtbot.waitSignal(run.succeeded, timeout=WAIT_MS) as ended:
+        run.abort()  # which lets it go on, to its end
+    assert ended.args[0].kept
+
+    def hard(desk: Desk) -> Done:
+        with desk.step("counting") as advance:
+            while True:
+                advance(1)
+
+    run.start("Counting", hard)
+    qtbot.waitUntil(lambda: run._desk is not None, timeout=WAIT_MS)
+    with qtbot.waitSignal(run.ended_early, timeout=WAIT_MS):
+        run.abort()
+    assert issubclass(JobCancelledError, KeyboardInterrupt)  # what a task in the terminal sees

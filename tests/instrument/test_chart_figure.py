@@ -1,0 +1,58 @@
+"""A chart's picture has a dozen lines at most, named apart from each other, and what lies on the front."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from instrument.evaluation.chart import ChartData, colours_of
+from instrument.evaluation.chart_figure import MOST_LINES, chart_figure, chosen, draw_chart
+from recon.evaluation.scored import KINDS, SECONDS, Point, pareto
+
+SCORE = KINDS["reconstruction"].scores[0]
+
+
+def _points(settings: int) -> tuple[Point, ...]:
+    """Settings of four families, the later ones slower and, but for one in three, better."""
+    return tuple(
+        Point(
+            f"solver{n % 4} convolution p{n}",
+            count,
+            1e-3 * (n + 1) * count,
+            psnr_db=15 + 4 * np.log10(count) + n * (n % 3 > 0) / 4,
+            peak_mib=1.0 + n,
+            family=f"solver{n % 4} convolution",
+        )
+        for n in range(settings)
+        for count in (3, 10, 30)
+    )
+
+
+def test_a_dozen_lines_hold_the_front_and_the_best_of_each_family() -> None:
+    points = _points(40)
+    runs = {
+        name: [p for p in points if p.setting == name] for name in dict.fromkeys(p.setting for p in points)
+    }
+    front = pareto(points, SCORE)
+    shown = chosen(runs, front, SCORE)
+    assert len(shown) == MOST_LINES
+    assert {runs[name][0].family for name in shown} == {p.family for p in points}
+    best = max(points, key=lambda p: p.psnr_db).setting
+    assert shown[0] == best
+    few = chosen(dict(list(runs.items())[:5]), [], SCORE)
+    assert len(few) == 5
+
+
+def test_names_stand_apart_beside_the_panel_and_say_what_the_front_costs() -> None:
+    data = ChartData("reconstruction", {"simulated": True}, _points(40), {}, ())
+    axes = Figure().subplots()
+    shown = draw_chart(axes, data.points, SECONDS, SCORE, colours_of(data))
+    names = list(axes.texts)
+    assert len(names) == len(shown) == MOST_LINES
+    heights = sorted(text.get_position()[1] for text in names)
+    assert np.diff(heights).min() > 0.06
+    assert not any("convolution" in text.get_text() for text in names)  # what all have in common is not said
+    bold = [text.get_text() for text in names if text.get_fontweight() == "bold"]
+    assert bold
+    assert all(text.endswith(("ms", " s")) for text in bold)
+    assert len(chart_figure(data).axes) == 2

@@ -1,0 +1,76 @@
+"""Volumes on voxels of one size: beads at their places, light that stays, and grids that cannot be."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.camera.grid import Grid, metric_grid, metric_volume
+from recon.errors import InputError
+
+Z_UM = 1 / np.linspace(1 / 9000, 1 / 15000, 7)
+GRID = Grid((7, 90, 110), (40, 60), Z_UM, 2e-3 * Z_UM, None, np.linspace((30.0, -80.0), (60.0, 120.0), 7))
+
+
+def _middle(volume, grid):
+    """Where the light of a volume lies, (x, y, z), and how much there is."""
+    total = volume.sum(dtype=float)
+    z, y, x = (np.average(np.arange(n), weights=volume.sum(axis=tuple({0, 1, 2} - {axis})))
+               for axis, n in enumerate(volume.shape))  # fmt: skip
+    assert grid.upright
+    x_um, y_um, _ = grid.place_um(0, y, x)
+    return np.array([x_um, y_um, grid.z_um[0] + z * grid.spacing_um[0]]), total
+
+
+@pytest.mark.parametrize("voxel_um", [None, 28.0, 60.0])
+@pytest.mark.parametrize("order", [1, -1])
+def test_beads_come_out_at_their_places_with_their_light(voxel_um, order):
+    grid = replace(GRID, z_um=Z_UM[::order], pitch_um=2e-3 * Z_UM[::order], axis_um=GRID.axis_um[::order])
+    rng = np.random.default_rng(0)
+    for _ in range(2):
+        z, row, column = rng.integers(1, 6), *rng.integers(10, 80, 2)
+        volume = np.zeros(GRID.shape, np.float32)
+        volume[z, row, column] = 5
+        metric, placed = metric_volume(volume, grid, voxel_um)
+        (x, y, depth), light = _middle(metric, placed)
+        expected = grid.place_um(z, row, column)
+        largest = max(placed.pitch_um[0], grid.pitch_um[z])
+        assert np.abs(np.array([x, y]) - expected[:2]).max() < largest / 2
+        assert abs(depth - expected[2]) < max(placed.spacing_um[0], grid.spacing_um[z]) / 2
+        assert light == pytest.approx(5, rel=0.1)
+
+
+def test_an_even_glow_is_even_and_colours_stay_apart():
+    """As much light a cubic micrometre everywhere is as much a voxel: wide voxels of far planes hold more."""
+    size = GRID.pitch_um**2 * np.gradient(Z_UM)
+    glow = np.broadcast_to(size[:, None, None, None].astype(np.float32), (*GRID.shape, 2)).copy()
+    glow[..., 1] *= 3
+    metric, placed = metric_volume(glow, GRID)
+    assert placed.is_metric
+    assert not GRID.is_metric
+    inside = metric[1:-1, 30:-40, 40:-40, 0]
+    assert np.ptp(inside) < 0.1 * inside.mean()
+    np.testing.assert_allclose(metric[..., 1], 3 * metric[..., 0], rtol=1e-5)
+    assert metric[0, 0, 0, 0] == 0  # beside what the nearest plane shows
+
+
+def test_equal_voxels_stay_as_they_are():
+    even = Grid((4, 9, 7), (4, 3), np.arange(4) * 50.0 + 1000, np.full(4, 5.0), upright=True)
+    volume = np.random.default_rng(1).random(even.shape, np.float32)
+    metric, placed = metric_volume(volume, even)
+    np.testing.assert_allclose(metric, volume, rtol=1e-5)
+    assert placed.place_um(2, 1, 6) == even.place_um(2, 1, 6)
+
+
+@pytest.mark.parametrize(
+    ("grid", "voxel_um", "words"),
+    [
+        (replace(GRID, pitch_um=np.full(7, np.nan)), None, "are not known"),
+        (replace(GRID, z_um=np.r_[Z_UM[:6], Z_UM[5]]), None, "same depth"),
+        (Grid((1, 9, 9), (4, 4), Z_UM[:1], Z_UM[:1]), None, "one plane"),
+        (GRID, -3.0, "above 0"),
+    ],
+)
+def test_what_cannot_be_brought_to_equal_voxels_is_refused(grid, voxel_um, words):
+    with pytest.raises(InputError, match=words):
+        metric_grid(grid, voxel_um)
