@@ -171,7 +171,7 @@ class DisplayWorld(Surroundings):
     def _modulation(self, slm: DisplaySlm) -> tuple[Image, Image]:
         """Return the phase that light gains at each pixel, and the part of its amplitude that returns."""
         if self.options.mirrors:
-            return np.zeros(slm.shape, np.float32), slm.displayed / np.float32(255)
+            return np.zeros(slm.shape, np.float32), (slm.displayed / 255).astype(np.float32)
         phase = slm.phase_rad
         lost = self.options.amplitude_swing * np.sin(phase / 2) ** 2
         return phase, (1 - lost).astype(np.float32)
