@@ -10,7 +10,7 @@ import traceback
 from pathlib import Path
 from types import FrameType, TracebackType
 
-from PySide6.QtCore import QCoreApplication, QSettings, QTimer
+from PySide6.QtCore import QCoreApplication, QSettings, QSize, QTimer
 from PySide6.QtWidgets import QApplication
 
 from gui.main_window import MainWindow, theme_of
@@ -21,6 +21,8 @@ from instrument.bench.config import BenchConfig
 from instrument.bench.config_file import no_bench
 from instrument.files.errors import BenchError, in_words
 
+_FRAME = QSize(16, 40)
+"""What a window manager puts round a window, at most: the first window fits the screen with it."""
 _SIGNAL_CHECK_MS = 200
 """Python sees signals only while it runs: an idle event loop has to be woken for them."""
 
@@ -68,7 +70,7 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
             before[number] = signal.signal(number, end)
     try:
-        window = MainWindow(session, settings, app.primaryScreen().availableSize())
+        window = MainWindow(session, settings, app.primaryScreen().availableSize() - _FRAME)
         window.show()
         app.processEvents()  # the first sight of it, before there is anything to stop
         # What stays is not looked through for garbage again and again, 0.1 s during which nothing answers.

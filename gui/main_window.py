@@ -17,10 +17,10 @@ from PySide6.QtWidgets import (
     QProgressBar,
     QSizePolicy,
     QToolBar,
-    QToolButton,
     QWidget,
 )
 
+from gui.help import help_of
 from gui.jobs import Job
 from gui.making import PanelMaker
 from gui.panel import Panel
@@ -28,9 +28,9 @@ from gui.panels import PANELS
 from gui.panels.unserved import UnservedPanel
 from gui.session import BenchSession
 from gui.session_news import OperatorRequest, name_of
-from gui.theme import THEMES, apply_theme, colours
-from gui.way_on import ReconnectButton
-from gui.widgets.building import PanelPlace, button, fill, label, tabs
+from gui.theme import THEMES, apply_theme
+from gui.widgets.building import PanelPlace, button, label, tabs
+from gui.widgets.device_chips import DeviceChips
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.plots import restyle_all
@@ -51,47 +51,6 @@ _ROOMY = QSize(1500, 860)
 _COMPACT_PX = 480
 """Width of the panels at the right of a small screen."""
 _BY_HAND, _BREAKS_OFF = QMessageBox.Icon.Information, QMessageBox.Icon.Warning
-
-
-class DeviceChips(QWidget):
-    """One chip a device; a click shows all about it, "Reconnect" appears where one has failed."""
-
-    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
-        super().__init__(parent)
-        self._session = session
-        self.chips: dict[str, QToolButton] = {}
-        self.reconnect_buttons: dict[str, ReconnectButton] = {}
-        for kind in session.kinds:
-            chip = QToolButton()
-            chip.setAutoRaise(True)
-            chip.clicked.connect(partial(self._show_all, kind))
-            again = ReconnectButton(session, kind, self, "Reconnect")
-            self.chips[kind], self.reconnect_buttons[kind] = chip, again
-            self.show_state(kind)
-        pairs = zip(self.chips.values(), self.reconnect_buttons.values(), strict=True)
-        shown: list[QWidget] = [widget for pair in pairs for widget in pair]
-        fill(self, *(shown or [label("No bench is open")]), across=True, spacing=4)
-        session.device_changed.connect(self.show_state)
-
-    def show_state(self, kind: str) -> None:
-        """Show how a device is doing now."""
-        state = self._session.state(kind)
-        now = colours()
-        colour = {"open": now.ok, "failed": now.error, "opening": now.warning}.get(state.condition, now.dim)
-        chip = self.chips[kind]
-        word = {"open": "", "opening": " …", "failed": " failed", "closed": " closed"}[state.condition]
-        chip.setText(f"● {name_of(kind)}{word}")
-        chip.setStyleSheet(f"color: {colour}; border: none; padding: 2px 4px;")
-        chip.setToolTip(state.text or state.condition)
-
-    def restyle(self) -> None:
-        """Take over the colours of the theme in use."""
-        for kind in self.chips:
-            self.show_state(kind)
-
-    def _show_all(self, kind: str) -> None:
-        state = self._session.state(kind)
-        TextWindow(name_of(kind), state.text or state.condition, self).show()
 
 
 class MainWindow(QMainWindow):
@@ -253,9 +212,14 @@ class MainWindow(QMainWindow):
         self._simulated_action = bar.addWidget(self.simulated)
         self.chips = DeviceChips(self.session)
         bar.addWidget(self.chips)
-        stretch = QWidget()
-        stretch.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Preferred)
-        bar.addWidget(stretch)
+        self.strip = StepStrip(self.session)
+        self.strip.wanted.connect(self._take_step)
+        if self._compact:
+            bar.addWidget(self.strip)
+        else:
+            stretch = QWidget()
+            stretch.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Preferred)
+            bar.addWidget(stretch)
         tip = "Halt all motion, turn the light off, end what runs (Esc)"
         self.stop_button = button("STOP", tip, self.session.stop)
         self.stop_button.setObjectName("stop")
@@ -263,8 +227,8 @@ class MainWindow(QMainWindow):
         bar.addWidget(self.stop_button)
         bar.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
         self.addToolBar(Qt.ToolBarArea.TopToolBarArea, bar)
-        self.strip = StepStrip(self.session)
-        self.strip.wanted.connect(self._take_step)
+        if self._compact:
+            return
         below = QToolBar("What comes next")
         below.setObjectName("next-bar")
         below.setMovable(False)
@@ -307,6 +271,20 @@ class MainWindow(QMainWindow):
             self._add_action(bench, f"Reconnect the {name_of(kind)}", "", reconnect)
         bench.addSeparator()
         self._add_action(bench, "&Quit", "Ctrl+Q", self.close)
+        about = self.menuBar().addMenu("&Help")
+        self._add_action(about, "&This panel, and all keys", "F1", self.show_help)
+
+    def show_help(self) -> TextWindow:
+        """Show what the panel that has the keyboard is for, and every key."""
+        focused = QApplication.focusWidget()
+        current = self.tabs.currentWidget()
+        shown = [name for name, panel in self._panels.items() if focused and panel.isAncestorOf(focused)]
+        shown += [name for name, place in self._places.items() if place is current and name in self._panels]
+        name = next(iter(shown), "start")
+        actions = [action for menu in self.menuBar().actions() for action in menu.menu().actions()]  # type: ignore[attr-defined]
+        window = TextWindow("Help", help_of(name, self.panel(name), focused, actions), self)
+        window.show()
+        return window
 
     def _add_action(self, menu: QMenu, words: str, keys: str, call: Callable[[], object]) -> QAction:
         action = QAction(words, self)

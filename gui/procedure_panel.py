@@ -16,12 +16,13 @@ from gui.background import NewestOnly
 from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
+from gui.panels.unserved import why_not
 from gui.procedure_run import Ended, ProcedureRun, RunBar, Situation, script
 from gui.session import BenchSession
 from gui.session_news import name_of
 from gui.way_on import WayOn
 from gui.widgets.building import after_rest, button, choice, fill, label, mark, scrolled, split, text_view
-from instrument.bench.config_file import other_bench_for
+from instrument.bench.config_file import TEMPLATES
 from instrument.files.errors import BenchError, SettingsError, count, duration, size
 
 _CHECK_MS = 250
@@ -97,6 +98,9 @@ class ProcedurePanel(Panel):
         tip = "Take what was measured to where it is used"
         self.use_button = button(self.use_words, tip, self._use)
         self.use_button.hide()
+        tip = "A simulated bench that serves this routine, in the place of this one"
+        self.other_button = button("", tip, self._open_other)
+        self.other_button.hide()
         self.way_on = WayOn(self.session, self)
         self.way_on.go_on.connect(self.resume)
         self._left = NewestOnly(self.jobs, "Looking for runs that did not end")
@@ -111,6 +115,7 @@ class ProcedurePanel(Panel):
             self.run_bar,
             self.use_button,
             self.way_on,
+            self.other_button,
             margins=(0, 0, 6, 0),
         )
         yield
@@ -184,14 +189,17 @@ class ProcedurePanel(Panel):
         self.outlook, self._unchecked = None, False
         needed = () if self._with_files else ("camera", *self.routine.needs)
         missing = [kind for kind in needed if not self.session.is_open(kind)]
+        unserved = why_not(self.session, self.routine.title, needed, self.routine.tried_on)
+        self.other_button.setVisible(bool(unserved))
+        if unserved:
+            self.other_button.setText(f"Open the simulated {TEMPLATES[self.routine.tried_on][0]}")
+            self._say(unserved, wrong=True)
+            self.run_bar.set_startable("It takes another bench.")
+            return
         if missing:
             names = " and ".join(map(name_of, missing))
-            self._say(f"The bench has no {names} that is open.", wrong=True)
+            self._say(f"The {names} of this bench must be open.", wrong=True)
             self.run_bar.set_startable("Not all devices are open.")
-            return
-        if needed and (wrong := other_bench_for(self.session.config, needed, self.routine.tried_on)):
-            self._say(wrong, wrong=True)
-            self.run_bar.set_startable("It takes another bench.")
             return
         bench, routine = self.session.bench, self.routine
         first = routine.start if routine.name not in self._started else None
@@ -259,6 +267,9 @@ class ProcedurePanel(Panel):
             return
         self.accepted()
         self.use_button.hide()
+        tip = "A simulated bench that serves this routine, in the place of this one"
+        self.other_button = button("", tip, self._open_other)
+        self.other_button.hide()
         self.way_on.offer(None)
         self._left.forget()
         self._said_at_end = ""
@@ -340,6 +351,9 @@ class ProcedurePanel(Panel):
     def _job_ended(self, job: Job) -> None:
         if self._unchecked and job.lanes:
             self._rest.start()
+
+    def _open_other(self) -> None:
+        self.session.handed_on.emit("start", self.routine.tried_on)
 
     def _use(self) -> None:
         self.session.handed_on.emit(self.handed_to, self._result)

@@ -15,12 +15,13 @@ from PySide6.QtCore import QObject, Qt, QTimer, Signal
 
 from drivers.camera import Camera
 from drivers.errors import DeviceError, LimitError, StoppedError
-from drivers.frame import Frame
+from drivers.frame import Frame, FrameMetadata
 from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, joined, words_for
 from gui.session_news import DeviceState, LogBridge, OperatorRequest, is_gone, name_of
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig, Kind
 from instrument.bench.photograph import LightState, switch_light
+from instrument.live.light_log import LightLog, light_words
 from instrument.live.live_camera import LiveCamera
 
 Level = Literal["debug", "info", "warning", "error"]
@@ -78,6 +79,7 @@ class BenchSession(QObject):
         self.config = config
         self.bench = Bench(config, self._ask)
         self.live = LiveCamera(self.bench.camera if config.devices else None)
+        self.lights = LightLog(partial(light_words, self.bench))
         self.jobs = JobRunner(self)
         self.jobs.job_ended.connect(self._job_ended)
         self._states: dict[str, DeviceState] = {kind: DeviceState("closed") for kind in self.bench.devices}
@@ -235,7 +237,18 @@ class BenchSession(QObject):
 
         return self.jobs.exclusive(title, alone)
 
+    def describe_frame(self, frame: FrameMetadata) -> str:
+        """Return when a frame came, how long it was exposed, what was lit, and whether it is simulated."""
+        lit = self.lights.during(frame)
+        words = [
+            f"{frame.utc.astimezone():%H:%M:%S}",
+            f"{frame.exposure_ms:.4g} ms",
+            f"light: {lit or frame.led_pattern or 'not known'}",
+        ]
+        return ", ".join([*words, "SIMULATED"] if self.state("camera").simulated else words)
+
     def _job_ended(self, job: Job) -> None:
+        self.lights.note()
         if job.error is not None:
             self._note_error(job)
         elif job.lanes and not job.quiet:

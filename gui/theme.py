@@ -196,6 +196,8 @@ QComboBox QAbstractItemView {{ border: 1px solid {c.border}; padding: 0; }}
 QGraphicsView {{ border: 1px solid transparent; }}
 QGraphicsView:focus {{ border: 1px solid {c.accent}; }}
 *[refused="true"] {{ border: 2px solid {c.error}; color: {c.error}; font-weight: 700; }}
+QLabel[warns="warning"] {{ color: {c.warning}; font-weight: 700; }}
+QLabel[warns="error"] {{ color: {c.error}; font-weight: 700; }}
 QLabel#reason {{ color: {c.error}; font-size: {SMALL_PT}pt; }}
 QLabel#refusal {{ color: {c.warning}; }}
 QLabel#dim, QLabel[role="dim"] {{ color: {c.dim}; }}
@@ -227,6 +229,7 @@ QPushButton#primary:focus {{ border: 2px solid {c.text}; padding: 3px 12px; }}
 QPushButton#primary:disabled {{ background: {c.field}; color: {unused}; border-color: {c.line}; }}
 QLabel#simulated, QLabel#caution {{ background: {c.badge}; color: {c.badge_text}; font-weight: 800;
   border: 1px solid {c.warning}; padding: 3px 10px; border-radius: 4px; letter-spacing: 1px; }}
+QLabel#caption {{ background: {c.panel}; color: {c.text}; padding: 2px 8px; border-radius: 4px; }}
 QFrame#jog-pad {{ background: {c.field}; border: 1px dashed {c.border}; border-radius: 5px; }}
 QFrame#jog-pad[active="true"] {{ border: 2px solid {c.accent}; }}
 QFrame#strip {{ background: {c.panel}; border-bottom: 1px solid {c.line}; }}

@@ -227,6 +227,9 @@ class HologramsPanel(Panel):
             return compute(order, config, size, context, write=not preview)
 
         job = self._started(self.follow(self.jobs.compute(title, work)))
+        self.views.begin()
+        for early in (job.failed, job.cancelled):
+            early.connect(lambda _: self.views.go_back())
         job.progressed.connect(self._progressed)
         job.succeeded.connect(self._computed)
         return job

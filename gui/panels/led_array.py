@@ -55,6 +55,7 @@ class LedPanel(DevicePanel):
         self.brightness = QSlider(Qt.Orientation.Horizontal)
         self.brightness.setRange(1, 255)
         self.brightness.setValue(255)
+        self.brightness.setAccessibleName("Brightness")
         self.brightness.setToolTip("Brightness of the LEDs that are lit, and of those lit next: 1 to 255")
         self._rest = after_rest(self, _REST_MS, self.dim)
         session.stop_pressed.connect(self._rest.stop)  # what was pulled before STOP lights nothing after it

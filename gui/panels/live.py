@@ -25,6 +25,7 @@ from instrument.bench.photograph import (
     photograph_name,
     write_snapshot,
 )
+from instrument.files.errors import duration
 from instrument.live.frame_view import sensor_roi
 from instrument.live.live_camera import LiveCameraStatus
 from recon.base.declare import Imports, expression
@@ -140,6 +141,7 @@ class LivePanel(Panel):
     # Frames --------------------------------------------------------------------------------------
     def look(self) -> None:
         """Show the newest frame, if it is another than the one shown."""
+        self.session.lights.note()
         if not self.isVisible():
             return
         if self._shown_at and time.monotonic() - self._shown_at[-1] < _LEAST_GAP_S:
@@ -154,6 +156,8 @@ class LivePanel(Panel):
             self.count()
             self._light_the_scene()
         self.picture.show_frame(frame)
+        self.picture.view.set_caption(self._caption(frame))
+        self.picture.view.caution_against("")
         self.under_mouse.setText(self.picture.view.under_mouse())
 
     @property
@@ -168,10 +172,26 @@ class LivePanel(Panel):
             return
         self._show_light()
         frame = self.picture.frame
+        if frame is not None:
+            self._judge_age(frame)
         if self._waits() or frame is None:
             return
         self.picture.measure()
         self.status.setText(self._figures(frame))
+
+    def _caption(self, frame: Frame) -> str:
+        """Say when a frame came, what lit it, and which job took it."""
+        holder = self.session.jobs.exclusive_job
+        by = f", taken by: {holder.title}" if holder is not None else ""
+        return self.session.describe_frame(frame.metadata) + by
+
+    def _judge_age(self, frame: Frame) -> None:
+        """Veil a picture that is not of now, and say since when."""
+        age_s = (time.monotonic_ns() - frame.metadata.host_time_ns) / 1e9
+        if age_s < _PATIENCE_S + 3e-3 * frame.metadata.exposure_ms:
+            return
+        since = "Held" if not self.session.live_wanted else "Old picture, no other has come"
+        self.picture.view.caution_against(f"{since} for {duration(age_s)}", old=self.session.live_wanted)
 
     def _waits(self) -> bool:
         """Tell where no frame comes although the camera runs, and for how long; return whether it is so."""

@@ -13,17 +13,19 @@ import numpy.typing as npt
 from PySide6.QtGui import QHideEvent
 from PySide6.QtWidgets import QComboBox, QWidget
 
+from drivers.frame import FrameMetadata
 from gui.background import LiveFollower, NewestOnly
 from gui.forms.options_form import FOLDED, OptionsForm
 from gui.jobs import Job, JobContext
 from gui.panel import Panel, on_bench
 from gui.session import BenchSession
-from gui.widgets.building import button, choice, every, fill, in_row, label, offer, scrolled
+from gui.widgets.building import Hint, button, choice, every, fill, in_row, label, offer, scrolled
 from gui.widgets.dialogues import elided, path_field
 from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.files.errors import BenchError, duration
+from instrument.live.light_log import NOTHING_LIT
 from instrument.live.live import LiveResult
 from instrument.reconstruction.job import find_calibration
 from recon.base.declare import Imports, expression, options_of
@@ -115,10 +117,15 @@ class LiveReconstructionPanel(Panel):
         self.options_button = button("Options", tip, checkable=True)
         self.options_button.toggled.connect(folded.setVisible)
         self.status = label(_NO_CALIBRATION, "dim", wraps=True)
+        self.hint = Hint(
+            "No calibration yet: with one, what the camera sees becomes a picture as it comes.",
+            "Calibrate…",
+            lambda: session.handed_on.emit("sweeps", ""),
+        )
         first = in_row((self.file, 1), self.browse_button, self.plane)
         switches = (self.run_button, self.refine_button, self.options_button)
         second = in_row(*switches, None, label("within"), self.budget)
-        fill(self.body, first, (self.view, 1), self.status, second, (folded, 1))
+        fill(self.body, first, (self.view, 1), (self.hint, 1), self.status, second, (folded, 1))
         session.run_finished.connect(self._run_finished)
         self._timer = every(self, _LOOK_MS, self.look)
         folder = session.runs_folder
@@ -200,6 +207,7 @@ class LiveReconstructionPanel(Panel):
         job = self.session.jobs.compute("Preparing the preview", work)
         job.quiet = True
         self._loading = job
+        self._call_old("another preview is being prepared")
         job.succeeded.connect(lambda value: self._ready(job, value))
         job.failed.connect(lambda why: self._not_ready(job, why))
         job.ended.connect(lambda: self._not_loading(job))
@@ -255,6 +263,8 @@ class LiveReconstructionPanel(Panel):
     # Pictures ------------------------------------------------------------------------------------
     def look(self) -> None:
         """Show the newest picture, if it is another than the one shown."""
+        self.hint.setVisible(self.loaded is None)
+        self.view.setVisible(self.loaded is not None)
         runs = self.run_button.isChecked() and self._refining is None and self._loading is None
         if runs and self.isVisible():
             self.follower.follow()
@@ -277,14 +287,27 @@ class LiveReconstructionPanel(Panel):
         self._log_new(() if how is None else how.warnings)
         rate = "" if how is None or not how.pictures_per_s > 0 else f", {how.pictures_per_s:.1f} pictures/s"
         passed = "" if how is None else f", {how.passed_over} frames passed over"
-        self.view.caution_against(result.picture.doubt)
+        self.view.caution_against(self._doubt(result))
+        self.view.set_caption(self._caption(result.metadata))
         self.status.setText(f"latency {result.latency_ms:.0f} ms{rate}{passed}\n{result.picture.quality}")
 
     def _call_old(self, why: str) -> None:
         """Say over the picture that it stays while no other comes: of frames, or of the preview."""
         if self._shown is not None:
-            doubt = self._shown.picture.doubt
-            self.view.caution_against(". ".join(filter(None, (f"Old picture: {why}", doubt))))
+            doubt = self._doubt(self._shown)
+            self.view.caution_against(". ".join(filter(None, (f"Old picture: {why}", doubt))), old=True)
+
+    def _doubt(self, result: LiveResult) -> str:
+        """Return what is doubtful about a picture: by its pixels, and by what lit its frame."""
+        lit = self.session.lights.during(result.metadata)
+        if lit == NOTHING_LIT and not result.picture.doubt:
+            return "Its frame was taken with nothing lit"
+        return result.picture.doubt
+
+    def _caption(self, frame: FrameMetadata) -> str:
+        """Say of which frame a picture is, and with which calibration it was made."""
+        made = "" if self.loaded is None else f", calibration: {self.loaded.path.parent.name}"
+        return self.session.describe_frame(frame) + made
 
     def _log_new(self, warnings: tuple[str, ...]) -> None:
         """Write each warning into the log once."""
@@ -346,10 +369,14 @@ class LiveReconstructionPanel(Panel):
         job = self.session.jobs.compute("Refining the newest frame", work)
         self._refining = job
         self.refine_button.setText("■ End")
-        self.view.caution_against("" if self._shown is None else self._shown.picture.doubt)
+        self.view.caution_against(
+            f"In the making, from the frame of {frame.metadata.utc.astimezone():%H:%M:%S}"
+        )
+        self.view.set_caption(self._caption(frame.metadata))
         self.status.setText(f"Refining frame {frame.metadata.frame_id} …")
         job.progressed.connect(self._refined_so_far)
         job.succeeded.connect(self._refined)
+        job.succeeded.connect(lambda _: self.view.caution_against(self._refined_doubt(frame.metadata)))
         job.failed.connect(lambda why: self.refused(None, why))
         job.ended.connect(self._refining_ended)
 
@@ -367,6 +394,15 @@ class LiveReconstructionPanel(Panel):
             self.status,
             f"Refined: {result.solver} with {result.prior}, {len(result.history)} iterations, "
             f"{result.seconds:.1f} s, {result.stop_reason}. {' '.join(result.warnings)}",
+        )
+
+    def _refined_doubt(self, frame: FrameMetadata) -> str:
+        """Return what was doubtful about the frame that was refined, as its preview had it."""
+        shown = self._shown
+        if shown is not None and shown.metadata.frame_id == frame.frame_id:
+            return self._doubt(shown)
+        return (
+            "Its frame was taken with nothing lit" if self.session.lights.during(frame) == NOTHING_LIT else ""
         )
 
     def _refining_ended(self) -> None:

@@ -20,7 +20,7 @@ from gui.panel import Panel
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
 from gui.theme import as_shown
-from gui.widgets.building import button, fill, in_row, label, split, tabs
+from gui.widgets.building import Hint, button, fill, in_row, label, split, tabs
 from gui.widgets.dialogues import Question, choose_path
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
@@ -59,6 +59,7 @@ class ReconstructionsPanel(Panel):
         """Make the widgets."""
         session = self.session
         self.list = QListWidget()
+        self.list.setAccessibleName("Reconstructions")
         self.list.setToolTip("Reconstructions in the data folder, the newest first (Enter opens)")
         self.list.setAlternatingRowColors(True)
         self.list.itemActivated.connect(self._open_item)
@@ -89,10 +90,13 @@ class ReconstructionsPanel(Panel):
         self.place.setMinimumWidth(10)
         for hovered in (self.picture.hovered, self.volume.hovered):
             hovered.connect(self.place.setText)
-        empty = label("Open a result on the left, or reconstruct one.", "dim")
-        empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self.empty = Hint(
+            "Nothing is open: choose a result on the left, or reconstruct a photograph.",
+            "Reconstruct…",
+            lambda: self.tabs.setCurrentWidget(self.form),
+        )
         self.viewers = QStackedWidget()
-        for widget in (empty, self.picture, self.volume):
+        for widget in (self.empty, self.picture, self.volume):
             self.viewers.addWidget(widget)
         yield from self._arrange()
         session.run_finished.connect(lambda _: self.refresh())
@@ -301,11 +305,29 @@ class ReconstructionsPanel(Panel):
         self.job = job = self.jobs.compute(f"Reconstructing {request.image.name}", do)
         self._begun(job, "Reading …")
         self._close_result()
+        self._show_nothing(f"{request.image.name} is being read …")
         self._opening, self._first_picture = None, True
         self.heading.setText(f"<b>{request.image.name}</b>: in the making")
         job.progressed.connect(lambda so_far: self._progressed(so_far, volume=volume))
         job.succeeded.connect(self._reconstructed)
+        for ended, words in ((job.failed, "failed"), (job.cancelled, "stopped")):
+            ended.connect(lambda _, words=words: self._not_reconstructed(request.image.name, words))
         return job
+
+    def _show_nothing(self, words: str) -> None:
+        """Take what was shown of another result away."""
+        self.empty.say(words)
+        self.viewers.setCurrentWidget(self.empty)
+        self.place.clear()
+        self.facts.show_facts([])
+        self.convergence.show_histories((), None)
+
+    def _not_reconstructed(self, name: str, words: str) -> None:
+        """Say over what there is that it did not become a result."""
+        if self.result is None and self._opening is None:
+            self.heading.setText(f"<b>{name}</b>: {words}, nothing was written")
+            if self.viewers.currentWidget() is self.empty:
+                self._show_nothing(f"{name}: {words}. The form says why.")
 
     def explain(self) -> Job | None:
         """Say what the model ``auto`` would choose for the form, and why; nothing is reconstructed."""

@@ -20,6 +20,7 @@ from gui.panel import Panel
 from gui.procedure_run import ProcedureRun, RunBar, script
 from gui.session import BenchSession
 from gui.widgets.building import (
+    Hint,
     after_rest,
     button,
     cell,
@@ -33,6 +34,7 @@ from gui.widgets.building import (
 )
 from gui.widgets.image_view import ImageView, usual_levels
 from instrument.bench.photograph import Progress
+from instrument.files.errors import count
 from instrument.runs.inspection import RunSummary, Verification, run_paths, summary, verify
 from instrument.runs.run import Run, RunCondition
 from recon.base.declare import Imports, expression
@@ -81,8 +83,13 @@ class RunsPanel(Panel):
         self._wanted: Path | None = None
         self._make_list()
         self._make_details()
-        left = fill(QWidget(), self.where, (self.table, 1), margins=(0, 0, 6, 0))
-        foot = in_row((self.bar, 1), in_column(self.use_button, self.verify_button, self.folder_button, None))
+        left = fill(QWidget(), self.where, (self.table, 1), (self.hint, 1), margins=(0, 0, 6, 0))
+        foot = in_row(
+            (self.bar, 1),
+            in_column(
+                self.use_button, self.play_button, self.export_button, self.verify_button, self.folder_button
+            ),
+        )
         top = fill(QWidget(), (self.view, 1), self.slider, self.frame_words, margins=(6, 0, 0, 0))
         below = fill(QWidget(), (self.about, 1), foot, margins=(6, 0, 0, 0))
         right = split(top, below, sizes=[480, 260], down=True)
@@ -135,6 +142,8 @@ class RunsPanel(Panel):
         self.folder_button.setEnabled(True)
         self.verify_button.setEnabled(True)
         self.use_button.setEnabled(opened.is_usable)
+        self.play_button.setEnabled(opened.run.plan is None and bool(opened.stored))
+        self.export_button.setEnabled(bool(opened.stored))
         self._show_frame(middle)
 
     def as_python(self) -> str:
@@ -178,7 +187,13 @@ class RunsPanel(Panel):
         self.table.setTextElideMode(Qt.TextElideMode.ElideMiddle)
         self.table.verticalHeader().hide()
         self.table.currentCellChanged.connect(lambda row, *_: self._row_chosen(row))
-        self.where = label(role="dim", selectable=True, wraps=True)
+        self.where = label(role="dim", selectable=True, yields=True)
+        self.hint = Hint(
+            "No run yet: each calibration, plan and recording becomes one.",
+            "Calibrate…",
+            lambda: self.session.handed_on.emit("sweeps", ""),
+        )
+        self.hint.hide()
 
     def _make_details(self) -> None:
         self.view = ImageView()
@@ -188,6 +203,7 @@ class RunsPanel(Panel):
         self.slider.valueChanged.connect(self._show_frame)
         self.frame_words = label(role="dim", yields=True)
         self.about = text_view("Click a run to open it.")
+        self.about.setAccessibleName("About the run")
         self.bar = RunBar(self.run, "Resume")
         self.bar.set_startable("No run is open.")
         self.bar.start.connect(self.resume)
@@ -195,6 +211,10 @@ class RunsPanel(Panel):
         self.folder_button = button("Open folder", tip, self._open_folder, enabled=False)
         tip = "Reconstruct photographs with this run's calibration"
         self.use_button = button("Reconstruct with it…", tip, self._use, enabled=False)
+        tip = "Play it as a film, follow regions, reconstruct it as a video"
+        self.play_button = button("Play as a film…", tip, self._play, enabled=False)
+        tip = "Write frames for other programs: TIFF, HDF5, NumPy, PNG, MP4"
+        self.export_button = button("Export…", tip, self._export, enabled=False)
         tip = "Read every frame and hold it against its checksum; changes nothing"
         self.verify_button = button("Verify", tip, self._verify, enabled=False)
 
@@ -202,7 +222,11 @@ class RunsPanel(Panel):
     def _show_list(self, summaries: list[RunSummary]) -> None:
         wanted = self._wanted or self._opening or (self.opened and self.opened.path)
         self.summaries = summaries
-        self.where.setText(f"{self.session.runs_folder}: {len(summaries)} runs")
+        folder = self.session.runs_folder
+        self.where.setText(f"{count(len(summaries), 'run')} in {folder.name} of {folder.parent.name}")
+        self.where.setToolTip(str(folder))
+        self.hint.setVisible(not summaries)
+        self.table.setVisible(bool(summaries))
         paths = [listed.path for listed in summaries]
         chosen = paths.index(wanted) if wanted in paths else -1
         with QSignalBlocker(self.table):
@@ -244,7 +268,8 @@ class RunsPanel(Panel):
         self.bar.set_startable("No run is open.")
         self.folder_button.setEnabled(False)
         self.verify_button.setEnabled(False)
-        self.use_button.setEnabled(False)
+        for each in (self.use_button, self.play_button, self.export_button):
+            each.setEnabled(False)
 
     def _show_frame(self, number: int) -> None:
         run = self.opened
@@ -265,6 +290,14 @@ class RunsPanel(Panel):
     def _use(self) -> None:
         if self.opened is not None:
             self.session.handed_on.emit("reconstructions", self.opened.path / SWEEP.result)
+
+    def _play(self) -> None:
+        if self.opened is not None:
+            self.session.handed_on.emit("films", self.opened.path)
+
+    def _export(self) -> None:
+        if self.opened is not None:
+            self.session.handed_on.emit("tasks", ("export", {"run": self.opened.path}))
 
     def _verify(self) -> None:
         """Read every frame of the run that is shown; ends early where another run is opened."""
@@ -314,7 +347,12 @@ def _read_frame(run: Run, index: int) -> _Picture | str:
     except Exception as error:  # noqa: BLE001 - a damaged file is named, whatever it raises
         return str(error)
     low, high = usual_levels(image)
-    words = [f"Frame {index} of {run.n_frames}", f"{metadata.exposure_ms:.4g} ms", metadata.led_pattern or ""]
+    words = [
+        f"Frame {index} of {run.n_frames}",
+        f"{metadata.utc.astimezone():%Y-%m-%d %H:%M:%S}",
+        f"{metadata.exposure_ms:.4g} ms",
+        metadata.led_pattern or "",
+    ]
     place = ", ".join(_axis_words(axis, value) for axis, value in (metadata.stage_position or {}).items())
     return _Picture(
         image,

@@ -166,7 +166,7 @@ class SweepsPanel(ProcedurePanel):
         metadata = newest.metadata
         full_scale = (1 << metadata.significant_bits) - 1
         self._show_image(newest.image, full_scale)
-        words = [f"Last frame: {metadata.exposure_ms:.4g} ms", f"light {metadata.led_pattern or 'unknown'}"]
+        words = [f"Last frame: {self.session.describe_frame(metadata)}"]
         if metadata.saturated_fraction:
             pixels = round(metadata.saturated_fraction * newest.image.size)
             words.append(f"SATURATED: {count(max(pixels, 1), 'pixel')}")

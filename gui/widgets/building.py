@@ -166,8 +166,9 @@ class Hint(QWidget):
         fill(self, None, *parts, None, margins=(16, 8, 16, 8), spacing=10)
 
     def say(self, words: str) -> None:
-        """Say something else."""
+        """Say something else, to which nothing is to be done here."""
         self.words.setText(words)
+        self.button.hide()
 
 
 def label(
@@ -192,6 +193,7 @@ def choice(
     made = QComboBox()
     made.addItems(list(words))
     made.setToolTip(tip)
+    made.setAccessibleName(tip)
     if chosen is not None:
         made.currentIndexChanged.connect(chosen)
     return made
@@ -225,10 +227,11 @@ def text_view(text: str = "", tip: str = "") -> QPlainTextEdit:
     made = QPlainTextEdit(text)
     made.setReadOnly(True)
     made.setToolTip(tip)
+    made.setAccessibleName(tip or "Text")
     return made
 
 
-def mark(widget: QWidget, name: str, on: bool) -> None:
+def mark(widget: QWidget, name: str, on: bool | str) -> None:
     """Set a property that the style sheet looks at, such as ``refused``."""
     widget.setProperty(name, on)
     widget.style().unpolish(widget)
@@ -245,7 +248,9 @@ def table(
     made.setEditTriggers(QTableWidget.EditTrigger.NoEditTriggers)
     made.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
     made.setTabKeyNavigation(False)
+    made.setCornerButtonEnabled(False)
     made.setToolTip(tip)
+    made.setAccessibleName(tip or ", ".join(columns))
     made.verticalHeader().setDefaultSectionSize(row_px)
     header = made.horizontalHeader()
     header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)

@@ -128,6 +128,7 @@ def path_field(
     field = QLineEdit()
     field.setPlaceholderText(words)
     field.setToolTip(f"{tip}; Enter loads it")
+    field.setAccessibleName(words)
     field.returnPressed.connect(load)
 
     def chosen(path: Path) -> None:
@@ -137,7 +138,10 @@ def path_field(
     def choose() -> None:
         choose_path(field, browse, tip, field.text() or str(start or ""), chosen, filters)
 
-    return field, button("…", f"Choose a {'folder' if browse == 'folder' else 'file'}", choose)
+    what = f"Choose a {'folder' if browse == 'folder' else 'file'}"
+    browse_button = button("…", what, choose)
+    browse_button.setAccessibleName(f"{what}: {words}")
+    return field, browse_button
 
 
 _MOST_CHARACTERS = 220

@@ -109,6 +109,7 @@ class PathEntry(QWidget):
         self.button = QToolButton()
         self.button.setText("…")
         self.button.setToolTip("Choose")
+        self.button.setAccessibleName("Choose")
         self.button.clicked.connect(self._choose)
         fill(self, (entry, 1), self.button, across=True, spacing=3)
 
@@ -194,6 +195,7 @@ class NumberEdit(_Refusing):
         self._integer = integer
         self._tip = tip
         self._value = value
+        self.setAccessibleName(tip.partition("\n")[0] or "Number")  # a form's label takes its place
         self.setPlaceholderText(empty)
         self.setAlignment(Qt.AlignmentFlag.AlignRight)
         self.returnPressed.connect(self.submit)

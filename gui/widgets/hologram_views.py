@@ -276,6 +276,25 @@ class HologramViews(QWidget):
         both.setStretchFactor(0, 4)
         fill(self, both)
 
+    def begin(self) -> None:
+        """Call what is shown of the hologram before by its name, while another is computed."""
+        for view in (self.seen, self.captured):
+            view.caution_against("" if view.image is None else "Of the hologram before", old=True)
+        self.phase.caution_against("In the making")
+
+    def go_back(self) -> None:
+        """Show the hologram before again, where the other did not come about."""
+        for view in (self.seen, self.captured, self.phase):
+            view.caution_against("")
+        if self.computed is None:
+            self.phase.clear()
+        else:
+            self._show_phase(self.computed)
+
+    def _show_phase(self, computed: Computed) -> None:
+        self.phase.show_image(computed.result.hologram.phase_rad[0], 0.0, 2 * np.pi)
+        self._draw_history(computed.result.hologram.history)
+
     def show_progress(self, progress: Progress) -> None:
         """Show the phase so far, and how good it is."""
         self.phase.show_image(progress.phase_rad, 0.0, 2 * np.pi)
@@ -289,9 +308,8 @@ class HologramViews(QWidget):
         offer(self.plane, [(f"seen at {z_mm:g} mm", z_mm) for z_mm in depths])
         self.plane.setVisible(len(depths) > 1)
         self._show_plane(0)
-        self.phase.show_image(computed.result.hologram.phase_rad[0], 0.0, 2 * np.pi)
+        self.go_back()
         self.captured.clear()
-        self._draw_history(computed.result.hologram.history)
         self.metrics.show_facts(_facts(computed))
 
     def show_photographed(self, photographed: Photographed, picture: str) -> None:

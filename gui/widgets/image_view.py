@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QEvent, QObject, QPointF, QRectF, Qt, Signal
-from PySide6.QtGui import QKeyEvent
+from PySide6.QtGui import QKeyEvent, QResizeEvent
 from PySide6.QtWidgets import QLabel, QWidget
 
 from gui.theme import colours, grey_indices, indices_of, spares_hues, table
@@ -19,6 +19,9 @@ from instrument.live.frame_view import SATURATED, fill_indices, index_table
 
 Image = npt.NDArray[Any]
 
+_MARGIN_PX = 8
+_VEILED = 0.35
+"""Opacity of an image that is not current."""
 _PAN = 0.05
 """An arrow key moves what is shown by this part of it, where arrows mean nothing else."""
 
@@ -73,6 +76,8 @@ class ImageView(QWidget):
         self._pan = self.box.mouseDragEvent
         self.box.mouseDragEvent = self._dragged
         self.image: Image | None = None
+        self.naming = (0, 0, 1)
+        """The sensor's column and row of the image's first pixel, and its pixels along one of the image's."""
         self._colour_map = colour_map or colours().colour_map
         self._placed: tuple[Any, ...] = ()
         self._mouse: QPointF | None = None
@@ -89,6 +94,9 @@ class ImageView(QWidget):
         self._caution.setObjectName("caution")
         self._caution.setWordWrap(True)
         self._caution.hide()
+        self._caption = QLabel(parent=self.graphics)
+        self._caption.setObjectName("caption")
+        self._caption.hide()
         scene = self.graphics.scene()
         scene.sigMouseMoved.connect(self._moved)
         scene.sigMouseClicked.connect(self._mouse_clicked)
@@ -170,12 +178,29 @@ class ImageView(QWidget):
         """What is written over the image."""
         return self._caution.text()
 
-    def caution_against(self, words: str) -> None:
-        """Write over the image why it is not what it seems; nothing where ``words`` are empty."""
+    @property
+    def caption(self) -> str:
+        """What is written below the image: what it is of."""
+        return self._caption.text()
+
+    def set_caption(self, words: str) -> None:
+        """Write at the image's lower edge what it is of: time, light, source."""
+        if words != self.caption:
+            self._caption.setText(words)
+            self._caption.setVisible(bool(words))
+            self._caption.adjustSize()
+        self._caption.move(_MARGIN_PX, self.graphics.height() - self._caption.height() - _MARGIN_PX)
+
+    def caution_against(self, words: str, *, old: bool = False) -> None:
+        """Write over the image why it is not what it seems; nothing where ``words`` are empty.
+
+        ``old``: veil it as well, for it is of another time, or of something else than its surroundings say.
+        """
+        self.item.setOpacity(_VEILED if old and words else 1.0)
         if words != self.caution:
             self._caution.setText(words)
             self._caution.setVisible(bool(words))
-        margin = 8
+        margin = _MARGIN_PX
         width = max(self.graphics.width() - 2 * margin, 1)
         self._caution.setFixedWidth(min(width, self._caution.fontMetrics().horizontalAdvance(words) + 40))
         self._caution.adjustSize()
@@ -185,6 +210,13 @@ class ImageView(QWidget):
         """Show nothing."""
         self.image = None
         self.item.clear()
+        self.set_caption("")
+        self.caution_against("")
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
+        """Keep what is written where it stands."""
+        super().resizeEvent(event)
+        self.set_caption(self.caption)
 
     def _step(self, image: Image) -> int:
         """Return how many pixels along each axis fall on one of the screen."""
@@ -239,12 +271,18 @@ class ImageView(QWidget):
         across, down = self.extent
         return (column, row) if 0 <= column < across and 0 <= row < down else None
 
+    def named(self, x: float, y: float) -> tuple[float, float]:
+        """Return what a place of the image is called: the sensor's pixel, for frames of a part of it."""
+        left, top, binning = self.naming
+        return left + x * binning, top + y * binning
+
     def describe(self, column: int, row: int) -> str:
         """Return a pixel's place and value in words."""
         assert self.image is not None
         value = self.image[row, column]
         words = " ".join(f"{v:.5g}" for v in np.atleast_1d(value))
-        return f"x {column}  y {row}  value {words}"
+        x, y = self.named(column, row)
+        return f"x {x:.0f}  y {y:.0f}  value {words}"
 
     def under_mouse(self) -> str:
         """Return place and value under the mouse in words, as they are now; empty outside."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import Signal
+from PySide6.QtCore import Qt, QTimer, Signal
+from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QFrame, QLabel, QSizePolicy, QWidget
 
 from gui.background import NewestOnly
@@ -13,6 +14,7 @@ from gui.theme import colours
 from gui.widgets.building import after_rest, button, every, fill, label
 
 _LOOK_MS = 500
+_AT_END = Qt.TextElideMode.ElideRight
 _REST_MS = 400
 """Rest after a job before the folder is read again."""
 
@@ -66,11 +68,25 @@ class StepStrip(QFrame):
         self._set(self.marks, "&nbsp;&nbsp; ".join(_mark(one, one is step) for one in steps))
         running = next((job.title for job in self._session.jobs.jobs if _is_run(job)), "")
         waits = self.step.panel == "reconnect" and not self.step.what
-        self._set(self.words, f"{running} is under way …" if running else self.step.words)
-        self.words.setToolTip(self.words.text())
+        self._say(f"{running} is under way …" if running else self.step.words)
         if self.button.text() != self.step.answer:
             self.button.setText(self.step.answer)
         self.button.setVisible(bool(self.step.answer) and not running and not waits)
+        layout = self.layout()
+        assert layout is not None
+        layout.activate()  # never a word cut off for a moment
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
+        """Show as much of the sentence as there is room for."""
+        super().resizeEvent(event)
+        QTimer.singleShot(0, self, lambda: self._say(self.words.toolTip()))
+
+    def _say(self, text: str) -> None:
+        """Show a sentence, its beginning where it is too long; all of it is the tool tip."""
+        self._set(self.words, self.words.fontMetrics().elidedText(text, _AT_END, self.words.width()))
+        if self.words.toolTip() != text:
+            self.words.setToolTip(text)
+            self.words.setAccessibleDescription(text)
 
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""

@@ -1,30 +1,36 @@
-"""A volume to browse: brightest along each axis, depth as colour, slices through any point."""
+"""A volume to browse: brightest along each axis, slices, from any side; regions of it measured."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QSignalBlocker, Qt, Signal
-from PySide6.QtWidgets import QButtonGroup, QGridLayout, QProgressBar, QSlider, QWidget
+from PySide6.QtGui import QKeySequence, QShortcut
+from PySide6.QtWidgets import QButtonGroup, QGridLayout, QProgressBar, QSlider, QStackedWidget, QWidget
 
 from gui.background import NewestOnly
 from gui.jobs import Job, JobContext, JobRunner
 from gui.theme import colours
 from gui.widgets.building import button, fill, in_row, label
 from gui.widgets.image_view import StretchedImage, whole_steps
+from gui.widgets.measure import Measure, Region, length_words, region_words, round_length
 from gui.widgets.plots import LevelsBar, curve_pen, plot_widget
+from gui.widgets.turning_view import TurningView, middle_pitch_um
 from instrument.files.volumes import Plane, VolumeSource
 from instrument.reconstruction.result_figures import Projections, grey, in_colour_of_depth, project
 
-Mode = Literal["brightest", "slices"]
+Mode = Literal["brightest", "slices", "turning"]
 Axis = Literal["z", "y", "x"]
 Planes = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
 
+_BAR_SHARE = 0.25
+"""Of the front view's width, about: its scale bar."""
 _AXES: tuple[Axis, Axis, Axis] = ("z", "y", "x")
 
 
@@ -70,6 +76,7 @@ class VolumeView(QWidget):
         self.point = (0, 0, 0)
         """Plane, row and column through which the slices go."""
         self.mode: Mode = "brightest"
+        self._bar: Any = None
 
         self.front, self.coloured = StretchedImage(), StretchedImage()
         self.side, self.top = StretchedImage(keep_aspect=False), StretchedImage(keep_aspect=False)
@@ -105,11 +112,33 @@ class VolumeView(QWidget):
             shortcut="Ctrl+J",
             checkable=True,
         )
+        self.turning_button = button(
+            "From any side",
+            "The volume in three dimensions: drag or arrow keys turn it, space keeps it turning (Ctrl+T)",
+            lambda: self.set_mode("turning"),
+            shortcut="Ctrl+T",
+            checkable=True,
+        )
+        self.turning = TurningView(jobs)
+        self.turning.failed.connect(self.failed)
+        self.turning.opened.connect(self._measure_again)
+        self.views, self.stack = QWidget(), QStackedWidget()
+        tip = "Drag over the front view: size, mean, deviation, most, and the mean along depth (Ctrl+M)"
+        self.measure_button = button("Measure", tip, shortcut="Ctrl+M", checkable=True)
+        self.measure = Measure(self.front)
+        self.measure_button.toggled.connect(self.measure.set_on)
+        self.measure.chosen.connect(self._measured)
+        self.measured = label(role="value", selectable=True, wraps=True)
+        self.measured.hide()
         group = QButtonGroup(self)
-        group.addButton(self.brightest_button)
-        group.addButton(self.slices_button)
+        for each in (self.brightest_button, self.slices_button, self.turning_button):
+            group.addButton(each)
+        for keys, by in ((Qt.Key.Key_PageUp, -1), (Qt.Key.Key_PageDown, 1)):
+            step = QShortcut(QKeySequence(keys), self, context=Qt.ShortcutContext.WidgetWithChildrenShortcut)
+            step.activated.connect(partial(self._step_plane, by))
         self.slider = QSlider(Qt.Orientation.Horizontal)
-        self.slider.setToolTip("Depth plane of the front view (arrow keys)")
+        self.slider.setToolTip("Depth plane of the front view (arrow keys; Page up and down from every view)")
+        self.slider.setAccessibleName("Depth plane")
         self.slider.valueChanged.connect(lambda z: self.go_to(z, *self.point[1:]))
         self.plane_label = label()
         self.progress = QProgressBar()
@@ -133,10 +162,14 @@ class VolumeView(QWidget):
         grid.setRowStretch(3, 2)
         grid.setColumnStretch(0, 3)
         grid.setColumnStretch(1, 2)
-        bar = in_row(self.brightest_button, self.slices_button, (self.slider, 1))
+        modes = (self.brightest_button, self.slices_button, self.turning_button)
+        bar = in_row(*modes, self.measure_button, (self.slider, 1))
         bar.addStretch()  # only where the slider is hidden
         bar.addWidget(self.plane_label)
-        fill(self, bar, self.progress, (grid, 1), self.levels)
+        fill(self.views, (grid, 1))
+        self.stack.addWidget(self.views)
+        self.stack.addWidget(self.turning)
+        fill(self, bar, self.progress, (self.stack, 1), self.measured, self.levels)
 
     # What is shown -------------------------------------------------------------------------------
     def open(self, source: VolumeSource, planes_um: Planes | None = None) -> Job:
@@ -165,8 +198,22 @@ class VolumeView(QWidget):
         job.failed.connect(self.failed)
         job.ended.connect(lambda: self._projecting_ended(job))
         self._job = job
+        self._place_bar(width)
         self.go_to(n_z // 2, height // 2, width // 2)
         return job
+
+    def _place_bar(self, width: int) -> None:
+        """Lay a bar of a round length over the front view, where the voxels' size is known."""
+        if self._bar is not None:
+            self.front.box.removeItem(self._bar)
+            self._bar = None
+        if (pitch_um := None if self._planes is None else middle_pitch_um(self._planes)) is not None:
+            length = round_length(_BAR_SHARE * width * pitch_um)
+            self._bar = pg.ScaleBar(length / pitch_um, brush=colours().text, pen=colours().text)
+            self._bar.text.setText(length_words(length))
+            self._bar.text.setColor(colours().text)
+            self._bar.setParentItem(self.front.box)
+            self._bar.anchor((1, 1), (1, 1), offset=(-14, -14))
 
     def show_front(self, front: Plane, *, keep_levels: bool) -> None:
         """Show only a front view: that of a volume in the making."""
@@ -184,21 +231,31 @@ class VolumeView(QWidget):
             self._job = None
         if self._source is not None:
             self._reader.forget(last=self._source.close)
+        self.turning.release()
+        self.measure.clear()
+        self.measured.clear()
         self._source = self.projections = None
         self.slices, self._asked = {}, {}
         self.progress.hide()
 
     def set_mode(self, mode: Mode) -> None:
-        """Show the brightest along each axis, or slices through a point."""
+        """Show the brightest along each axis, slices through a point, or the volume from any side."""
         self.mode = mode
-        (self.brightest_button if mode == "brightest" else self.slices_button).setChecked(True)
-        slices = mode == "slices"
+        buttons = {"brightest": self.brightest_button, "slices": self.slices_button}
+        buttons.get(mode, self.turning_button).setChecked(True)
+        slices, turning = mode == "slices", mode == "turning"
+        self.stack.setCurrentWidget(self.turning if turning else self.views)
+        self.measure_button.setVisible(not turning)
+        self.measured.setVisible(not turning and self.measure_button.isChecked())
+        if turning:
+            self._load_renderer()
+            self.turning.setFocus()
         for view in (self.front, self.side, self.top):
             view.arrows_pan = not slices
         self.slider.setVisible(slices)
         self.plane_label.setVisible(slices)
         self.profile.setVisible(slices)
-        self.coloured.setVisible(not slices)
+        self.coloured.setVisible(mode == "brightest")
         for lines in self._lines.values():
             for line in lines:
                 line.setVisible(slices)
@@ -239,6 +296,9 @@ class VolumeView(QWidget):
     @property
     def images(self) -> dict[str, Plane]:
         """What the views show, by name: for export."""
+        if self.mode == "turning":
+            shown = self.turning.pixels
+            return {} if shown is None else {"depth": np.asarray(shown / np.float32(255), np.float32)}
         if self.mode == "slices":
             names: dict[Axis, str] = {"z": "slice", "y": "slice-xz", "x": "slice-yz"}
             return {names[axis]: held.pixels for axis, held in self.slices.items()}
@@ -252,6 +312,48 @@ class VolumeView(QWidget):
         self._along.setPen(curve_pen(0))
         self._here.setPen(colours().dim)
         self._show()
+
+    # From any side, and measured -----------------------------------------------------------------
+    def _load_renderer(self) -> None:
+        """Read the volume for views from any side where that was not done yet."""
+        if self._source is not None and not self.turning.is_open:
+            self.turning.open(self._source, self._planes)
+
+    def _show_turning(self) -> None:
+        self.turning.set_looks(self.levels.levels, self.levels.colour_map)
+
+    def _measured(self, region: Region) -> None:
+        """Say what is in a region of the front view, and draw its mean along depth."""
+        shown = self._front_pixels()
+        if shown is None or self._source is None:
+            return
+        self._load_renderer()
+        pitch_um = None if self._planes is None else middle_pitch_um(self._planes)
+        where = f"plane {self.point[0] + 1}" if self.mode == "slices" else "brightest over depth"
+        words = f"{where}, {region_words(region, grey(shown), self._source.shape[1:], pitch_um)}"
+        if (renderer := self.turning.renderer) is not None:
+            along = renderer.along_depth(region.rows, region.columns)
+            best = int(along.argmax())
+            words += f"; most along depth at plane {best + 1}{self._depth_words(best)}"
+            self._along.setData(np.arange(1, len(along) + 1), along.astype(float))
+            if self.mode == "slices":
+                self._titles[3].setText("mean of the region along depth")
+        self.measured.setText(words)
+        self.measured.show()
+
+    def _measure_again(self) -> None:
+        if self.measure.regions:
+            self._measured(self.measure.regions[-1])
+
+    def _front_pixels(self) -> Plane | None:
+        if self.mode == "slices":
+            held = self.slices.get("z")
+            return None if held is None else held.pixels
+        return None if self.projections is None else self.projections.front
+
+    def _step_plane(self, by: int) -> None:
+        if self.mode == "slices":
+            self.go_to(self.point[0] + by, *self.point[1:])
 
     # Inside --------------------------------------------------------------------------------------
     def _take_projections(self, job: Job, projections: Projections) -> None:
@@ -276,7 +378,9 @@ class VolumeView(QWidget):
             return
         for view in (self.front, self.side, self.top, self.coloured):
             view.set_colour_map(self.levels.colour_map)
-        if self.mode == "slices":
+        if self.mode == "turning":
+            self._show_turning()
+        elif self.mode == "slices":
             self._show_slices()
         elif self.projections is not None:
             self._show_projections(self.projections)

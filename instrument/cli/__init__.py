@@ -66,6 +66,7 @@ COMMANDS: Mapping[str, Command] = {
         "bench:devices_app",
     ),
     "serve": Command(BENCH, "offer the devices to another computer, and a page in the browser", "serve"),
+    "test": Command(BENCH, "test this installation: files, cameras, solvers, simulated bench", "selftest"),
     "completion": Command(BENCH, "print completions for bash and zsh", "completion"),
     "calibrate": Command(BENCH, "measure PSFs, the sensor, the diffuser, or an SLM", "calibrate"),
     "snap": Command(BENCH, "take a photograph", "capture:snap_app"),

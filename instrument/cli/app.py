@@ -163,6 +163,8 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
     logging.basicConfig(
         level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
     )
+    for chatty in ("numba", "numcodecs", "matplotlib", "asyncio"):  # numba prints 30,000 lines a kernel
+        logging.getLogger(chatty).setLevel(logging.WARNING)
     _end_on_signals()
     try:
         # Not through typer's own main, which would answer Ctrl-C itself before a word is said about it.

@@ -134,7 +134,7 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
     with saying_what_is_left(target), naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
         options.set_camera(opened)
         switch_light(opened, light)
-        if options.exposure_ms is None and light is not LightState.DARK:
+        if options.exposure_ms is None:
             _expose(opened, light)
         with one_task("Frames") as advance:
             taken = opened.snap(options.average, on_progress=advance)
@@ -143,10 +143,21 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
 
 
 def _expose(bench: Bench, light: LightState) -> None:
-    """Find the exposure where bench.toml has none, and say how; the light is as it is to be."""
+    """Find the exposure where bench.toml has none, and say how; the light is as it is to be.
+
+    A dark frame's is another frame's, which is not known here: what the camera has is said.
+    """
     from calibration_routines.psf.exposure import auto_expose, hot_pixels
 
     if getattr(bench.config.devices["camera"].settings, "exposure_ms", None) is not None:
+        return
+    if light is LightState.DARK:
+        typer.echo(
+            "Note: no exposure is given, here or in bench.toml: this dark frame has the "
+            f"{bench.camera.exposure_ms:g} ms that the camera came with. It serves photographs of the same "
+            "exposure only: give theirs, --exposure-ms.",
+            err=True,
+        )
         return
     hot = None
     can_switch = {LightState.SCENE: bench.can_switch_scene, LightState.SOURCE: bench.can_switch_source}

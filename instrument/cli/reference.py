@@ -1,6 +1,7 @@
-"""The reference page of every options class.
+"""The reference page of every options class, and the manual page.
 
 ``python -m instrument.cli.reference > docs/reference/options.md``
+``python -m instrument.cli.reference --man > docs/diffuserbench.1``
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from collections.abc import Iterator
 
 import typer
 
-from instrument.cli import COMMANDS
+from instrument.cli import COMMANDS, EXAMPLES
 from instrument.cli.app import App
 from recon.base.option_text import table
 
@@ -53,5 +54,53 @@ def _commands() -> Iterator[tuple[str, object]]:
             yield from ((f"{name} {word}", command.callback) for word, command in inner.items())
 
 
+_MAN = """\
+.TH DIFFUSERBENCH 1 "" diffuserbench "User Commands"
+.SH NAME
+diffuserbench \\- runs a bench for computational optics: cameras behind a diffuser, holograms
+.SH SYNOPSIS
+.B diffuserbench
+.RB [ \\-\\-debug ]
+.I COMMAND
+.RI [ OPTIONS ]
+.SH DESCRIPTION
+Without hardware it runs on the built-in simulated bench.
+\\fBdiffuserbench\\fR \\fICOMMAND\\fR \\fB\\-\\-help\\fR says everything about one command.
+.SH COMMANDS
+{commands}
+.SH EXAMPLES
+.nf
+{examples}
+.fi
+.SH FILES
+.TP
+.B bench.toml
+The bench, in the working folder; \\fBdiffuserbench new\\fR writes one with every key explained.
+.SH ENVIRONMENT
+.TP
+.B DIFFUSERBENCH_DEBUG
+1: tracebacks of errors, as \\-\\-debug.
+.SH EXIT STATUS
+0 done, 1 a device or a check failed, 2 a mistake in what was asked, 130 interrupted.
+.SH SEE ALSO
+The documentation starts at docs/README.md of the source.
+"""
+
+
+def manual() -> str:
+    """Return the manual page, roff, of the commands; their options are in each one's ``--help``."""
+
+    def plain(text: str) -> str:
+        return text.replace("-", "\\-")
+
+    commands: list[str] = []
+    for group in dict.fromkeys(command.group for command in COMMANDS.values()):
+        commands.append(f".SS {group}")
+        of_it = ((name, command) for name, command in COMMANDS.items() if command.group == group)
+        commands += [f".TP\n.B {plain(name)}\n{plain(command.help)}" for name, command in of_it]
+    examples = "\n".join(plain(line) for line in EXAMPLES.splitlines()[1:])
+    return _MAN.format(commands="\n".join(commands), examples=examples)
+
+
 if __name__ == "__main__":
-    sys.stdout.write(page())
+    sys.stdout.write(manual() if "--man" in sys.argv else page())

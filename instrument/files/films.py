@@ -46,7 +46,7 @@ def write_mp4(
                         raise FileError(
                             path,
                             f"OpenCV {cv2.__version__} here cannot encode {codec}.",
-                            "Install opencv-contrib-python-headless from PyPI, or do without the MP4.",
+                            "Install opencv-python-headless from PyPI, or do without the MP4.",
                         )
                 writer.write(np.ascontiguousarray(even[..., ::-1]))
                 count += 1

@@ -48,7 +48,7 @@ from instrument.runs.run_files import (
     slm_image_name,
 )
 
-_PACKAGES = ("diffuserbench", "numpy", "scipy", "opencv-contrib-python-headless", "pydantic")
+_PACKAGES = ("diffuserbench", "numpy", "scipy", "opencv-python-headless", "pydantic")
 
 
 def provenance() -> dict[str, Any]:

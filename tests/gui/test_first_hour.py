@@ -13,14 +13,16 @@ from pytestqt.qtbot import QtBot
 
 from drivers.device import FoundDevice
 from drivers.registry.registry import Listing
+from gui.help import KEYS
 from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.panels.start import StartPanel
-from gui.panels.unserved import UnservedPanel
+from gui.panels.unserved import UnservedPanel, why_not
 from gui.session import BenchSession
+from gui.widgets.dialogues import TextWindow
 from instrument.bench.config import BenchConfig
-from instrument.bench.config_file import TEMPLATES, no_bench
+from instrument.bench.config_file import TEMPLATES, no_bench, parse_config, template
 from instrument.files.images import write_image
 
 LEFT = Qt.MouseButton.LeftButton
@@ -129,6 +131,21 @@ def test_panels_say_why_and_what_would_serve(qtbot: QtBot, bare: MainWindow, win
     assert "simulated display" in wanted[0].label  # type: ignore[attr-defined]
 
 
+def test_f1_tells_of_the_panel_in_front_and_of_every_key(
+    bare: MainWindow, pytestconfig: pytest.Config
+) -> None:
+    start_of(bare)
+    bare.show_help()
+    (said,) = bare.findChildren(TextWindow)
+    text = said.view.toPlainText()
+    assert text.index("Try the camera: ") < text.index("KEYS")
+    manual = (pytestconfig.rootpath / "docs" / "desktop.md").read_text()
+    told = {keys for keys, _ in KEYS} | {entry.shortcut for entry in PANELS.values()}
+    for keys in told:
+        assert f"{keys}  " in text
+        assert all(part.split("+")[-1].removeprefix(" ") in manual for part in keys.split(", ")), keys
+
+
 def test_a_new_bench_is_written_of_what_is_ticked(
     qtbot: QtBot, bare: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,3 +169,22 @@ def test_a_new_bench_is_written_of_what_is_ticked(
     assert bare.next_bench is not None
     assert sorted(bare.next_bench.devices) == ["camera", "stage"]
     assert bare.next_bench.bench.name == "mine"
+
+
+@pytest.mark.parametrize("name", TEMPLATES)
+def test_a_simulated_bench_serves_its_panels(qtbot: QtBot, name: str) -> None:
+    session = BenchSession(parse_config(template(name), None))
+    unserved = {
+        key for key, entry in PANELS.items() if why_not(session, entry.title, entry.needs, entry.tried_on)
+    }
+    assert (
+        unserved
+        == {
+            "default": {"alignment"},
+            "display": {"led_array"},
+            "led_microscope": {"alignment", "stage", "slm"},
+            "screen": {"alignment"},
+        }[name]
+    )
+    with qtbot.waitSignal(session.closed, timeout=WAIT_MS):
+        session.close()

@@ -95,7 +95,7 @@ def test_the_strip_names_the_next_step_and_leads_there(qtbot: QtBot, window: Mai
     assert sweeps.routine.name == "photograph"
     job = window.session.exclusive_job("A run", lambda context: context.cancel.wait(WAIT_MS / 1000))
     strip.look()
-    assert strip.words.text() == "A run is under way …"
+    assert strip.words.toolTip() == "A run is under way …"
     assert not strip.button.isVisible()
     job.cancel()
     qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)

@@ -23,6 +23,7 @@ from gui.widgets.building import every
 from gui.widgets.dialogues import TextWindow, choose_path
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import LightState
+from tests.gui.looks import faults
 
 WAIT_MS = 60_000
 
@@ -43,6 +44,7 @@ def test_every_panel_opens_and_copies_python(qtbot: QtBot, window: MainWindow) -
         panel.copy_button.click()
         code = QApplication.clipboard().text()
         compile(code, name, "exec")
+        assert not faults(window), name
     shortcuts = [entry.shortcut for entry in PANELS.values()]
     assert len(set(shortcuts)) == len(shortcuts)
 

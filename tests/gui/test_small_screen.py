@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from PySide6.QtCore import QPoint, QRect, QSettings, QSize
-from PySide6.QtWidgets import QScrollArea, QWidget
+from PySide6.QtCore import QPoint, QRect, QSettings, QSize, Qt
+from PySide6.QtWidgets import QLineEdit, QPushButton, QScrollArea, QWidget
 from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
+from gui.panels import PANELS
 from gui.panels.live import LivePanel
 from gui.session import BenchSession
+from gui.widgets.building import fill, label, scrolled
+from tests.gui.looks import SIZES, faults
 
 ROOM = QSize(1280, 720)
 
@@ -57,11 +60,28 @@ def test_the_live_view_is_whole_on_a_small_screen(qtbot: QtBot, small: MainWindo
         assert panel.isVisible(), name
 
 
-def test_no_panel_at_the_side_needs_scrolling_along_its_width(qtbot: QtBot, small: MainWindow) -> None:
-    for name in ("live_reconstruction", "stage", "led_array", "slm", "log"):
-        panel = small.show_panel(name)
+def test_nothing_is_cut_off_scrolled_twice_or_nameless_on_a_small_screen(
+    qtbot: QtBot, small: MainWindow
+) -> None:
+    small.resize(SIZES["1366x768"])
+    for name in PANELS:
+        small.show_panel(name)
         qtbot.wait(50)
-        assert _scroll_of(panel).horizontalScrollBar().maximum() == 0, name
+        assert not faults(small), name
+
+
+def test_faults_of_looks_are_found(qtbot: QtBot) -> None:
+    page = QWidget()
+    qtbot.addWidget(page)
+    inside = scrolled(fill(QWidget(), QPushButton("A button with many words"), QLineEdit(), 900))
+    fill(page, scrolled(fill(QWidget(), inside, 900)), label("words " * 40, wraps=True))
+    inside.setFixedSize(80, 120)
+    inside.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAsNeeded)
+    page.resize(300, 200)
+    page.show()
+    found = "\n".join(faults(page))
+    for words in ("many words", "has no name", "scrolls up and down within", "sideways"):
+        assert words in found
 
 
 def _scroll_of(panel: QWidget) -> QScrollArea:

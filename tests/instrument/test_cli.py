@@ -238,11 +238,15 @@ def test_snap_exposes_by_itself_unless_it_is_told_how(here: Path, capsys: pytest
     (here / "bench.toml").write_text(TINY)
     assert main(["snap", "--out", "found.tif"]) == 0
     assert "Auto-exposure" in capsys.readouterr().out
+    assert main(["snap", "--dark", "--out", "dark.tif"]) == 0
+    assert "no exposure is given" in capsys.readouterr().err
     (here / "bench.toml").write_text(TINY.replace("[stage]", "exposure_ms = 2\n[stage]", 1))
     assert main(["snap", "--out", "told.tif"]) == 0
     said = capsys.readouterr().out
     assert "Auto-exposure" not in said
     assert ", 2 ms," in said
+    assert main(["snap", "--dark", "--out", "dark-told.tif"]) == 0
+    assert "no exposure is given" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

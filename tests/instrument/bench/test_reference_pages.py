@@ -10,6 +10,7 @@ from instrument.bench.config import DEVICE_TABLES, PLAIN_TABLES
 from instrument.bench.config_file import parse_config, template
 from instrument.bench.config_reference import reference
 from instrument.cli import COMMANDS
+from instrument.cli.reference import manual
 from instrument.cli.reference import page as options_page
 
 DOCS = Path(__file__).parents[3] / "docs" / "reference"
@@ -26,6 +27,11 @@ def test_the_configuration_reference_is_what_the_models_say() -> None:
 def test_the_reference_of_options_is_what_they_are_declared_to_be() -> None:
     page = (DOCS / "options.md").read_text("utf-8")
     assert page == options_page(), "renew it: python -m instrument.cli.reference > docs/reference/options.md"
+
+
+def test_the_manual_page_has_every_command() -> None:
+    page = (DOCS.parent / "diffuserbench.1").read_text("utf-8")
+    assert page == manual(), "renew it: python -m instrument.cli.reference --man > docs/diffuserbench.1"
 
 
 def test_no_option_is_without_words() -> None:

@@ -1,0 +1,55 @@
+"""One chip a device, with its state in a word."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from PySide6.QtWidgets import QToolButton, QWidget
+
+from gui.session import BenchSession
+from gui.session_news import name_of
+from gui.theme import colours
+from gui.way_on import ReconnectButton
+from gui.widgets.building import fill, label
+from gui.widgets.dialogues import TextWindow
+
+
+class DeviceChips(QWidget):
+    """One chip a device; a click shows all about it, "Reconnect" appears where one has failed."""
+
+    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._session = session
+        self.chips: dict[str, QToolButton] = {}
+        self.reconnect_buttons: dict[str, ReconnectButton] = {}
+        for kind in session.kinds:
+            chip = QToolButton()
+            chip.setAutoRaise(True)
+            chip.clicked.connect(partial(self._show_all, kind))
+            again = ReconnectButton(session, kind, self, "Reconnect")
+            self.chips[kind], self.reconnect_buttons[kind] = chip, again
+            self.show_state(kind)
+        pairs = zip(self.chips.values(), self.reconnect_buttons.values(), strict=True)
+        shown: list[QWidget] = [widget for pair in pairs for widget in pair]
+        fill(self, *(shown or [label("No bench is open")]), across=True, spacing=4)
+        session.device_changed.connect(self.show_state)
+
+    def show_state(self, kind: str) -> None:
+        """Show how a device is doing now."""
+        state = self._session.state(kind)
+        now = colours()
+        colour = {"open": now.ok, "failed": now.error, "opening": now.warning}.get(state.condition, now.dim)
+        chip = self.chips[kind]
+        word = {"open": "", "opening": " …", "failed": " failed", "closed": " closed"}[state.condition]
+        chip.setText(f"● {name_of(kind)}{word}")
+        chip.setStyleSheet(f"color: {colour}; border: none; padding: 2px 4px;")
+        chip.setToolTip(state.text or state.condition)
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        for kind in self.chips:
+            self.show_state(kind)
+
+    def _show_all(self, kind: str) -> None:
+        state = self._session.state(kind)
+        TextWindow(name_of(kind), state.text or state.condition, self).show()

@@ -1,0 +1,31 @@
+"""What was lit during a frame, from when the light changed."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import pytest
+
+from drivers.frame import FrameMetadata
+from instrument.live.light_log import LightLog
+
+MS = 1_000_000
+
+
+def test_a_frame_has_the_light_of_its_exposure_not_that_of_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    now: list[tuple[int, str]] = []
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now[-1][0] * MS)
+    log = LightLog(lambda: now[-1][1])
+    for change in ((0, "nothing lit"), (1000, "scene"), (1001, "scene"), (3000, "point source")):
+        now.append(change)
+        log.note()
+    frame = FrameMetadata(0, None, 2000 * MS, datetime.now(UTC), 100.0, 1.0, "Mono8", 8, 0.0, (0, 0, 4, 4), 1)
+    assert log.during(frame) == "scene"
+    assert log.during(replace(frame, host_time_ns=900 * MS)) == "nothing lit"
+    assert log.during(replace(frame, host_time_ns=1050 * MS)) == "nothing lit, then scene"
+    assert log.during(replace(frame, host_time_ns=4000 * MS, exposure_ms=3500.0)) == (
+        "nothing lit, then scene, then point source"
+    )
+    assert log.during(replace(frame, host_time_ns=-500 * MS)) == "", "before anything was known"
