@@ -67,8 +67,8 @@ def read_hdf5(path: Path, inside: str, *, matlab: bool = False) -> Read:
 
     ``matlab``: its axes are in MATLAB's order, the last first.
 
-    Raises FileError when it is damaged, none or several arrays could be meant, its numbers are in other files,
-    or h5py is not installed.
+    Raises FileError when it is damaged, none or several arrays could be meant, its numbers are elsewhere, or
+    h5py is not installed.
     """
     try:
         import h5py
