@@ -101,6 +101,13 @@ PANELS: Mapping[str, PanelEntry] = {
         "Ctrl+Shift+H",
         "Compute a hologram, show it, photograph it",
     ),
+    "films": PanelEntry(
+        "Films",
+        "gui.panels.films:FilmsPanel",
+        "centre",
+        "Ctrl+Shift+V",
+        "A recording or a reconstructed video: play it, follow regions, export",
+    ),
     "tasks": PanelEntry(
         "Files",
         "gui.panels.tasks:TasksPanel",
