@@ -22,7 +22,7 @@ from typing import Any
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 
 import numpy as np
-from PySide6.QtCore import QSettings, Qt, QtMsgType, qInstallMessageHandler
+from PySide6.QtCore import QSettings, QSize, Qt, QtMsgType, qInstallMessageHandler
 from PySide6.QtTest import QTest
 
 import instrument
@@ -30,7 +30,7 @@ from gui.app import application
 from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.session import BenchSession
-from gui.theme import apply_theme
+from gui.theme import THEMES, apply_theme
 from instrument.bench.config_file import parse_config
 from instrument.cli import main as command
 from instrument.files.images import write_image
@@ -87,7 +87,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder of the pictures")
     parser.add_argument("--work", type=Path, default=Path("runs/screenshots"), help="folder of what is shown")
     parser.add_argument("--size", default=SIZE, help=f"of the window in pixels, default {SIZE}")
-    parser.add_argument("--theme", choices=("dark", "red"), default="dark")
+    parser.add_argument("--theme", choices=list(THEMES), default="dark")
     parser.add_argument("--panel", action="append", choices=list(PANELS), help="only this one; repeatable")
     given = parser.parse_args()
     width, height = (int(part) for part in given.size.split("x"))
@@ -155,7 +155,7 @@ def _open(folder: Path, width: int, height: int) -> MainWindow:
     session = BenchSession(parse_config(bench.read_text(), bench))
     settings = QSettings(str(folder / "window.ini"), QSettings.Format.IniFormat)
     settings.clear()
-    window = MainWindow(session, settings)
+    window = MainWindow(session, settings, QSize(width, height))
     window.resize(width, height)
     window.show()
     opened: list[bool] = []

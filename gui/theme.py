@@ -196,6 +196,8 @@ QComboBox QAbstractItemView {{ border: 1px solid {c.border}; padding: 0; }}
 QGraphicsView {{ border: 1px solid transparent; }}
 QGraphicsView:focus {{ border: 1px solid {c.accent}; }}
 *[refused="true"] {{ border: 2px solid {c.error}; color: {c.error}; font-weight: 700; }}
+QLabel[warns="warning"] {{ color: {c.warning}; font-weight: 700; }}
+QLabel[warns="error"] {{ color: {c.error}; font-weight: 700; }}
 QLabel#reason {{ color: {c.error}; font-size: {SMALL_PT}pt; }}
 QLabel#refusal {{ color: {c.warning}; }}
 QLabel#dim, QLabel[role="dim"] {{ color: {c.dim}; }}

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import os
 
+# Several test processes share the cores. It is read when NumPy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from hypothesis import HealthCheck, settings
 
 settings.register_profile(

@@ -13,7 +13,7 @@ from PySide6.QtCore import QObject, QSignalBlocker, Qt, Signal
 from PySide6.QtGui import QFontDatabase
 from PySide6.QtWidgets import QCheckBox, QComboBox, QPlainTextEdit, QWidget
 
-from gui.widgets.building import narrow
+from gui.widgets.building import fill, narrow
 from gui.widgets.dialogues import Browse
 from gui.widgets.entry import Entry, NumberEdit, PathEntry, existing_path
 from instrument.files.errors import BenchError
@@ -52,6 +52,8 @@ class Behaviour:
     enabled_when : callable, optional
         Called with what is chosen and ticked in the form, by name; returns why the field does not apply,
         empty where it does. One that does not apply has its default.
+    beside : callable, optional
+        Makes what stands beside a number: a button that finds it.
     """
 
     browse: Browse = "open"
@@ -63,6 +65,7 @@ class Behaviour:
     help_of: Callable[[str], str] | None = None
     offers: Callable[[], Sequence[str]] | None = None
     enabled_when: Callable[[dict[str, Any]], str] | None = None
+    beside: Callable[[], QWidget] | None = None
 
 
 class OptionField(QObject):
@@ -173,7 +176,10 @@ class NumberField(OptionField):
             empty += f" ({self.unit})" if self.unit else ""
         self.widget: NumberEdit = NumberEdit(self.unit, integer=option.is_whole, tip=self.tip, empty=empty)
         self.widget.check = lambda number: self.problem(self._in_own_unit(number))
-        self.whole = self.widget
+        beside = behaviour.beside
+        self.whole = (
+            self.widget if beside is None else fill(QWidget(), (self.widget, 1), beside(), across=True)
+        )
         self.widget.textChanged.connect(self.edited)
         self.widget.refused.connect(self.refused)
         self.widget.submitted.connect(self.settled)

@@ -29,8 +29,8 @@ class PanelEntry(NamedTuple):
     tip: str
     needs: tuple[str, ...] = ()
     """Kinds of devices without which it can do nothing."""
-    tried_on: str = "default"
-    """The simulated bench that serves it, one of ``instrument.bench.config_file.TEMPLATES``."""
+    tried_on: str = ""
+    """Of simulated benches the only one that serves it, of ``instrument.bench.config_file.TEMPLATES``."""
 
     def load(self) -> type[Panel]:
         """Return the panel's class, with all that it needs imported and compiled; for any thread."""
@@ -101,6 +101,13 @@ PANELS: Mapping[str, PanelEntry] = {
         "Ctrl+Shift+H",
         "Compute a hologram, show it, photograph it",
     ),
+    "films": PanelEntry(
+        "Films",
+        "gui.panels.films:FilmsPanel",
+        "centre",
+        "Ctrl+Shift+V",
+        "A recording or a reconstructed video: play it, follow regions, export",
+    ),
     "tasks": PanelEntry(
         "Files",
         "gui.panels.tasks:TasksPanel",
@@ -130,8 +137,6 @@ PANELS: Mapping[str, PanelEntry] = {
         "Which LEDs are lit",
         ("led_array",),
     ),
-    "slm": PanelEntry(
-        "SLM", "gui.panels.slm:SlmPanel", "right", "Ctrl+9", "What is on the SLM", ("slm",), "display"
-    ),
+    "slm": PanelEntry("SLM", "gui.panels.slm:SlmPanel", "right", "Ctrl+9", "What is on the SLM", ("slm",)),
     "log": PanelEntry("Log", "gui.panels.log:LogPanel", "bottom", "Ctrl+0", "What happened, with filters"),
 }

@@ -84,7 +84,12 @@ class RunsPanel(Panel):
         self._make_list()
         self._make_details()
         left = fill(QWidget(), self.where, (self.table, 1), (self.hint, 1), margins=(0, 0, 6, 0))
-        foot = in_row((self.bar, 1), in_column(self.use_button, self.verify_button, self.folder_button, None))
+        foot = in_row(
+            (self.bar, 1),
+            in_column(
+                self.use_button, self.play_button, self.export_button, self.verify_button, self.folder_button
+            ),
+        )
         top = fill(QWidget(), (self.view, 1), self.slider, self.frame_words, margins=(6, 0, 0, 0))
         below = fill(QWidget(), (self.about, 1), foot, margins=(6, 0, 0, 0))
         right = split(top, below, sizes=[480, 260], down=True)
@@ -137,6 +142,8 @@ class RunsPanel(Panel):
         self.folder_button.setEnabled(True)
         self.verify_button.setEnabled(True)
         self.use_button.setEnabled(opened.is_usable)
+        self.play_button.setEnabled(opened.run.plan is None and bool(opened.stored))
+        self.export_button.setEnabled(bool(opened.stored))
         self._show_frame(middle)
 
     def as_python(self) -> str:
@@ -204,6 +211,10 @@ class RunsPanel(Panel):
         self.folder_button = button("Open folder", tip, self._open_folder, enabled=False)
         tip = "Reconstruct photographs with this run's calibration"
         self.use_button = button("Reconstruct with it…", tip, self._use, enabled=False)
+        tip = "Play it as a film, follow regions, reconstruct it as a video"
+        self.play_button = button("Play as a film…", tip, self._play, enabled=False)
+        tip = "Write frames for other programs: TIFF, HDF5, NumPy, PNG, MP4"
+        self.export_button = button("Export…", tip, self._export, enabled=False)
         tip = "Read every frame and hold it against its checksum; changes nothing"
         self.verify_button = button("Verify", tip, self._verify, enabled=False)
 
@@ -257,7 +268,8 @@ class RunsPanel(Panel):
         self.bar.set_startable("No run is open.")
         self.folder_button.setEnabled(False)
         self.verify_button.setEnabled(False)
-        self.use_button.setEnabled(False)
+        for each in (self.use_button, self.play_button, self.export_button):
+            each.setEnabled(False)
 
     def _show_frame(self, number: int) -> None:
         run = self.opened
@@ -278,6 +290,14 @@ class RunsPanel(Panel):
     def _use(self) -> None:
         if self.opened is not None:
             self.session.handed_on.emit("reconstructions", self.opened.path / SWEEP.result)
+
+    def _play(self) -> None:
+        if self.opened is not None:
+            self.session.handed_on.emit("films", self.opened.path)
+
+    def _export(self) -> None:
+        if self.opened is not None:
+            self.session.handed_on.emit("tasks", ("export", {"run": self.opened.path}))
 
     def _verify(self) -> None:
         """Read every frame of the run that is shown; ends early where another run is opened."""

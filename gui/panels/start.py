@@ -29,6 +29,8 @@ _TRIED = {
 _IMAGES = "Images (*.tif *.tiff *.png *.npy *.npz *.bmp *.jpg);;All files (*)"
 _COLUMNS = 2
 _WIDEST_PX = 900
+_CARD_PX = 64
+"""Height of a button: its name and two lines."""
 
 
 class StartPanel(Panel):
@@ -87,6 +89,7 @@ class StartPanel(Panel):
         card = QCommandLinkButton(words, about)
         card.setObjectName("card")
         card.setIconSize(QSize(0, 0))
+        card.setMinimumHeight(_CARD_PX)
         card.setAccessibleDescription(about)
         card.clicked.connect(lambda: call())
         self.cards[name] = card

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,7 +32,7 @@ from gui.widgets.building import (
     text_view,
 )
 from gui.widgets.sweep_views import Picture
-from instrument.tasks import TASKS
+from instrument.tasks import TASKS, VIDEOS
 from instrument.tasks.task import WRITTEN, Desk, Done, Task
 from recon.base.declare import Imports, Option, expression
 
@@ -60,6 +61,9 @@ class TasksPanel(Panel):
         self._reader = NewestOnly(session.jobs, "Reading a picture")
         self._given: dict[str, Path] = {}
         self.files: tuple[Path, ...] = ()
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
         self.choice = choice((), "What to do")
         self.choice.setAccessibleName("Task")
         for name, entry in TASKS.items():
@@ -72,7 +76,10 @@ class TasksPanel(Panel):
         end = "End as soon as possible; what can be kept is kept"
         self.run_bar = RunBar(self.run, "Start", tips=(tip, end))
         left = fill(QWidget(), self.choice, self.about, (self.stack, 1), self.run_bar, margins=(0, 0, 6, 0))
-        fill(self.body, split(left, self._make_results(), sizes=[430, 800], stretch=1, firm=True))
+        yield
+        results = self._make_results()
+        yield
+        fill(self.body, split(left, results, sizes=[430, 800], stretch=1, firm=True))
         self.choice.currentIndexChanged.connect(self._chosen)
         self.run_bar.start.connect(self.start)
         self.run.told.connect(self._told)
@@ -119,9 +126,10 @@ class TasksPanel(Panel):
         self.choice.setCurrentIndex(self.choice.findData(name))
         self._chosen()
 
-    def take(self, path: Path) -> None:
-        """Verify a run that another panel hands on."""
-        self.choose("verify", runs=(path,))
+    def take(self, what: Any) -> None:
+        """Show a task, with what another panel hands on filled in: the task's name, and options by name."""
+        name, values = what
+        self.choose(name, **values)
 
     def _chosen(self) -> None:
         name, entry = self.name, TASKS[self.name]
@@ -261,7 +269,7 @@ class TasksPanel(Panel):
         elif not done.good:
             mark(self.words, "refused", True)
         self.folder_button.setEnabled(bool(done.files))
-        self.use_button.setEnabled(any(map(_panel_for, done.files)))
+        self.use_button.setEnabled(any(map(self._panel_for, done.files)))
         self.run_bar.show_end("Ended early" if done.kept else "Done", complete=not done.kept)
         pictures = [path for path in done.files if path.suffix in _PICTURES]
         if pictures:
@@ -291,6 +299,14 @@ class TasksPanel(Panel):
         self.picture.show_pixmap(QPixmap.fromImage(picture))
         self.results.setCurrentWidget(self.picture)
 
+    def _panel_for(self, path: Path) -> str:
+        """Return the name of the panel that works with a result; empty where there is none."""
+        if path.name in ("chart.json", "stability.json"):
+            return "charts"
+        if path.name.endswith(".ome.zarr") and TASKS[self.name].group == VIDEOS:
+            return "films"
+        return "reconstructions" if (path / "calibration.json").is_file() else ""
+
     def _open(self, path: Path) -> None:
         QDesktopServices.openUrl(QUrl.fromLocalFile(str(path)))
 
@@ -300,7 +316,7 @@ class TasksPanel(Panel):
 
     def _use(self) -> None:
         for path in self.files:
-            if panel := _panel_for(path):
+            if panel := self._panel_for(path):
                 self.session.handed_on.emit(panel, path)
                 return
 
@@ -323,10 +339,3 @@ def _behaviour(o: Option, *, needed: bool) -> Behaviour:
         return Behaviour(browse="folder" if folder else "save")
     exists = o.kinds == (Path,)
     return Behaviour(browse="folder" if folder else "open", must_exist=exists, needed=needed)
-
-
-def _panel_for(path: Path) -> str:
-    """Return the name of the panel that works with a result; empty where there is none."""
-    if path.name in ("chart.json", "stability.json"):
-        return "charts"
-    return "reconstructions" if (path / "calibration.json").is_file() else ""

@@ -21,6 +21,7 @@ class UnservedPanel(Panel):
     ) -> None:
         super().__init__(session, parent)
         self.title = title
+        tried_on = tried_on or "default"
         what = TEMPLATES[tried_on][0]
         hint = Hint(
             why,
@@ -38,7 +39,7 @@ class UnservedPanel(Panel):
 
 
 def why_not(session: BenchSession, title: str, needs: Sequence[str], tried_on: str) -> str:
-    """Return why a bench cannot serve a panel that needs devices; empty where it can."""
+    """Return why a bench cannot serve what needs devices, simulated ones ``tried_on``; empty where it can."""
     missing = [name_of(kind) for kind in needs if kind not in session.kinds]
     if not session.kinds and needs:
         return f"{title} needs a bench with {_listed([name_of(kind) for kind in needs])}; no bench is open."
@@ -47,7 +48,7 @@ def why_not(session: BenchSession, title: str, needs: Sequence[str], tried_on: s
             f"{title} needs {_listed(missing)}, which {session.config.label} does not have. "
             "A table in its bench.toml adds one."
         )
-    if wrong := not_tried_on(session.config, needs, tried_on):
+    if tried_on and (wrong := not_tried_on(session.config, needs, tried_on)):
         return (
             f"{title} takes a simulated {TEMPLATES[tried_on][0]}: the simulated "
             f"{' and '.join(map(name_of, wrong))} of {session.config.label} would see nothing of it."

@@ -231,7 +231,7 @@ def text_view(text: str = "", tip: str = "") -> QPlainTextEdit:
     return made
 
 
-def mark(widget: QWidget, name: str, on: bool) -> None:
+def mark(widget: QWidget, name: str, on: bool | str) -> None:
     """Set a property that the style sheet looks at, such as ``refused``."""
     widget.setProperty(name, on)
     widget.style().unpolish(widget)

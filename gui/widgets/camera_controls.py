@@ -11,6 +11,7 @@ from typing import Any
 from PySide6.QtWidgets import QLineEdit, QProgressBar, QWidget
 from shiboken6 import isValid
 
+from calibration_routines.psf.exposure import AutoExposure, auto_expose
 from drivers.camera import Camera, Roi
 from gui.background import NewestOnly
 from gui.forms.fields import Behaviour, ChoiceField, NumberField
@@ -59,10 +60,13 @@ class CameraForm(QWidget):
         self._panel = panel
         self._session = panel.session
         self.state: CameraState | None = None
-        self.form = OptionsForm(
-            [CameraOptions],
-            {name: Behaviour(offers=partial(self._offered, offered)) for name, offered in _OFFERED.items()},
-        )
+        tip = "Find the exposure that fills the sensor's range in the present light, nothing saturated"
+        self.auto_button = button("Auto", tip, self.expose)
+        behaviours = {
+            name: Behaviour(offers=partial(self._offered, offered)) for name, offered in _OFFERED.items()
+        }
+        behaviours["exposure_ms"] = Behaviour(beside=lambda: self.auto_button)
+        self.form = OptionsForm([CameraOptions], behaviours)
         self.widgets = self.form.widgets
         self.form.hide_fields(_OF_HARDWARE)
         self.form.refused.connect(panel.refused)
@@ -85,6 +89,29 @@ class CameraForm(QWidget):
             "Reading the camera", lambda _: read_camera(self._session.bench.camera), {"camera"}, quiet=True
         )
         job.succeeded.connect(self._show)
+
+    def expose(self) -> None:
+        """Find an exposure for what is lit now, and say how good it is."""
+
+        def work(camera: Camera) -> tuple[AutoExposure, CameraState]:
+            return auto_expose(camera), read_camera(camera)
+
+        start = partial(self._session.camera_job, "Auto exposure", work, idle=True)
+        job = self._panel.begin(start, self.auto_button)
+        if job is not None:
+            self.auto_button.setEnabled(False)
+            job.succeeded.connect(self._exposed)
+            job.ended.connect(lambda: self.auto_button.setEnabled(True))
+
+    def _exposed(self, found: tuple[AutoExposure, CameraState]) -> None:
+        exposure, state = found
+        self._taken("exposure_ms", state)
+        self._panel.accepted(self.auto_button)
+        if exposure.usable:
+            self._session.log("info", exposure.message)
+        else:
+            self._session.log("warning", exposure.message)
+            self._panel.refused(self.auto_button, exposure.message)
 
     def set_region(self, region: Roi | None) -> Job | None:
         """Send a region (None: the whole sensor) to the camera."""

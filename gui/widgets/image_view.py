@@ -76,6 +76,8 @@ class ImageView(QWidget):
         self._pan = self.box.mouseDragEvent
         self.box.mouseDragEvent = self._dragged
         self.image: Image | None = None
+        self.naming = (0, 0, 1)
+        """The sensor's column and row of the image's first pixel, and its pixels along one of the image's."""
         self._colour_map = colour_map or colours().colour_map
         self._placed: tuple[Any, ...] = ()
         self._mouse: QPointF | None = None
@@ -269,12 +271,18 @@ class ImageView(QWidget):
         across, down = self.extent
         return (column, row) if 0 <= column < across and 0 <= row < down else None
 
+    def named(self, x: float, y: float) -> tuple[float, float]:
+        """Return what a place of the image is called: the sensor's pixel, for frames of a part of it."""
+        left, top, binning = self.naming
+        return left + x * binning, top + y * binning
+
     def describe(self, column: int, row: int) -> str:
         """Return a pixel's place and value in words."""
         assert self.image is not None
         value = self.image[row, column]
         words = " ".join(f"{v:.5g}" for v in np.atleast_1d(value))
-        return f"x {column}  y {row}  value {words}"
+        x, y = self.named(column, row)
+        return f"x {x:.0f}  y {y:.0f}  value {words}"
 
     def under_mouse(self) -> str:
         """Return place and value under the mouse in words, as they are now; empty outside."""

@@ -13,7 +13,14 @@ from gui.theme import NAMES, colours
 from gui.widgets.building import button, choice, fill, in_row
 from gui.widgets.image_view import ImageView, whole_steps
 from gui.widgets.plots import HistogramPlot, curve_pen, plot_widget
-from instrument.live.frame_view import histogram, line_profile, percentiles
+from instrument.live.frame_view import (
+    FrameFigures,
+    histogram,
+    line_profile,
+    not_stretched,
+    percentiles,
+    sensor_roi,
+)
 
 
 class CrossHair(QObject):
@@ -218,7 +225,9 @@ class LivePicture(QWidget):
         self.colour_map = choice(NAMES, "Colour map; saturated pixels have a colour of their own")
         self.colour_map.setCurrentText(self.view.colour_map)
         self.colour_map.currentTextChanged.connect(self.view.set_colour_map)
-        tip = "Counts shown darkest and brightest: full range, percentiles, or dragged"
+        tip = (
+            "Counts shown darkest and brightest: full range, percentiles (over a sixteenth of it), or dragged"
+        )
         self.stretch = choice(LEVELS, tip)
         self.stretch.setCurrentIndex(1)
         self.stretch.currentTextChanged.connect(lambda _: self._stretch_chosen())
@@ -233,7 +242,9 @@ class LivePicture(QWidget):
             "Drag a region of interest, or arrow keys (Alt: its size; Return sends it)",
             checkable=True,
         )
-        self.apply_region = button("Send", "Send the region to the camera", self.region_sent)
+        self.apply_region = button(
+            "Send", "Send the region to the camera: top, left, height, width of the sensor", self.region_sent
+        )
         self.apply_region.hide()
         for switch, what in (
             (self.cross_button, (self.cross_hair.set_enabled,)),
@@ -260,6 +271,8 @@ class LivePicture(QWidget):
     def show_frame(self, frame: Frame) -> None:
         """Show a frame with the levels in use."""
         self.frame = frame
+        top, left = frame.metadata.roi[:2]
+        self.view.naming = (left, top, frame.metadata.binning)
         self.view.show_image(frame.image, *self.levels, frame.full_scale)
 
     def measure(self) -> None:
@@ -285,12 +298,20 @@ class LivePicture(QWidget):
         counts = histogram(frame.image)
         wanted = LEVELS[self.stretch.currentText()]
         if wanted is not None:
-            self.levels = percentiles(counts, *wanted)
+            self.levels = not_stretched(percentiles(counts, *wanted), frame.full_scale)
         elif self.stretch.currentText() == "full range":
             self.levels = (0.0, float(frame.full_scale))
-        self.histogram.show_counts(counts, frame.full_scale, *self.levels)
+        self.histogram.show_counts(counts, FrameFigures.of(counts, frame.full_scale), *self.levels)
         if (ends := self.profile_line.ends) is not None:
             self._profile_curve.setData(*line_profile(frame.image, *ends))
+            (x0, y0), (x1, y1) = (self.view.named(*end) for end in ends)
+            words = (
+                f"along the line from x {x0:.0f} y {y0:.0f} to x {x1:.0f} y {y1:.0f} of the sensor (pixels)"
+            )
+            self.profile_plot.setLabel("bottom", words)
+        if (rectangle := self.region_box.rectangle) is not None:
+            region = sensor_roi(frame.metadata, *rectangle)
+            self.apply_region.setText(f"Send {', '.join(map(str, region.as_tuple()))}")
 
     def _stretch_chosen(self) -> None:
         if self.frame is not None:  # at once, and where the frame is held as well

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
-from PySide6.QtCore import QSignalBlocker, Qt, Signal
+from PySide6.QtCore import QRectF, QSignalBlocker, Qt, Signal
+from PySide6.QtGui import QColor, QPainter, QPaintEvent
 from PySide6.QtWidgets import QGraphicsItem, QWidget
 
 from gui.theme import NAMES, colours
-from gui.widgets.building import button, choice, fill, narrow
+from gui.widgets.building import button, choice, fill, label, mark, narrow
 from gui.widgets.entry import NumberEdit
 from instrument.files.seen import levels_of
-from instrument.live.frame_view import grouped
+from instrument.live.frame_view import FrameFigures, grouped
 
 # Images are (row, column) here as everywhere else in the project.
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
@@ -199,7 +200,55 @@ class LevelsBar(QWidget):
         self.changed.emit()
 
 
+_NEAR_FULL = 0.9
+"""Of the sensor's range: from here on it is said that little is left."""
+
+
+class RangeBar(QWidget):
+    """The sensor's whole range as a bar: what the counts fill, where the mean is; with the figures below."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.figures: FrameFigures | None = None
+        self.words = label(wraps=True, selectable=True)
+        self.words.setObjectName("figures")
+        self.words.setToolTip("Of the raw data, all pixels; share: the largest count of the sensor's range")
+        fill(self, _BAR_PX, self.words)
+
+    def show_figures(self, figures: FrameFigures) -> None:
+        """Show the figures of a frame."""
+        self.figures = figures
+        words = f"max {figures.largest} ({figures.share:.1%})   mean {figures.mean:.1f}"
+        warns = ""
+        if figures.saturated > 0:
+            words += f"   SATURATED {max(figures.saturated, 1e-6):.2g}".replace("e-0", "e-") + " of pixels"
+            warns = "error"
+        elif figures.share > _NEAR_FULL:
+            words += "   near full scale"
+            warns = "warning"
+        self.words.setText(words)
+        if self.words.property("warns") != warns:
+            mark(self.words, "warns", warns)
+        self.update()
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: N802 - Qt's name
+        """Draw the bar."""
+        now, figures = colours(), self.figures
+        painter = QPainter(self)
+        painter.fillRect(0, 0, self.width(), _BAR_PX, QColor(now.field))
+        if figures is None:
+            return
+        scale = self.width() / figures.full_scale
+        left, right = scale * figures.least, max(scale * figures.largest, scale * figures.least + 2)
+        filled = (
+            now.error if figures.saturated > 0 else now.warning if figures.share > _NEAR_FULL else now.accent
+        )
+        painter.fillRect(QRectF(left, 1, right - left, _BAR_PX - 2), QColor(filled))
+        painter.fillRect(QRectF(scale * figures.mean - 1, 0, 2, _BAR_PX), QColor(now.text))
+
+
 _LIVE_BINS = 256
+_BAR_PX = 10
 _SHADE = 18
 """Opacity of the counts between the levels, of 255."""
 
@@ -234,23 +283,34 @@ class HistogramPlot(QWidget):
         self.full_scale.setToolTip("full scale of the sensor")
         self.plot.addItem(self.full_scale)
         self._style_lines()
-        self._ranges = (0, 0.0)
-        self.setToolTip("Histogram of the raw data. Drag the borders to choose levels; red: full scale")
+        self._ranges: tuple[float, ...] = ()
+        self.setToolTip(
+            "Histogram of the raw data, as far as they reach; the bar below is the sensor's whole range. "
+            "Drag the borders to choose levels"
+        )
         self.setMinimumHeight(130)
         self.setFocusPolicy(Qt.FocusPolicy.NoFocus)
-        fill(self, self.plot)
+        self.range = RangeBar()
+        fill(self, (self.plot, 1), self.range)
 
-    def show_counts(self, counts: npt.NDArray[np.float32], full_scale: int, low: float, high: float) -> None:
-        """Show a histogram of all counts (``instrument.live.frame_view.histogram``) and the levels in use."""
-        bins = grouped(counts, full_scale, _LIVE_BINS)
-        step = (full_scale + 1) / _LIVE_BINS
-        self.curve.setData(np.arange(_LIVE_BINS) * step, np.maximum(bins, 0.5))
+    def show_counts(
+        self, counts: npt.NDArray[np.float32], figures: FrameFigures, low: float, high: float
+    ) -> None:
+        """Show a histogram of all counts (``instrument.live.frame_view.histogram``) and the levels in use.
+
+        It reaches over what the data fill; the bar below has the sensor's whole range.
+        """
+        first, last = figures.span
+        bins, step = grouped(counts, first, last, _LIVE_BINS)
+        self.curve.setData(first + np.arange(_LIVE_BINS) * step, np.maximum(bins, 0.5))
         decades = float(np.ceil(np.log10(max(float(bins.max()), 10.0))))
-        if (full_scale, decades) != self._ranges:
-            self._ranges = (full_scale, decades)
-            self.plot.setXRange(0, full_scale * 1.02, padding=0)
+        if (first, last, figures.full_scale, decades) != self._ranges:
+            self._ranges = (first, last, figures.full_scale, decades)
+            margin = 0.02 * (last - first + 1)
+            self.plot.setXRange(first - margin, last + margin, padding=0)
             self.plot.setYRange(-0.3, decades, padding=0)
-            self.full_scale.setValue(full_scale)
+            self.full_scale.setValue(figures.full_scale)
+        self.range.show_figures(figures)
         with QSignalBlocker(self.region):
             self.region.setRegion((low, high))
 

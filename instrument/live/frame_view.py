@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -15,6 +16,8 @@ from recon.optics.jit import compiled
 SATURATED = 255
 """Index of saturated pixels; signal uses 0 to 254."""
 _SIGNAL = SATURATED - 1
+_PARTS = 64
+_LEAST_SPAN = 16
 
 Counts = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
@@ -79,13 +82,48 @@ def histogram(image: Counts) -> npt.NDArray[np.float32]:
     return np.asarray(cv2.calcHist([flat], [0], None, [n], [0, n]), np.float32).ravel()
 
 
-def grouped(counts: npt.NDArray[np.float32], full_scale: int, bins: int = 256) -> npt.NDArray[np.float32]:
-    """Return a histogram in ``bins`` equal steps from zero to the sensor's full scale."""
-    used = counts[: full_scale + 1]
+def grouped(
+    counts: npt.NDArray[np.float32], first: int, last: int, bins: int = 256
+) -> tuple[npt.NDArray[np.float32], int]:
+    """Return a histogram from one count to another in ``bins`` equal steps, and a step's size in counts."""
+    used = counts[first : last + 1]
     size = -(-len(used) // bins)
     padded = np.zeros(size * bins, np.float32)
     padded[: len(used)] = used
-    return np.asarray(padded.reshape(bins, size).sum(axis=1))
+    return np.asarray(padded.reshape(bins, size).sum(axis=1)), size
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFigures:
+    """What a frame's counts are, in figures."""
+
+    least: int
+    largest: int
+    mean: float
+    full_scale: int
+    saturated: float
+    """Share of the pixels at full scale."""
+
+    @classmethod
+    def of(cls, counts: npt.NDArray[np.float32], full_scale: int) -> FrameFigures:
+        """Return the figures of a histogram of all counts."""
+        there = np.flatnonzero(counts)
+        total = float(counts.sum(dtype=np.float64))
+        mean = float(np.dot(np.arange(len(counts)), counts.astype(np.float64))) / total
+        saturated = float(counts[full_scale:].sum(dtype=np.float64)) / total
+        return cls(int(there[0]), int(there[-1]), mean, full_scale, saturated)
+
+    @property
+    def share(self) -> float:
+        """The largest count as a share of full scale."""
+        return self.largest / self.full_scale
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """First and last count of a scale that the data fill: even parts of the sensor's range."""
+        part = max(1, (self.full_scale + 1) // _PARTS)
+        first = self.least // part * part
+        return first, min(self.full_scale, (self.largest // part + 1) * part - 1)
 
 
 def percentiles(counts: npt.NDArray[np.float32], low: float, high: float) -> tuple[float, float]:
@@ -93,6 +131,12 @@ def percentiles(counts: npt.NDArray[np.float32], low: float, high: float) -> tup
     total = np.cumsum(counts, dtype=np.float64)
     at = np.searchsorted(total, np.array([low, high]) / 100 * total[-1])
     return float(at[0]), float(max(at[1], at[0] + 1))
+
+
+def not_stretched(levels: tuple[float, float], full_scale: int) -> tuple[float, float]:
+    """Return levels that span a sixteenth of the sensor's range at least: noise in the dark looks dark."""
+    low, high = levels
+    return low, max(high, low + full_scale / _LEAST_SPAN)
 
 
 def line_profile(

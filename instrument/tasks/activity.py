@@ -10,9 +10,9 @@ from typing import Annotated
 from instrument.files.errors import BenchError, FileError
 from instrument.files.volumes import is_zarr_name
 from instrument.reconstruction.activity import ActivitySettings, find_activity, write_activity
+from instrument.reconstruction.film import open_video
 from instrument.reconstruction.options import InputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.video import VideoRequest
-from instrument.reconstruction.video_files import VideoPictures
 from instrument.runs.run_files import STATE
 from instrument.tasks.task import Desk, Done, Only, saying_what_is_left, task
 from instrument.tasks.video import make_video
@@ -68,7 +68,7 @@ def activity(
             made = make_video(desk, _request(files, source, inputs, scene), force=files.force)
             if made.kept:
                 return made
-        pictures = opened(files.out / _VIDEO if is_recording else files.video)
+        pictures = open_video(files.out / _VIDEO if is_recording else files.video)
         warm = pictures.attributes.get("diffuserbench", {}).get("warm_iterations")
         if warm is not None and warm < WARM_ITERATIONS:
             desk.warn(
@@ -135,14 +135,3 @@ def _request(
         options=scene,
         video=VideoOptions(warm_iterations=WARM_ITERATIONS),
     )
-
-
-def opened(path: Path) -> VideoPictures:
-    """Open a video; FileError where it is something else."""
-    try:
-        video = VideoPictures(path)
-        if video.axes not in ("tyx", "tcyx", "tzyx", "tczyx"):
-            raise KeyError("t")
-    except (FileNotFoundError, KeyError, IndexError, ValueError, TypeError) as error:
-        raise FileError(path, "is no video of 'reconstruct --video'.", "See docs/video.md.") from error
-    return video

@@ -39,7 +39,7 @@ class AnalysisFiles:
 
 @dataclass(frozen=True, kw_only=True)
 class RefocusOptions:
-    """Which PSF is brought to which depths."""
+    """Which PSFs are brought to which depths, and over the field."""
 
     calibration: Path = option(
         help="A calibration, or a run with one.", metavar="CALIBRATION", positional=True
@@ -51,6 +51,11 @@ class RefocusOptions:
     deflection_deg: float = option(
         0.25, help="How far the diffuser typically bends light.", unit="deg", above=0
     )
+    response: Path | None = option(
+        None,
+        help="Make PSFs over the field of the one on the axis: angular_response.json of calibrate angular.",
+    )
+    points: int = option(3, help="Places a side, with --response.", least=1)
     force: bool = option(False, help="Replace a calibration that exists.")
 
 
@@ -194,29 +199,39 @@ def compare(desk: Desk, options: CompareOptions) -> Done:
 @task(
     "diffuserbench refocus runs/axial --z-mm 27.5 --out calibration-27.5",
     "diffuserbench refocus calibration --z-mm 12 --z-mm 14 --z-mm 16 --out near",
+    "diffuserbench refocus calibration --z-mm 2 --response angular_response.json --points 5 --out field",
 )
-def refocus(desk: Desk, options: RefocusOptions) -> Done:
-    """Bring a calibration's PSF to other depths by paraxial scaling, with the error to expect.
+def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
+    """Bring a calibration's PSFs to other depths by paraxial scaling, with the error to expect.
 
-    Between two calibrated depths both neighbours are scaled, registered and mixed (Kuo 2020, Eq. 5.2).
-    `reconstruct --calibration FOLDER --z-mm Z` does the same by itself.
+    Between two calibrated depths both neighbours are scaled, registered and mixed, at every place of the
+    field that was calibrated (Kuo 2020, Eqs. 5.2, 5.3). `reconstruct --calibration FOLDER --z-mm Z` does the
+    same by itself. With --response PSFs over the field are made of the one on the axis (Eq. 5.1).
     """
     import numpy as np
 
+    from calibration_routines.optics.angular_response import load_response
     from instrument.files.calibration_file import load_calibration, save_calibration
     from instrument.reconstruction.job import find_calibration
-    from recon.camera.refocus import central_places
     from recon.camera.refocus import refocus as refocused
+    from recon.camera.refocus import refocus_field
+    from recon.camera.two_part import two_part
 
     if len(set(options.z_um)) < len(options.z_um):
         raise BenchError("--z-mm: a depth is asked for twice.")
+    if "points" in given and options.response is None:
+        raise BenchError("--points is how many places --response makes: give --response too.")
     folder = find_calibration(options.calibration)
     measured = load_calibration(folder)
     made = [refocused(measured, z, deflection_deg=options.deflection_deg) for z in options.z_um]
+    fields = [refocus_field(measured, one.z_um) for one in made]
+    if options.response is not None:
+        response = load_response(options.response).fall_off()
+        fields = [two_part(field, response, points=options.points) for field in fields]
     new = replace(
-        measured,
-        psfs=np.stack([one.psf for one in made]),
-        source_positions_um=np.array([(*one.source_um, one.z_um) for one in made]),
+        fields[0],
+        psfs=np.concatenate([field.psfs for field in fields]),
+        source_positions_um=np.concatenate([field.source_positions_um for field in fields]),
         quality={
             "refocused": [
                 {
@@ -228,13 +243,14 @@ def refocus(desk: Desk, options: RefocusOptions) -> Done:
                 for one in made
             ]
         },
-        provenance={**measured.provenance, "refocused_from": str(folder.resolve())},
+        provenance={**fields[0].provenance, "refocused_from": str(folder.resolve())},
     )
     path = save_calibration(new, options.out, overwrite=options.force)
     if measured.provenance.get("simulated"):
         desk.say("SIMULATED: the calibration comes from the simulated bench")
-    for one in made:
-        desk.say(f"{one.z_um / 1e3:g} mm: {one}")
+    for one, field in zip(made, fields, strict=True):
+        places = f" ({len(field.psfs)} places of the field)" if len(field.psfs) > 1 else ""
+        desk.say(f"{one.z_um / 1e3:g} mm{places}: {one}")
         if one.extrapolated:
             near, far = (v / 1e3 for v in one.calibrated_um)
             desk.warn(
@@ -242,9 +258,4 @@ def refocus(desk: Desk, options: RefocusOptions) -> Done:
                 f"{f'{near:.4g} to {far:.4g} mm' if far > near else f'depth, {near:.4g} mm'}: the pattern is "
                 "extrapolated, by scaling alone. Measure a PSF there where it matters."
             )
-    if len(measured.psfs) > len(central_places(measured)):
-        desk.warn(
-            "Note: the calibration has several places at a depth; the one nearest to the axis was taken, how "
-            "PSFs vary over the field is lost. reconstruct --model local uses all of them."
-        )
     return Done((path,))

@@ -6,8 +6,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from instrument.files.errors import BenchError
+from instrument.files.errors import BenchError, FileError
 from instrument.files.volumes import is_zarr_name, uneven_steps
+from instrument.reconstruction.film import Film, Window, open_video, write_film
 from instrument.runs.export import export as export_run
 from instrument.runs.inspection import verify as verify_run
 from instrument.runs.run import Run
@@ -52,6 +53,14 @@ def _slice(text: str) -> slice:
     return slice(*numbers)
 
 
+def _window(text: str) -> Window:
+    words = text.split(",")
+    if len(words) != 4 or not all(word.strip().isdecimal() for word in words) or "0" in words[2:]:
+        raise ValueError("give four whole numbers: top, left, height, width.")
+    top, left, height, width = map(int, words)
+    return slice(top, top + height), slice(left, left + width)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
     """What is written where, how fast a film plays, and on which voxels a volume lies."""
@@ -60,8 +69,8 @@ class ExportOptions:
         help="The run's folder; or a reconstruction's file.", metavar="RUN|RESULT", positional=True
     )
     out: Path = option(
-        help="File ending in .ome.tif, .tif, .h5, .npy or .mp4, or a folder for PNG files. "
-        "A picture: .tif, .npy, .png; a volume: .tif, .npy, .ome.zarr.",
+        help="File ending in .ome.tif, .tif, .h5, .npy, .mp4, .gif or .csv, or a folder for PNG files. "
+        "A picture: .tif, .npy, .png; a volume: .tif, .npy, .ome.zarr; a video: .mp4, .gif, .csv, .ome.zarr.",
         metavar="TARGET",
         positional=True,
     )
@@ -75,10 +84,19 @@ class ExportOptions:
     )
     frames_per_s: float | None = option(
         None,
-        help="Frames a second of an MP4.",
+        help="Frames a second of an MP4 or GIF.",
         least=0.1,
         flags=("--fps",),
-        applies=("run",),
+        applies=("run", "film"),
+    )
+    regions: tuple[Window, ...] = option(
+        (),
+        help="Rows and columns whose mean a .csv follows, with dF/F; repeatable.",
+        default_words="the whole picture",
+        metavar="T,L,H,W",
+        flags=("--region",),
+        parse=_window,
+        applies=("film",),
     )
     metric: bool = option(
         False,
@@ -99,6 +117,7 @@ class ExportOptions:
     "diffuserbench export RUN psfs.ome.tif --label psf",
     "diffuserbench export RUN video.mp4",
     "diffuserbench export RUN frames/ --frames 0:100",
+    "diffuserbench export film.ome.zarr curves.csv --region 10,20,5,5 --region 40,8,6,6",
     "diffuserbench export volume.tif volume.ome.zarr --metric",
 )
 def export(desk: Desk, options: ExportOptions, given: Given) -> Done:
@@ -106,6 +125,9 @@ def export(desk: Desk, options: ExportOptions, given: Given) -> Done:
 
     Frames that are not there (gaps of a recording, steps not done) are left out, and said.
     """
+    if _is_film(options.run, options.out):
+        given.refuse("a film", "film")
+        return _export_film(desk, options)
     if _is_result(options.run):
         return _export_result(desk, options, given)
     given.refuse("a run", "run")
@@ -120,6 +142,28 @@ def export(desk: Desk, options: ExportOptions, given: Given) -> Done:
     if absent := len(wanted) - len(indices):
         desk.warn(f"Warning: {absent} frames that are not in the run were left out.")
     return Done((out,))
+
+
+def _is_film(path: Path, target: Path) -> bool:
+    """Whether pictures that follow each other are written: a video's, or a run's as GIF or curves."""
+    if is_zarr_name(path) and path.is_dir():
+        try:
+            open_video(path)
+        except FileError:
+            return False
+        return True
+    return path.is_dir() and target.suffix.lower() in (".gif", ".csv")
+
+
+def _export_film(desk: Desk, options: ExportOptions) -> Done:
+    film = Film(options.run)
+    height, width = film.read(0).shape[:2]
+    for rows, columns in options.regions:
+        if rows.stop > height or columns.stop > width:
+            raise BenchError(f"--region: the pictures have {height} x {width} pixels.")
+    with desk.step("Pictures") as advance:
+        write_film(film, options.out, fps=options.frames_per_s, regions=options.regions, advance=advance)
+    return Done((options.out,))
 
 
 def _is_result(path: Path) -> bool:

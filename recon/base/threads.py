@@ -3,15 +3,20 @@
 FFTs and kernels both take their number of threads from here. Work is cut into blocks in a way that never
 changes a result: every output element is computed whole by one thread, and sums are taken over fixed blocks
 first. So results are equal to the last bit for any number of threads.
+
+Linear algebra stays on one thread meanwhile (:func:`linear_algebra_on_one_thread`): its matrices are small,
+and its library's own threads wait for each other by spinning on the cores that others need.
 """
 
 from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Sized
+from collections.abc import Callable, Iterator, Sized
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache
+from typing import Any
 
 _lock = threading.Lock()
 _inside = threading.local()
@@ -76,3 +81,42 @@ def in_blocks(kernel: Callable[[int, int], object], length: int, *, grain: int =
 def over_rows(kernel: Callable[..., object], first: Sized, *args: object) -> None:
     """Run ``kernel(start, stop, first, *args)`` over the rows of its first array, shared among threads."""
     in_blocks(lambda start, stop: kernel(start, stop, first, *args), len(first))
+
+
+class _LinearAlgebra:
+    """Who wants it on one thread, and what the libraries had before the first of them."""
+
+    users = 0
+    before: Any = None
+
+
+@lru_cache(maxsize=1)
+def _libraries() -> Any:
+    import scipy.linalg  # noqa: F401 # brings its own library, which must be there to be found
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+@contextmanager
+def linear_algebra_on_one_thread() -> Iterator[None]:
+    """Keep BLAS and LAPACK to one thread within a block or a decorated function, in the whole process.
+
+    For 100 small factorisations on two cores that others use, two threads took 10 times the processor time.
+    What was set before is back when the last of those who asked has ended.
+    """
+    libraries = _libraries()
+    with _lock:
+        if not _LinearAlgebra.users:
+            _LinearAlgebra.before = libraries.limit(limits=1, user_api="blas")
+        _LinearAlgebra.users += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _LinearAlgebra.users -= 1
+            if not _LinearAlgebra.users:
+                for library in libraries.lib_controllers:  # which listen to the first thread that asked, and
+                    if hasattr(library, "clear_controlling_thread"):  # this may be another
+                        library.clear_controlling_thread(force=True)
+                _LinearAlgebra.before.restore_original_limits()

@@ -15,7 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera.camera_model import members_of_depths
-from recon.camera.registration import displacement, moved, rescaled
+from recon.camera.field_registration import remembered_field
+from recon.camera.registration import displacement, moved, register, rescaled
+from recon.camera.transformed import geometric_centre, resampled
+from recon.camera.varying_psfs import interpolation_weights
 from recon.errors import InputError
 from recon.types import Calibration
 
@@ -25,6 +28,8 @@ Floats = npt.NDArray[np.float32]
 SAME_DEPTH = 1e-4
 """Difference of scale below which a calibrated PSF serves as it is: a twentieth of a pixel at the edge of a
 pattern 1000 pixels wide."""
+SAME_PLACE = 0.02
+"""Places of two depths that differ by no more of the field were meant to be the same."""
 LEAST_LIKENESS = 0.5
 """Scaled neighbours less alike than this are not mixed: the mixture would be a double image."""
 TYPICAL_DEFLECTION_DEG = 0.25
@@ -123,22 +128,20 @@ def refocus(
     """
     depths, psfs = central_psfs(calibration)
     distance_um = _distance_um(calibration)
-    if not 0 < z_um < np.inf:
-        raise InputError(f"The depth to refocus to is above 0, not {z_um:g} um.")
-    psf, members, weights = _mixed(depths, psfs, z_um, distance_um)
-    scales = tuple(paraxial_scale(depths[k], z_um, distance_um) for k in members)
+    mixture = _mixture(depths, psfs, z_um, distance_um)
+    members, weights = mixture.members, mixture.weights
     bend_um = np.deg2rad(deflection_deg) * distance_um
-    error = sum(w * bend_um * abs(1 - 1 / s) for w, s in zip(weights, scales, strict=True))
-    if max(abs(s - 1) for s in scales) < SAME_DEPTH:
+    error = sum(w * bend_um * abs(1 - 1 / s) for w, s in zip(weights, mixture.scales, strict=True))
+    if max(abs(s - 1) for s in mixture.scales) < SAME_DEPTH:
         likeness: float | None = 1.0
     else:
         likeness = _expected_similarity(depths, psfs, z_um, members, distance_um)
     x_um, y_um = central_places(calibration)[members[int(np.argmax(weights))]]
     return Refocused(
-        psf,
+        mixture.of([psfs[k] for k in members]),
         float(z_um),
         tuple(float(depths[k]) for k in members),
-        scales,
+        mixture.scales,
         float(error),
         likeness,
         (float(x_um), float(y_um)),
@@ -146,8 +149,121 @@ def refocus(
     )
 
 
+def refocus_field(calibration: Calibration, z_um: float) -> Calibration:
+    """Return what a calibration would hold of one depth, at one that need not have been calibrated.
+
+    Every place of the field is brought there as the one on the axis (Kuo 2020, Eqs. 5.2 and 5.3 in depth):
+    the photographs of the neighbouring depths are scaled about where their pattern lies, and mixed. Where the
+    depths were calibrated at the same places, or at the same angles, so is the new one; else at those of the
+    depth with most, the other's PSFs interpolated between its own.
+
+    What no photograph shows, of patterns that reach beyond the sensor, is dark.
+
+    Raises as :func:`refocus`, and InputError where the pixel pitch is not known.
+    """
+    depths, psfs = central_psfs(calibration)
+    distance_um = _distance_um(calibration)
+    pitch_um = calibration.geometry.pixel_pitch_um
+    mixture = _mixture(depths, psfs, z_um, distance_um)
+    groups = members_of_depths(calibration.source_positions_um)
+    central = _central(calibration)
+    sides = [next(g for g in groups if central[k] in g) for k in mixture.members]
+    if mixture.scales == (1.0,):
+        return calibration.part(sides[0])
+    if max(len(g) for g in sides) == 1:
+        alone = mixture.of([psfs[k] for k in mixture.members])
+        return _of_places(calibration, alone[None], [(*_axis_at(calibration, mixture, z_um), z_um)])
+    if pitch_um is None:
+        raise InputError(
+            "The pixel pitch is not known, so a field of PSFs cannot be brought to another depth."
+        )
+    fields = _of_equal_places([_Side.of(calibration, group) for group in sides])
+    x_um, y_um = _axis_at(calibration, mixture, z_um)
+    # Pixels by which the pattern of a place is displaced go with x / z: linear in 1 / z between the depths.
+    ratios = [depths[k] / z_um if len(fields) == 1 else 1.0 for k in mixture.members]
+    points = np.zeros_like(fields[0].points)
+    for weight, ratio, side in zip(mixture.weights, ratios, fields, strict=True):
+        points += weight * ratio * side.points
+    points = np.round(points)  # whole pixels are registered back without another interpolation
+    per_px = pitch_um * z_um / distance_um
+    positions = [(x_um - column * per_px, y_um - row * per_px, z_um) for row, column in points]
+    made = [
+        mixture.of([side.psfs[j] for side in fields], [side.points[j] for side in fields], point)
+        for j, point in enumerate(points)
+    ]
+    return _of_places(calibration, np.stack(made), positions)
+
+
+def _of_places(calibration: Calibration, psfs: Floats, positions: Any) -> Calibration:
+    return replace(calibration, psfs=psfs, source_positions_um=np.array(positions, np.float64), quality={})
+
+
+def _axis_at(calibration: Calibration, mixture: _Mixture, z_um: float) -> tuple[float, float]:
+    """Return where the source of the pattern in the middle would be, at another depth."""
+    central = calibration.source_positions_um[_central(calibration)][list(mixture.members)]
+    places = np.nan_to_num(central[:, :2])
+    if len(places) > 1:
+        places = places * (z_um / central[:, 2:])
+    x, y = np.asarray(mixture.weights) @ places
+    return float(x), float(y)
+
+
+@dataclass(frozen=True)
+class _Side:
+    """The photographs of one depth: ``points`` (n, 2), pixels by which each lies off the central one."""
+
+    psfs: Floats
+    points: npt.NDArray[np.float64]
+    places_um: npt.NDArray[np.float64]
+
+    @classmethod
+    def of(cls, calibration: Calibration, group: npt.NDArray[np.intp]) -> _Side:
+        _, field, _ = remembered_field(calibration, group)
+        own = int(np.flatnonzero(group == calibration.nearest_to_axis(group))[0])
+        points = field.points - field.points[own]
+        return cls(calibration.psfs[group], points, calibration.source_positions_um[group])
+
+    def at(self, points: npt.NDArray[np.float64]) -> _Side:
+        """Return PSFs at other places, displaced by ``points``, from those around (Eq. 5.3)."""
+        psfs = []
+        for row, column in points:
+            weights = interpolation_weights(self.points, np.eye(len(self.points)), [row], [column])[:, 0, 0]
+            used = np.flatnonzero(weights > 1e-6)
+            total: Any = 0.0
+            shown: Any = 1e-9
+            for j in used:
+                by = row - self.points[j, 0], column - self.points[j, 1]
+                total = total + weights[j] * moved(self.psfs[j], *by)
+                shown = shown + weights[j] * moved(np.ones(self.psfs.shape[2:], np.float32), *np.round(by))
+            psfs.append(np.asarray(total / shown, np.float32))
+        places = np.column_stack([points, np.full(len(points), np.nan)])
+        return _Side(np.stack(psfs), points, places)
+
+
+def _of_equal_places(sides: list[_Side]) -> list[_Side]:
+    """Return the depths' photographs, the same places in the same order."""
+    if len(sides) == 1:
+        return sides
+    first, second = sides
+    for divided in (False, True):  # the same x and y, or the same angles
+        a, b = (s.places_um[:, :2] / (s.places_um[:, 2:] if divided else 1) for s in sides)
+        if len(a) != len(b) or not np.isfinite(a).all() or not np.isfinite(b).all():
+            break
+        away = np.linalg.norm(a[:, None] - b, axis=2)
+        order = away.argmin(axis=1)
+        size = max(float(np.ptp(a, axis=0).max()), 1e-12)
+        if len(set(order.tolist())) == len(order) and away.min(axis=1).max() < SAME_PLACE * size:
+            return [first, _Side(second.psfs[order], second.points[order], second.places_um[order])]
+    fuller = int(len(second.psfs) > len(first.psfs))
+    other = 1 - fuller
+    # At the same x and y the displacement goes with 1 / z.
+    ratio = float(np.mean(sides[fuller].places_um[:, 2]) / np.mean(sides[other].places_um[:, 2]))
+    made = sides[other].at(sides[fuller].points * ratio)
+    return [sides[0], made] if other else [made, sides[1]]
+
+
 def at_depth(calibration: Calibration, z_um: float) -> tuple[Calibration, Refocused | None]:
-    """Return a calibration of one PSF at ``z_um``, and how it was made (None where it was calibrated).
+    """Return a calibration at ``z_um`` alone, and how it was made (None where it was calibrated).
 
     Where the calibration has the depth (to :data:`SAME_DEPTH` of the pattern's scale), its PSFs are returned
     as they are. Raises as :func:`refocus`.
@@ -159,16 +275,7 @@ def at_depth(calibration: Calibration, z_um: float) -> tuple[Calibration, Refocu
         return calibration, None
     made = refocus(calibration, z_um)
     provenance = {**calibration.provenance, "refocused_to_um": z_um, "refocused_from_um": made.from_z_um}
-    return (
-        replace(
-            calibration,
-            psfs=made.psf[None],
-            source_positions_um=np.array([[*made.source_um, z_um]]),
-            quality={},
-            provenance=provenance,
-        ),
-        made,
-    )
+    return replace(refocus_field(calibration, z_um), provenance=provenance), made
 
 
 def central_psfs(calibration: Calibration) -> tuple[npt.NDArray[np.float64], Floats]:
@@ -201,33 +308,78 @@ def _central(calibration: Calibration) -> list[int]:
     return chosen
 
 
-def _mixed(
-    depths: npt.NDArray[np.float64], psfs: Floats, z_um: float, distance_um: float
-) -> tuple[Floats, list[int], list[float]]:
-    """Return the PSF at ``z_um``, the planes it was made of and their weights."""
+@dataclass(frozen=True)
+class _Mixture:
+    """How PSFs at a depth are made: of which planes, how much of each, how much larger, and where.
+
+    ``offsets`` (row, column) is what is added to a plane's scaled pattern so that it lies on the other's.
+    """
+
+    members: tuple[int, ...]
+    weights: tuple[float, ...]
+    scales: tuple[float, ...]
+    dimmed: tuple[float, ...]
+    offsets: tuple[tuple[float, float], ...]
+
+    def of(self, psfs: list[Floats], points: Any = None, target: Any = (0.0, 0.0)) -> Floats:
+        """Mix one photograph of each plane: displaced by ``points``, (row, column) each, into ``target``."""
+        points = np.zeros((len(psfs), 2)) if points is None else np.asarray(points)
+        parts = []
+        for psf, scale, dimmed, offset, point in zip(
+            psfs, self.scales, self.dimmed, self.offsets, points, strict=True
+        ):
+            middle, s = geometric_centre(psf), 1 / scale
+            start = middle + point - s * (middle + target + np.asarray(offset))
+            whole = s == 1 and np.allclose(start, np.round(start), atol=1e-9)
+            brought = moved(psf, *-np.round(start)) if whole else resampled(psf, [s, s], start)
+            shown = [
+                (s * np.arange(n) + first >= 0) & (s * np.arange(n) + first <= n - 1)
+                for n, first in zip(psf.shape[-2:], start, strict=True)
+            ]
+            parts.append((brought * np.float32(dimmed), shown[0][:, None] & shown[1]))
+        if len(parts) == 1:
+            return parts[0][0]
+        mixed = sum(w * psf * seen for w, (psf, seen) in zip(self.weights, parts, strict=True))
+        total = sum(w * seen for w, (_, seen) in zip(self.weights, parts, strict=True))
+        return np.asarray(mixed / np.where(total > 0, total, 1), np.float32)
+
+
+def _mixture(depths: npt.NDArray[np.float64], psfs: Floats, z_um: float, distance_um: float) -> _Mixture:
+    """Return what PSFs at ``z_um`` are made of, by the central ones, (n_z, n_channels, height, width)."""
+    if not 0 < z_um < np.inf:
+        raise InputError(f"The depth to refocus to is above 0, not {z_um:g} um.")
+
+    def of(members: tuple[int, ...], weights: tuple[float, ...]) -> _Mixture:
+        scales = tuple(paraxial_scale(depths[k], z_um, distance_um) for k in members)
+        dimmed = tuple(((distance_um + depths[k]) / (distance_um + z_um)) ** 2 for k in members)
+        return _Mixture(members, weights, scales, dimmed, ((0.0, 0.0),) * len(members))
+
     exact = np.flatnonzero(np.abs(depths / z_um - 1) < 1e-9)  # but for rounding
     if exact.size:
-        return psfs[exact[0]], [int(exact[0])], [1.0]
+        return _Mixture((int(exact[0]),), (1.0,), (1.0,), (1.0,), ((0.0, 0.0),))
     above = int(np.searchsorted(depths, z_um))
     if above in (0, len(depths)):
-        nearest = min(above, len(depths) - 1)
-        return refocus_psf(psfs[nearest], depths[nearest], z_um, distance_um), [nearest], [1.0]
+        return of((min(above, len(depths) - 1),), (1.0,))
     near, far = above - 1, above
     share = float((1 / depths[near] - 1 / z_um) / (1 / depths[near] - 1 / depths[far]))
-    scaled = [refocus_psf(psfs[k], depths[k], z_um, distance_um) for k in (near, far)]
+    both = of((near, far), (1 - share, share))
+    scaled = [
+        replace(both, members=(k,), weights=(1.0,), scales=(s,), dimmed=(b,), offsets=((0.0, 0.0),)).of(
+            [psfs[k]]
+        )
+        for k, s, b in zip((near, far), both.scales, both.dimmed, strict=True)
+    ]
     # The stage's line need not pass through the sensor's centre: what is left between the two scaled
     # patterns grows evenly in 1/z, so each goes its share of the way.
-    rows, columns = displacement(scaled[1].mean(axis=0), scaled[0].mean(axis=0))
-    if rows or columns:
-        scaled = [
-            moved(psf, part * rows, part * columns)
-            for psf, part in zip(scaled, (share, share - 1), strict=True)
-        ]
-    if _likeness(*scaled) < LEAST_LIKENESS:
-        nearest = near if share <= 0.5 else far
-        return refocus_psf(psfs[nearest], depths[nearest], z_um, distance_um), [nearest], [1.0]
-    mixed = (1 - share) * scaled[0] + share * scaled[1]
-    return np.asarray(mixed, np.float32), [near, far], [1 - share, share]
+    second, first = (psf.mean(axis=0) for psf in scaled[::-1])
+    whole = displacement(second, first)
+    found = register(second, first, near=whole, within_px=2.0)
+    rows, columns = (found.rows, found.columns) if found.reliable else whole
+    if _likeness(scaled[0], moved(scaled[1], -rows, -columns)) < LEAST_LIKENESS:
+        return of((near if share <= 0.5 else far,), (1.0,))
+    return replace(
+        both, offsets=((share * rows, share * columns), ((share - 1) * rows, (share - 1) * columns))
+    )
 
 
 def _likeness(first: Array, second: Array) -> float:
@@ -236,7 +388,7 @@ def _likeness(first: Array, second: Array) -> float:
 
 
 def _expected_similarity(
-    depths: npt.NDArray[np.float64], psfs: Floats, z_um: float, members: list[int], distance_um: float
+    depths: npt.NDArray[np.float64], psfs: Floats, z_um: float, members: tuple[int, ...], distance_um: float
 ) -> float | None:
     """Predict what a measured PSF would agree to, from calibrated PSFs left out one at a time.
 
@@ -250,7 +402,9 @@ def _expected_similarity(
     missed = []
     for k in nearest:
         rest = np.arange(len(depths)) != k
-        predicted, used, _ = _mixed(depths[rest], psfs[rest], float(depths[k]), distance_um)
+        mixture = _mixture(depths[rest], psfs[rest], float(depths[k]), distance_um)
+        used = mixture.members
+        predicted = mixture.of([psfs[rest][j] for j in used])
         rows, columns = displacement(psfs[k].mean(axis=0), predicted.mean(axis=0))
         likeness = _likeness(moved(predicted, rows, columns), psfs[k])
         gap = min(abs(1 / depths[rest][j] - 1 / depths[k]) for j in used)

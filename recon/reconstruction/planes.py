@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from recon.analysis.correlation import similarity
 from recon.camera.camera_model import Depths, members_of_depths
-from recon.camera.refocus import refocus
+from recon.camera.refocus import refocus, refocus_field
 from recon.camera.registration import rescaled
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
@@ -177,8 +177,10 @@ def between_of(
     unlike = tuple(k for k in gaps if alike[k] < UNLIKE)
     numbers = {"least_likeness": alike[worst]}
     why = f"PSFs of neighbouring depths agree to {alike[worst]:.2f} or more ({UNLIKE:g} is enough)"
-    told = True
-    if unlike or overrides.between:
+    told = not depths.varies
+    if depths.varies:
+        why += "; of PSFs that vary over the field none are added unless asked for"
+    elif unlike or overrides.between:
         made = refocus(calibration, middle(depths.z_um, worst))
         expected = made.expected_similarity
         told = expected is not None and expected >= MADE_ALIKE
@@ -192,7 +194,8 @@ def between_of(
     if added:
         value = f"{len(added)} plane{'s' if len(added) > 1 else ''}"
         return added, Decision("between", value, why, None, "no planes", asked, numbers)
-    return (), Decision("between", "no planes", why, f"{len(gaps)} planes", None, asked, numbers)
+    more = None if depths.varies and not asked else f"{len(gaps)} planes"
+    return (), Decision("between", "no planes", why, more, None, asked, numbers, open=more is not None)
 
 
 def middle(depths_um: Array, k: int) -> float:
@@ -201,25 +204,22 @@ def middle(depths_um: Array, k: int) -> float:
 
 
 def with_planes_between(calibration: Calibration, depths_um: Array, between: tuple[int, ...]) -> Calibration:
-    """Return the calibration of one PSF a depth with refocused PSFs between depths ``k`` and ``k + 1``."""
+    """Return the calibration with PSFs between depths ``k`` and ``k + 1``, as many as these have."""
     if not between:
         return calibration
-    psfs, positions = [], []
-    for k, (psf, position) in enumerate(zip(calibration.psfs, calibration.source_positions_um, strict=True)):
-        psfs.append(psf)
-        positions.append(position)
+    parts = []
+    for k, group in enumerate(members_of_depths(calibration.source_positions_um)):
+        parts.append(calibration.part(group))
         if k in between:
-            made = refocus(calibration, middle(depths_um, k))
-            psfs.append(made.psf)
-            positions.append(np.array([*made.source_um, made.z_um]))
-    return replace(calibration, psfs=np.stack(psfs), source_positions_um=np.stack(positions))
+            parts.append(refocus_field(calibration, middle(depths_um, k)))
+    psfs = np.concatenate([part.psfs for part in parts])
+    positions = np.concatenate([part.source_positions_um for part in parts])
+    return replace(calibration, psfs=psfs, source_positions_um=positions)
 
 
 def _prevented(calibration: Calibration, depths: Depths) -> str | None:
     z = depths.z_um
     steps = np.diff(z)
-    if depths.varies or len(z) != len(calibration.psfs):
-        return "PSFs that vary over the field are not brought to other depths"
     if not calibration.geometry.diffuser_distance_mm or not np.isfinite(z).all() or (z <= 0).any():
         return "the depths, or the distance from diffuser to sensor, are not known"
     if not ((steps > 0).all() or (steps < 0).all()):

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from recon.base.checks import require_photograph
 from recon.base.declare import with_overrides
+from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.camera_model import CAMERAS
 from recon.errors import InputError
 from recon.priors import PRIORS
@@ -38,6 +39,7 @@ FACTS = tuple(f.name for f in fields(Measurement) if f.name != "image")
 """What is known of a measurement, by the names that :func:`reconstruct` takes them by."""
 
 
+@linear_algebra_on_one_thread()
 def reconstruct(
     measurement: Measurement | npt.ArrayLike,
     calibration: Calibration | npt.ArrayLike,

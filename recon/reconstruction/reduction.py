@@ -153,8 +153,7 @@ def reduced(choice: Choice, problem: Problem) -> Problem:
         noise = None if noise is None else float(np.sqrt(np.sum((tint.weights * deviation) ** 2)))
         flat = True
     if choice.between:
-        depths_um = calibration.source_positions_um[:, 2]
-        calibration = with_planes_between(calibration, depths_um, choice.between)
+        calibration = with_planes_between(calibration, problem.depths.z_um, choice.between)
     factor = choice.binning
     every = sorted([*range(choice.n_planes), *(k + 0.5 for k in choice.between)])
     places = places_of(choice)

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.namespace import Namespace, to_host
+from recon.base.threads import linear_algebra_on_one_thread
 from recon.priors.base import Prior
 
 
@@ -201,6 +202,7 @@ class Solver(ABC):
     def solution(self) -> Array:
         """The present iterate on the operator's domain. A view or copy: not to be written to."""
 
+    @linear_algebra_on_one_thread()
     def advance(self) -> IterationRecord:
         """Do one iteration and count it, for those who decide after each whether to go on; untimed."""
         known = self.step()
@@ -210,6 +212,7 @@ class Solver(ABC):
     def compile(self) -> None:  # noqa: B027 (a solver without compiled code has nothing to do)
         """Have compiled code ready: its first use on a machine takes seconds that are no iteration's."""
 
+    @linear_algebra_on_one_thread()
     def run(
         self,
         rules: StoppingRules | None = None,

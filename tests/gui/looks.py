@@ -10,6 +10,7 @@ from PySide6.QtWidgets import (
     QAbstractButton,
     QAbstractScrollArea,
     QComboBox,
+    QCommandLinkButton,
     QLabel,
     QLineEdit,
     QListView,
@@ -51,6 +52,10 @@ def cut_off(root: QWidget) -> Iterator[str]:
         gives_way = part.sizePolicy().horizontalPolicy() == QSizePolicy.Policy.Ignored or (
             isinstance(part, QLabel) and part.minimumWidth() > 0
         )
+        if isinstance(part, QCommandLinkButton):
+            if part.height() < part.heightForWidth(part.width()) - _SLACK_PX:
+                yield f"{_where(part)}: {words!r} is cut off below"
+            continue
         fits = isinstance(part, QComboBox) or part.width() >= part.sizeHint().width() - _SLACK_PX
         if not gives_way and not fits:
             yield f"{_where(part)}: {words!r} needs {part.sizeHint().width()} px and has {part.width()}"

@@ -18,11 +18,11 @@ from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.panels.start import StartPanel
-from gui.panels.unserved import UnservedPanel
+from gui.panels.unserved import UnservedPanel, why_not
 from gui.session import BenchSession
 from gui.widgets.dialogues import TextWindow
 from instrument.bench.config import BenchConfig
-from instrument.bench.config_file import TEMPLATES, no_bench
+from instrument.bench.config_file import TEMPLATES, no_bench, parse_config, template
 from instrument.files.images import write_image
 
 LEFT = Qt.MouseButton.LeftButton
@@ -169,3 +169,22 @@ def test_a_new_bench_is_written_of_what_is_ticked(
     assert bare.next_bench is not None
     assert sorted(bare.next_bench.devices) == ["camera", "stage"]
     assert bare.next_bench.bench.name == "mine"
+
+
+@pytest.mark.parametrize("name", TEMPLATES)
+def test_a_simulated_bench_serves_its_panels(qtbot: QtBot, name: str) -> None:
+    session = BenchSession(parse_config(template(name), None))
+    unserved = {
+        key for key, entry in PANELS.items() if why_not(session, entry.title, entry.needs, entry.tried_on)
+    }
+    assert (
+        unserved
+        == {
+            "default": {"alignment"},
+            "display": {"led_array"},
+            "led_microscope": {"alignment", "stage", "slm"},
+            "screen": {"alignment"},
+        }[name]
+    )
+    with qtbot.waitSignal(session.closed, timeout=WAIT_MS):
+        session.close()

@@ -17,6 +17,7 @@ from gui.panels.live import LivePanel
 from gui.widgets.image_view import ImageView
 from instrument.bench.photograph import LightState
 from instrument.files.images import read_image
+from instrument.live.frame_view import FrameFigures, not_stretched
 from instrument.plan.led_shapes import BrightField
 from instrument.runs.run import Run
 
@@ -74,6 +75,35 @@ def test_exposure_typed_reaches_the_camera_and_is_read_back(qtbot: QtBot, live: 
     qtbot.waitUntil(lambda: live.session.bench.camera.exposure_ms == 3.21, timeout=WAIT_MS)
     qtbot.waitUntil(lambda: live.form.widgets["exposure_ms"].text() == "3.21 ms", timeout=WAIT_MS)
     assert live.session.live.is_running
+
+
+def test_auto_finds_the_exposure_and_the_figures_beside_the_histogram_say_what_is_there(
+    qtbot: QtBot, live: LivePanel
+) -> None:
+    live.switch_light(LightState.SCENE)
+    qtbot.waitUntil(lambda: "light: scene" in live.picture.view.caption, timeout=WAIT_MS)
+    before = live.session.bench.camera.exposure_ms
+    qtbot.mouseClick(live.form.auto_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(live.form.auto_button.isEnabled, timeout=WAIT_MS)
+    exposure_ms = live.session.bench.camera.exposure_ms
+    assert exposure_ms != before
+    assert live.form.widgets["exposure_ms"].text().startswith(f"{exposure_ms:.4g}")
+    qtbot.waitUntil(lambda: live.picture.frame.metadata.exposure_ms == exposure_ms, timeout=WAIT_MS)  # type: ignore[union-attr]
+    live.count()
+    figures = live.picture.histogram.range.figures
+    assert figures is not None
+    assert 0.6 < figures.share < 1
+    assert f"max {figures.largest}" in live.picture.histogram.range.words.text()
+    live.picture.frame = live.picture._measured = None
+    counts = np.zeros(65536, np.float32)
+    counts[[100, 1600]] = 5, 1
+    figures = FrameFigures.of(counts, 65535)
+    assert (figures.largest, figures.mean, figures.span) == (1600, 350.0, (0, 2047))
+    assert not_stretched((100.0, 120.0), 65535)[1] > 4000, "noise in the dark looks dark"
+    counts[65535] = 2
+    live.picture.histogram.show_counts(counts, FrameFigures.of(counts, 65535), 0, 1)
+    assert "SATURATED" in live.picture.histogram.range.words.text()
+    assert live.picture.histogram.range.words.property("warns") == "error"
 
 
 def test_a_wrong_exposure_is_refused_at_the_field(qtbot: QtBot, live: LivePanel) -> None:

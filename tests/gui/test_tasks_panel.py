@@ -11,6 +11,7 @@ import pytest
 from pytestqt.qtbot import QtBot
 
 from gui.jobs import JobCancelledError
+from gui.panel import whole
 from gui.panels.tasks import TasksPanel
 from gui.session import BenchSession
 from instrument.files.calibration_file import save_calibration
@@ -23,7 +24,7 @@ from tests.gui.conftest import WAIT_MS
 @pytest.fixture
 def panel(qtbot: QtBot, make_session: Callable[[], BenchSession]) -> TasksPanel:
     """The panel without a bench that is open."""
-    panel = TasksPanel(make_session())
+    panel = whole(TasksPanel(make_session()))
     qtbot.addWidget(panel)
     return panel
 

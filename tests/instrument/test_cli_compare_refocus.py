@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from calibration_routines.optics.angular_response import AngularResponse, Curve, save_response
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from instrument.cli import main
@@ -59,6 +60,22 @@ def test_a_psf_at_another_depth_is_a_calibration(
     assert np.vdot(psf, truth) / np.linalg.norm(psf) / np.linalg.norm(truth) > 0.98
     assert main(words) == 2  # it is there already
     assert main([*words, "--force"]) == 0
+
+
+def test_the_angular_response_makes_a_field_of_one_psf(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    angles = np.arange(-40.0, 41.0, 5.0)
+    curve = Curve(tuple(angles), tuple(np.exp(-((angles / 13) ** 2) / 2)), (1.0,) * len(angles))
+    save_response(AngularResponse(curve, curve), tmp_path / "response.json")
+    words = ["refocus", str(folder / "calibration"), "--z-mm", "75", "--out", str(tmp_path / "field")]
+    assert main([*words, "--points", "2"]) == 2
+    assert "give --response too" in capsys.readouterr().err
+    assert main([*words, "--points", "2", "--response", str(tmp_path / "response.json")]) == 0
+    assert "(4 places of the field)" in capsys.readouterr().out
+    made = load_calibration(tmp_path / "field")
+    assert len(made.psfs) == 4
+    assert len(set(map(tuple, made.source_positions_um[:, :2].tolist()))) == 4
 
 
 @pytest.mark.parametrize("depths", [["--z-mm", "0"], ["--z-mm", "75", "--z-mm", "75"]])

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import recon
-from recon import InputError
+from recon import InputError, Options, Problem
 from recon.base.blocks import block_mean, enlarged
 from recon.camera.camera_model import CAMERAS, OfferedCamera
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.planes import put_back
-from recon.reconstruction.reduction import reduced_calibration
+from recon.reconstruction.reduction import reduced, reduced_calibration
 from recon.reconstruction.rules import drift, precision_of
 from recon.solvers.base import StopReason
 
@@ -197,13 +197,16 @@ def test_a_depth_that_gets_light_of_a_plane_between_is_not_called_empty():
     assert not found.volume[list(empty.planes)].any()
 
 
-def test_like_depths_get_none_and_what_cannot_be_made_is_refused(beads):
+def test_like_depths_get_no_planes_between_and_fields_where_asked_for(beads):
     scene = make_scene("beads", size=32, depths=8, density=0.3, seed=1)
     choice = choose(scene.measurement, scene.calibration, prior="l1")
     assert choice.between == ()
     assert decision(choice, "between").numbers["least_likeness"] > 0.8
-    with pytest.raises(InputError, match="vary over the field"):
-        choose(beads.measurement, beads.calibration, prior="l1", choose=Overrides(between=True))
+    asked = choose(beads.measurement, beads.calibration, prior="l1", choose=Overrides(between=True))
+    assert asked.between
+    smaller = reduced(asked, Problem.of(beads.measurement, beads.calibration, Options(prior="l1")))
+    assert {len(f.points) for f in smaller.depths.fields} == {9}
+    assert len(smaller.depths.fields) == len(asked.planes) + len(asked.between)
 
 
 def test_float64_is_offered_everywhere(beads):

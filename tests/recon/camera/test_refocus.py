@@ -117,7 +117,8 @@ def test_of_a_field_the_psf_nearest_to_the_axis_is_taken_and_said() -> None:
     assert made.extrapolated
     assert "(x = 1, y = 0 mm)" in str(made)
     moved, _ = at_depth(field, 80e3)
-    assert moved.source_positions_um.tolist() == [[1e3, 0.0, 80e3]]
+    assert len(moved.psfs) == 3
+    np.testing.assert_allclose(moved.source_positions_um[:, 0], [-8e3, 1e3, 8e3], atol=60)
     assert not refocus(calibrated([40e3, 60e3, 100e3]), 75e3).extrapolated
 
 

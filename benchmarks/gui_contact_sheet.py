@@ -1,0 +1,129 @@
+"""Every panel of the desktop program, empty, filled and failed, in every theme, on one sheet.
+
+    python benchmarks/gui_contact_sheet.py --out sheet.jpg                  all of it; some minutes
+    python benchmarks/gui_contact_sheet.py --out sheet.jpg --size 1350x690 --state empty --panel live
+    QT_SCALE_FACTOR=2 python benchmarks/gui_contact_sheet.py --out sheet.jpg --state empty
+
+The last one is 3840 x 2160 at scale 2. Empty: a bench whose folder holds nothing. Failed: all of its devices
+unplugged. Filled: with what ``gui_screenshots.py`` makes and keeps (``--work``). Words cut off, places
+scrolled twice or sideways, and parts without a name for screen readers are looked for in each
+(``tests/gui/looks.py``) and printed; exit status 1 where there are any. Needs no screen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+sys.path.append(str(Path(__file__).parents[1]))
+
+import gui_screenshots as shots
+from PySide6.QtCore import QRect, Qt, qInstallMessageHandler
+from PySide6.QtGui import QColor, QImage, QPainter
+from PySide6.QtTest import QTest
+
+from drivers.simulated.world import SimulatedWorld
+from gui.app import application
+from gui.panels import PANELS
+from gui.theme import THEMES, apply_theme
+from tests.gui.looks import faults
+
+STATES = ("empty", "filled", "failed")
+HEADING_PX = 22
+RESTYLED_MS = 120
+
+
+def main() -> int:
+    """Make the sheet, and tell of faults."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, help="the sheet, .jpg or .png")
+    parser.add_argument("--work", type=Path, default=Path("runs/screenshots"), help="folder of what is shown")
+    parser.add_argument("--size", default="1600x980", help="of the window in pixels, default 1600x980")
+    parser.add_argument("--state", action="append", choices=STATES, help="only this one; repeatable")
+    parser.add_argument("--theme", action="append", choices=list(THEMES), help="only this one; repeatable")
+    parser.add_argument("--panel", action="append", choices=list(PANELS), help="only this one; repeatable")
+    parser.add_argument("--tile", type=int, default=400, help="width of a picture on the sheet, pixels")
+    given = parser.parse_args()
+    width, height = (int(part) for part in given.size.split("x"))
+    panels, themes = given.panel or list(PANELS), given.theme or list(THEMES)
+    qInstallMessageHandler(shots._quietly)
+    apply_theme(application(), themes[0])
+    tiles: dict[tuple[str, str, str], QImage] = {}
+    found: list[str] = []
+    for state in given.state or STATES:
+        for name, theme, picture, wrong in _pictures(state, panels, themes, (width, height), given.work):
+            tiles[name, state, theme] = picture.scaledToWidth(
+                given.tile, Qt.TransformationMode.SmoothTransformation
+            )
+            found += [f"{state}, {name}, {theme}: {fault}" for fault in wrong]
+    _sheet(tiles).save(str(given.out), quality=85)
+    print(given.out)
+    found = list(dict.fromkeys(found))
+    print("\n".join([*found, f"{len(found)} faults in {len(tiles)} pictures"]))
+    return 1 if found else 0
+
+
+def _pictures(
+    state: str, panels: list[str], themes: list[str], size: tuple[int, int], work: Path
+) -> Iterator[tuple[str, str, QImage, list[str]]]:
+    """Yield every panel in every theme: name, theme, picture, faults."""
+    own = Path(tempfile.mkdtemp())
+    folder = work.resolve() / "camera" if state == "filled" else own / "camera"
+    folder.mkdir(parents=True, exist_ok=True)
+    if state == "filled":
+        shots._prepare_camera(folder)
+    else:
+        (folder / "bench.toml").write_text(shots.CAMERA)
+    window = shots._open(folder, *size)
+    if state == "failed":
+        world = window.session.bench.shared["simulated"]
+        assert isinstance(world, SimulatedWorld)
+        for kind in window.session.kinds:
+            world.unplug(kind)
+            window.session.reconnect(kind)
+        shots._wait(
+            lambda: all(window.session.state(k).condition == "failed" for k in window.session.kinds),
+            "the devices to fail",
+        )
+    for name in panels:
+        if state == "filled" and name not in shots.DISPLAY:
+            shots._show(window, name, own)
+        else:
+            window.show_panel(name)
+            QTest.qWait(shots.SETTLE_MS)
+        for theme in themes:
+            window.set_theme(theme)
+            QTest.qWait(RESTYLED_MS)
+            yield name, theme, window.grab().toImage(), faults(window)
+    shots._close(window)
+    shutil.rmtree(own, ignore_errors=True)
+
+
+def _sheet(tiles: dict[tuple[str, str, str], QImage]) -> QImage:
+    """Put the pictures in rows of a panel and columns of state and theme."""
+    rows = list(dict.fromkeys(name for name, _, _ in tiles))
+    columns = list(dict.fromkeys((state, theme) for _, state, theme in tiles))
+    first = next(iter(tiles.values()))
+    across, down = first.width(), first.height() + HEADING_PX
+    sheet = QImage(across * len(columns), down * len(rows), QImage.Format.Format_RGB888)
+    sheet.fill(QColor("#808080"))
+    painter = QPainter(sheet)
+    for (name, state, theme), picture in tiles.items():
+        x, y = columns.index((state, theme)) * across, rows.index(name) * down
+        place = QRect(x + 4, y, across - 8, HEADING_PX)
+        painter.drawText(place, Qt.AlignmentFlag.AlignVCenter, f"{PANELS[name].title}, {state}, {theme}")
+        painter.drawImage(x, y + HEADING_PX, picture)
+    painter.end()
+    return sheet
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,228 @@
+"""A film as people look at it: a recording or a reconstructed video; curves of regions; exports."""
+
+from __future__ import annotations
+
+import csv
+import io
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.atomic import require_new, whole_file, write_text
+from instrument.files.errors import FileError
+from instrument.files.films import as_shown, write_mp4
+from instrument.files.volumes import is_zarr_name
+from instrument.reconstruction.video_files import (
+    DEFAULT_FPS,
+    SAMPLES,
+    VideoPictures,
+    create_output,
+    levels_of,
+    require_video,
+)
+from instrument.runs.run import Run
+
+Window = tuple[slice, slice]
+"""Rows and columns."""
+Advance = Callable[[int, int], object]
+FILM_SUFFIXES = (".mp4", ".gif", ".ome.zarr", ".csv")
+BASELINE_PERCENTILE = 20.0
+_GIF_MS = 10
+"""What a GIF's times are told in."""
+
+
+class Film:
+    """The pictures of a recording, or of a video that was reconstructed from one.
+
+    Parameters
+    ----------
+    path : Path
+        A run, or the ``.ome.zarr`` of ``reconstruct --video`` or ``activity``.
+
+    Raises FileError where it is neither, or has no picture.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._video = open_video(path) if is_zarr_name(path) else None
+        self._run = None if self._video is not None else Run.open(path)
+        if self._video is not None:
+            self.indices = tuple(i for i in range(len(self._video)) if self._video.is_written(i))
+            self.period_s = self._video.period_s
+            self.simulated = bool(self._video.attributes.get("diffuserbench", {}).get("simulated"))
+        else:
+            assert self._run is not None
+            require_video(self._run)
+            self.indices = tuple(sorted(self._run.records))
+            self.period_s = self._run.frame_period_s
+            self.simulated = self._run.is_simulated
+        if not self.indices:
+            raise FileError(path, "has no pictures yet.")
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether its pictures are frames of a camera, and nothing was reconstructed."""
+        return self._run is not None
+
+    @property
+    def times_s(self) -> npt.NDArray[np.float64]:
+        """Of its pictures; their numbers, where the rate is not known."""
+        return np.array(self.indices) * (self.period_s or 1.0)
+
+    @property
+    def fps(self) -> float:
+        """Pictures a second as it was taken; 25 where that is not known."""
+        return 1 / self.period_s if self.period_s else DEFAULT_FPS
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def read(self, place: int) -> npt.NDArray[Any]:
+        """Return the picture at a place among those that there are, (height, width[, 3])."""
+        index = self.indices[place]
+        if self._video is not None:
+            return self._video.flat(index)
+        assert self._run is not None
+        return self._run.frame(index)
+
+    def levels(self) -> tuple[float, float]:
+        """Return black and white for all pictures, from some of them."""
+        places = np.unique(np.linspace(0, len(self) - 1, SAMPLES).round().astype(int))
+        return levels_of([np.asarray(self.read(int(place)), np.float32) for place in places])
+
+
+def open_video(path: Path) -> VideoPictures:
+    """Open a video; FileError where it is something else."""
+    try:
+        video = VideoPictures(path)
+        if video.axes not in ("tyx", "tcyx", "tzyx", "tczyx"):
+            raise KeyError("t")
+    except (FileNotFoundError, KeyError, IndexError, ValueError, TypeError) as error:
+        raise FileError(path, "is no video of 'reconstruct --video'.", "See docs/video.md.") from error
+    return video
+
+
+def curves(film: Film, regions: Sequence[Window], advance: Advance | None = None) -> npt.NDArray[np.float64]:
+    """Return the mean of regions in every picture, (n_regions, n_pictures); colours are averaged.
+
+    ``advance``: ``advance(pictures done, pictures)`` after each; may raise to end the work.
+    """
+    found = np.empty((len(regions), len(film)))
+    for place in range(len(film)):
+        picture = film.read(place)
+        found[:, place] = [picture[window].mean(dtype=np.float64) for window in regions]
+        if advance is not None:
+            advance(place + 1, len(film))
+    return found
+
+
+def relative(courses: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return dF/F: the change against each course's own 20th percentile, relative to that."""
+    base = np.percentile(courses, BASELINE_PERCENTILE, axis=-1, keepdims=True)
+    changes: npt.NDArray[np.float64] = (courses - base) / np.maximum(np.abs(base), 1e-12)
+    return changes
+
+
+def write_film(
+    film: Film,
+    target: Path,
+    *,
+    fps: float | None = None,
+    levels: tuple[float, float] | None = None,
+    regions: Sequence[Window] = (),
+    advance: Advance | None = None,
+) -> Path:
+    """Write a film in the format that the target's name asks for, whole or not at all; returns the target.
+
+    Parameters
+    ----------
+    target : Path
+        ``.mp4``, ``.gif`` (8 bit), ``.ome.zarr`` (all values), ``.csv`` (means of regions). Must not exist.
+    fps : float, optional
+        Pictures a second; default: as it was taken.
+    levels : (float, float), optional
+        Values shown black and white.
+    regions : sequence of (slice, slice)
+        Rows and columns, for ``.csv``; none: the whole picture.
+    advance : callable, optional
+        ``advance(pictures done, pictures)`` after each; may raise to end the work.
+
+    Raises FileError when the target exists, has another suffix, or cannot be written.
+    """
+    name = target.name.lower()
+    if not name.endswith(FILM_SUFFIXES):
+        raise FileError(target, f"a film's name ends in {', '.join(FILM_SUFFIXES)}.")
+    require_new(target)
+    if name.endswith(".csv"):
+        windows = list(regions) or [(slice(None), slice(None))]
+        write_text(target, curves_csv(film, windows, curves(film, windows, advance)))
+        return target
+    if name.endswith(".ome.zarr"):
+        _write_zarr(film, target, advance)
+        return target
+    low, high = film.levels() if levels is None else levels
+    shown = (as_shown(picture, low, high) for picture in _pictures(film, advance))
+    if name.endswith(".gif"):
+        _write_gif(target, shown, fps or film.fps)
+    else:
+        write_mp4(target, shown, fps or film.fps)
+    return target
+
+
+def curves_csv(film: Film, regions: Sequence[Window], courses: npt.NDArray[np.float64]) -> str:
+    """Return the means of regions and their dF/F as CSV, a line a picture; columns say where regions lie."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    height, width = film.read(0).shape[:2]
+    spans = [(rows.indices(height), columns.indices(width)) for rows, columns in regions]
+    names = [f"{r[0]}-{r[1]}_{c[0]}-{c[1]}" for r, c in spans]
+    time = "time_s" if film.period_s else "frame_number"
+    writer.writerow(["frame", time, *(f"mean_{n}" for n in names), *(f"dff_{n}" for n in names)])
+    for index, at, means, changes in zip(
+        film.indices, film.times_s, courses.T, relative(courses).T, strict=True
+    ):
+        writer.writerow([index, f"{at:.6g}", *(f"{v:.6g}" for v in means), *(f"{v:.5f}" for v in changes)])
+    return text.getvalue()
+
+
+def _pictures(film: Film, advance: Advance | None) -> Iterator[npt.NDArray[Any]]:
+    for place in range(len(film)):
+        yield film.read(place)
+        if advance is not None:
+            advance(place + 1, len(film))
+
+
+def _write_zarr(film: Film, target: Path, advance: Advance | None) -> None:
+    about = {"of": str(film.path.resolve()), "simulated": film.simulated}
+    shape = film.read(0).shape
+    create_output(target, len(film), shape, period_s=film.period_s, grid=None, attributes=about)
+    try:
+        made = VideoPictures(target, write=True)
+        for place, picture in enumerate(_pictures(film, advance)):
+            made.write(place, np.asarray(picture, np.float32))
+    except BaseException:
+        shutil.rmtree(target)
+        raise
+
+
+def _write_gif(target: Path, shown: Iterator[npt.NDArray[np.uint8]], fps: float) -> None:
+    """Write a GIF that plays without end; one picture at a time in memory."""
+    from PIL import Image  # of Matplotlib's own needs
+
+    frames = (Image.fromarray(picture).quantize(256) for picture in shown)
+    first = next(frames)
+    duration_ms = max(round(1000 / fps / _GIF_MS) * _GIF_MS, 2 * _GIF_MS)  # shown faster by no browser
+    with whole_file(target) as temporary:
+        first.save(
+            temporary,
+            "gif",
+            save_all=True,
+            append_images=frames,
+            duration=duration_ms,
+            loop=0,
+            optimize=False,
+        )

@@ -1,0 +1,90 @@
+"""A film in the window: played, pulled, its regions followed, written for others."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+from PySide6.QtCore import QPointF
+from pytestqt.qtbot import QtBot
+
+from gui.panel import whole
+from gui.panels.films import FilmsPanel
+from gui.session import BenchSession
+from instrument.cli import main
+from instrument.reconstruction.video_files import VideoPictures, create_output
+from tests.gui.conftest import WAIT_MS
+
+COUNT, LOST = 30, 7
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Path:
+    """A spot that flashes over even ground; one picture was not made."""
+    path = tmp_path / "film.ome.zarr"
+    create_output(path, COUNT, (24, 32), period_s=0.05, grid=None, attributes={"simulated": True})
+    pictures = VideoPictures(path, write=True)
+    for index in range(COUNT):
+        picture = np.full((24, 32), 0.5, np.float32)
+        picture[8:12, 10:16] += 2.0 if 15 <= index < 20 else 1.0
+        if index != LOST:
+            pictures.write(index, picture)
+    return path
+
+
+def test_a_film_is_played_followed_and_written(
+    qtbot: QtBot, make_session: Callable[[], BenchSession], film: Path, tmp_path: Path
+) -> None:
+    session = make_session()
+    panel = whole(FilmsPanel(session))
+    qtbot.addWidget(panel)
+    panel.resize(900, 700)
+    panel.show()
+    with qtbot.waitSignal(panel.open(film).ended, timeout=WAIT_MS):
+        pass
+    assert "29 pictures, 20 a second   SIMULATED" in panel.heading.text()
+    assert not panel.reconstruct_button.isEnabled()  # it is reconstructed
+    panel.slider.setValue(20)
+    qtbot.waitUntil(lambda: panel.words.text() == "1.050 s, picture 21 of 29", timeout=WAIT_MS)
+    panel.speed.setCurrentText("4 x")
+    panel.play_button.click()
+    qtbot.waitUntil(lambda: panel.slider.value() < 20, timeout=WAIT_MS)  # round at the end
+    panel.play_button.click()
+    assert not panel._timer.isActive()
+    panel.region_button.click()
+    panel.measure._dragged(QPointF(10, 8), QPointF(15, 11))
+    qtbot.waitUntil(lambda: panel.courses.size == 29, timeout=WAIT_MS)
+    assert panel.courses[0, [0, 14, 19]] == pytest.approx([1.5, 2.5, 1.5])
+    panel.quantity.setCurrentIndex(1)
+    (item,) = panel.plot.listDataItems()
+    assert item.getData()[1].max() == pytest.approx(1 / 1.5)
+    for name in ("curves.csv", "film.gif", "film.mp4", "copy.ome.zarr"):
+        job = panel.export_to(tmp_path / name)
+        assert job is not None
+        with qtbot.waitSignal(job.succeeded, timeout=WAIT_MS):
+            pass
+    rows = list(csv.DictReader((tmp_path / "curves.csv").read_text().splitlines()))
+    assert [float(rows[14][name]) for name in ("frame", "time_s", "mean_8-12_10-16")] == [15, 0.75, 2.5]
+    with Image.open(tmp_path / "film.gif") as gif:
+        assert sum(frame.info["duration"] for frame in ImageSequence.Iterator(gif)) == 29 * 50
+    assert int(cv2.VideoCapture(str(tmp_path / "film.mp4")).get(cv2.CAP_PROP_FRAME_COUNT)) == 29
+    assert VideoPictures(tmp_path / "copy.ome.zarr").read(14)[9, 12] == 2.5
+    exec(panel.as_python(), {})
+    handed: list[object] = []
+    session.handed_on.connect(lambda name, what: handed.append((name, what)))
+    panel.activity_button.click()
+    assert handed == [("tasks", ("activity", {"video": film}))]
+    words = ["export", str(film), str(tmp_path / "again.csv"), "--region", "8,10,4,6"]
+    assert main(words) == 0
+    assert (tmp_path / "again.csv").read_text() == (tmp_path / "curves.csv").read_text()
+    assert main(words) == 2  # it is there
+    assert main([*words[:2], str(tmp_path / "x.csv"), "--region", "8,10,40,6"]) == 2
+    with qtbot.waitSignal(panel.open(tmp_path).failed, timeout=WAIT_MS):
+        pass
+    assert panel.film is not None  # the one before stays
+    panel.shutdown()

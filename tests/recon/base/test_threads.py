@@ -1,0 +1,57 @@
+"""The one place for threads: linear algebra keeps out of the way of the program's own."""
+
+import threading
+
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+import recon  # noqa: F401 # with the libraries that it brings
+from recon.base.threads import linear_algebra_on_one_thread
+
+
+def threads() -> set[int]:
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+@pytest.fixture(autouse=True)
+def _two() -> object:
+    with linear_algebra_on_one_thread():
+        pass  # all libraries are loaded
+    with threadpool_limits(2, user_api="blas"):
+        yield
+
+
+def test_it_is_one_within_and_what_it_was_afterwards() -> None:
+    seen = []
+
+    @linear_algebra_on_one_thread()
+    def inner() -> None:
+        seen.append(threads())
+
+    assert threads() == {2}
+    with linear_algebra_on_one_thread():
+        inner()
+        seen.append(threads())
+    assert seen == [{1}, {1}]
+    assert threads() == {2}
+
+
+def test_it_comes_back_after_an_error_and_when_the_last_has_ended() -> None:
+    with pytest.raises(ZeroDivisionError), linear_algebra_on_one_thread():
+        1 / 0  # noqa: B018
+    assert threads() == {2}
+    within, leave = threading.Event(), threading.Event()
+
+    def other() -> None:
+        with linear_algebra_on_one_thread():
+            within.set()
+            leave.wait(10)
+
+    thread = threading.Thread(target=other)
+    with linear_algebra_on_one_thread():
+        thread.start()
+        assert within.wait(10)
+    assert threads() == {1}
+    leave.set()
+    thread.join(10)
+    assert threads() == {2}
