@@ -4,8 +4,8 @@
 
 In an empty folder lie a PSF and a photograph, raw 16-bit TIFFs of 270 x 480 pixels (SIMULATED). Steps are
 what somebody types who has read nothing but the README: in the terminal, and in Python. Each runs in a
-process of its own, starting included; kernels are compiled before. ``--against`` types the same at another checkout
-(``git worktree add FOLDER COMMIT``). "Worked" is status 0 and the file that was asked for.
+process of its own, starting included; kernels are compiled before. ``--against`` types the same at another
+checkout (``git worktree add FOLDER COMMIT``). "Worked" is status 0 and the file that was asked for.
 """
 
 from __future__ import annotations
