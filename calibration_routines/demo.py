@@ -54,6 +54,8 @@ PICTURE = Path(__file__).with_name("demo_picture.jpg")
 """A cup of coffee; photograph by Rachel Michetti, CC0 (docs/reference/demo-picture.md)."""
 
 
+VOLUME_ITERATIONS = 12
+"""Of the lights: they are in their planes long before the last change is small."""
 SCREEN_PIXELS = (420, 280)
 """Width and height of the picture on the screen: no finer than the camera's binned pixels see it."""
 
@@ -358,6 +360,7 @@ def _run(place: Path, listener: Listener, settings: DemoSettings, stages: Stages
             prior="l1",
             model="convolution",
             judged=False,
+            iterations=VOLUME_ITERATIONS,
             time_s=limit_s / 2,
             on_progress=lambda record, _: stages.share(record.seconds, limit_s / 2, at_most=True),
         )

@@ -179,7 +179,10 @@ def _facts(done: DemoResult, truth: Float) -> list[tuple[str, str]]:
         ("calibration", f"{settings.planes} planes, {settings.average} frames each"),
         ("photographs", f"red, green, blue; {settings.photograph_average} frames each"),
         ("on the screen", f"{truth.shape[1] - 2 * _MARGIN} x {truth.shape[0] - 2 * _MARGIN} pixels"),
-        ("picture", f"{size} x 3, {result.solver} + {result.prior}: {len(result.history)} iterations"),
-        ("volume", f"{size} x {len(volume.volume)}, {volume.solver} + {volume.prior}: {len(volume.history)}"),
+        ("picture", f"{size} x 3, {result.solver} + {result.prior}: {len(result.history)} it."),
+        (
+            "volume",
+            f"{size} x {len(volume.volume)}, {volume.solver} + {volume.prior}: {len(volume.history)} it.",
+        ),
         ("compared", "in the screen, linear light, one factor"),
     ]
