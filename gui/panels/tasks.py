@@ -188,11 +188,7 @@ class TasksPanel(Panel):
 
     def _in_form_words(self, text: str) -> str:
         """Return a message with the fields' labels where the terminal's has flags."""
-        page = self._pages[self.name]
-        for field in sorted(page.form.fields.values(), key=lambda f: -len(f.option.flag)):
-            if field.option.flag.startswith("--"):
-                text = text.replace(field.option.flag, f"“{field.bare_label}”")
-        return text
+        return self._pages[self.name].form.in_its_words(text)
 
     def as_python(self) -> str:
         """Return lines that carry out the task as the form stands."""
