@@ -84,6 +84,7 @@ COMMANDS: Mapping[str, Command] = {
     "activity": _task(RECONSTRUCTION, "activity"),
     "analyze": _task(ANALYSIS, "analyze"),
     "compare": _task(ANALYSIS, "compare"),
+    "optics": _task(ANALYSIS, "optics"),
     "chart": Command(ANALYSIS, "time and memory against error, for every method", "chart"),
     "stability": Command(ANALYSIS, "map where methods fail, against pairs of stresses", "stability"),
     "refocus": _task(ANALYSIS, "refocus"),
