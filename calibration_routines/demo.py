@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -18,7 +18,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.demo_picture import Comparison, Viewer, compare, write_pictures
+from calibration_routines.demo_chart import chart_of
+from calibration_routines.demo_picture import Comparison, Viewer, compare
+from calibration_routines.demo_volume import Lights, Placed
+from calibration_routines.demo_write import write_pictures
 from calibration_routines.optics.photograph import (
     FieldResponse,
     Photograph,
@@ -34,6 +37,7 @@ from calibration_routines.psf.sweep_procedure import quality_lines
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
+from instrument.evaluation.chart import ChartData
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
 from instrument.runs.finish import ctrl_c_remembered
@@ -44,9 +48,14 @@ from recon.base.declare import option
 from recon.optics.scene import Scene, picture
 
 FILE = "demo.json"
+GREEN = 1
+"""Of red, green and blue: the light of PSFs, of the second scene and of the chart."""
 PICTURE = Path(__file__).with_name("demo_picture.jpg")
 """A cup of coffee; photograph by Rachel Michetti, CC0 (docs/reference/demo-picture.md)."""
 
+
+SCREEN_PIXELS = (420, 280)
+"""Width and height of the picture on the screen: no finer than the camera's binned pixels see it."""
 
 _HIDDEN: dict[str, Any] = {"flags": ("",)}  # not offered: the demo is the same for everybody
 
@@ -62,7 +71,7 @@ class DemoSettings:
     )
     camera_binning: int = option(2, least=1, help="In the camera, 2 as in Kuo 2020, Sec. 4.3.", **_HIDDEN)
     binning: int = option(
-        2, least=1, help="Of PSFs and photograph in software: to the optical resolution.", **_HIDDEN
+        2, least=1, help="Of PSFs and photographs in software: to the optical resolution.", **_HIDDEN
     )
     z_mm: tuple[float, float] = option(
         (100.0, 500.0), unit="mm", help="Nearest and farthest plane of the sweep.", **_HIDDEN
@@ -74,17 +83,22 @@ class DemoSettings:
     half_field_deg: float = option(
         18.0, unit="deg", help="Half the angle under which the picture's width is seen.", **_HIDDEN
     )
-    average: int = option(4, least=1, help="Frames averaged, for PSFs and for the photograph.", **_HIDDEN)
+    lights: int = option(32, least=2, help="Green lights that wind away from the camera.", **_HIDDEN)
+    average: int = option(2, least=1, help="Frames averaged for PSFs.", **_HIDDEN)
+    photograph_average: int = option(8, least=1, help="The same of photographs.", **_HIDDEN)
     reconstruction_s: float = option(
-        12.0,
+        60.0,
         unit="s",
         least=0.1,
         flags=("--reconstruction-s",),
         metavar="S",
-        help="Time for the reconstruction.",
+        help="Time for the picture, at most; half as much for the volume.",
+    )
+    chart_s: float = option(
+        12.0, unit="s", least=0.1, help="Time for the chart of methods, at most.", **_HIDDEN
     )
     time_scale: float = option(
-        1.0, least=0, help="Real seconds per simulated second of motion and exposure.", **_HIDDEN
+        0.1, least=0, help="Real seconds per simulated second of motion and exposure.", **_HIDDEN
     )
     seed: int = option(0, least=0, help="Of the simulated diffuser, sensor and noise.")
 
@@ -97,6 +111,7 @@ class DemoSettings:
             planes=self.planes,
             average=self.average,
             binning=self.binning,
+            dark_frames=2 * self.average,
         )
 
     @property
@@ -108,14 +123,19 @@ class DemoSettings:
     def scene_size_um(self) -> tuple[float, float]:
         """Height and width of the picture on the screen."""
         width = 2 * self.scene_z_um * float(np.tan(np.radians(self.half_field_deg)))
-        rows, columns = read_picture().shape
+        rows, columns = read_picture().shape[:2]
         return width * rows / columns, width
 
-    def scene(self) -> Scene:
-        """Return the scene: the picture on a screen that glows in the colour of the point source."""
-        radiance = np.zeros((*read_picture().shape, 3), np.float32)
-        radiance[..., 1] = read_picture()
+    def scene(self, shown: Sequence[bool] = (True, True, True)) -> Scene:
+        """Return the scene: the picture on a screen, or what it shows in some of red, green and blue."""
+        radiance = read_picture() * np.asarray(shown, np.float32)
         return picture(radiance, self.scene_z_um, self.scene_size_um[1], name="a cup of coffee on a screen")
+
+    @property
+    def volume(self) -> Lights:
+        """The second scene: lights in a spiral from the nearest plane to the farthest."""
+        half = float(np.tan(np.radians(self.half_field_deg)))
+        return Lights(self.lights, self.sweep.z_um, (0.62 * half, half))
 
     def bench_toml(self) -> str:
         """Return the configuration of the demo's bench."""
@@ -149,21 +169,22 @@ time_scale = {self.time_scale:g}
 
 
 def read_picture() -> npt.NDArray[np.float32]:
-    """Return the demo's picture as light from a screen: linear, 0 to 1, grey, (height, width) float32."""
-    levels = cv2.imread(str(PICTURE), cv2.IMREAD_GRAYSCALE)
+    """Return the demo's picture as light from a screen: linear, 0 to 1, (280, 420, 3) float32."""
+    levels = cv2.imread(str(PICTURE), cv2.IMREAD_COLOR)
     if levels is None:
         raise FileNotFoundError(f"The demo's picture {PICTURE} is missing: install diffuserbench again.")
-    return (np.asarray(levels, np.float32) / 255.0) ** np.float32(2.2)
+    light = (np.asarray(levels[..., ::-1], np.float32) / 255.0) ** np.float32(2.2)
+    return np.asarray(cv2.resize(light, SCREEN_PIXELS, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def new_folder(parent: Path) -> Path:
-    """Make a folder ``demo-DATE-TIME`` in ``parent``, which is made as well where missing.
+def new_folder(parent: Path, kind: str = "demo") -> Path:
+    """Make a folder ``KIND-DATE-TIME`` in ``parent``, which is made as well where missing.
 
     Raises FileError when it cannot be made.
     """
     if parent.exists() and not parent.is_dir():
         raise FileError(parent, "is no folder.", "Name a folder with --out.")
-    folder = free_name(parent, f"demo-{datetime.now(UTC):%Y-%m-%d-%H%M%S}")
+    folder = free_name(parent, f"{kind}-{datetime.now(UTC):%Y-%m-%d-%H%M%S}")
     try:
         folder.mkdir(parents=True)
     except OSError as error:
@@ -201,25 +222,27 @@ class Journal:
             self.seconds[name] = round(time.perf_counter() - started, 2)
 
 
-class _Stages(Listener):
-    """Times the demo's stages, and hands on how each goes; Ctrl-C ends it at any of these moments."""
+class Stages(Listener):
+    """Times a demo's stages, and hands on how each goes; Ctrl-C ends it at any of these moments."""
 
     def __init__(self, journal: Journal, listener: Listener, check: Callable[[], None]) -> None:
-        self._journal, self._listener, self._check = journal, listener, check
+        self.journal, self._listener, self._check = journal, listener, check
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Enter a stage."""
-        with self._journal.stage(name):
+        with self.journal.stage(name):
             self._listener.step(name)
             yield
             self._check()
 
     def share(self, done: float, total: float, *, at_most: bool = False) -> None:
+        """Hand on how much is done, unless it is to end."""
         self._check()
         self._listener.share(done, total, at_most=at_most)
 
     def frame(self, status: RunStatus) -> None:
+        """Hand on how much of a run is done."""
         self.share(status.done, status.total)
 
 
@@ -229,8 +252,25 @@ class Measured:
 
     calibration: SweepCalibration
     response: FieldResponse
-    photo: Photograph
+    photos: tuple[Photograph, Photograph, Photograph]
+    """Of the screen in red, green and blue, one after the other."""
+    lights: Photograph
+    """Of the second scene."""
     bench_label: str
+    sensitivity: tuple[float, float, float]
+    """Of the sensor to red, green and blue, from its data sheet."""
+
+    @property
+    def colours(self) -> npt.NDArray[np.float32]:
+        """The three photographs as one measurement, (height, width, 3), each as if exposed as the green one.
+
+        The colours are balanced by the sensor's sensitivity.
+        """
+        green = self.photos[GREEN].exposure_ms * self.sensitivity[GREEN]
+        shares = zip(self.photos, self.sensitivity, strict=True)
+        return np.stack(
+            [photo.measurement * np.float32(green / (photo.exposure_ms * s)) for photo, s in shares], axis=-1
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +283,10 @@ class DemoResult:
     reconstruction: Reconstruction
     comparison: Comparison
     """Of the reconstruction with the ground truth, inside the picture on the screen."""
+    volume: Reconstruction
+    placed: Placed
+    """Where the second scene's lights are, and were found."""
+    chart: ChartData
     seconds: dict[str, float]
     """Seconds of each stage."""
     files: dict[str, Path]
@@ -260,13 +304,20 @@ def run_demo(
     Raises what made it fail (BenchError, DeviceError, OSError); KeyboardInterrupt or SystemExit after the
     bench was made safe and the run marked as aborted.
     """
-    settings = settings or DemoSettings()
-    place = new_folder(Path(folder))
+    listener, settings = listener or Listener(), settings or DemoSettings()
+    with told_in(Path(folder), "demo", listener) as (place, stages):
+        return _run(place, listener, settings, stages)
+
+
+@contextmanager
+def told_in(parent: Path, kind: str, listener: Listener) -> Iterator[tuple[Path, Stages]]:
+    """Give a new folder and the stages of what is done in it; its journal says how that ended, whatever."""
+    place = new_folder(parent, kind)
     journal = Journal(place)
     try:
         journal.note(state="running")
         with ctrl_c_remembered() as check:
-            return _run(place, listener or Listener(), settings, journal, check)
+            yield place, Stages(journal, listener, check)
     except BaseException as error:
         aborted = isinstance(error, KeyboardInterrupt | SystemExit)
         journal.note(state="aborted" if aborted else "failed", error=str(error) or type(error).__name__)
@@ -274,11 +325,8 @@ def run_demo(
         raise
 
 
-def _run(
-    place: Path, listener: Listener, settings: DemoSettings, journal: Journal, check: Callable[[], None]
-) -> DemoResult:
-    stages = _Stages(journal, listener, check)
-    stage = stages.stage
+def _run(place: Path, listener: Listener, settings: DemoSettings, stages: Stages) -> DemoResult:
+    stage, journal = stages.stage, stages.journal
     write_text(place / "bench.toml", settings.bench_toml())
     with stage("open the bench"):
         bench = open_bench(parse_config(settings.bench_toml(), place / "bench.toml"))
@@ -290,29 +338,56 @@ def _run(
             measured = _measure(bench, place, settings, listener, stages)
         finally:
             bench.stop()
-            journal.note(left=_state_of(bench))
-        viewer = Viewer(_world(bench), settings, measured)
+            journal.note(left=state_of(bench))
+        viewer = Viewer(world_of(bench), settings, measured)
     with stage("compile kernels (kept)"):
         _warm_up()
-    with stage("reconstruct"):
+    limit_s = settings.reconstruction_s
+    with stage("reconstruct the picture"):
         result = reconstruct(
-            measured.photo.measurement,
+            measured.colours,
             measured.calibration.calibration,
             z_um=settings.scene_z_um,
-            time_s=settings.reconstruction_s,
-            on_progress=viewer.watch(lambda seconds: stages.share(seconds, settings.reconstruction_s)),
+            time_s=limit_s,
+            on_progress=lambda record, _: stages.share(record.seconds, limit_s, at_most=True),
+        )
+    with stage("reconstruct the volume"):
+        volume = reconstruct(
+            measured.lights.measurement,
+            measured.calibration.calibration,
+            prior="l1",
+            model="convolution",
+            judged=False,
+            time_s=limit_s / 2,
+            on_progress=lambda record, _: stages.share(record.seconds, limit_s / 2, at_most=True),
+        )
+    with stage("chart methods"):
+        chart = chart_of(
+            measured.photos[GREEN],
+            measured.calibration.calibration.part([settings.scene_plane]),
+            viewer.collected,
+            settings.chart_s,
+            lambda done: stages.share(done, 1.0),
         )
     comparison = compare(viewer.picture(result.image), viewer.truth, viewer.field)
-    with stage("write the pictures"):
-        files = write_pictures(place, settings, measured, result, viewer, comparison)
-    journal.note(
-        state="completed", psnr_db=round(comparison.psnr_db, 2), ssim=round(comparison.ssim, 4), stage=""
+    placed = settings.volume.placed(volume, measured.calibration.calibration)
+    done = DemoResult(
+        place, settings, measured, result, comparison, volume, placed, chart, journal.seconds, {}
     )
-    return DemoResult(place, settings, measured, result, comparison, dict(journal.seconds), files)
+    with stage("write the pictures"):
+        done.files.update(write_pictures(done, viewer))
+    journal.note(
+        state="completed",
+        psnr_db=round(comparison.psnr_db, 2),
+        ssim=round(comparison.ssim, 4),
+        lights_in_their_plane=placed.in_plane,
+        stage="",
+    )
+    return done
 
 
 def _measure(
-    bench: Bench, place: Path, settings: DemoSettings, listener: Listener, stages: _Stages
+    bench: Bench, place: Path, settings: DemoSettings, listener: Listener, stages: Stages
 ) -> Measured:
     """Do everything that needs the bench."""
     stage = stages.stage
@@ -341,19 +416,31 @@ def _measure(
             place,
             listener=stages,
         )
-    with stage("photograph the scene"):
-        _world(bench).set_scene(settings.scene())
-        exposure = expose_scene(bench)
-        photo = photograph(
-            bench,
-            exposure.exposure_ms,
-            place,
-            average=settings.average,
-            dark_frames=settings.average,
-            binning=settings.binning,
-            listener=stages,
-        )
-    return Measured(done, response, photo, bench.label)
+    with stage("photograph the scene in three colours"):
+        photos = [
+            _photographed(bench, settings.scene(np.arange(3) == band), place, settings, stages)
+            for band in range(3)
+        ]
+    with stage("photograph lights in a volume"):
+        lights = _photographed(bench, settings.volume.scene(), place, settings, stages)
+    sensitivity = world_of(bench).sensor.quantum_efficiency
+    return Measured(done, response, (photos[0], photos[1], photos[2]), lights, bench.label, sensitivity)
+
+
+def _photographed(
+    bench: Bench, scene: Scene, place: Path, settings: DemoSettings, stages: Stages
+) -> Photograph:
+    """Put a scene in front of the camera, and photograph it."""
+    world_of(bench).set_scene(scene)
+    return photograph(
+        bench,
+        expose_scene(bench).exposure_ms,
+        place,
+        average=settings.photograph_average,
+        dark_frames=settings.photograph_average,
+        binning=settings.binning,
+        listener=stages,
+    )
 
 
 def _warm_up() -> None:
@@ -363,17 +450,18 @@ def _warm_up() -> None:
     reconstruct(psf + 1.0, psf, iterations=2)
 
 
-def _world(bench: Bench) -> SimulatedWorld:
+def world_of(bench: Bench) -> SimulatedWorld:
+    """Return a demo's simulated world."""
     world = bench.shared[SimulatedWorld.table]
     if not isinstance(world, SimulatedWorld):
         raise TypeError(f"The demo's bench is simulated, not {type(world).__name__}.")
     return world
 
 
-def _state_of(bench: Bench) -> dict[str, Any]:
+def state_of(bench: Bench) -> dict[str, Any]:
     """Return what the bench is left as, for the record."""
     return {
         "light": bench.led_array.pattern.description if bench.led_array is not None else "none",
         "stage_moving": bench.stage is not None and bench.stage.is_moving,
-        "scene_lit": _world(bench).scene_lit,
+        "scene_lit": world_of(bench).scene_lit,
     }

@@ -380,6 +380,7 @@ _MODULES = (
     "optics.screen_bench",
     "display.slm_calibration",
     "display.mask_alignment",
+    "display.display_learning",
 )
 """Each has its routines as ``ROUTINES``. They are imported when somebody asks what there is."""
 

@@ -22,7 +22,7 @@ from recon.holography import Display, HologramModel, Scores, Target, compute_hol
 from recon.holography.camera_map import CameraMap
 from recon.holography.judge import compare, low_pass
 from recon.holography.options import Envelope
-from recon.holography.target import make_band
+from recon.holography.target import Band, make_band
 
 Array = npt.NDArray[Any]
 _GAIN = 0.8  # part of what a photograph lacked that is asked for beyond
@@ -86,9 +86,8 @@ class HologramCamera:
             for _ in range(average):
                 total += io.photograph(exposure_ms)
         ceiling = 0.98 * io.full_scale / io.bench.camera.exposure_ms * len(fields) * average
-        shape = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
-        picture = np.fft.ifftshift(self.camera.resample(total, shape))
-        seen = np.fft.fftshift(low_pass(picture, display.slm_shape))
+        band = make_band(display.slm_shape, display.factor, "alias-free")
+        seen = low_passed_picture(self.camera.lags(total, band), band, display.slm_shape)
         wanted, peak = wanted_picture(target, display)
         scaled = seen * (wanted.mean() / seen.mean())
         return Capture(
@@ -140,12 +139,17 @@ def wanted_picture(target: Target, display: Display) -> tuple[npt.NDArray[np.flo
     """Return the low-passed target on the smallest grid that holds it, and its peak."""
     band = make_band(display.slm_shape, display.factor, "alias-free")
     spectrum, peak = target.spectrum(display, band)
+    return low_passed_picture(spectrum, band, display.slm_shape), peak
+
+
+def low_passed_picture(lags: Array, band: Band, slm_shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+    """Return the picture of a band's lags through the eye's low-pass, the axis in the middle."""
     height, width = band.seen_shape
     half = np.zeros((height, width // 2 + 1), complex)
     rows = np.r_[0 : band.top, height - (band.kept[0] - band.top) : height]
-    half[rows, : band.kept[1]] = spectrum
+    half[rows, : band.kept[1]] = lags
     image = np.fft.irfft2(half, (height, width)) * (height * width)
-    return np.fft.fftshift(low_pass(image, display.slm_shape)), peak
+    return np.fft.fftshift(low_pass(image, slm_shape))
 
 
 @dataclass(frozen=True, slots=True)

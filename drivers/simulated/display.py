@@ -76,6 +76,34 @@ class DisplayOptions(CommonOptions):
     dc_phase_rad: float = Field(0.6, description="Its phase.")
     fill: float = Field(0.93, gt=0, le=1, description="Modulating part of an SLM pixel's area.")
     flatness_rad: float = Field(0.0, ge=0, description="Peak of the SLM's flatness error.")
+    amplitude_swing: float = Field(
+        0.0, ge=0, lt=1, description="Part of the amplitude that the SLM loses at a phase of pi; none at 0."
+    )
+    mirrors: bool = Field(
+        False, description="Mirrors in the SLM's place: levels are amplitudes, 0 is dark, 255 is 1."
+    )
+    crosstalk_px: float = Field(
+        0.0, ge=0, le=2, description="Width of what smooths the phase across pixel borders, SLM pixels."
+    )
+    beam_mm: float = Field(
+        0.0, ge=0, description="Radius of the laser's beam on the SLM, to exp(-2) of its peak; 0 is even."
+    )
+    beam_centre_um: tuple[float, float] = Field((0.0, 0.0), description="x, y of the beam's peak.")
+    wavefront_rad: float = Field(
+        0.0, ge=0, description="Root mean square of the Fourier lens' aberrations over the mask."
+    )
+    wavefront_seed: int = Field(0, ge=0, description="Of these aberrations.")
+    vignetting: float = Field(
+        0.0, ge=0, le=1, description="Light lost by lens and camera at the middle of the field's border."
+    )
+    mask_depth: float = Field(
+        1.0, gt=0, description="Depth of the mask's steps over the one that it was made for."
+    )
+    mask_roughness_rad: float = Field(
+        0.0,
+        ge=0,
+        description="Of the phase of the mask's pixels, standard deviation.",
+    )
 
 
 class DisplayWorld(Surroundings):
@@ -96,7 +124,7 @@ class DisplayWorld(Surroundings):
 
     def __init__(self, options: DriverOptions) -> None:
         super().__init__(DisplayOptions.of(options), SENSOR)
-        self._phase: Callable[[], npt.NDArray[np.float32]] | None = None
+        self._slm: DisplaySlm | None = None
         self._stage: Callable[[], Mapping[str, float]] = dict
         self._slm_pitch_um = 8.0
         self._optics: ScatteringDisplay | None = None
@@ -104,9 +132,9 @@ class DisplayWorld(Surroundings):
         self._image: tuple[Any, Image] | None = None
 
     # What the devices do to the world ---
-    def mount_slm(self, phase: Callable[[], npt.NDArray[np.float32]], pitch_um: float) -> None:
-        """Put an SLM in the beam: what tells its phase, and its pitch."""
-        self._phase, self._slm_pitch_um = phase, pitch_um
+    def mount_slm(self, slm: DisplaySlm) -> None:
+        """Put an SLM in the beam."""
+        self._slm, self._slm_pitch_um = slm, slm.options.pixel_pitch_um
 
     def mount_mask(self, position: Callable[[], Mapping[str, float]]) -> None:
         """Put the mask on a stage: what tells the carriage's true position by axis name."""
@@ -127,24 +155,32 @@ class DisplayWorld(Surroundings):
 
     def photons_per_s(self, weights: tuple[float, float, float], binning: int = 1) -> Image | None:
         """Return electrons a second on every binned camera pixel now, or None when the laser is off."""
-        if not self.scene_lit or self._phase is None:
+        if not self.scene_lit or self._slm is None:
             return None
         with self._lock:
             key = self.light_key()
             if self._image is None or self._image[0] != key:
-                phase = self._phase()
+                phase, amplitude = self._modulation(self._slm)
                 optics = self._scattering_display(phase.shape)
-                light = optics.irradiance(phase + self._flatness_map(phase.shape), self.pose())
+                light = optics.irradiance(phase + self._flatness_map(phase.shape), self.pose(), amplitude)
                 light *= np.float32(self.options.light)
                 self._image = (key, light)
             image = self._image[1]
         return image if binning == 1 else block_sum(image, binning)
 
+    def _modulation(self, slm: DisplaySlm) -> tuple[Image, Image]:
+        """Return the phase that light gains at each pixel, and the part of its amplitude that returns."""
+        if self.options.mirrors:
+            return np.zeros(slm.shape, np.float32), (slm.displayed / 255).astype(np.float32)
+        phase = slm.phase_rad
+        lost = self.options.amplitude_swing * np.sin(phase / 2) ** 2
+        return phase, (1 - lost).astype(np.float32)
+
     def light_key(self) -> tuple[Any, ...]:
         """Return something that changes whenever :meth:`photons_per_s` does."""
-        if not self.scene_lit or self._phase is None:
+        if not self.scene_lit or self._slm is None:
             return (False,)
-        return (True, hash(self._phase().tobytes()), self.pose())
+        return (True, hash(self._slm.displayed.tobytes()), self.pose())
 
     def _scattering_display(self, slm_shape: tuple[int, ...]) -> ScatteringDisplay:
         if self._optics is None:
@@ -157,7 +193,11 @@ class DisplayWorld(Surroundings):
                 sensor_pitch_um=self.sensor.pitch_um,
                 **options.model_dump(include={field.name for field in fields(DisplaySpec)}),
             )
-            self._optics = ScatteringDisplay(spec, pi * bits * options.masked)
+            phase = (pi * options.mask_depth * options.masked) * bits
+            if options.mask_roughness_rad > 0:
+                rough = np.random.default_rng(options.seed + 4).normal(size=phase.shape)
+                phase += options.mask_roughness_rad * rough
+            self._optics = ScatteringDisplay(spec, phase)
         return self._optics
 
     def _flatness_map(self, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
@@ -214,7 +254,7 @@ class DisplaySlm(SimulatedSlm):
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         super().__init__(options, shared)
-        self.world.mount_slm(lambda: self.phase_rad, self.options.pixel_pitch_um)
+        self.world.mount_slm(self)
 
 
 class DisplayCamera(SimulatedCamera):

@@ -144,6 +144,8 @@ def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -
     options.check(len(what), spots=spots)
     correction = load_slm_correction(options.slm_calibration) if options.slm_calibration else None
     place = load_alignment(options.alignment) if options.alignment else None
+    if place is not None:
+        place.require_correction(correction is not None)
     read = [read_slm_image(path) for path in what]
     with naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
         if opened.slm is None:

@@ -33,6 +33,7 @@ from recon.holography import (
 )
 from recon.holography.display import greatest_defocus_mm, no_mask
 from recon.holography.judge import compare
+from recon.holography.learned import Learned
 from recon.holography.options import Fit
 from recon.holography.pose import NODES, Pose
 from recon.holography.target import make_band
@@ -314,6 +315,10 @@ class Alignment:
     mask_shape: tuple[int, int]
     """Of the mask that it holds for, in pixels."""
     simulated: bool
+    learned: Learned | None = None
+    """What photographs taught of the display."""
+    corrected: bool | None = None
+    """Whether they were taken with an SLM calibration, which holds from then on."""
 
     def of(self, display: Display) -> Display:
         """Return the display with this mask's displacement.
@@ -325,7 +330,25 @@ class Alignment:
                 "alignment",
                 f"holds for a mask of {self.mask_shape} pixels; this display's has {display.mask.shape}.",
             )
-        return replace(display, displacement=self.pose.displacement(self.mask_shape) + self.rest)
+        displacement = self.pose.displacement(self.mask_shape) + self.rest
+        if self.learned is None:
+            return replace(display, displacement=displacement)
+        return replace(display, displacement=displacement).taught(self.learned)
+
+    def require_correction(self, given: bool) -> None:
+        """Refuse to show a pattern otherwise than what was learned of the display.
+
+        Raises BenchError where it was learned with an SLM calibration and none is given, or the other way.
+        """
+        if self.learned is not None and self.corrected is not None and self.corrected != given:
+            raise BenchError(
+                "This display was learned "
+                + (
+                    "with an SLM calibration: give the same --slm-calibration."
+                    if self.corrected
+                    else "without an SLM calibration: leave --slm-calibration out, or learn it again."
+                )
+            )
 
 
 def save_alignment(path: Path, alignment: Alignment, facts: Mapping[str, Any]) -> None:

@@ -88,16 +88,16 @@ def summary_figure(summary: Summary) -> Figure:
     )
     pictures = outer[0].subgridspec(1, len(summary.panels), wspace=0.06)
     for column, panel in enumerate(summary.panels):
-        _draw_panel(figure.add_subplot(pictures[0, column]), panel)
+        draw_panel(figure.add_subplot(pictures[0, column]), panel)
     if summary.sweep:
         strip = outer[1].subgridspec(1, len(summary.sweep), wspace=0.05)
         for column, panel in enumerate(summary.sweep):
-            _draw_panel(figure.add_subplot(strip[0, column]), panel, small=True)
+            draw_panel(figure.add_subplot(strip[0, column]), panel, small=True)
         top = outer[1].get_position(figure).y1
         figure.text(0.035, top + 0.028, summary.sweep_title, fontsize=13, color=INK, va="bottom")
     bottom = outer[rows - 1].subgridspec(1, 2, width_ratios=[1.25, 1.0], wspace=0.12)
     _draw_convergence(figure.add_subplot(bottom[0, 0]), summary.convergence)
-    _draw_facts(figure.add_subplot(bottom[0, 1]), summary.lines)
+    draw_facts(figure.add_subplot(bottom[0, 1]), summary.lines)
     figure.text(0.035, 0.955, summary.title, fontsize=17, color=INK, weight="bold", va="center")
     if summary.simulated:
         mark_simulated(figure, 0.955)
@@ -123,7 +123,8 @@ def save_figure(figure: Figure, path: Path | str) -> Path:
     return target
 
 
-def _draw_panel(axes: Axes, panel: Panel, *, small: bool = False) -> None:
+def draw_panel(axes: Axes, panel: Panel, *, small: bool = False) -> None:
+    """Draw a picture with its title, caption and scale bar."""
     white = panel.white if panel.white is not None else float(np.percentile(panel.image, 99.8))
     shown = np.clip(panel.image / max(white, 1e-12), 0.0, 1.0) ** panel.gamma
     axes.imshow(shown, cmap="gray", vmin=0.0, vmax=1.0, interpolation="antialiased")
@@ -189,10 +190,11 @@ def style(axes: Axes, title: str, x: str = "", y: str = "", *, title_size: float
         spine.set_edgecolor(FAINT)
 
 
-def _draw_facts(axes: Axes, lines: Sequence[tuple[str, str]]) -> None:
+def draw_facts(axes: Axes, lines: Sequence[tuple[str, str]]) -> None:
+    """List facts, name and value, where a plot would be."""
     axes.set_axis_off()
     step = 1.0 / max(len(lines), 8)
     for index, (name, value) in enumerate(lines):
         y = 1.0 - (index + 0.4) * step
         axes.text(0.0, y, name, transform=axes.transAxes, fontsize=10.5, color=FAINT, va="center")
-        axes.text(0.34, y, value, transform=axes.transAxes, fontsize=10.5, color=INK, va="center")
+        axes.text(0.3, y, value, transform=axes.transAxes, fontsize=10.5, color=INK, va="center")

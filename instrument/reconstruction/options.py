@@ -227,7 +227,8 @@ class OutputOptions:
     force: bool = option(False, help="Overwrite files that exist.", group=_OUTPUT)
     explain: bool = option(
         False,
-        help="Only say what auto would choose, why, and what a step up or down would be.",
+        help="Only say what auto would choose and why, what a step up or down would be, and the time and "
+        "memory that it will take.",
         applies=_KEPT,
         group=_OUTPUT,
     )

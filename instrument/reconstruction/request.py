@@ -13,6 +13,7 @@ import numpy.typing as npt
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, read_stack
+from instrument.reconstruction.forecast import Forecast, forecast
 from instrument.reconstruction.job import (
     Job,
     job_from_calibration,
@@ -93,6 +94,10 @@ class _Request:
         problem = Problem.of(self._measurement(job), job.calibration, self.options)
         require_two_images(problem)
         return choice_for(refined(problem)[0] if self.options.refine_psf else problem)
+
+    def forecast(self, job: Job) -> Forecast:
+        """Say what time and memory it will take, by its first iterations; errors as :meth:`solve`."""
+        return forecast(self._measurement(job), job.calibration, self.options)
 
     def _measurement(self, job: Job) -> Measurement:
         """Return a job's photograph with what is known of it."""

@@ -32,7 +32,10 @@ def reconstruct_photograph(
 ) -> Done:
     """Reconstruct, tell, write. ``explain``: only say what with."""
     if output.explain:
-        _tell_choice(desk, request.explain(request.prepare()))
+        job = request.prepare()
+        _tell_choice(desk, request.explain(job))
+        with desk.step("the first iterations"):
+            desk.fact("Will take", str(request.forecast(job)))
         return Done()
     outputs.check(0, overwrite=output.force)
     is_volume = isinstance(request, VolumeRequest)

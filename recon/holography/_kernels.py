@@ -151,6 +151,42 @@ def gather_displaced(
                         out[j + b, i + a] += value * (wy * wx)
 
 
+@njit(nogil=True, cache=True)
+def _response(at: float, response: Any) -> tuple[complex, complex]:
+    """``r(at)``, linear between levels of a whole turn, and how it rises a radian."""
+    steps = (len(response) - 1) / (2 * np.pi)
+    i = min(max(int(at * steps), 0), len(response) - 2)
+    rise = response[i + 1] - response[i]
+    return response[i] + rise * (at * steps - i), rise * steps
+
+
+@njit(nogil=True, cache=True)
+def respond(phase: Any, response: Any, dc: Any, out: Any) -> None:
+    """``out = mean(r(phase) exp(j phase)) + dc``, the mean over the phases of each sample."""
+    n = phase.shape[0] // out.shape[0]
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            total = 0j
+            for b in range(y * n, (y + 1) * n):
+                for a in range(x * n, (x + 1) * n):
+                    at = phase[b, a]
+                    total += _response(at, response)[0] * complex(np.cos(at), np.sin(at))
+            out[y, x] = total / (n * n) + dc
+
+
+@njit(nogil=True, cache=True)
+def respond_back(phase: Any, response: Any, light: Any, gradient: Any, out: Any) -> None:
+    """Change of the loss with each phase, from the gradient by the field of :func:`respond`."""
+    n = phase.shape[0] // gradient.shape[0]
+    for y in range(phase.shape[0]):
+        for x in range(phase.shape[1]):
+            at = phase[y, x]
+            r, rise = _response(at, response)
+            turned = light[y // n, x // n] * (rise + 1j * r) * complex(np.cos(at), np.sin(at))
+            g = gradient[y // n, x // n]
+            out[y, x] = 2 * (g.real * turned.real + g.imag * turned.imag) / (n * n)
+
+
 @njit(nogil=True, cache=True, fastmath=True)
 def rows_to_spectrum(
     field: Any, spectrum: Any, ey: Any, ex: Any, filled: int, scale: float, start: int, stop: int

@@ -8,13 +8,16 @@ map from the field of view to the camera before anything is aligned, distortion 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.fft import fast_length
 from recon.errors import InputError
 from recon.holography.display import Display
+from recon.holography.target import Band
 
 Array = npt.NDArray[Any]
 
@@ -48,18 +51,24 @@ class CameraMap:
         column = (self.shape[1] - 1) / 2 + x * self.pixels_across + terms[..., 1]
         return row, column
 
-    def resample(self, image: Array, shape: tuple[int, int]) -> npt.NDArray[np.float64]:
-        """Return the camera's picture on a grid over the field of view, the axis in the middle.
+    def lags(self, image: Array, band: Band) -> npt.NDArray[np.complex128]:
+        """Return Fourier coefficients of the light over the field of view at a band's kept lags.
 
-        Where the grid is coarser than the camera's pixels the mean over a grid step is taken.
+        As ``HologramModel.lags``, in the image's unit. The camera is read by cubic splines, so finely that
+        what it sees does not alias into the band, and the mean over its pixels is undone.
         """
-        from scipy.ndimage import map_coordinates, uniform_filter
+        from scipy.ndimage import map_coordinates, spline_filter
 
-        size = [max(1, round(self.pixels_across / n)) for n in shape]
-        smooth = uniform_filter(np.asarray(image, float), size) if max(size) > 1 else np.asarray(image, float)
+        least = [max(2 * reach + 2, reach + self.pixels_across / 2) for reach in band.radius]
+        shape = (fast_length(ceil(least[0])), fast_length(ceil(least[1]), real=True))
         y, x = ((np.arange(n) - n // 2) / n for n in shape)
         places = self.pixels(*np.meshgrid(y, x, indexing="ij"))
-        return np.asarray(map_coordinates(smooth, places, order=1, mode="constant"), np.float64)
+        smooth = spline_filter(np.asarray(image, np.float32), order=3, output=np.float32)
+        seen = map_coordinates(smooth, places, order=3, prefilter=False, mode="constant")
+        spectrum = np.fft.rfft2(np.fft.ifftshift(seen)) / seen.size
+        down, across = (lag / self.pixels_across for lag in band.lags())
+        kept = spectrum[np.ix_(band.lags()[0].astype(int) % shape[0], band.lags()[1].astype(int))]
+        return np.asarray(kept / np.sinc(down)[:, None] / np.sinc(across), np.complex128)
 
 
 def _terms(y: Array, x: Array) -> Array:

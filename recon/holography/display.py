@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import asin, atan, ceil, degrees, pi, radians, sin, sqrt, tan
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.errors import InputError
+from recon.holography.learned import Learned
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +120,8 @@ class Display:
     displacement : ndarray, float, (rows, columns, 2), or None
         Where the mask really lies: the mask cell at ``(y, x)`` sees the SLM at ``(y + dy, x + dx)``, in mask
         pixels; ``dy, dx`` on nodes that span the mask from edge to edge, bilinear in between.
+    learned : Learned or None
+        What photographs taught of it; ``dc`` is part of that then.
     """
 
     slm_shape: tuple[int, int]
@@ -129,6 +132,7 @@ class Display:
     dc: DcTerm = DcTerm(0.0)
     mask_fill: float = 0.0
     displacement: npt.NDArray[np.float64] | None = None
+    learned: Learned | None = None
 
     def __post_init__(self) -> None:
         for name in ("slm_pitch_um", "wavelength_nm", "focal_mm"):
@@ -189,6 +193,21 @@ class Display:
         """Return the mask pixels' intensity envelope over the field, in FFT order, as two factors."""
         y, x = (np.sinc(self.mask_fill * np.fft.fftfreq(n)) ** 2 for n in shape)
         return y, x
+
+    def taught(self, learned: Learned) -> Display:
+        """Return the display with what was learned of it."""
+        light = complex(*learned.dc)
+        whole = abs(light) ** 2 + float((learned.response**2).sum(axis=1).mean())
+        dc = DcTerm(min(abs(light) ** 2 / whole, 0.9), float(np.angle(light)))
+        return replace(self, learned=learned, dc=dc)
+
+    def transmitted(self, shape: tuple[int, int]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Return the envelope with the vignetting that was learned, as :meth:`envelope`."""
+        y, x = self.envelope(shape)
+        if self.learned is None:
+            return y, x
+        down, across = self.learned.shading(shape)
+        return y * down, x * across
 
 
 def greatest_defocus_mm(

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -88,6 +88,7 @@ def hologram_limit(
     Raises InputError for another loss or a complex SLM.
     """
     options = options or HologramOptions()
+    display = replace(display, learned=None)
     if options.complex_slm or options.loss != "frequency":
         raise InputError("The limit is known for a phase SLM and the loss 'frequency'.")
     model = HologramModel(display, [target], options, frames=COLUMNS)

@@ -27,6 +27,7 @@ from recon.base.fft import irfft, rfft
 from recon.base.threads import get_threads, in_blocks
 from recon.errors import InputError
 from recon.holography.display import Display
+from recon.holography.learned import Panel
 from recon.holography.losses import loss_of
 from recon.holography.options import HologramOptions
 from recon.holography.target import Target, make_band, weights_on
@@ -88,6 +89,10 @@ class HologramModel:
 
         self._kernels = _kernels
         options = with_overrides(options or HologramOptions(), overrides)
+        if display.learned is not None and options.complex_slm:
+            raise InputError(
+                "What was learned of the display is of a phase SLM; leave it out for a complex one."
+            )
         self.display = display
         self.targets = tuple(targets)
         self.options = options
@@ -114,13 +119,41 @@ class HologramModel:
                 self._wanted_images = [self._image_of(s, self._cutoff) for s in self._wanted]
         self._field = np.zeros((self.frames, *self.band.shape), self.dtype)
         self._spectrum = np.empty((self.band.shape[0], self.band.kept[1]), self.dtype)
+        self._defocus = [tuple(h.astype(self.dtype) for h in display.defocus(t.z_mm)) for t in self.targets]
+        self._nodes: npt.NDArray[Any] | None = None
+        self._mean_light = 1.0
+        self.take(display)
+        self._mean_light = self._mean_power()
+        self._table *= self._real.type(1 / np.sqrt(self._mean_light))
+
+    @property
+    def wraps(self) -> bool:
+        """Whether what is shown jumps where a phase does."""
+        return self._panel is not None
+
+    def hold(self, slm: ComplexArray | None, *, within: bool = False) -> None:
+        """Let phases run on beyond a turn from those of these patterns, in all that follows; None: wrap.
+
+        ``within``: they stop at its ends; :meth:`stopped` are the patterns that are shown then.
+        """
+        if self._panel is not None:
+            self._panel.hold(slm, within=within)
+
+    def stopped(self, slm: ComplexArray) -> ComplexArray:
+        """Return the patterns that are shown of these while phases stop at the ends of a turn."""
+        return slm if self._panel is None else self._panel.stopped(slm)
+
+    def take(self, display: Display) -> None:
+        """Model another display of the same size, mask and lens; targets and light stay in their units."""
+        self.display = display
+        self._panel = None if display.learned is None else Panel(display, self.dtype)
         nodes = display.displacement
         self._nodes = None if nodes is None else np.ascontiguousarray(nodes, dtype=self._real)
-        aperture = np.sqrt(1.0 / np.prod(display.mask.shape) / self.frames / self._mean_power())
-        response = display.mask.response(display.wavelength_nm) * aperture
+        aperture = np.sqrt(1.0 / np.prod(display.mask.shape) / self.frames / self._mean_light)
+        depth = 1.0 if display.learned is None else display.learned.mask_depth
+        response = display.mask.response(display.wavelength_nm / depth) * aperture
         self._table = response.astype(self.dtype)
-        self._defocus = [tuple(h.astype(self.dtype) for h in display.defocus(t.z_mm)) for t in self.targets]
-        ey, ex = display.envelope(self.band.shape)
+        ey, ex = display.transmitted(self.band.shape)
         self._ey, self._ex = ey.astype(self._real), ex.astype(self._real)
 
     @property
@@ -135,7 +168,7 @@ class HologramModel:
     def evaluate(self, slm: ComplexArray) -> Evaluation:
         """Return loss, gradient and PSNR for SLM patterns, complex (n_frames, height, width)."""
         patterns = self._check(slm)
-        gradient = np.zeros((self.frames, *self.display.slm_shape), self.dtype)
+        gradient = np.zeros(patterns.shape, self.dtype)
         loss = 0.0
         errors = []
         for plane in range(len(self.targets)):
@@ -148,7 +181,10 @@ class HologramModel:
             self._kernels.columns(self._spectrum, False, get_threads())
             for frame in range(self.frames):
                 self._backward(frame, plane, gradient[frame])
-        gradient *= self._real.type(self.display.dc.modulated)
+        if self._panel is None:
+            gradient *= self._real.type(self.display.dc.modulated)
+        else:
+            gradient = self._panel.back(np.asarray(slm, self.dtype), gradient)
         error = float(np.mean(errors))
         return Evaluation(loss, gradient, -10 * np.log10(error) if error > 0 else np.inf)
 
@@ -174,14 +210,18 @@ class HologramModel:
         """Return Fourier coefficients at the kept lags, (rows, columns), of what is seen, or wanted."""
         if slm is None:
             return self._wanted[plane]
-        self._intensity_spectrum(self._check(slm), plane)
+        return self.lags_of_field(self._check(slm), plane)
+
+    def lags_of_field(self, fields: ComplexArray, plane: int = 0) -> ComplexArray:
+        """Return :meth:`lags` of fields as they leave the SLM, all light included."""
+        self._intensity_spectrum(fields, plane)
         rows, top = self.band.kept[0], self.band.top
         return np.concatenate([self._spectrum[:top], self._spectrum[len(self._spectrum) - rows + top :]])
 
     def efficiency(self, slm: ComplexArray, plane: int = 0) -> float:
         """Return the part of the light on the SLM that reaches the field, DC term and envelope included."""
         self._intensity_spectrum(self._check(slm), plane)
-        return float(self._spectrum[0, 0].real) * self._mean_power()
+        return float(self._spectrum[0, 0].real) * self._mean_light
 
     def slope(self) -> ComplexArray:
         """Return the row spectra of ``dL/dI`` of the pattern that was evaluated last, for :meth:`weighed`."""
@@ -217,9 +257,10 @@ class HologramModel:
             0,
             self.band.shape[0],
         )
-        out = np.zeros(self.display.slm_shape, self.dtype)
+        panel = self._panel
+        out = np.zeros(self.display.slm_shape if panel is None else panel.shape, self.dtype)
         self._columns_and_gather(0, plane, out)
-        return out
+        return out if panel is None else panel.collected(out)
 
     # Steps -------------------------------------------------------------------------------------
     def _spectrum_of(self, target: Target) -> tuple[ComplexArray, float]:
@@ -228,22 +269,30 @@ class HologramModel:
         spectrum *= share
         return spectrum.astype(self.dtype), peak * share
 
+    @property
+    def _factor(self) -> int:
+        """Mask pixels a sample of the SLM's field, along each axis."""
+        return self.display.factor if self._panel is None else self._panel.factor
+
     def _mean_power(self) -> float:
         """Return the mean light that passes from an SLM of random phases, relative to a mask in place."""
         display = self.display
+        sent = 1.0 if self._panel is None else self._panel.mean_power()
         if self._nodes is None:
-            return 1.0
+            return sent
         mixed, covered = self._kernels.mean_power(
             self._nodes, display.mask.shape, display.slm_shape, display.factor
         )
         if covered == 0:
             raise InputError("The mask is displaced so far that it sees nothing of the SLM.")
-        return float((1 - display.dc.power) * mixed + display.dc.power * covered)
+        return float(sent * ((1 - display.dc.power) * mixed + display.dc.power * covered))
 
     def _check(self, slm: ComplexArray) -> ComplexArray:
         expected = (self.frames, *self.display.slm_shape)
         if slm.shape != expected:
             raise InputError(f"SLM patterns must be {expected}, not {slm.shape}.")
+        if self._panel is not None:
+            return self._panel.field(np.asarray(slm, self.dtype))
         dc = self.display.dc
         if dc.power == 0:
             return np.ascontiguousarray(slm, self.dtype)
@@ -251,7 +300,7 @@ class HologramModel:
 
     def _intensity_spectrum(self, patterns: ComplexArray, plane: int) -> None:
         """Fill ``_field`` with the image plane's fields and ``_spectrum`` with the intensity's kept lags."""
-        mask, k = self.display.mask.levels, self.display.factor
+        mask, k = self.display.mask.levels, self._factor
         height, width = mask.shape
         hy, hx = self._defocus[plane]
         self._spectrum[:] = 0
@@ -320,7 +369,7 @@ class HologramModel:
         self._columns_and_gather(frame, plane, out)
 
     def _columns_and_gather(self, frame: int, plane: int, out: ComplexArray) -> None:
-        mask, k, nodes = self.display.mask.levels, self.display.factor, self._nodes
+        mask, k, nodes = self.display.mask.levels, self._factor, self._nodes
         height, width = mask.shape
         hy, hx = self._defocus[plane]
         field = self._field[frame]

@@ -11,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -125,6 +125,8 @@ def compute_hologram(
         search = _Lbfgs(variable, variable.pack(_start(initial, model, options)))
     else:
         search = _Nesterov(model, _start(initial, model, options), complex_slm)
+    if isinstance(search, _Lbfgs) and isinstance(variable, _Phase) and model.wraps:
+        return _in_turns(variable, search, watch)
     history, reason = watch.run(search, options.iterations, options.psnr_db)
     return Hologram(search.slm.astype(np.complex64), history, reason, history[-1].seconds)
 
@@ -414,6 +416,35 @@ def _on_levels(variable: _Phase, x: Array, levels: int, watch: _Watch) -> Hologr
     rounded = HologramRecord(last.iteration, last.seconds, *point)
     slm = variable.field(np.rint(x / step) * step)
     return Hologram(slm.astype(np.complex64), (*history[:-1], rounded), reason, last.seconds)
+
+
+TURNS = ((0.25, False), (0.2, False), (0.15, False), (0.2, True), (0.2, True))
+"""Where a display jumps as phases wrap: parts of the iterations in which none does, and whether phases stop
+at the ends of their turn then, so that nothing jumps afterwards."""
+
+
+def _in_turns(variable: _Phase, search: _Lbfgs, watch: _Watch) -> Hologram:
+    """Search with phases that do not wrap, and wrap them in between; the best wrapped ones count."""
+    model = variable.model
+    history: tuple[HologramRecord, ...] = (HologramRecord(0, 0.0, *search.point),)
+    best, slm = search.point, search.slm
+    reason, done = HologramStop.ITERATIONS, 0.0
+    for part, within in TURNS:
+        done += part
+        model.hold(search.slm, within=within)
+        going = _Lbfgs(variable, search.x)
+        history, reason = watch.run(
+            going, round(watch.options.iterations * done), watch.options.psnr_db, history
+        )
+        now = model.stopped(going.slm)
+        model.hold(None)
+        search = _Lbfgs(variable, variable.pack(now))
+        if search.point.loss < best.loss:
+            best, slm = search.point, now
+        history = (*history[:-1], replace(history[-1], loss=best.loss, psnr_db=best.psnr_db))
+        if reason not in (HologramStop.ITERATIONS, HologramStop.CONVERGED):
+            break
+    return Hologram(slm.astype(np.complex64), history, reason, history[-1].seconds)
 
 
 @dataclass(frozen=True, slots=True)

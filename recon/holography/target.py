@@ -139,7 +139,7 @@ class Target:
         is 1. So the target is scaled until its mean, the envelope divided out, is 1.
         """
         image = np.fft.ifftshift(np.asarray(self.image, np.float64))
-        ey, ex = display.envelope((image.shape[0], image.shape[1]))
+        ey, ex = display.transmitted((image.shape[0], image.shape[1]))
         scale = 1.0 / float((image / ey[:, None] / ex).mean())
         peak = float(self.image.max()) if self.white is None else self.white
         return image * scale, peak * scale

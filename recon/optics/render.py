@@ -21,7 +21,7 @@ from scipy import fft
 
 from recon.base.threads import get_threads
 from recon.optics.fall_off import FallOff, response_on
-from recon.optics.grid import PixelGrid, mixed_spectrum
+from recon.optics.grid import FloatArray, PixelGrid, mixed_spectrum
 from recon.optics.scene import Layer, Scene
 from recon.optics.wave import WavePropagator
 
@@ -85,14 +85,21 @@ def render(
         )
     # Transforms leave rounding errors around zero where it is dark.
     np.maximum(image, 0, out=image)
-    for place, power, diameter in scene.points():
+
+    def bead(point: tuple[FloatArray, FloatArray, float]) -> Image | None:
+        place, power, diameter = point
         source = (float(place[0]), float(place[1]), float(place[2]))
         spectrum = mixed_spectrum(product(weights, power), settings.spectral_samples)
         if not spectrum:
-            continue
+            return None
         light = propagator.psf(source, grid, spectrum, diameter_um=diameter, emission="isotropic")
         light *= response_on(grid, source, propagator.distance_um, fall_off)
-        image += np.float32(bead_photons) * light
+        return light
+
+    with ThreadPoolExecutor(get_threads(), "render") as pool:
+        for light in pool.map(bead, scene.points()):
+            if light is not None:
+                image += np.float32(bead_photons) * light
     return image
 
 

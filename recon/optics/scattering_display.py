@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
+from scipy import ndimage
 
 from recon.optics.jit import compiled
 
@@ -68,6 +69,18 @@ class DisplaySpec:
     sensor_roll_mrad : float
     lens_distortion : float
         Radial (third order) distortion of the Fourier lens, relative, at the middle of the field's border.
+    crosstalk_px : float
+        Width (standard deviation) of what smooths the SLM's phase across its pixels' borders, SLM pixels.
+    beam_mm : float
+        Radius at which the light on the SLM has fallen to ``exp(-2)`` of its peak; 0 is even light.
+    beam_centre_um : (float, float)
+        ``(x, y)`` of that peak.
+    wavefront_rad : float
+        Root mean square of the Fourier lens' aberrations over the mask: Zernike-like polynomials of second to
+        fourth order, at random.
+    wavefront_seed : int
+    vignetting : float
+        Part of the light that the lens and the camera lose at the middle of the field's border.
     """
 
     slm_pitch_um: float = 8.0
@@ -86,6 +99,12 @@ class DisplaySpec:
     sensor_offset_um: tuple[float, float] = (0.0, 0.0)
     sensor_roll_mrad: float = 0.0
     lens_distortion: float = 0.0
+    crosstalk_px: float = 0.0
+    beam_mm: float = 0.0
+    beam_centre_um: tuple[float, float] = (0.0, 0.0)
+    wavefront_rad: float = 0.0
+    wavefront_seed: int = 0
+    vignetting: float = 0.0
 
     @property
     def field_um(self) -> float:
@@ -111,14 +130,20 @@ class ScatteringDisplay:
         self.spec = spec
         self.threads = threads
         n = spec.oversampling
-        mask = np.exp(1j * np.asarray(mask_phase_rad)).astype(np.complex64)
+        error = spec.wavefront_rad * _wavefront(mask_phase_rad.shape, spec.wavefront_seed)
+        mask = np.exp(1j * (np.asarray(mask_phase_rad) + error)).astype(np.complex64)
         self._mask = np.repeat(np.repeat(mask, n, axis=0), n, axis=1)
         self._coarse = mask.shape
         pitch_mm = spec.mask_pitch_um * 1e-3 / n
         fy, fx = (scipy.fft.fftfreq(m, pitch_mm).astype(np.float32) for m in self._mask.shape)
         self._f2 = tuple(f**2 * np.float32(np.pi * spec.wavelength_nm * 1e-6) for f in (fy, fx))
 
-    def irradiance(self, phase_rad: npt.NDArray[np.floating], pose: MaskPose) -> Image:
+    def irradiance(
+        self,
+        phase_rad: npt.NDArray[np.floating],
+        pose: MaskPose,
+        amplitude: npt.NDArray[np.floating] | None = None,
+    ) -> Image:
         """Return the light on the camera's pixels, float32 (height, width).
 
         In units of the mean over the field of view that an ideal SLM without losses would give.
@@ -128,24 +153,48 @@ class ScatteringDisplay:
         phase_rad : ndarray, real, (height, width)
             Phase at every SLM pixel, errors of the SLM included.
         pose : MaskPose
+        amplitude : ndarray, real, (height, width), optional
+            At every SLM pixel; 1 by default.
         """
-        field = self._on_mask(phase_rad, pose)
+        field = self._on_mask(phase_rad, pose, amplitude)
         field *= self._mask
         return self._on_sensor(field, pose.roll_mrad)
 
-    def _on_mask(self, phase_rad: npt.NDArray[np.floating], pose: MaskPose) -> Complex:
+    def _on_mask(
+        self,
+        phase_rad: npt.NDArray[np.floating],
+        pose: MaskPose,
+        amplitude: npt.NDArray[np.floating] | None = None,
+    ) -> Complex:
         """Return the field that reaches the mask, in the mask's frame."""
         spec = self.spec
         stray = np.sqrt(spec.dc_power) * np.exp(1j * spec.dc_phase_rad)
+        parts = 1
+        if spec.crosstalk_px > 0:
+            # The phase changes within a pixel: as many samples as there are of the field, at most.
+            parts = max(int(spec.slm_pitch_um * spec.oversampling / spec.mask_pitch_um), 1)
+            phase_rad = _finer(phase_rad, parts)
+            phase_rad = ndimage.gaussian_filter(phase_rad, spec.crosstalk_px * parts, mode="nearest")
+            amplitude = None if amplitude is None else _finer(amplitude, parts)
+        shown = np.exp(1j * phase_rad) if amplitude is None else amplitude * np.exp(1j * phase_rad)
         modulated = np.sqrt(1 - spec.dc_power) * (
-            spec.fill * np.exp(1j * phase_rad) + (1 - spec.fill) * np.exp(1j * spec.dc_phase_rad)
+            spec.fill * shown + (1 - spec.fill) * np.exp(1j * spec.dc_phase_rad)
         )
+        light = modulated + stray
+        if spec.beam_mm > 0:
+            pitch_mm = spec.slm_pitch_um / parts * 1e-3
+            x0, y0 = (1e-3 * at for at in spec.beam_centre_um)
+            down, across = (
+                np.exp(-((((np.arange(m) - (m - 1) / 2) * pitch_mm - at) / spec.beam_mm) ** 2))
+                for m, at in zip(light.shape, (y0, x0), strict=True)
+            )
+            light *= (down / np.sqrt((down**2).mean()))[:, None] * (across / np.sqrt((across**2).mean()))
         field = np.empty(self._mask.shape, np.complex64)
         corner_um = 0.5 * spec.mask_pitch_um * np.hypot(*self._coarse)
         _resample(
-            (modulated + stray).astype(np.complex64),
+            light.astype(np.complex64),
             field,
-            (spec.mask_pitch_um / spec.oversampling, spec.slm_pitch_um),
+            (spec.mask_pitch_um / spec.oversampling, spec.slm_pitch_um / parts),
             (pose.shift_x_um, pose.shift_y_um),
             (
                 (1 + spec.magnification) * np.cos(pose.roll_mrad * 1e-3),
@@ -213,9 +262,26 @@ class ScatteringDisplay:
             pixel,
             (spec.sensor_offset_um[0] / spec.field_um, spec.sensor_offset_um[1] / spec.field_um),
             (spec.sensor_roll_mrad - mask_roll_mrad) * 1e-3,
-            4 * spec.lens_distortion,
+            (4 * spec.lens_distortion, 4 * spec.vignetting),
         )
         return sensor
+
+
+def _finer(values: npt.NDArray[np.floating], parts: int) -> npt.NDArray[np.floating]:
+    return np.repeat(np.repeat(values, parts, axis=0), parts, axis=1)
+
+
+def _wavefront(shape: tuple[int, ...], seed: int) -> npt.NDArray[np.float32]:
+    """Return random aberrations of second to fourth order over an aperture, mean 0, rms 1."""
+    rng = np.random.default_rng(seed)
+    y, x = (np.linspace(-1, 1, n) * n / max(shape) for n in shape)
+    total = np.zeros(shape)
+    for order in (2, 3, 4):
+        for i in range(order + 1):
+            term = np.multiply.outer(y**i, x ** (order - i))
+            total += rng.normal() / order * (term - term.mean()) / term.std()
+    total -= total.mean()
+    return np.asarray(total / total.std(), np.float32)
 
 
 def _taps() -> Image:
@@ -295,12 +361,14 @@ def _read(
     pixel: float,
     offset: tuple[float, float],
     roll: float,
-    cubic: float,
+    radial: tuple[float, float],
 ) -> None:
     """Interpolate pixel means to every camera pixel's place; lengths in units of the field of view.
 
-    Beyond the field it is dark; a pixel on its border has the part that is inside.
+    ``radial`` is the distortion and the light lost, at a distance of 1. Beyond the field it is
+    dark; a pixel on its border has the part that is inside.
     """
+    cubic, lost = radial
     for i in range(sensor.shape[0]):
         for j in range(sensor.shape[1]):
             a = (i - 0.5 * (sensor.shape[0] - 1)) * pixel + offset[0]
@@ -326,4 +394,5 @@ def _read(
                 for c in range(_TAPS):
                     inner += across[c] * line[(column + c - _TAPS // 2 + 1) % light.shape[1]]
                 total += down[r] * inner
-            sensor[i, j] = max(total, 0.0) * part_y * part_x
+            passed = max(1.0 - lost * (y * y + x * x), 0.0)
+            sensor[i, j] = max(total, 0.0) * part_y * part_x * passed

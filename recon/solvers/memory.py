@@ -6,7 +6,8 @@ import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -125,6 +126,50 @@ def available_bytes() -> int:
     if limit.exists() and used.exists() and limit.read_text().strip().isdigit():
         free.append(int(limit.read_text()) - int(used.read_text()))
     return min(free, default=2**62)
+
+
+class MemoryMeter:
+    """Measures the most memory that this process took at a time since the meter was made, in MiB.
+
+    NaN where the system does not say (it is Linux that does).
+    """
+
+    def __init__(self) -> None:
+        self._before = _reset_peak_mib()
+        self._most = 0.0
+
+    def peak_mib(self) -> float:
+        """Return the most so far beyond what was taken at the start, without what was taken aside."""
+        return max(self._most, _status_mib("VmHWM") - self._before)
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Do something whose memory does not count, nor what it leaves behind."""
+        self._most = self.peak_mib()
+        present = _status_mib("VmRSS")
+        try:
+            yield
+        finally:
+            self._before += _reset_peak_mib() - present
+
+
+def _reset_peak_mib() -> float:
+    """Forget the highest memory so far; return what is taken now, MiB (NaN where the system does not say)."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return float("nan")
+    return _status_mib("VmHWM")
+
+
+def _status_mib(name: str) -> float:
+    status = Path("/proc/self/status")
+    if not status.exists():
+        return float("nan")
+    for line in status.read_text().splitlines():
+        if line.startswith(name + ":"):
+            return int(line.split()[1]) / 1024
+    return float("nan")
 
 
 class Storage:

@@ -35,12 +35,17 @@ SMALL = DemoSettings(
     planes=3,
     scene_plane=1,
     half_field_deg=5.0,
+    lights=4,
+    photograph_average=4,
     reconstruction_s=5.0,
+    chart_s=0.3,
     time_scale=0.0,
 )
 
 
-MOVING = ("dark frames and axial sweep", "response over the field", "photograph the scene", "reconstruct")
+SOLVING = ("reconstruct the picture", "reconstruct the volume", "chart methods")
+PHOTOGRAPHING = ("photograph the scene in three colours", "photograph lights in a volume")
+MOVING = ("dark frames and axial sweep", "response over the field", *PHOTOGRAPHING, *SOLVING)
 SAFE = {"light": "off", "stage_moving": False, "scene_lit": False}
 
 
@@ -63,7 +68,7 @@ class Troubling(Listener):
 
     def share(self, done: float, total: float, *, at_most: bool = False) -> None:
         name = self.stages[-1]
-        if name == self.trouble_in and (done >= total / 2 or name == "reconstruct"):
+        if name == self.trouble_in and (done >= total / 2 or name in SOLVING):
             self.make_trouble()
 
     def exposures(self, found: SweepExposures) -> None:
@@ -81,7 +86,9 @@ def test_the_small_demo_reconstructs_its_scene(shown: tuple[DemoResult, Troublin
     assert result.comparison.psnr_db > 24
     assert result.comparison.ssim > 0.7
     assert list(result.seconds) == listener.stages
-    assert result.measured.photo.saturated_pixels == 0
+    assert not any(photo.saturated_pixels for photo in (*result.measured.photos, result.measured.lights))
+    assert result.placed.in_plane == SMALL.lights
+    assert {point.psnr_db > 0 for point in result.chart.points} == {True}
     assert result.measured.calibration.findings == ()
 
 
@@ -105,8 +112,8 @@ def test_a_picture_shifted_or_turned_over_scores_worse(shown: tuple[DemoResult, 
     result, _ = shown
     truth = cv2.imread(str(result.files["ground truth, linear float32"]), cv2.IMREAD_UNCHANGED)
     picture = cv2.imread(str(result.files["picture, linear float32"]), cv2.IMREAD_UNCHANGED)
-    height, width = truth.shape
-    field = scene_field(truth.shape, (height // 2, width // 2), (height - 8.0, width - 8.0), 1.0)
+    height, width = truth.shape[:2]
+    field = scene_field((height, width), (height // 2, width // 2), (height - 8.0, width - 8.0), 1.0)
     right = compare(picture, truth, field).psnr_db
     assert compare(picture[::-1], truth, field).psnr_db < right - 5
     assert compare(picture[:, ::-1], truth, field).psnr_db < right - 5
@@ -118,7 +125,7 @@ def test_pictures_stand_upright(shown: tuple[DemoResult, Troubling]) -> None:
     original = read_picture()
     for name in ("picture", "ground truth, linear float32"):
         image = cv2.imread(str(result.files[name]), cv2.IMREAD_UNCHANGED)[4:-4, 4:-4]  # without the margin
-        expected = cv2.resize(original, image.shape[::-1], interpolation=cv2.INTER_AREA)
+        expected = cv2.resize(original[..., ::-1], image.shape[1::-1], interpolation=cv2.INTER_AREA)
         assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.9
 
 
@@ -135,10 +142,13 @@ def test_the_demo_as_it_is_keeps_its_promise(
     assert float(found[1]) > 28  # promised: 24
     assert float(found[2]) > 0.8
     assert "SIMULATED" in out
-    for stage in ("home the stage", "dark frames and axial sweep", "photograph the scene", "reconstruct"):
+    lights = re.search(r"Lights: (\d+) of (\d+) found", out)
+    assert lights
+    assert int(lights[1]) >= 0.9 * int(lights[2])
+    for stage in ("home the stage", "dark frames and axial sweep", *PHOTOGRAPHING, *SOLVING):
         assert re.search(rf"[0-9.]+  {stage}", out)
     (folder,) = tmp_path.iterdir()
-    assert (folder / "summary.png").stat().st_size < 400_000
+    assert (folder / "summary.png").stat().st_size < 800_000
 
 
 STOP, FAIL = KeyboardInterrupt(), DeviceError("camera (simulated)", "was unplugged.")
@@ -151,9 +161,9 @@ STOP, FAIL = KeyboardInterrupt(), DeviceError("camera (simulated)", "was unplugg
         ("expose without saturating", STOP),
         ("dark frames and axial sweep", STOP),
         ("dark frames and axial sweep", FAIL),
-        ("photograph the scene", STOP),
-        ("photograph the scene", FAIL),
-        ("reconstruct", STOP),
+        (PHOTOGRAPHING[0], STOP),
+        (PHOTOGRAPHING[1], FAIL),
+        ("reconstruct the picture", STOP),
         ("write the pictures", STOP),
     ],
 )
@@ -176,7 +186,7 @@ def test_whatever_ends_it_the_bench_is_safe_and_the_record_says_so(
     assert record["left"] == SAFE
     assert not any(device.is_open for device in benches[0].devices.values())
     runs = sorted(path for path in folder.iterdir() if (path / "state.json").exists())
-    if stage in MOVING and stage != "reconstruct":
+    if stage in MOVING and stage not in SOLVING:
         expected = RunCondition.ABORTED if record["state"] == "aborted" else RunCondition.FAILED
         assert [Run.open(run).condition for run in runs][-1] is expected
 
@@ -193,7 +203,7 @@ from calibration_routines import demo
 from instrument.cli import main
 small = demo.DemoSettings(
     preset="tiny", camera_binning=1, binning=1, z_mm=(60.0, 150.0), planes=3, scene_plane=1,
-    half_field_deg=5.0, reconstruction_s=5.0, time_scale=1.0,
+    half_field_deg=5.0, lights=4, chart_s=0.3, reconstruction_s=5.0, time_scale=1.0,
 )
 import instrument.cli.demo as command
 command.DemoSettings = lambda **_: small

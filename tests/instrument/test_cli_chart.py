@@ -172,7 +172,7 @@ def test_memory_taken_aside_does_not_count():
     # In a process of its own: what this one has freed before would be taken again, and not count as taken.
     program = """
 import numpy as np
-from instrument.evaluation.chart import MemoryMeter
+from recon.solvers.memory import MemoryMeter
 meter = MemoryMeter()
 own = np.ones(6 << 20)  # 48 MiB
 with meter.aside():

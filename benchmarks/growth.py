@@ -1,0 +1,167 @@
+"""Draw time and memory of reconstructions against pixels, planes, PSFs, frames and threads, with slopes.
+
+    python benchmarks/growth.py [--most 1.0] [--out growth] [--iterations 30]
+
+Each case runs in a process of its own on points seen through random lenslets (SIMULATED): first the
+forecast that ``reconstruct --explain`` gives, from six iterations, then the whole of it. Written are
+``growth.png`` and ``growth.csv``: seconds and memory against each size, the exponent by which they grow, what
+the forecast missed, and the largest that fits into this machine's memory, by the last two sizes. ``--most``
+scales the sizes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import multiprocessing
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from instrument.files.figures import ACCENT, INK, SECOND, save_figure, style
+from instrument.reconstruction.forecast import forecast
+from recon import Calibration, Geometry, reconstruct
+from recon.base.threads import set_threads
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
+from recon.solvers.memory import GIB, MemoryMeter, available_bytes
+
+
+@dataclass(frozen=True)
+class Case:
+    """A reconstruction: how much of everything."""
+
+    side: int = 192
+    planes: int = 1
+    psfs: int = 1
+    """Along each side of the field."""
+    frames: int = 1
+    threads: int = 1
+
+
+def cases(most: float) -> dict[str, list[tuple[int, Case]]]:
+    """Return for each thing that grows its sizes and the cases."""
+    sides = [round(n * most**0.5 / 16) * 16 for n in (128, 256, 512, 1024)]
+    return {
+        "pixels": [(n * n, Case(side=n)) for n in sides],
+        "planes": [(n, Case(planes=n)) for n in (2, 4, 8, 16, 32)],
+        "PSFs": [(n * n, Case(psfs=n)) for n in (1, 2, 3, 5)],
+        "frames": [(n, Case(side=128, frames=n)) for n in (2, 4, 8)],
+        "threads": [(n, Case(side=512, threads=n)) for n in (1, 2)],
+    }
+
+
+def scene(case: Case) -> tuple[np.ndarray, Calibration]:
+    """Return photographs (frames, side, side) and PSFs; the values do not matter, the sizes do."""
+    rng = np.random.default_rng(0)
+    n, support = case.side, case.side // 3
+    y, x = np.mgrid[:n, :n] - n / 2
+    places, psfs = [], []
+    for plane in range(case.planes):
+        z_um = 2e4 / (1 - 0.4 * plane / max(case.planes - 1, 1))
+        for row in range(case.psfs):
+            for column in range(case.psfs):
+                lenslets = np.random.default_rng(1).random((n, n)) ** 400
+                inside = np.hypot(y, x) < support * (1 + 0.3 * plane / case.planes) / 2
+                psfs.append((lenslets * inside).astype(np.float32)[None])
+                offset = (np.array([column, row]) - (case.psfs - 1) / 2) * 1000
+                places.append([*offset, z_um])
+    calibration = Calibration(
+        np.stack(psfs), np.array(places, np.float64), geometry=Geometry(10.0, 5.0, None)
+    )
+    points = (rng.random((case.frames, n, n)) > 0.999).astype(np.float32)
+    spectra = np.fft.rfft2(points) * np.fft.rfft2(np.fft.ifftshift(psfs[0][0]))
+    light = np.fft.irfft2(spectra, (n, n)).clip(0)
+    return rng.poisson(1000 * light / light.max() + 10).astype(np.float32), calibration
+
+
+def measure(case: Case, iterations: int, answer: Any) -> None:
+    """Forecast a case, then run it; sends seconds and bytes of both."""
+    set_threads(case.threads)
+    photographs, calibration = scene(case)
+    model = "local" if case.psfs > 1 else "convolution"
+    options = ReconstructionOptions(
+        model=model,
+        prior="tv" if case.planes == 1 else "l1",
+        iterations=iterations,
+        tolerance=0.0,
+        judged=False,
+    )
+    small = scene(Case(side=48, planes=case.planes, psfs=case.psfs))
+    reconstruct(small[0][0], small[1], options, iterations=2)  # kernels are compiled
+    told = forecast(Measurement(photographs[0]), calibration, options)
+    meter, began, last = MemoryMeter(), time.perf_counter(), None
+    for photograph in photographs:
+        last = reconstruct(photograph, calibration, options, warm=last)
+    seconds, memory = time.perf_counter() - began, meter.peak_mib() * 2**20
+    answer.send((told.seconds * case.frames, told.memory_bytes, seconds, memory))
+
+
+def measured(case: Case, iterations: int) -> tuple[float, float, float, float]:
+    """Run a case in a process of its own."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=measure, args=(case, iterations, theirs))
+    process.start()
+    theirs.close()
+    found: tuple[float, float, float, float] = ours.recv()
+    process.join()
+    return found
+
+
+def slope(sizes: list[int], values: list[float]) -> float:
+    """Return the exponent of growth over the two largest sizes."""
+    ratio = np.log(sizes[-1] / sizes[-2])
+    return float(np.log(max(values[-1], 1e-9) / max(values[-2], 1e-9)) / ratio)
+
+
+def main() -> None:
+    """Measure all cases, print and draw them."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--most", type=float, default=1.0, help="pixels, times those of 1024 x 1024")
+    parser.add_argument("--iterations", type=int, default=30)
+    parser.add_argument("--only", help="one of pixels, planes, PSFs, frames, threads")
+    parser.add_argument("--out", type=Path, default=Path("growth"))
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    wanted = {k: v for k, v in cases(options.most).items() if options.only in (None, k)}
+    figure = Figure(figsize=(4.2 * len(wanted), 4.4), layout="constrained")
+    panels = figure.subplots(1, len(wanted), squeeze=False)[0]
+    rows = []
+    for axes, (what, grown) in zip(panels, wanted.items(), strict=True):
+        sizes = [size for size, _ in grown]
+        found = [measured(case, options.iterations) for _, case in grown]
+        seconds, memory = [f[2] for f in found], [f[3] for f in found]
+        for size, (told_s, told_bytes, took_s, took_bytes) in zip(sizes, found, strict=True):
+            rows.append([what, size, took_s, told_s, took_bytes / 2**20, told_bytes / 2**20])
+            print(
+                f"{what:<8}{size:>9}  {took_s:8.2f} s (forecast {told_s / took_s - 1:+.0%})  "
+                f"{took_bytes / 2**20:8.1f} MiB (forecast {told_bytes / took_bytes - 1:+.0%})",
+                flush=True,
+            )
+        time_slope, memory_slope = slope(sizes, seconds), slope(sizes, memory)
+        words = f"time ~ size^{time_slope:.2f}, memory ~ size^{memory_slope:.2f}"
+        if memory_slope > 0.1:
+            fits = sizes[-1] * (0.9 * available_bytes() / memory[-1]) ** (1 / memory_slope)
+            words += f"; {fits:.2g} {what} fit into {available_bytes() / GIB:.0f} GiB"
+        print(f"{what:<8}{words}")
+        axes.loglog(sizes, seconds, "o-", color=SECOND, label="seconds")
+        axes.loglog(sizes, [f[0] for f in found], "x", color=SECOND, label="forecast")
+        axes.loglog(sizes, [m / 2**20 for m in memory], "s-", color=ACCENT, label="MiB")
+        axes.loglog(sizes, [f[1] / 2**20 for f in found], "+", color=ACCENT, label="forecast")
+        style(axes, words.replace("; ", "\n").replace(", ", "\n"), what, "", title_size=9)
+        axes.legend(fontsize=8, frameon=False, labelcolor=INK)
+    with (options.out / "growth.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["what", "size", "seconds", "forecast_s", "mib", "forecast_mib"])
+        writer.writerows(rows)
+    figure.suptitle(f"{options.iterations} iterations, SIMULATED", fontsize=10, color=INK)
+    save_figure(figure, options.out / "growth.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,201 @@
+"""Learn how a display differs from its description, by photographs of random phases."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration_routines.display.display_io import DisplayBench, bring_mask, require_slm, writable
+from calibration_routines.display.hologram_photograph import HologramCamera
+from calibration_routines.procedure import Checked, Listener, Outcome, Outlook, Procedure, Routine
+from instrument.bench.bench import Bench
+from instrument.display.hologram import Alignment, bench_display, load_alignment, save_alignment
+from instrument.files.atomic import require_new
+from instrument.files.slm_image import load_slm_correction
+from instrument.runs.run_control import RunControl
+from recon.base.declare import option
+from recon.holography import Display
+from recon.holography.learn import Lesson, Look, learn_display
+from recon.holography.pose import NODES, Pose
+from recon.holography.target import make_band
+
+DISPLAY_FILE = "display.json"
+"""Where the command line writes it."""
+ASIDE = 3
+"""Photographs that are not fitted but judge."""
+
+
+def photograph_looks(seen: HologramCamera, count: int, *, seed: int = 0) -> list[Look]:
+    """Show random phases and photograph each once; returns them with what was seen."""
+    rng = np.random.default_rng(seed)
+    band = make_band(seen.display.slm_shape, seen.display.factor, "alias-free")
+    looks = []
+    for _ in range(count):
+        slm = np.exp(1j * rng.uniform(0, 2 * np.pi, seen.display.slm_shape)).astype(np.complex64)
+        seen.io.show(slm)
+        frame = seen.io.photograph(seen.io.exposure_ms(seen.mean_per_ms))
+        looks.append(Look(slm, seen.camera.lags(frame, band)))
+    return looks
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningProcedure(Checked, Procedure):
+    """Photograph random phases, fit the display's model to them, judge it by others."""
+
+    alignment: Path | None = option(
+        None,
+        metavar="FILE",
+        help="Of the mask, from align mask; or an earlier display file, which is gone on from.",
+        default_words="none: the mask is in its place",
+    )
+    slm_calibration: Path | None = option(
+        None,
+        metavar="FILE",
+        label="SLM calibration",
+        help="Look-up table and flatness, from calibrate slm.",
+        default_words="none: an ideal SLM",
+    )
+    patterns: int = option(
+        13, least=ASIDE + 2, most=58, help=f"Random patterns to photograph; {ASIDE} of them judge."
+    )
+    out: Path | None = option(
+        None,
+        flags=("--out", "-o"),
+        metavar="FILE",
+        label="File",
+        help="Where what is learned goes (.json).",
+        default_words=f"{DISPLAY_FILE}; in the window dated, beside the runs",
+    )
+    overwrite: bool = option(False, flags=("--force",), help="Overwrite a file that exists.")
+
+    @property
+    def frames(self) -> int:
+        """Frames it takes."""
+        return self.patterns + 2
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Refuse a bench without SLM, files that cannot be read, a file that exists."""
+        slm = require_slm(bench)
+        if self.out is not None:
+            require_new(self.out, overwrite=self.overwrite)
+        if self.slm_calibration is not None:
+            load_slm_correction(self.slm_calibration)
+        display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
+        if self.alignment is not None:
+            load_alignment(self.alignment).of(display)
+        height, width = display.slm_shape
+        return Outlook(
+            (f"{self.patterns} random patterns of {height} x {width} pixels, {self.frames} frames",)
+        )
+
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
+        """Photograph, learn, and save what ``hologram`` and ``show`` take as an alignment."""
+        slm, out = require_slm(bench), writable(bench, folder, self.out, "display")
+        place = load_alignment(self.alignment) if self.alignment is not None else None
+        nominal = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
+        io = DisplayBench(
+            bench,
+            bench.config.display.slm_binning,
+            load_slm_correction(self.slm_calibration) if self.slm_calibration else None,
+            check=control.check,
+            on_frame=lambda frames: listener.share(frames, self.frames),
+        )
+        if place is not None:
+            bring_mask(bench, place.stage_position)
+        else:
+            place = _in_place(nominal, bench)
+        listener.step("photographing random patterns")
+        seen = HologramCamera.registered(io, place.of(nominal))
+        looks = photograph_looks(seen, self.patterns)
+        bench.stop()
+        listener.step("learning")
+
+        def progress(share: float, _words: str) -> None:
+            control.check()
+            listener.share(share, 1.0)
+
+        lesson = learn_display(seen.display, looks, aside=ASIDE, on_progress=progress)
+        found = learned_alignment(place, nominal, lesson, corrected=self.slm_calibration is not None)
+        facts = {
+            "bench": bench.label,
+            "frames": io.frames,
+            "camera_residual_px": seen.camera.residual_px,
+            "unexplained": {"before": lesson.before, "after": lesson.after, "rounds": list(lesson.rounds)},
+        }
+        save_alignment(out, found, facts)
+        return Outcome(
+            verdict=tuple(learning_lines(lesson, io.frames, simulated=found.simulated)),
+            good=True,
+            calibration=out,
+            result=lesson,
+        )
+
+
+def _in_place(display: Display, bench: Bench) -> Alignment:
+    """Return the alignment of a mask that is where it should be."""
+    rest = np.zeros((*NODES, 2))
+    return Alignment(Pose(), {}, rest, 1.0, {}, display.mask.shape, bool(bench.simulated_kinds))
+
+
+def learned_alignment(place: Alignment, nominal: Display, lesson: Lesson, *, corrected: bool) -> Alignment:
+    """Return an alignment with what was learned; as it was where nothing was."""
+    if not lesson.helps or lesson.display.displacement is None:
+        return place
+    rest: npt.NDArray[Any] = lesson.display.displacement - place.pose.displacement(nominal.mask.shape)
+    return replace(place, rest=rest, learned=lesson.display.learned, corrected=corrected)
+
+
+def learning_lines(lesson: Lesson, frames: int, *, simulated: bool) -> list[str]:
+    """Return what was learned and how good it is, in lines."""
+    mark = " (SIMULATED)" if simulated else ""
+    lines = [
+        f"{frames} frames{mark}. Of the contrast of {ASIDE} photographs that were not fitted, "
+        f"{1 - lesson.before**2:.1%} was explained before, {1 - lesson.after**2:.1%} is now"
+    ]
+    learned = lesson.display.learned
+    if not lesson.helps or learned is None:
+        return [*lines, "  The display is as it is described: nothing was changed."]
+    told = learned.response[:, 0] + 1j * learned.response[:, 1]
+    told = told / told.mean()
+    light, height_width = learned.illumination((32, 64)), (64, 64)
+    down, across = (np.fft.fftshift(row) for row in learned.shading(height_width))
+    least = np.sort(np.abs(light) ** 2, axis=None)[len(light) // 2]
+    lines += [
+        f"  light that is not modulated {lesson.display.dc.power:.1%}; cross-talk "
+        f"{learned.crosstalk_px[0]:.2f} x {learned.crosstalk_px[1]:.2f} SLM pixels; mask depth "
+        f"{learned.mask_depth:.3f} of what it should be",
+        f"  SLM levels: phase off by {np.abs(np.angle(told)).max():.2f} rad, amplitude by "
+        f"{np.abs(np.abs(told) - 1).max():.0%} at most",
+        f"  light on the SLM: {least:.0%} of the mean where it is dim; wavefront "
+        f"{np.sqrt((learned.phase[2:] ** 2).sum()):.2f} rad rms beyond tilt",
+        f"  light at the field's border: {down[[0, -1]].mean() / down[32]:.0%} (above, below), "
+        f"{across[[0, -1]].mean() / across[32]:.0%} (sides) of the middle's, mask pixels' envelope apart",
+    ]
+    return lines
+
+
+ROUTINES = (
+    Routine(
+        name="display",
+        title="Display model",
+        help="Learn from photographs of random patterns how the display differs from its description: SLM, "
+        "light, lens, mask.",
+        details="SLM amplitude and phase, cross-talk, light that is not modulated, illumination, wavefront, "
+        "vignetting, depth and place of the mask are fitted to photographs, and judged by others. Align the "
+        "mask before. Give the file to hologram and show as --alignment.",
+        options=LearningProcedure,
+        procedure=lambda options: options,
+        needs=("slm",),
+        tried_on="display",
+        examples=(
+            "diffuserbench calibrate display --bench display.toml --alignment alignment.json",
+            "diffuserbench calibrate display --alignment alignment.json --patterns 40",
+        ),
+        file=DISPLAY_FILE,
+    ),
+)
+"""Row of :data:`calibration_routines.procedure.routines`."""
