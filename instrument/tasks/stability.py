@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from instrument.files.errors import BenchError, FileError
 from instrument.tasks.task import Desk, Done, command_line, saying_what_is_left, task
@@ -36,6 +36,11 @@ class StabilityOptions:
     list_maps: bool = option(False, help="Only list maps and their methods.", flags=("--list",))
     redraw: bool = option(False, help="Only draw what stability.json holds.")
     shipped: bool = option(False, help="With --redraw: the maps that come with the program.")
+    case: Path | None = option(
+        None,
+        help="With --redraw: mark where this reconstruction lies, the cell whose evidence is most like its.",
+        metavar="RESULT",
+    )
 
 
 @task(
@@ -44,6 +49,7 @@ class StabilityOptions:
     "diffuserbench stability light erasures --method 'admm tv' --out maps",
     "diffuserbench stability --size full --out stability",
     "diffuserbench stability --redraw --out stability",
+    "diffuserbench stability light erasures --redraw --shipped --case reconstruction.tif",
 )
 def stability(desk: Desk, options: StabilityOptions) -> Done:
     """Map where methods fail: the error against pairs of stresses, with the failure boundary drawn.
@@ -61,9 +67,10 @@ def stability(desk: Desk, options: StabilityOptions) -> Done:
             desk.say(f"{'':<20}methods: {'; '.join(stress.methods)}")
         return Done()
     if options.redraw:
-        return _redraw(options.out, [s.name for s in chosen] if names else None, shipped=options.shipped)
-    if options.shipped:
-        raise BenchError("--shipped goes with --redraw.")
+        wanted_names = [s.name for s in chosen] if names else None
+        return _redraw(desk, options, wanted_names)
+    if options.shipped or options.case is not None:
+        raise BenchError("--shipped and --case go with --redraw.")
     wanted = {s.name: _methods(s.methods, options.method) for s in chosen}
     chosen = [s for s in chosen if wanted[s.name]]
     if not chosen:
@@ -114,17 +121,52 @@ def _draw(record: dict[str, object], picture: Path) -> None:
     save_figure(map_figure(record), picture)
 
 
-def _redraw(out: Path, names: list[str] | None, *, shipped: bool) -> Done:
+def _redraw(desk: Desk, options: StabilityOptions, names: list[str] | None) -> Done:
     from instrument.files.stability_file import RESULT, read_stability
     from recon.verdict.cases import SHIPPED
 
-    maps = read_stability(SHIPPED if shipped else out / RESULT)["maps"]
+    out = options.out
+    maps = read_stability(SHIPPED if options.shipped else out / RESULT)["maps"]
     if missing := [n for n in names or () if n not in maps]:
         raise BenchError(f"Not made yet: {', '.join(missing)}. Leave --redraw out to make them.")
+    verdict = None if options.case is None else _verdict_of(options.case)
     _make(out)
     for name in names or maps:
+        if verdict is not None:
+            desk.fact(name, _mark(maps[name], verdict))
         _draw(maps[name], out / f"{name}.png")
     return Done(tuple(out / f"{name}.png" for name in names or maps))
+
+
+def _verdict_of(case: Path) -> dict[str, Any]:
+    """Return a reconstruction's verdict as it is recorded.
+
+    Raises FileError when it is none, or has none.
+    """
+    from instrument.reconstruction.stored_result import open_result
+
+    verdict: dict[str, Any] | None = open_result(case).record.get("verdict")
+    if not verdict or not verdict.get("evidence"):
+        raise FileError(case, "was not judged, so that it has no place on a map.", "Reconstruct it anew.")
+    return verdict
+
+
+def _mark(record: dict[str, Any], verdict: dict[str, Any]) -> str:
+    """Mark a map with the cell that a case is most like; return in words which it is."""
+    from instrument.evaluation.figures import label_of, ticks_of
+    from recon.verdict.likeness import most_like
+
+    like = most_like(verdict["evidence"], verdict["method"], record)
+    if like is None:
+        return f"no method of it fails as {verdict['method']} does, or its cells tell too little"
+    record["methods"][like.method]["case"] = [like.ix, like.iy]
+    place = ", ".join(
+        f"{label_of(record[axis])} {ticks_of(record[axis])[index]}"
+        for axis, index in (("x", like.ix), ("y", like.iy))
+    )
+    return (
+        f"most like {place}: severity {like.severity:.2g}; {like.distance:.1f} times all cases' scatter away"
+    )
 
 
 def _tell(desk: Desk, name: str, record: dict[str, object]) -> None:
