@@ -145,9 +145,10 @@ THIN = "\u2009"
 def grouped(digits: str) -> str:
     """Return a number's digits with thin spaces between thousands, from five digits before the point on."""
     whole, point, rest = digits.partition(".")
-    return (
-        f"{int(whole):,}".replace(",", THIN) + point + rest if whole.lstrip("-")[4:].isdecimal() else digits
-    )
+    bare = whole.lstrip("-")
+    if len(bare) < 5 or not bare.isdecimal():
+        return digits
+    return f"{int(whole):,}".replace(",", THIN) + point + rest
 
 
 def _factor(typed: str, unit: str) -> float | None:
