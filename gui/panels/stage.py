@@ -16,7 +16,7 @@ from gui.panel import DevicePanel, on_bench
 from gui.session import BenchSession
 from gui.widgets.building import button, fill, in_column, in_row, label, mark, share_bar
 from gui.widgets.dialogues import Question
-from gui.widgets.entry import NumberEdit
+from gui.widgets.entry import NumberEdit, grouped
 from gui.widgets.image_view import step_factor
 from gui.widgets.kept_bar import KeptBar
 from recon.base.declare import Imports
@@ -150,7 +150,7 @@ class StagePanel(DevicePanel):
             )
             minus.setFixedWidth(34)
             plus.setFixedWidth(34)
-            limit = label(f"{axis.lower_limit:g} … {axis.upper_limit:g}", "dim")
+            limit = label(f"{grouped(f'{axis.lower_limit:g}')} … {grouped(f'{axis.upper_limit:g}')}", "dim")
             limit.setToolTip(f"Soft limits, {unit}")
             self._grid.addWidget(label(letter, "value"), number, 0)
             self._grid.addLayout(in_column(gauge, limit, spacing=1), number, 2)
@@ -180,7 +180,7 @@ class StagePanel(DevicePanel):
         self._here = position
         for name, row in self.rows.items():
             here = position[name]
-            row.position.setText(f"{here:,.1f} {_words(row.axis.unit)}".replace(",", "\u2009"))
+            row.position.setText(f"{grouped(f'{here:.1f}')} {_words(row.axis.unit)}")
             travel = row.axis.upper_limit - row.axis.lower_limit
             row.gauge.setValue(round(_GAUGE * (here - row.axis.lower_limit) / travel) if travel else 0)
             if row.target.value is None or not row.target.hasFocus():
