@@ -71,13 +71,7 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
             before[number] = signal.signal(number, end)
     try:
         window = MainWindow(session, settings, app.primaryScreen().availableSize() - _FRAME)
-        window.show()
-        app.processEvents()  # the first sight of it, before there is anything to stop
-        # What stays is not looked through for garbage again and again, 0.1 s during which nothing answers.
-        session.opened.connect(gc.freeze)
-        window.maker.made.connect(gc.freeze)
-        if not session.is_closing:
-            session.open()
+        show_and_open(window)
         status = app.exec()
         session.join()
     finally:
@@ -87,6 +81,17 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
             signal.signal(number, handler)
     window.deleteLater()
     return status, window.next_bench
+
+
+def show_and_open(window: MainWindow) -> None:
+    """Show a window, and open its bench when it was seen: what takes long is done before there is light."""
+    window.show()
+    application().processEvents()
+    # What stays is not looked through for garbage again and again, 0.1 s during which nothing answers.
+    window.session.opened.connect(gc.freeze)
+    window.maker.made.connect(gc.freeze)
+    if not window.session.is_closing:
+        window.session.open()
 
 
 def show_mistake(error: BenchError) -> None:

@@ -311,7 +311,7 @@ class MainWindow(QMainWindow):
         """Change the looks of the whole program and remember it."""
         app = QApplication.instance()
         assert isinstance(app, QApplication)
-        apply_theme(app, name)
+        apply_theme(app, name, self)
         self._settings.setValue("theme", name)
         restyle_all(self)  # every panel: one white picture spoils a dark room
 

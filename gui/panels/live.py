@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QButtonGroup, QWidget
 
@@ -26,7 +28,7 @@ from instrument.bench.photograph import (
     write_snapshot,
 )
 from instrument.files.errors import duration
-from instrument.live.frame_view import sensor_roi
+from instrument.live.frame_view import fill_indices, index_table, sensor_roi
 from instrument.live.live_camera import LiveCameraStatus
 from recon.base.declare import Imports, expression
 
@@ -51,19 +53,35 @@ class LivePanel(Panel):
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
+        self.photograph: Path | None = None
+        """The last one that was taken here."""
+
+    @classmethod
+    def prepare(cls) -> None:
+        """Compile what shows a frame."""
+        for dtype in (np.uint8, np.uint16):
+            blank = np.zeros((2, 2), dtype)
+            blank.flags.writeable = False  # as a frame's
+            fill_indices(blank, index_table(dtype, 0, 1), 1, np.zeros((2, 2), np.uint8))
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
+        session = self.session
         self.picture = LivePicture()
+        yield
         self.picture.region_sent.connect(self.send_region)
         self.form = CameraForm(self)
+        yield
         self.record_bar = RecordBar(self)
         self.status = label("Waiting for the first frame …", "dim", selectable=True, wraps=True, yields=True)
         self.under_mouse = label()
         self.picture.view.hovered.connect(self.under_mouse.setText)
-        self.photograph: Path | None = None
-        """The last one that was taken here."""
         self._came_s = time.monotonic()
         """When the last frame came, or could have begun to."""
         self._shown_at: deque[float] = deque(maxlen=400)
+        yield
         self._lay_out()
+        yield
         session.device_changed.connect(self._device_changed)
         self.offer_reconnect("camera")
         every(self, _LOOK_MS, self.look).setTimerType(Qt.TimerType.PreciseTimer)

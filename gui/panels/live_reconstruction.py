@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -83,6 +83,10 @@ class LiveReconstructionPanel(Panel):
         self._shown: LiveResult | None = None
         self._logged: tuple[str, ...] = ()
         """Warnings of the reconstructor in use that are in the log already."""
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
+        session = self.session
         self.view = ImageView()
         self.file, self.browse_button = path_field(
             "calibration folder",
@@ -108,6 +112,7 @@ class LiveReconstructionPanel(Panel):
         declared = (*options_of(ReconstructionOptions), *options_of(LiveOptions))
         own = ("z_um", "budget_ms")
         self.options = OptionsForm([o for o in declared if o.name not in own], folded=(*FOLDED, "Computing"))
+        yield
         self.options.show_for("live picture")
         self.options.settled.connect(lambda _: self._rebuild())
         self.options.refused.connect(self.refused)
@@ -117,6 +122,7 @@ class LiveReconstructionPanel(Panel):
         self.options_button = button("Options", tip, checkable=True)
         self.options_button.toggled.connect(folded.setVisible)
         self.status = label(_NO_CALIBRATION, "dim", wraps=True)
+        yield
         self.hint = Hint(
             "No calibration yet: with one, what the camera sees becomes a picture as it comes.",
             "Calibrate…",
@@ -126,6 +132,7 @@ class LiveReconstructionPanel(Panel):
         switches = (self.run_button, self.refine_button, self.options_button)
         second = in_row(*switches, None, label("within"), self.budget)
         fill(self.body, first, (self.view, 1), (self.hint, 1), self.status, second, (folded, 1))
+        yield
         session.run_finished.connect(self._run_finished)
         self._timer = every(self, _LOOK_MS, self.look)
         folder = session.runs_folder

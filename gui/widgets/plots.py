@@ -29,12 +29,11 @@ def plot_widget(
 
     pyqtgraph has no type annotations, hence ``Any``.
     """
-    plot = pg.PlotWidget()
+    plot = pg.PlotWidget(enableMenu=False)
     restyle(plot)
     plot.setLabel("bottom", _label(x_label, x_unit))
     plot.setLabel("left", _label(y_label, y_unit))
     plot.showGrid(x=grid, y=grid, alpha=0.15)
-    plot.setMenuEnabled(False)
     for axis in ("bottom", "left"):
         plot.getAxis(axis).enableAutoSIPrefix(False)  # units are in the labels as people here say them
     return plot
@@ -118,13 +117,12 @@ class LevelsBar(QWidget):
         self.map = narrow(choice(NAMES, "Colour map of grey images"), 4)
         self.map.setCurrentText(colours().colour_map)
         self.map.currentTextChanged.connect(lambda _: self.changed.emit())
-        self.plot: Any = pg.PlotWidget(background=colours().panel)
+        self.plot: Any = pg.PlotWidget(background=colours().panel, enableMenu=False)
         self.plot.setFixedHeight(44)
         self.plot.setMinimumWidth(50)
         self.plot.hideAxis("left")
         self.plot.hideAxis("bottom")
         self.plot.setMouseEnabled(x=False, y=False)
-        self.plot.setMenuEnabled(False)
         self.plot.hideButtons()
         self.plot.setToolTip(
             "Histogram (logarithmic count); drag the edges to set what is darkest and brightest"

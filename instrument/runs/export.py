@@ -18,6 +18,7 @@ from instrument.files.atomic import check_writable, require_new, whole_file
 from instrument.files.errors import BenchError, FileError, ranges
 from instrument.files.films import as_shown, write_mp4
 from instrument.files.images import write_image
+from instrument.runs.frame_facts import z_steps_um
 from instrument.runs.run import Run
 from instrument.runs.run_files import RunError
 
@@ -95,7 +96,7 @@ def _tiff(run: Run, path: Path, indices: list[int], images: Iterator[Image], *, 
     shape = (len(indices), *array.frame_shape)
     pitch_um = float(run.provenance["pixel_pitch_um"])
     noted = [run.metadata(i) for i in indices]
-    axis = "Z" if ome and run.plan is not None and _z_steps_um(noted).size else "T"
+    axis = "Z" if ome and run.plan is not None and z_steps_um(noted).size else "T"
     metadata: dict[str, Any] = {"axes": f"{axis}YXS" if array.is_colour else f"{axis}YX"}
     if ome:
         metadata |= {"Name": run.path.name, **_ome_facts(run, indices, noted, axis)}
@@ -137,7 +138,7 @@ def _ome_facts(run: Run, indices: list[int], noted: list[FrameMetadata], axis: s
     if run.array.dtype.kind == "u":
         facts["SignificantBits"] = first.significant_bits
     if axis == "Z":
-        facts |= {"PhysicalSizeZ": float(np.median(np.abs(_z_steps_um(noted)))), "PhysicalSizeZUnit": "µm"}
+        facts |= {"PhysicalSizeZ": float(np.median(np.abs(z_steps_um(noted)))), "PhysicalSizeZUnit": "µm"}
     elif run.frame_period_s:
         facts |= {"TimeIncrement": run.frame_period_s, "TimeIncrementUnit": "s"}
     told = ("pixel_format", "black_level", "gain", "binning", "roi", "led_pattern", "slm_image_hash")
@@ -148,16 +149,6 @@ def _ome_facts(run: Run, indices: list[int], noted: list[FrameMetadata], axis: s
         "frames": ranges(indices),
     }
     return facts
-
-
-def _z_steps_um(noted: list[FrameMetadata]) -> npt.NDArray[np.float64]:
-    """Return the steps of a sweep along z alone, which goes one way; nothing for other frames."""
-    places = [one.stage_position for one in noted]
-    others = {tuple(v for name, v in place.items() if name != "z_um") for place in places}
-    if len(others) > 1 or not all("z_um" in place for place in places):
-        return np.empty(0)
-    steps = np.diff([place["z_um"] for place in places])
-    return steps if bool((steps > 0).all() or (steps < 0).all()) else np.empty(0)
 
 
 def _hdf5(run: Run, path: Path, indices: list[int], images: Iterator[Image]) -> None:

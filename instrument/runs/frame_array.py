@@ -11,7 +11,7 @@ import math
 import os
 import shutil
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +24,7 @@ import numpy.typing as npt
 from instrument.files.atomic import make_folder, sync_folder, write_json
 from instrument.files.errors import FileError
 from instrument.files.reading import parse_json, read_bytes
-from instrument.files.volumes import ome_attributes, ome_axis
+from instrument.files.volumes import ome_attributes
 
 Image = npt.NDArray[Any]
 _LEVEL = "0"
@@ -223,14 +223,17 @@ class FrameArray:
             return np.moveaxis(flat.reshape(channels, height, width), 0, -1)
         return flat.reshape(self.frame_shape)
 
-    def resize(self, n_frames: int, *, frame_period_s: float | None = None) -> None:
-        """Change the number of frames that the array says it has, and the time between them if given."""
+    def resize(self, n_frames: int) -> None:
+        """Change the number of frames that the array says it has."""
         self._described["shape"][0] = n_frames
         write_json(self.path / DESCRIPTIONS[0], self._described)
         self.n_frames = n_frames
-        if frame_period_s is not None:
-            group = parse_json(read_bytes(self.path / DESCRIPTIONS[1]))
-            write_json(self.path / DESCRIPTIONS[1], with_period(group, frame_period_s))
+
+    def describe(self, array: dict[str, Any], group: dict[str, Any]) -> None:
+        """Write what the array and the image say of themselves."""
+        for name, described in zip(DESCRIPTIONS, (array, group), strict=True):
+            write_json(self.path / name, described)
+        self._described, self.n_frames = array, int(array["shape"][0])
 
     def description_sums(self) -> dict[str, int]:
         """Return the CRC-32 of the files that describe the array and the image."""
@@ -279,8 +282,13 @@ class FrameArray:
         return _Draft(handle, path, StoredChunk(len(data), zlib.crc32(data)))
 
 
-def description_of(n_frames: int, frame_shape: tuple[int, ...], data_type: str) -> dict[str, Any]:
-    """Return what the array's own ``zarr.json`` holds; parameters as :meth:`FrameArray.create`."""
+def description_of(
+    n_frames: int, frame_shape: tuple[int, ...], data_type: str, axis: str = "t"
+) -> dict[str, Any]:
+    """Return what the array's own ``zarr.json`` holds; parameters as :meth:`FrameArray.create`.
+
+    ``axis`` is that of the frames, t or z.
+    """
     colour = len(frame_shape) == 3
     shape = [n_frames, *((frame_shape[2], *frame_shape[:2]) if colour else frame_shape)]
     return {
@@ -294,26 +302,36 @@ def description_of(n_frames: int, frame_shape: tuple[int, ...], data_type: str) 
         "codecs": [
             {"name": "bytes", **({} if data_type == "uint8" else {"configuration": {"endian": "little"}})}
         ],
-        "dimension_names": ["t", "c", "y", "x"] if colour else ["t", "y", "x"],
+        "dimension_names": [axis, "c", "y", "x"] if colour else [axis, "y", "x"],
         "attributes": {},
     }
 
 
 def group_of(
-    axes: Sequence[str], pixel_pitch_um: float, name: str, frame_period_s: float | None = None
+    axes: Sequence[str],
+    pixel_pitch_um: float,
+    name: str,
+    step: float | None = None,
+    first: float | None = None,
+    more: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return what the image's ``zarr.json`` holds.
 
-    A plan's steps have no even spacing in time; a recording gets it at its end.
+    Parameters
+    ----------
+    axes : sequence of str
+        Of the array, the frames' first.
+    pixel_pitch_um : float
+    name : str
+    step, first : float, optional
+        Along the frames' axis, in its unit; None where steps are not even or not known, and where the first
+        place is not known or the axis goes against the frames.
+    more : mapping, optional
+        Further attributes: ``omero`` of OME, ``diffuserbench`` beside it. They are known at a run's end.
     """
-    ome = ome_attributes(name, axes, {"y": pixel_pitch_um, "x": pixel_pitch_um})
-    group = {"zarr_format": 3, "node_type": "group", "attributes": {"ome": ome}}
-    return group if frame_period_s is None else with_period(group, frame_period_s)
-
-
-def with_period(group: dict[str, Any], frame_period_s: float) -> dict[str, Any]:
-    """Give an image's ``zarr.json`` the time between frames; returns it."""
-    multiscale = group["attributes"]["ome"]["multiscales"][0]
-    multiscale["axes"][0] = ome_axis("t", known=True)
-    multiscale["datasets"][0]["coordinateTransformations"][0]["scale"][0] = frame_period_s
-    return group
+    rest = dict(more or {})
+    steps = {axes[0]: step, "y": pixel_pitch_um, "x": pixel_pitch_um}
+    ome = ome_attributes(name, axes, steps, origin=None if first is None else {axes[0]: first})
+    if "omero" in rest:
+        ome["omero"] = rest.pop("omero")
+    return {"zarr_format": 3, "node_type": "group", "attributes": {"ome": ome, **rest}}

@@ -15,7 +15,8 @@ from instrument.files.atomic import json_text, sync_folder, write_bytes
 from instrument.files.errors import FileError, ranges
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
-from instrument.runs.frame_array import DESCRIPTIONS, FrameArray, description_of, group_of
+from instrument.runs.frame_array import DESCRIPTIONS, FrameArray
+from instrument.runs.frame_facts import descriptions
 from instrument.runs.log import AppendOnlyLog, Lost, Unlisted, log_line, read_lines
 from instrument.runs.run import Run
 from instrument.runs.run_files import (
@@ -77,9 +78,7 @@ def _array_problems(run: Run) -> list[FileProblem]:
         return []
     array = run.array
     n_frames = array.n_frames if run.plan is None else len(run.plan)
-    wanted = description_of(n_frames, array.frame_shape, array.dtype.name)
-    pitch_um = float(run.provenance["pixel_pitch_um"])
-    group = group_of(wanted["dimension_names"], pitch_um, run.label, run.frame_period_s)
+    wanted, group = descriptions(run, n_frames)
     ended = run.events[-1] if run.events and run.events[-1].get("kind") == "finished" else {}
     sums = ended.get("descriptions", {})
     found = []

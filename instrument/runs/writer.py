@@ -28,6 +28,7 @@ from instrument.files.atomic import json_text, make_folder, sync_folder, write_b
 from instrument.files.record import plain
 from instrument.plan import Plan
 from instrument.runs.frame_array import FrameArray
+from instrument.runs.frame_facts import descriptions
 from instrument.runs.log import AppendOnlyLog, FrameRecord, Gap, log_line
 from instrument.runs.repair import keep_beside, mend_files, settle_recording
 from instrument.runs.run import FinishReason, Run
@@ -302,12 +303,15 @@ class RunWriter:
         """Append a gap of a recording to the log."""
         self._append(gap.to_json())
 
-    def _trim(self) -> None:
-        """Give a recording's array the length and the frame period that the log tells."""
+    def _describe(self) -> None:
+        """Let the array say what the log tells of its frames; a recording's has as many as there are."""
         run = Run.open(self.path)
-        if self._array is None or run.plan is not None:
+        if self._array is None or (run.plan is not None and not run.records):
             return
-        self._array.resize(run.n_frames, frame_period_s=run.frame_period_s)
+        if not run.records:
+            self._array.resize(run.n_frames)
+        else:
+            self._array.describe(*descriptions(run, run.n_frames if run.plan is None else len(run.plan)))
 
     def finish(self, reason: FinishReason, error: str = "") -> Run:
         """Say how the run ended, close its files, and return it for reading.
@@ -319,8 +323,8 @@ class RunWriter:
             utc = self._state.get("finished_utc", utc)
         ended = {"reason": reason.value, "error": error}
         try:
-            with _disk(self.path, "its array could not be trimmed"):
-                self._trim()
+            with _disk(self.path, "its array could not be described"):
+                self._describe()
             sums = self._array.description_sums() if self._array is not None else {}
             self.note("finished", **ended, descriptions=sums, utc=utc)
             self._set_state(state="finished", **ended, finished_utc=utc)

@@ -83,6 +83,7 @@ def test_a_coloured_picture_is_shown_by_its_brightness_in_the_red_map(qtbot: QtB
 
 
 def test_a_line_of_the_log_keeps_what_its_colour_says(window: MainWindow) -> None:
+    window.panel("live")
     log = window.panel("log")
     assert isinstance(log, LogPanel)
     window.session.log("info", "a line of before")

@@ -11,12 +11,15 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+import zarr
+from ome_zarr_models.v05 import Image
 
 from drivers.frame import FrameMetadata
 from instrument.cli import main
 from instrument.files.errors import FileError
 from instrument.plan import Part, Plan
 from instrument.runs.export import export
+from instrument.runs.inspection import verify
 from instrument.runs.log import Gap
 from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_files import RunError
@@ -110,6 +113,18 @@ def test_ome_tiff_tells_when_and_where_each_frame_was_taken(tmp_path: Path) -> N
     np.testing.assert_array_equal(
         tifffile.imread(tmp_path / "a.ome.tif"), [image(i, False) for i in range(3)]
     )
+    # The frames' own OME-Zarr says the same.
+    group = zarr.open_group(run.path / "frames.ome.zarr", mode="r")
+    multiscale = Image.from_zarr(group).ome_attributes.multiscales[0]
+    assert (multiscale.axes[0].name, multiscale.axes[0].unit) == ("z", "micrometer")
+    scale, shift = multiscale.datasets[0].coordinateTransformations
+    assert (scale.scale[0], shift.translation[0]) == (250.0, 1000.0)
+    assert group.attrs["ome"]["omero"]["channels"][0]["window"]["max"] == 4095
+    facts = group.attrs["diffuserbench"]
+    assert (facts["black_level"], facts["significant_bits"], facts["exposure_ms"]) == (64.0, 12, 10.0)
+    assert facts["frames"]["z_um"] == [1000.0, 1250.0, 1500.0]
+    assert facts["frames"]["time_s"] == [0.0, 1.0, 2.0]
+    assert verify(run).is_sound
 
 
 def test_numpy(run: Run, tmp_path: Path) -> None:
