@@ -12,6 +12,7 @@ from rich.markup import escape
 
 from calibration_routines.demo import DemoResult, DemoSettings, run_demo
 from calibration_routines.display.demo_display import DisplayDemoSettings, run_display_demo
+from calibration_routines.film_demo import FilmSettings, run_film
 from instrument.cli.app import App, examples
 from instrument.cli.calibrate import TerminalListener
 
@@ -37,6 +38,20 @@ def demo(options: DemoSettings, out: OutFolder = Path("runs")) -> None:
     with _Terminal(Console(highlight=False)) as listener:
         result = run_demo(out, listener, options)
     listener.verdict(result)
+
+
+@app.command("film", epilog=examples("diffuserbench demo film", "diffuserbench demo film --frames 100"))
+def film(settings: FilmSettings, out: OutFolder = Path("runs")) -> None:
+    """Film a SIMULATED animal that moves and flashes, reconstruct the film, find what is active, judge it.
+
+    Calibrates the simulated microscope with nine PSFs, records, reconstructs with the camera model that the
+    film asks for, looks for activity, and draws cells, dF/F and blood flow beside the truth. Takes minutes.
+    """
+    with _Terminal(Console(highlight=False)) as listener:
+        result = run_film(out, listener, settings)
+    listener.ended(result.seconds, result.files)
+    for line in result.lines():
+        typer.echo(line)
 
 
 @app.command("display", epilog=examples("diffuserbench demo display"))

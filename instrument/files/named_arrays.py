@@ -67,7 +67,8 @@ def read_hdf5(path: Path, inside: str, *, matlab: bool = False) -> Read:
 
     ``matlab``: its axes are in MATLAB's order, the last first.
 
-    Raises FileError when it is damaged, none or several arrays could be meant, or h5py is not installed.
+    Raises FileError when it is damaged, none or several arrays could be meant, its numbers are elsewhere, or
+    h5py is not installed.
     """
     try:
         import h5py
@@ -82,6 +83,10 @@ def read_hdf5(path: Path, inside: str, *, matlab: bool = False) -> Read:
             found[name] = entry.shape
 
     def read(name: str) -> npt.NDArray[Any]:
+        if file[name].external or file[name].is_virtual:
+            raise FileError(
+                path, f"keeps the numbers of {name} in other files.", "Copy them into one file (h5repack)."
+            )
         reading.require_plausible(path, file[name].nbytes, path.stat().st_size)
         return np.asarray(file[name][()])
 

@@ -66,6 +66,21 @@ def _npz(folder: Path) -> Path:
     return folder / "a.npz"
 
 
+def _hdf5(folder: Path) -> Path:
+    import h5py
+
+    with h5py.File(folder / "a.h5", "w") as file:
+        file.create_dataset("psf", data=np.stack([_pixels()] * 3), compression="gzip")
+    return folder / "a.h5"
+
+
+def _matlab(folder: Path) -> Path:
+    from scipy.io import savemat
+
+    savemat(folder / "a.mat", {"psf": _pixels(), "z_um": 1e5}, do_compression=True)
+    return folder / "a.mat"
+
+
 def _written(name: str, text: str) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         (folder / name).write_text(text)
@@ -132,6 +147,8 @@ READERS: dict[str, Reader] = {
     "npy": Reader(_npy, _image_and_stack),
     "npy-volume": Reader(_npy, _volume),
     "npz": Reader(_npz, read_image),
+    "hdf5": Reader(_hdf5, _image_and_stack),
+    "matlab": Reader(_matlab, _image_and_stack),
     "side-car": Reader(_png, lambda path: read_image(path), ("../a.json",)),
     "result": Reader(_result, lambda path: open_result(path / "picture.tif"), ("picture.json",)),
     "run": Reader(

@@ -120,6 +120,11 @@ def test_arrays_of_hdf5_and_matlab_files(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_image(f"{h5}::photograph").pixels, PICTURE)
     with pytest.raises(FileError, match="holds no array called psf"):
         read_image(f"{h5}::psf")
+    PICTURE.tofile(tmp_path / "elsewhere")
+    with h5py.File(tmp_path / "out.h5", "w") as file:
+        file.create_dataset("psf", (8, 6), "u2", external=[(str(tmp_path / "elsewhere"), 0, PICTURE.nbytes)])
+    with pytest.raises(FileError, match="keeps the numbers of psf in other files"):
+        read(tmp_path / "out.h5")
     mat = tmp_path / "psfs.mat"
     scipy.io.savemat(mat, {"psf": np.moveaxis(STACK, 0, -1), "z": np.arange(5)}, do_compression=True)
     np.testing.assert_array_equal(read_stack(mat).pixels, STACK)

@@ -1,27 +1,23 @@
-"""``diffuserbench stability``: maps of where methods fail, against pairs of stresses."""
+"""Maps of where methods fail, against pairs of stresses."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import typer
-
-from instrument.cli.app import App, examples
-from instrument.cli.progress import progress_bar
 from instrument.files.errors import BenchError, FileError
-from instrument.tasks.task import saying_what_is_left
+from instrument.tasks.task import Desk, Done, command_line, saying_what_is_left, task
 from recon.base.declare import option
-
-app = App()
 
 
 @dataclass(frozen=True, kw_only=True)
 class StabilityOptions:
     """Which maps, how large, and where they are kept."""
 
+    names: tuple[str, ...] = option(
+        (), help="Maps; default all.", metavar="[NAME]...", label="Maps", default_words="all", positional=True
+    )
     method: tuple[str, ...] = option(
         (),
         help="Only these methods; repeatable.",
@@ -35,27 +31,21 @@ class StabilityOptions:
         help="Where maps are kept and gone on with.",
         metavar="FOLDER",
         flags=("--out", "-o"),
+        label="Result",
     )
     list_maps: bool = option(False, help="Only list maps and their methods.", flags=("--list",))
     redraw: bool = option(False, help="Only draw what stability.json holds.")
     shipped: bool = option(False, help="With --redraw: the maps that come with the program.")
 
 
-@app.command(
-    epilog=examples(
-        "diffuserbench stability --list",
-        "diffuserbench stability light --size quick",
-        "diffuserbench stability light erasures --method 'admm tv' --out maps",
-        "diffuserbench stability --size full --out stability",
-        "diffuserbench stability --redraw --out stability",
-    )
+@task(
+    "diffuserbench stability --list",
+    "diffuserbench stability light --size quick",
+    "diffuserbench stability light erasures --method 'admm tv' --out maps",
+    "diffuserbench stability --size full --out stability",
+    "diffuserbench stability --redraw --out stability",
 )
-def stability(
-    options: StabilityOptions,
-    names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="Maps; default all.", show_default=False)
-    ] = None,
-) -> None:
+def stability(desk: Desk, options: StabilityOptions) -> Done:
     """Map where methods fail: the error against pairs of stresses, with the failure boundary drawn.
 
     For each map a PNG, and stability.json with all of them. Ctrl-C keeps what is done; the same command goes
@@ -63,15 +53,15 @@ def stability(
     """
     from recon.evaluation.maps import MAPS, cells_of, map_named, run_map
 
+    names = options.names
     chosen = [map_named(name) for name in names or MAPS]
     if options.list_maps:
         for stress in chosen:
-            typer.echo(f"{stress.name:<20}{stress.title}\n{'':<20}{stress.x.label} x {stress.y.label}")
-            typer.echo(f"{'':<20}methods: {'; '.join(stress.methods)}")
-        return
+            desk.say(f"{stress.name:<20}{stress.title}\n{'':<20}{stress.x.label} x {stress.y.label}")
+            desk.say(f"{'':<20}methods: {'; '.join(stress.methods)}")
+        return Done()
     if options.redraw:
-        _redraw(options.out, [s.name for s in chosen] if names else None, shipped=options.shipped)
-        return
+        return _redraw(options.out, [s.name for s in chosen] if names else None, shipped=options.shipped)
     if options.shipped:
         raise BenchError("--shipped goes with --redraw.")
     wanted = {s.name: _methods(s.methods, options.method) for s in chosen}
@@ -86,20 +76,25 @@ def stability(
     log = CellLog(out)
     jobs = {s.name: cells_of(s, size, wanted[s.name]) for s in chosen}
     pictures = [out / f"{s.name}.png" for s in chosen]
-    with saying_what_is_left(out / RESULT, *pictures), progress_bar() as bar:
-        task = bar.add_task("stability", total=sum(map(len, jobs.values())), note="")
+    with (
+        saying_what_is_left(out / RESULT, *pictures),
+        desk.step("stability", sum(map(len, jobs.values()))) as advance,
+    ):
+        done = 0
         for stress, picture in zip(chosen, pictures, strict=True):
             asked = set(jobs[stress.name])
             made = [c for c in log.of(stress, size) if (c.method, c.ix, c.iy) in asked]
-            bar.update(task, advance=len(made), note=stress.name)
+            done += len(made)
+            advance(done, note=stress.name)
             for cell in run_map(stress, size, methods=wanted[stress.name], known=made):
                 log.add(stress, size, cell)
-                bar.update(task, advance=1, note=f"{stress.name}: {cell.method}")
+                done += 1
+                advance(done, note=f"{stress.name}: {cell.method}")
             record = map_record(stress, size, log.of(stress, size))
-            write_stability(out, {stress.name: record}, " ".join(["diffuserbench", *sys.argv[1:]]))
+            write_stability(out, {stress.name: record}, command_line("stability", options))
             _draw(record, picture)
-            _tell(stress.name, record)
-    typer.echo(f"Wrote {', '.join(map(str, (out / RESULT, *pictures)))}")
+            _tell(desk, stress.name, record)
+    return Done((out / RESULT, *pictures))
 
 
 def _methods(offered: tuple[str, ...], asked: tuple[str, ...]) -> list[str]:
@@ -119,7 +114,7 @@ def _draw(record: dict[str, object], picture: Path) -> None:
     save_figure(map_figure(record), picture)
 
 
-def _redraw(out: Path, names: list[str] | None, *, shipped: bool) -> None:
+def _redraw(out: Path, names: list[str] | None, *, shipped: bool) -> Done:
     from instrument.files.stability_file import RESULT, read_stability
     from recon.verdict.cases import SHIPPED
 
@@ -129,13 +124,13 @@ def _redraw(out: Path, names: list[str] | None, *, shipped: bool) -> None:
     _make(out)
     for name in names or maps:
         _draw(maps[name], out / f"{name}.png")
-        typer.echo(f"Drew {out / f'{name}.png'}")
+    return Done(tuple(out / f"{name}.png" for name in names or maps))
 
 
-def _tell(name: str, record: dict[str, object]) -> None:
+def _tell(desk: Desk, name: str, record: dict[str, object]) -> None:
     methods = record["methods"]
     assert isinstance(methods, dict)
     for method, result in methods.items():
         failed = [f for row in result["failure"] for f in row]
         share = sum(f is not None for f in failed)
-        typer.echo(f"{name:<20}{method:<24}{share:3d} of {len(failed)} cells fail, {result['seconds']:.0f} s")
+        desk.say(f"{name:<20}{method:<24}{share:3d} of {len(failed)} cells fail, {result['seconds']:.0f} s")
