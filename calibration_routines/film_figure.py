@@ -92,7 +92,7 @@ def write_film_figure(path: Path, activity: Activity, truth: Truth, judged: Judg
     speed.set_ylabel("um/s")
     speed.legend(fontsize=8, loc="upper right")
     speed.set_title(
-        f"speed of the blood: mean {judged.mean_speed_um_s:.0f}, true {judged.true_mean_speed_um_s:.0f} um/s",
+        f"speed of the blood: median {judged.median_um_s:.0f}, true {judged.true_median_um_s:.0f} um/s",
         fontsize=10,
     )
     with whole_file(path) as temporary:
