@@ -177,14 +177,14 @@ def read_picture() -> npt.NDArray[np.float32]:
     return np.asarray(cv2.resize(light, SCREEN_PIXELS, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def new_folder(parent: Path) -> Path:
-    """Make a folder ``demo-DATE-TIME`` in ``parent``, which is made as well where missing.
+def new_folder(parent: Path, kind: str = "demo") -> Path:
+    """Make a folder ``KIND-DATE-TIME`` in ``parent``, which is made as well where missing.
 
     Raises FileError when it cannot be made.
     """
     if parent.exists() and not parent.is_dir():
         raise FileError(parent, "is no folder.", "Name a folder with --out.")
-    folder = free_name(parent, f"demo-{datetime.now(UTC):%Y-%m-%d-%H%M%S}")
+    folder = free_name(parent, f"{kind}-{datetime.now(UTC):%Y-%m-%d-%H%M%S}")
     try:
         folder.mkdir(parents=True)
     except OSError as error:
@@ -222,25 +222,27 @@ class Journal:
             self.seconds[name] = round(time.perf_counter() - started, 2)
 
 
-class _Stages(Listener):
-    """Times the demo's stages, and hands on how each goes; Ctrl-C ends it at any of these moments."""
+class Stages(Listener):
+    """Times a demo's stages, and hands on how each goes; Ctrl-C ends it at any of these moments."""
 
     def __init__(self, journal: Journal, listener: Listener, check: Callable[[], None]) -> None:
-        self._journal, self._listener, self._check = journal, listener, check
+        self.journal, self._listener, self._check = journal, listener, check
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Enter a stage."""
-        with self._journal.stage(name):
+        with self.journal.stage(name):
             self._listener.step(name)
             yield
             self._check()
 
     def share(self, done: float, total: float, *, at_most: bool = False) -> None:
+        """Hand on how much is done, unless it is to end."""
         self._check()
         self._listener.share(done, total, at_most=at_most)
 
     def frame(self, status: RunStatus) -> None:
+        """Hand on how much of a run is done."""
         self.share(status.done, status.total)
 
 
@@ -302,13 +304,20 @@ def run_demo(
     Raises what made it fail (BenchError, DeviceError, OSError); KeyboardInterrupt or SystemExit after the
     bench was made safe and the run marked as aborted.
     """
-    settings = settings or DemoSettings()
-    place = new_folder(Path(folder))
+    listener, settings = listener or Listener(), settings or DemoSettings()
+    with told_in(Path(folder), "demo", listener) as (place, stages):
+        return _run(place, listener, settings, stages)
+
+
+@contextmanager
+def told_in(parent: Path, kind: str, listener: Listener) -> Iterator[tuple[Path, Stages]]:
+    """Give a new folder and the stages of what is done in it; its journal says how that ended, whatever."""
+    place = new_folder(parent, kind)
     journal = Journal(place)
     try:
         journal.note(state="running")
         with ctrl_c_remembered() as check:
-            return _run(place, listener or Listener(), settings, journal, check)
+            yield place, Stages(journal, listener, check)
     except BaseException as error:
         aborted = isinstance(error, KeyboardInterrupt | SystemExit)
         journal.note(state="aborted" if aborted else "failed", error=str(error) or type(error).__name__)
@@ -316,11 +325,8 @@ def run_demo(
         raise
 
 
-def _run(
-    place: Path, listener: Listener, settings: DemoSettings, journal: Journal, check: Callable[[], None]
-) -> DemoResult:
-    stages = _Stages(journal, listener, check)
-    stage = stages.stage
+def _run(place: Path, listener: Listener, settings: DemoSettings, stages: Stages) -> DemoResult:
+    stage, journal = stages.stage, stages.journal
     write_text(place / "bench.toml", settings.bench_toml())
     with stage("open the bench"):
         bench = open_bench(parse_config(settings.bench_toml(), place / "bench.toml"))
@@ -332,8 +338,8 @@ def _run(
             measured = _measure(bench, place, settings, listener, stages)
         finally:
             bench.stop()
-            journal.note(left=_state_of(bench))
-        viewer = Viewer(_world(bench), settings, measured)
+            journal.note(left=state_of(bench))
+        viewer = Viewer(world_of(bench), settings, measured)
     with stage("compile kernels (kept)"):
         _warm_up()
     limit_s = settings.reconstruction_s
@@ -381,7 +387,7 @@ def _run(
 
 
 def _measure(
-    bench: Bench, place: Path, settings: DemoSettings, listener: Listener, stages: _Stages
+    bench: Bench, place: Path, settings: DemoSettings, listener: Listener, stages: Stages
 ) -> Measured:
     """Do everything that needs the bench."""
     stage = stages.stage
@@ -417,15 +423,15 @@ def _measure(
         ]
     with stage("photograph lights in a volume"):
         lights = _photographed(bench, settings.volume.scene(), place, settings, stages)
-    sensitivity = _world(bench).sensor.quantum_efficiency
+    sensitivity = world_of(bench).sensor.quantum_efficiency
     return Measured(done, response, (photos[0], photos[1], photos[2]), lights, bench.label, sensitivity)
 
 
 def _photographed(
-    bench: Bench, scene: Scene, place: Path, settings: DemoSettings, stages: _Stages
+    bench: Bench, scene: Scene, place: Path, settings: DemoSettings, stages: Stages
 ) -> Photograph:
     """Put a scene in front of the camera, and photograph it."""
-    _world(bench).set_scene(scene)
+    world_of(bench).set_scene(scene)
     return photograph(
         bench,
         expose_scene(bench).exposure_ms,
@@ -444,17 +450,18 @@ def _warm_up() -> None:
     reconstruct(psf + 1.0, psf, iterations=2)
 
 
-def _world(bench: Bench) -> SimulatedWorld:
+def world_of(bench: Bench) -> SimulatedWorld:
+    """Return a demo's simulated world."""
     world = bench.shared[SimulatedWorld.table]
     if not isinstance(world, SimulatedWorld):
         raise TypeError(f"The demo's bench is simulated, not {type(world).__name__}.")
     return world
 
 
-def _state_of(bench: Bench) -> dict[str, Any]:
+def state_of(bench: Bench) -> dict[str, Any]:
     """Return what the bench is left as, for the record."""
     return {
         "light": bench.led_array.pattern.description if bench.led_array is not None else "none",
         "stage_moving": bench.stage is not None and bench.stage.is_moving,
-        "scene_lit": _world(bench).scene_lit,
+        "scene_lit": world_of(bench).scene_lit,
     }

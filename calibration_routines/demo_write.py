@@ -87,9 +87,7 @@ def _figure(done: DemoResult, viewer: Viewer, picture: Float, truth: Float) -> F
     bottom = outer[2].subgridspec(1, 3, width_ratios=[1.3, 0.72, 1.15])
     axes = figure.add_subplot(bottom[0, 0])
     draw_chart(axes, done.chart.points, SECONDS, done.chart.kind.scores[0], colours_of(done.chart))
-    axes.set_title(
-        "What methods cost on the green photograph, and how good they get", fontsize=13, color=INK, loc="left"
-    )
+    axes.set_title("Speed against accuracy (green, half the pixels)", fontsize=13, color=INK, loc="left")
     draw_facts(figure.add_subplot(bottom[0, 2]), _facts(done, truth))
     figure.text(0.035, 0.97, "Photographs without a lens", fontsize=17, color=INK, weight="bold", va="center")
     mark_simulated(figure, 0.97)
@@ -181,10 +179,7 @@ def _facts(done: DemoResult, truth: Float) -> list[tuple[str, str]]:
         ("calibration", f"{settings.planes} planes, {settings.average} frames each"),
         ("photographs", f"red, green, blue; {settings.photograph_average} frames each"),
         ("on the screen", f"{truth.shape[1] - 2 * _MARGIN} x {truth.shape[0] - 2 * _MARGIN} pixels"),
-        ("picture", f"{result.solver} + {result.prior}, {size} x 3, {result.seconds:.1f} s"),
-        (
-            "volume",
-            f"{volume.solver} + {volume.prior}, {size} x {len(volume.volume)}, {volume.seconds:.1f} s",
-        ),
+        ("picture", f"{size} x 3, {result.solver} + {result.prior}: {len(result.history)} iterations"),
+        ("volume", f"{size} x {len(volume.volume)}, {volume.solver} + {volume.prior}: {len(volume.history)}"),
         ("compared", "in the screen, linear light, one factor"),
     ]

@@ -17,6 +17,8 @@ _DARK = 0.05
 """Below this share of full scale a picture's brightest pixels are lost in the noise of most cameras."""
 _SATURATED = 1e-3
 """Share of saturated pixels from which a photograph is spoilt."""
+EXPOSE = "expose"
+"""What the live view is asked to do: to find an exposure for what is lit."""
 _STRIDE = 4
 """Of the pixels that are looked at, along both sides: the state of the light shows in a sixteenth."""
 
@@ -187,7 +189,9 @@ def _exposed(facts: Facts, *, later: bool) -> Step:
         "dark": "The picture is nearly black: light the scene, or expose longer.",
         "saturated": "The picture is saturated: expose shorter.",
     }.get(facts.light, "")
-    return Step("Expose", later or facts.light == "good", words, "Look at it", "live")
+    what = "" if facts.light == "unknown" else EXPOSE
+    answer = "Auto exposure" if what else "Look at it"
+    return Step("Expose", later or facts.light == "good", words, answer, "live", what)
 
 
 def _camera(facts: Facts) -> tuple[Step, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
+from typing import cast
 
 from PySide6.QtCore import QEvent, QObject, QSettings, QSize, Qt
 from PySide6.QtGui import QAction, QCloseEvent, QGuiApplication, QKeyEvent, QKeySequence, QShortcut, QWindow
@@ -13,10 +14,10 @@ from PySide6.QtWidgets import (
     QDockWidget,
     QMainWindow,
     QMenu,
+    QMenuBar,
     QMessageBox,
     QProgressBar,
     QSizePolicy,
-    QToolBar,
     QWidget,
 )
 
@@ -29,13 +30,13 @@ from gui.panels.unserved import UnservedPanel
 from gui.session import BenchSession
 from gui.session_news import OperatorRequest, name_of
 from gui.theme import THEMES, apply_theme
-from gui.widgets.building import PanelPlace, button, label, tabs
+from gui.widgets.building import PanelPlace, button, fill, in_row, label, tabs
 from gui.widgets.device_chips import DeviceChips
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.plots import restyle_all
 from gui.widgets.step_strip import StepStrip
-from instrument.bench.config import BenchConfig
+from instrument.bench.config import BenchConfig, Kind
 
 _AREAS = {
     "top right": Qt.DockWidgetArea.RightDockWidgetArea,
@@ -202,40 +203,24 @@ class MainWindow(QMainWindow):
 
     # Bars and menus ------------------------------------------------------------------------------
     def _make_top_bar(self) -> None:
-        bar = QToolBar("Bench")
-        bar.setObjectName("bench-bar")
-        bar.setMovable(False)
-        bar.toggleViewAction().setEnabled(False)  # STOP stays in reach
+        """Make the menus, devices and STOP: one row that nothing can push STOP out of; the strip below it."""
+        self.menus = QMenuBar()
+        self.menus.setNativeMenuBar(False)
+        self.menus.setSizePolicy(QSizePolicy.Policy.Maximum, QSizePolicy.Policy.Preferred)
         self.simulated = label("SIMULATED")
         self.simulated.setObjectName("simulated")
         self.simulated.setToolTip("Some or all devices of this bench have no hardware behind them")
-        self._simulated_action = bar.addWidget(self.simulated)
         self.chips = DeviceChips(self.session)
-        bar.addWidget(self.chips)
-        self.strip = StepStrip(self.session)
-        self.strip.wanted.connect(self._take_step)
-        if self._compact:
-            bar.addWidget(self.strip)
-        else:
-            stretch = QWidget()
-            stretch.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Preferred)
-            bar.addWidget(stretch)
         tip = "Halt all motion, turn the light off, end what runs (Esc)"
         self.stop_button = button("STOP", tip, self.session.stop)
         self.stop_button.setObjectName("stop")
         self.stop_button.setFocusPolicy(Qt.FocusPolicy.TabFocus)
-        bar.addWidget(self.stop_button)
-        bar.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
-        self.addToolBar(Qt.ToolBarArea.TopToolBarArea, bar)
-        if self._compact:
-            return
-        below = QToolBar("What comes next")
-        below.setObjectName("next-bar")
-        below.setMovable(False)
-        below.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
-        below.addWidget(self.strip)
-        self.addToolBarBreak(Qt.ToolBarArea.TopToolBarArea)
-        self.addToolBar(Qt.ToolBarArea.TopToolBarArea, below)
+        self.strip = StepStrip(self.session)
+        self.strip.wanted.connect(self._take_step)
+        first = in_row(self.menus, 12, self.simulated, self.chips, None, self.stop_button, spacing=4)
+        header = fill(QWidget(), first, self.strip, spacing=0)
+        header.setObjectName("header")
+        self.setMenuWidget(header)
 
     def _make_status_bar(self) -> None:
         self.job_label = label("Ready")
@@ -245,33 +230,36 @@ class MainWindow(QMainWindow):
         self.job_progress.hide()
         self.statusBar().addWidget(self.job_progress)
         self.statusBar().addWidget(self.job_label, 1)
+        self._problem = ""
+        """The warning or error that was told last."""
         self.session.logged.connect(self._show_problem)
+        self.session.device_changed.connect(self._forget_problem)
 
     def _make_menus(self) -> None:
-        view = self.menuBar().addMenu("&View")
+        view = self.menus.addMenu("&View")
         for name, entry in PANELS.items():
             action = self._add_action(view, entry.title, entry.shortcut, partial(self.bring, name))
             action.setToolTip(entry.tip)
-        theme = self.menuBar().addMenu("&Theme")
+        theme = self.menus.addMenu("&Theme")
         for number, (name, words) in enumerate(
             (("dark", "&Dark"), ("red", "&Red, for the dark room"), ("light", "&Light"))
         ):
             self._add_action(theme, words, f"Ctrl+Shift+{number + 1}", partial(self.set_theme, name))
-        camera = self.menuBar().addMenu("&Camera")
+        camera = self.menus.addMenu("&Camera")
         for words, keys, what in (
             ("&Live view, or hold the last frame", "Ctrl+L", "toggle_live"),
             ("Take a &photograph", "Ctrl+K", "snap"),
             ("&Record, or end the recording", "Ctrl+R", "record"),
         ):
             self._add_action(camera, words, keys, partial(self._on_live_panel, what))
-        bench = self.menuBar().addMenu("&Bench")
+        bench = self.menus.addMenu("&Bench")
         self._add_action(bench, "&Another bench …", "Ctrl+O", partial(self.bring, "start"))
         for kind in self.session.kinds:
             reconnect = partial(self.session.reconnect, kind)
             self._add_action(bench, f"Reconnect the {name_of(kind)}", "", reconnect)
         bench.addSeparator()
         self._add_action(bench, "&Quit", "Ctrl+Q", self.close)
-        about = self.menuBar().addMenu("&Help")
+        about = self.menus.addMenu("&Help")
         self._add_action(about, "&This panel, and all keys", "F1", self.show_help)
 
     def show_help(self) -> TextWindow:
@@ -281,7 +269,7 @@ class MainWindow(QMainWindow):
         shown = [name for name, panel in self._panels.items() if focused and panel.isAncestorOf(focused)]
         shown += [name for name, place in self._places.items() if place is current and name in self._panels]
         name = next(iter(shown), "start")
-        actions = [action for menu in self.menuBar().actions() for action in menu.menu().actions()]  # type: ignore[attr-defined]
+        actions = [action for menu in self.menus.actions() for action in menu.menu().actions()]  # type: ignore[attr-defined]
         window = TextWindow("Help", help_of(name, self.panel(name), focused, actions), self)
         window.show()
         return window
@@ -343,7 +331,7 @@ class MainWindow(QMainWindow):
     # What runs -----------------------------------------------------------------------------------
     def _show_simulated(self, _kind: str = "") -> None:
         simulated = [name_of(k) for k in self.session.kinds if self.session.state(k).simulated]
-        self._simulated_action.setVisible(bool(simulated))
+        self.simulated.setVisible(bool(simulated))
         everything = len(simulated) == len(self.session.kinds)
         self.simulated.setText("SIMULATED" if everything else f"SIMULATED: {', '.join(simulated)}")
 
@@ -370,7 +358,15 @@ class MainWindow(QMainWindow):
 
     def _show_problem(self, level: str, text: str) -> None:
         if level in ("warning", "error"):
+            self._problem = text
             self.job_label.setText(text.splitlines()[0][:200])
+
+    def _forget_problem(self, kind: str) -> None:
+        """Take a device's failure away that is over; the log keeps it."""
+        device = self.session.bench.devices.get(cast(Kind, kind))
+        mended = device is not None and self.session.is_open(kind) and device.name in self._problem
+        if mended and self.job_label.text() == self._problem.splitlines()[0][:200]:
+            self.job_label.setText("Ready")
 
     def _ask_operator(self, request: OperatorRequest) -> None:
         answers = ("Done", "Stop")

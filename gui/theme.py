@@ -261,7 +261,7 @@ QScrollBar:horizontal {{ background: {c.window}; height: 10px; }}
 QScrollBar::handle {{ background: {c.border}; border-radius: 4px; min-height: 24px; min-width: 24px; }}
 QScrollBar::add-line, QScrollBar::sub-line {{ width: 0; height: 0; }}
 QStatusBar {{ background: {c.panel}; color: {c.dim}; }}
-QToolBar {{ border: none; border-bottom: 1px solid {c.line}; }}
+QWidget#header {{ background: {c.panel}; }}
 QMenuBar {{ border: none; }}
 QMenuBar, QMenu {{ background: {c.panel}; color: {c.text}; }}
 QMenu::item:selected, QMenuBar::item:selected {{ background: {c.primary}; color: {c.primary_text}; }}

@@ -153,7 +153,7 @@ def _parts(output: dict[str, Any]) -> tuple[str, list[np.ndarray]]:
     return re.sub(r"<[^>]+>", " ", whole), pictures
 
 
-_UNSTEADY = re.compile(r"\d{4}-?\d\d-?\d\d\S*|[\d.]+ (?:ms|s|min|MB|GB)\b|/\S+")
+_UNSTEADY = re.compile(r"\d{4}-?\d\d-?\d\d\S*|[\d.]+ (?:ms|s|min|[kKMG]i?B)\b|/\S+")
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 

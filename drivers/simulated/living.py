@@ -25,7 +25,7 @@ BLOOD = 2.5
 STRAY = 0.5
 """Light of filters and of excitation on the sensor, relative to the animal's mean light at rest; it does not
 fade, and fills the sensor smoothly, brightest away from the middle."""
-NODES = (5, 3, 2)
+NODES = (7, 3, 2)
 """Places along x, y and z whose light is computed by diffraction; between them it is interpolated."""
 MOST_BYTES = 1 << 30
 

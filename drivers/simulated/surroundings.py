@@ -41,6 +41,10 @@ class Clock:
             return time.monotonic_ns()
         return round(1e9 * (self._began + self._skipped_s))
 
+    def read_s(self, ticks_ns: int) -> float:
+        """Return the simulated seconds since the world began at a reading of :attr:`ticks_ns`."""
+        return (1e-9 * ticks_ns - self._began) / (self.time_scale or 1.0)
+
     @property
     def utc(self) -> datetime:
         """The time of day; where nothing is waited for, as if it had been."""

@@ -316,6 +316,10 @@ class SimulatedWorld(Surroundings):
             self._born_s = self.clock.now_s
         return self.clock.now_s - self._born_s
 
+    def alive_at(self, ticks_ns: int) -> float:
+        """Return :attr:`alive_s` at a time of the devices' clock, as frames carry it."""
+        return self.clock.read_s(ticks_ns) - (self._born_s or 0.0)
+
     def light_key(self) -> tuple[Any, ...]:
         """Something that changes whenever :meth:`photons_per_s` does."""
         glow = self.emission

@@ -354,7 +354,10 @@ class EntryField(OptionField):
         return self.widget.text()
 
     def _set(self, value: Any) -> None:
-        if self.option.item is Path:
+        said = self.option.declaration
+        if said.parse is not None and said.default_words and value == self.option.default:
+            self.widget.setText("")  # the place holder has it in words
+        elif self.option.item is Path:
             self.widget.setText("; ".join(map(str, value or ())))
         else:
             self.widget.setText("" if value is None else shown(self.option, value))

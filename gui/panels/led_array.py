@@ -50,7 +50,7 @@ class LedPanel(DevicePanel):
         self._dimmed: tuple[LedPattern, LedPattern] | None = None
         """The pattern that was dimmed last, and the one whose hues it has: faint levels keep no hue."""
         self._positions: Any = None
-        self.now = label("–", selectable=True)
+        self.now = label("–", selectable=True, wraps=True)
         self.colour = choice(_COLOURS, "Colour of the LEDs that are lit next")
         self.brightness = QSlider(Qt.Orientation.Horizontal)
         self.brightness.setRange(1, 255)

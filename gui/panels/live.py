@@ -13,6 +13,7 @@ from PySide6.QtWidgets import QButtonGroup, QWidget
 
 from drivers.frame import Frame
 from gui.jobs import Job, JobContext
+from gui.journey import EXPOSE
 from gui.panel import Panel, on_bench
 from gui.session import BenchSession
 from gui.widgets.building import button, every, fill, in_row, label, split
@@ -155,6 +156,11 @@ class LivePanel(Panel):
         ]
         imports.names.add(("pathlib", "Path"))
         return on_bench(self.session.config.path, lines, imports)
+
+    def take(self, what: str) -> None:
+        """Find an exposure: the step to a picture that can be used."""
+        if what == EXPOSE:
+            self.form.expose()
 
     # Frames --------------------------------------------------------------------------------------
     def look(self) -> None:

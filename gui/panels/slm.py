@@ -31,7 +31,7 @@ class SlmPanel(DevicePanel):
         super().__init__(session, parent)
         self.view = ImageView("grey")
         self.view.setToolTip("Grey levels on the SLM now, 0 to 255")
-        self.now = label("–")
+        self.now = label("–", wraps=True)
         self.file, self.browse_button = path_field(
             "phase picture, 8 bit, 256 levels a turn",
             "A picture of the SLM's own size",

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from PySide6.QtCore import Qt, QUrl
 from PySide6.QtGui import QDesktopServices, QFontDatabase, QImage, QPixmap
-from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QLineEdit, QListWidget, QListWidgetItem, QStackedWidget, QVBoxLayout, QWidget
 
 from gui.background import NewestOnly
 from gui.forms.fields import Behaviour
@@ -32,7 +32,7 @@ from gui.widgets.building import (
     text_view,
 )
 from gui.widgets.sweep_views import Picture
-from instrument.tasks import TASKS, VIDEOS
+from instrument.tasks import CHARTS, DISPLAY, TASKS, VIDEOS
 from instrument.tasks.task import WRITTEN, Desk, Done, Task
 from recon.base.declare import Imports, Option, expression
 
@@ -84,8 +84,8 @@ class TasksPanel(Panel):
         self.run_bar.start.connect(self.start)
         self.run.told.connect(self._told)
         self.run.succeeded.connect(self._succeeded)
-        self.run.ended_early.connect(lambda words: self._ended(words, wrong=True))
-        self.run.failed.connect(lambda why: self._ended(self._in_form_words(why), wrong=True))
+        self.run.ended_early.connect(self._ended)
+        self.run.failed.connect(self._failed)
         self.run.over.connect(self._over)
         self._chosen()
 
@@ -161,7 +161,11 @@ class TasksPanel(Panel):
         if task.subject:
             form.show_for(task.subject)
         form.refused.connect(self.refused)
-        form.set_values({"bench": self.session.config.path})
+        for widget in form.widgets.values():
+            if isinstance(widget, QLineEdit):
+                widget.setPlaceholderText(form.in_its_words(widget.placeholderText()))
+        if TASKS[name].group == DISPLAY:
+            form.set_values({"bench": self.session.config.path})
         names = None
         out = next((o for o in options if o.name == "out"), None)
         place = task.out or (None if out is None or not isinstance(out.default, Path) else out.default)
@@ -185,14 +189,6 @@ class TasksPanel(Panel):
             }
 
         return self.asked(made)
-
-    def _in_form_words(self, text: str) -> str:
-        """Return a message with the fields' labels where the terminal's has flags."""
-        page = self._pages[self.name]
-        for field in sorted(page.form.fields.values(), key=lambda f: -len(f.option.flag)):
-            if field.option.flag.startswith("--"):
-                text = text.replace(field.option.flag, f"“{field.bare_label}”")
-        return text
 
     def as_python(self) -> str:
         """Return lines that carry out the task as the form stands."""
@@ -240,7 +236,7 @@ class TasksPanel(Panel):
         self.use_button.setEnabled(False)
 
     def _told(self, told: Told) -> None:
-        text = self._in_form_words(told.text)
+        text = self._pages[self.name].form.in_its_words(told.text)
         if told.kind == "table":
             made = table(told.headings, text, row_px=_ROW_PX)
             made.setRowCount(len(told.rows))
@@ -268,6 +264,10 @@ class TasksPanel(Panel):
             self._told(Told("warn", done.kept))
         elif not done.good:
             mark(self.words, "refused", True)
+        page = self._pages[self.name]
+        if page.names is not None and not done.kept and TASKS[self.name].group != CHARTS:
+            # What was interrupted, and a chart that has more to do, is gone on with under the same name.
+            page.names.suggest(page.form.value("out").name.partition(".")[0].rstrip("-0123456789"))
         self.folder_button.setEnabled(bool(done.files))
         self.use_button.setEnabled(any(map(self._panel_for, done.files)))
         self.run_bar.show_end("Ended early" if done.kept else "Done", complete=not done.kept)
@@ -275,9 +275,12 @@ class TasksPanel(Panel):
         if pictures:
             self._show(pictures[0])
 
-    def _ended(self, words: str, *, wrong: bool) -> None:
+    def _failed(self, why: str) -> None:
+        self._ended(self._pages[self.name].form.in_its_words(why))
+
+    def _ended(self, words: str) -> None:
         self.words.appendPlainText(words)
-        mark(self.words, "refused", wrong)
+        mark(self.words, "refused", True)
         self.run_bar.show_end(words.splitlines()[0], complete=False)
 
     def _over(self) -> None:
@@ -286,9 +289,6 @@ class TasksPanel(Panel):
         self.run_bar.words.setText(words)
         self.stack.setEnabled(True)
         self.choice.setEnabled(True)
-        page = self._pages[self.name]
-        if page.names is not None:
-            page.names.suggest(page.form.value("out").name.partition(".")[0].rstrip("-0123456789"))
 
     # Results -------------------------------------------------------------------------------------
     def _show(self, path: Path) -> None:

@@ -84,23 +84,16 @@ COMMANDS: Mapping[str, Command] = {
     "activity": _task(RECONSTRUCTION, "activity"),
     "analyze": _task(ANALYSIS, "analyze"),
     "compare": _task(ANALYSIS, "compare"),
-    "chart": Command(ANALYSIS, "time and memory against error, for every method", "chart"),
-    "stability": Command(ANALYSIS, "map where methods fail, against pairs of stresses", "stability"),
+    "optics": _task(ANALYSIS, "optics"),
+    "chart": _task(ANALYSIS, "chart"),
+    "stability": _task(ANALYSIS, "stability"),
     "refocus": _task(ANALYSIS, "refocus"),
     "hologram": Command(
         DISPLAY, "compute the SLM phase that shows a picture through the mask", "display:hologram_app"
     ),
     "align": Command(DISPLAY, "find the scattering mask and bring it to its place", "calibrate:align_app"),
-    "table7.1": Command(
-        DISPLAY,
-        "the dissertation's comparison of methods, also without aliasing",
-        "display:table_app",
-    ),
-    "etendue": Command(
-        DISPLAY,
-        "field of view, eyebox and resolution of a holographic display",
-        "display:etendue_app",
-    ),
+    "table7.1": _task(DISPLAY, "table7.1"),
+    "etendue": _task(DISPLAY, "etendue"),
 }
 
 

@@ -52,17 +52,33 @@ class RunFolder:
     )
 
 
-class App(typer.Typer):
-    """A typer application whose commands may take options objects, in the house style: plain help."""
+_HELP = ("--help", "-h")
 
-    def __init__(self, help_text: str = "") -> None:
+
+class App(typer.Typer):
+    """A typer application whose commands may take options objects, in the house style: plain help.
+
+    ``usual``: of several commands the one that is meant where none is named.
+    """
+
+    def __init__(self, help_text: str = "", *, usual: str | None = None) -> None:
+        class Group(typer.core.TyperGroup):
+            meant = usual
+
+            def parse_args(self, context: Any, arguments: list[str]) -> list[str]:
+                named = arguments[:1] and (arguments[0] in self.commands or arguments[0] in _HELP)
+                if self.meant is not None and not named:
+                    arguments = [self.meant, *arguments]
+                return super().parse_args(context, arguments)
+
         super().__init__(
+            cls=Group,
             help=help_text or None,
             add_completion=False,
             pretty_exceptions_enable=False,
             rich_markup_mode=None,
-            no_args_is_help=bool(help_text),
-            context_settings={"help_option_names": ["--help", "-h"], "max_content_width": 110},
+            no_args_is_help=bool(help_text) and usual is None,
+            context_settings={"help_option_names": list(_HELP), "max_content_width": 110},
         )
 
     def command(self, name: str | None = None, **settings: Any) -> Callable[[Any], Any]:

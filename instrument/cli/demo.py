@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -10,19 +11,22 @@ from rich.console import Console
 from rich.markup import escape
 
 from calibration_routines.demo import DemoResult, DemoSettings, run_demo
+from calibration_routines.display.demo_display import DisplayDemoSettings, run_display_demo
+from calibration_routines.film_demo import FilmSettings, run_film
 from instrument.cli.app import App, examples
 from instrument.cli.calibrate import TerminalListener
 
-app = App()
+app = App(
+    "Try the whole way on the simulated bench; without a name: demo camera.",
+    usual="camera",
+)
+OutFolder = Annotated[
+    Path, typer.Option("--out", "-o", metavar="FOLDER", help="Where the demo's folder is made.")
+]
 
 
-@app.command(epilog=examples("diffuserbench demo", "diffuserbench demo --out /tmp/demos"))
-def demo(
-    options: DemoSettings,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FOLDER", help="Where the demo's folder is made.")
-    ] = Path("runs"),
-) -> None:
+@app.command("camera", epilog=examples("diffuserbench demo", "diffuserbench demo --out /tmp/demos"))
+def demo(options: DemoSettings, out: OutFolder = Path("runs")) -> None:
     """Calibrate a SIMULATED lensless camera, photograph scenes with it, reconstruct and judge what comes out.
 
     Homes the stage, places the point source, exposes without saturating, takes dark frames, sweeps the source
@@ -36,6 +40,34 @@ def demo(
     listener.verdict(result)
 
 
+@app.command("film", epilog=examples("diffuserbench demo film", "diffuserbench demo film --frames 100"))
+def film(settings: FilmSettings, out: OutFolder = Path("runs")) -> None:
+    """Film a SIMULATED animal that moves and flashes, reconstruct the film, find what is active, judge it.
+
+    Calibrates the simulated microscope with nine PSFs, records, reconstructs with the camera model that the
+    film asks for, looks for activity, and draws cells, dF/F and blood flow beside the truth. Takes minutes.
+    """
+    with _Terminal(Console(highlight=False)) as listener:
+        result = run_film(out, listener, settings)
+    listener.ended(result.seconds, result.files)
+    for line in result.lines():
+        typer.echo(line)
+
+
+@app.command("display", epilog=examples("diffuserbench demo display"))
+def display(settings: DisplayDemoSettings, out: OutFolder = Path("runs")) -> None:
+    """Align the mask of a SIMULATED holographic display, learn how it differs, show and photograph a picture.
+
+    The picture is computed twice, by the alignment alone and by what was learned of the display; both are
+    photographed and compared with what was wanted. Takes minutes.
+    """
+    with _Terminal(Console(highlight=False)) as listener:
+        result = run_display_demo(out, listener, settings)
+    listener.ended(result.seconds, result.files)
+    for line in result.lines():
+        typer.echo(line)
+
+
 class _Terminal(TerminalListener):
     """Shows on the terminal what the demo does, and prints what it says on the way."""
 
@@ -43,14 +75,19 @@ class _Terminal(TerminalListener):
         """Print it."""
         self.print([words])
 
-    def verdict(self, result: DemoResult) -> None:
+    def ended(self, stages: Mapping[str, float], files: Mapping[str, Path]) -> None:
+        """Print how long each stage took, and what there is now."""
         self._console.print("\nSeconds")
-        for name, seconds in result.seconds.items():
+        for name, seconds in stages.items():
             self._console.print(f"  {seconds:6.1f}  {name}")
-        self._console.print(f"  {sum(result.seconds.values()):6.1f}  in all")
+        self._console.print(f"  {sum(stages.values()):6.1f}  in all")
         self._console.print("\nFiles (SIMULATED data)")
-        for name, path in result.files.items():
+        for name, path in files.items():
             self._say(f"  {name:<30} {path}")
+
+    def verdict(self, result: DemoResult) -> None:
+        """Print times, files, and how good picture and volume are."""
+        self.ended(result.seconds, result.files)
         comparison, placed = result.comparison, result.placed
         self._console.print()
         for name, solved in (("Picture", result.reconstruction), ("Volume", result.volume)):

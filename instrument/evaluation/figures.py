@@ -155,7 +155,8 @@ def map_figure(record: Mapping[str, Any]) -> Figure:
     """Draw a map as ``stability.json`` has it (one entry of ``maps``).
 
     Severity is shown from blue (far from failing) over white (at the boundary) to brown (failed); each cell
-    carries its error; the red line is the boundary, severity 1.
+    carries its error; the red line is the boundary, severity 1. Where a case of one's own was found to lie,
+    ``case`` of a method, is a ring.
     """
     from matplotlib.figure import Figure
 
@@ -189,6 +190,11 @@ def _draw_map(axes: Axes, name: str, method: Mapping[str, Any], record: Mapping[
             axes.text(ix, iy, f"{error:.2g}", ha="center", va="center", fontsize=7, color=colour)
     if n_x > 1 and n_y > 1 and np.isfinite(level).all() and level.min() < 0 <= level.max():
         axes.contour(level, levels=[0.0], colors=[ACCENT], linewidths=2.2)
+    if (case := method.get("case")) is not None:
+        axes.plot(*case, "o", ms=26, mfc="none", mec=INK, mew=2.5)
+        axes.annotate(
+            "yours", case, (0, 17), textcoords="offset points", ha="center", fontsize=9, weight="bold"
+        )
     for which, count in (("x", n_x), ("y", n_y)):
         about = record[which]
         getattr(axes, f"set_{which}ticks")(range(count))

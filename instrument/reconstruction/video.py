@@ -35,6 +35,7 @@ from instrument.reconstruction.video_job import VideoJob, VideoPlan
 from instrument.reconstruction.video_work import BlockReport, CancelledError, cluster, in_process, on_cluster
 from instrument.runs.run import Run
 from recon.base.declare import inapplicable
+from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.measurement import Floats, Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
@@ -91,6 +92,15 @@ class PreparedVideo:
         """Blocks still to be solved."""
         done = self.job.done()
         return [number for number in range(len(self.job.blocks)) if number not in done]
+
+    def doubt(self) -> str:
+        """Say why the calibration may be another camera's, by the first frame; empty where nothing does.
+
+        Takes about a second.
+        """
+        check = check_calibration(self.job.problem)
+        said = "" if check is None else "".join(check.sentences[:1])
+        return f"{said[:1].upper()}{said[1:]}"
 
 
 def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVideo:

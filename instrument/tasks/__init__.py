@@ -36,6 +36,7 @@ RUNS = "Runs"
 CALIBRATIONS = "Calibrations"
 VIDEOS = "Recordings"
 DISPLAY = "Holographic display"
+CHARTS = "Charts and maps"
 
 TASKS: Mapping[str, TaskEntry] = {
     "verify": TaskEntry(RUNS, "Verify runs", "read every frame of a run and check it", "runs:verify"),
@@ -57,6 +58,27 @@ TASKS: Mapping[str, TaskEntry] = {
         "one picture of a scene lit by patterns in turn",
         "solving:patterned",
     ),
+    "etendue": TaskEntry(
+        DISPLAY,
+        "Field of view and eyebox",
+        "field of view, eyebox and resolution of a holographic display",
+        "display:etendue",
+    ),
+    "table7.1": TaskEntry(
+        DISPLAY,
+        "Table 7.1",
+        "the dissertation's comparison of methods, also without aliasing",
+        "display:table",
+    ),
+    "chart": TaskEntry(
+        CHARTS, "Chart settings", "time and memory against error, for every method", "chart:chart"
+    ),
+    "stability": TaskEntry(
+        CHARTS,
+        "Map where methods fail",
+        "map where methods fail, against pairs of stresses",
+        "stability:stability",
+    ),
     "limit": TaskEntry(
         DISPLAY, "Limit of the display", "what any number of frames could reach for a picture", "spots:limit"
     ),
@@ -74,6 +96,12 @@ TASKS: Mapping[str, TaskEntry] = {
         "Compare two calibrations",
         "two calibrations: what moved, is a new one due",
         "calibrations:compare",
+    ),
+    "optics": TaskEntry(
+        CALIBRATIONS,
+        "Compare kinds of optics",
+        "objective, diffuser, lenslets side by side at equal light",
+        "optics:optics",
     ),
     "refocus": TaskEntry(
         CALIBRATIONS,

@@ -35,9 +35,14 @@ class ActivityFiles:
         group="Files",
     )
     out: Path = option(
-        Path("activity"), help="Made by this.", metavar="FOLDER", flags=("--out", "-o"), group="Files"
+        Path("activity"),
+        help="Made by this.",
+        metavar="FOLDER",
+        flags=("--out", "-o"),
+        label="Result",
+        group="Files",
     )
-    force: bool = option(False, help="Replace what is in the folder.", group="Files")
+    force: bool = option(False, help="Replace what is in the folder.", label="Overwrite", group="Files")
 
 
 @task(

@@ -27,6 +27,7 @@ class AnalysisFiles:
         Path("analysis.pdf"),
         help="The page (.pdf, .png, .svg); JSON beside.",
         flags=("--out", "-o"),
+        label="Result",
         group="Files",
     )
     response: Path | None = option(
@@ -34,7 +35,7 @@ class AnalysisFiles:
         help="Instead of --cutoff-deg: angular_response.json of calibrate angular.",
         group="Files",
     )
-    force: bool = option(False, help="Overwrite files that exist.", group="Files")
+    force: bool = option(False, help="Overwrite files that exist.", label="Overwrite", group="Files")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +57,7 @@ class RefocusOptions:
         help="Make PSFs over the field of the one on the axis: angular_response.json of calibrate angular.",
     )
     points: int = option(3, help="Places a side, with --response.", least=1)
-    force: bool = option(False, help="Replace a calibration that exists.")
+    force: bool = option(False, help="Replace a calibration that exists.", label="Overwrite")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +69,7 @@ class CompareOptions:
     out: Path | None = option(
         None, help="Write the figures as JSON.", metavar="FILE", flags=("--out", "-o"), label="Figures"
     )
-    force: bool = option(False, help="Overwrite a file that exists.")
+    force: bool = option(False, help="Overwrite a file that exists.", label="Overwrite")
 
 
 @task(

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Annotated
 
 from instrument.bench.config import BenchConfig
-from instrument.bench.config_file import load_config
 from instrument.display.hologram import bench_display, load_alignment, slm_size
 from instrument.display.hologram_files import HologramFiles
 from instrument.display.limit import lifts_of, limit_lines, limits_of_lifts
 from instrument.display.spots import SpotFiles, spots_of
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image
-from instrument.tasks.task import BenchFile, Desk, Done, Only, saying_what_is_left, task
+from instrument.tasks.task import BenchFile, Desk, Done, Only, bench_of, saying_what_is_left, task
 from recon.base.declare import option
 from recon.holography import Display, HologramOptions, HologramRecord, HologramStop, compute_spots
 
@@ -72,9 +71,10 @@ class HologramInputs:
         Path("slm.png"),
         help="8-bit phase, 256 levels a turn (--complex: .npy); .json and a preview.",
         flags=("--out", "-o"),
+        label="Result",
         group="Files",
     )
-    force: bool = option(False, help="Overwrite files that exist.", group="Files")
+    force: bool = option(False, help="Overwrite files that exist.", label="Overwrite", group="Files")
 
     def depths(self, count: int) -> list[float]:
         """Return the depth of each of ``count`` targets; BenchError where they do not fit."""
@@ -102,7 +102,7 @@ def limit(
     bench: BenchFile,
 ) -> Done:
     """Say what any number of frames could reach for a picture, the bench's mask and SLM."""
-    config = load_config(bench.bench)
+    config = bench_of(desk, bench)
     display = options.display_of(bench_display(config, slm_size(config), expansion=options.expansion))
     if inputs.alignment is not None:
         display = load_alignment(inputs.alignment).of(display)
@@ -117,7 +117,7 @@ def spots(
     bench: BenchFile,
 ) -> Done:
     """Compute the SLM phase that makes spots as bright as asked for, at any places and depths."""
-    config = load_config(bench.bench)
+    config = bench_of(desk, bench)
     return make_spots(desk, inputs, options, (config, slm_size(config)))
 
 

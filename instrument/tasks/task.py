@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import shlex
 import sys
 import typing
 from abc import ABC, abstractmethod
@@ -11,11 +12,15 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from instrument.files.atomic import protecting
 from instrument.files.errors import BenchError
 from recon.base.declare import Option, changed, option, options_of
+from recon.base.option_text import shown
+
+if TYPE_CHECKING:
+    from instrument.bench.config import BenchConfig
 
 
 class Advance(Protocol):
@@ -162,6 +167,32 @@ class BenchFile:
         flags=("--bench", "-b"),
         group="Bench",
     )
+
+
+def bench_of(desk: Desk, bench: BenchFile) -> BenchConfig:
+    """Return the configuration that is meant; says so where it is the built-in one."""
+    from instrument.bench.config_file import DEFAULT_NAME, load_config
+
+    config = load_config(bench.bench)
+    if config.path is None:
+        desk.warn(
+            f"No {DEFAULT_NAME} in this folder: the built-in SIMULATED bench is used (diffuserbench new)."
+        )
+    return config
+
+
+def command_line(name: str, *objects: object) -> str:
+    """Return the words that carry out a task in the terminal."""
+    first, others = [], []
+    for o, value in (pair for one in objects for pair in changed(one)):
+        each = [shown(o, one) for one in value] if o.item is not None else [shown(o, value)]
+        if o.declaration.positional:
+            first += each
+        elif isinstance(value, bool):
+            others.append(o.flags[0].split("/")[-1] if not value else o.flag)
+        else:
+            others += [word for one in each for word in (o.flag, one)]
+    return shlex.join(["diffuserbench", name, *first, *others])
 
 
 Part = tuple[type, tuple[Option, ...]]

@@ -74,7 +74,8 @@ def make_video(desk: Desk, request: VideoRequest, *, force: bool) -> Done:
     )
     blocks = f"{len(prepared.job.blocks)} blocks of {plan.block}"
     desk.fact("Video", f"{len(plan.frames)} frames in {blocks}: {how}")
-    for warning in prepared.warnings:
+    doubt = "" if prepared.resumed else prepared.doubt()
+    for warning in (*prepared.warnings, *filter(None, (doubt,))):
         desk.warn(f"Warning: {warning}")
     if prepared.resumed:
         desk.fact("Resumed", f"{_frames_done(prepared)} frames are done already")

@@ -14,7 +14,7 @@ from recon.optics.scene import Beads, Scene
 
 Floats = npt.NDArray[np.float64]
 
-CELLS, TISSUE, PLANES = 200, 120, 24
+CELLS, TISSUE, PLANES = 200, 100, 24
 """Cells that may flash, spots of tissue that never do, planes that both lie in."""
 ACTIVE = 0.5
 """Share of the cells that flash at all."""
@@ -129,11 +129,11 @@ class Animal:
 def draw_animal(z_um: float, height_um: float, seed: int = 0) -> Animal:
     """Draw an animal for a field of so many micrometres in height at a distance.
 
-    It is as long as the field is high, two fifths as wide, and a twenty-fifth of its distance thick. Cells
-    keep a diameter from one another.
+    It is a quarter longer than the field is high, half as wide, and a twenty-fifth of its distance thick.
+    Cells keep a diameter from one another.
     """
     rng = np.random.default_rng([seed, 1948])
-    length, width, thickness = 0.96 * height_um, 0.38 * height_um, 0.04 * z_um
+    length, width, thickness = 1.25 * height_um, 0.5 * height_um, 0.04 * z_um
     diameter = 0.01 * height_um
     planes = z_um + thickness * (np.arange(PLANES) - (PLANES - 1) / 2) / PLANES
     way = _vessel(length, width, z_um)

@@ -31,7 +31,10 @@ _WITH_KEYS = (QAbstractButton, QComboBox, QLineEdit, QListView, QPlainTextEdit, 
 
 def faults(root: QWidget) -> list[str]:
     """Return all faults of what is visible in a window or panel, one sentence each."""
-    return [*cut_off(root), *scrolled_twice(root), *nameless(root)]
+    stop = root.findChild(QWidget, "stop")
+    hidden = stop is not None and stop.visibleRegion().boundingRect() != stop.rect()
+    gone = ["STOP is not wholly in sight"] if hidden else []
+    return [*gone, *cut_off(root), *scrolled_twice(root), *nameless(root)]
 
 
 def cut_off(root: QWidget) -> Iterator[str]:

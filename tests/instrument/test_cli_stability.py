@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from instrument.cli.stability import app
+from instrument.cli import COMMANDS
 from instrument.evaluation.figures import ticks_of
 from instrument.files.errors import BenchError, FileError
 from instrument.files.stability_file import CellLog, read_stability
@@ -41,7 +41,7 @@ def one_map(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run(*arguments: str) -> str:
-    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    result = CliRunner().invoke(COMMANDS["stability"].load(), arguments, catch_exceptions=False)
     assert result.exit_code == 0
     return result.output
 
@@ -58,7 +58,7 @@ def test_a_map_is_made_drawn_and_written(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_map_goes_on_where_it_was(tmp_path: Path) -> None:
-    assert CliRunner().invoke(app, ["easy", "-o", str(tmp_path)]).exit_code != 0
+    assert CliRunner().invoke(COMMANDS["stability"].load(), ["easy", "-o", str(tmp_path)]).exit_code != 0
     done = len((tmp_path / "cells.jsonl").read_text().splitlines())
     assert done == 3
     # Cut off in the middle of a line, as a power failure would leave it.
@@ -100,7 +100,7 @@ def test_redraw_needs_no_trial(tmp_path: Path) -> None:
 
 def test_mistakes_are_sentences(tmp_path: Path) -> None:
     def fails(*arguments: str) -> None:
-        CliRunner().invoke(app, arguments, catch_exceptions=False)
+        CliRunner().invoke(COMMANDS["stability"].load(), arguments, catch_exceptions=False)
 
     with pytest.raises(BenchError, match="No map has the method nothing"):
         fails("easy", "--method", "nothing", "-o", str(tmp_path))

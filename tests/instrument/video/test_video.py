@@ -542,6 +542,16 @@ def test_the_command(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["reconstruct", "--video"]) == 2
 
 
+def test_a_calibration_of_another_camera_is_said(recording: Path, tmp_path: Path) -> None:
+    assert prepare_video(request(recording, tmp_path)).doubt() == ""
+    other = tmp_path / "other.npy"
+    np.save(other, np.load(recording.parent / "psf.npy")[::-1, ::-1])
+    wrong = replace(request(recording, tmp_path, psf=other), out=tmp_path / "o.ome.zarr")
+    doubt = prepare_video(wrong).doubt()
+    assert "calibration" in doubt
+    assert doubt[0].isupper()
+
+
 def test_prepared_is_what_the_window_shows(recording: Path, tmp_path: Path) -> None:
     prepared = prepare_video(request(recording, tmp_path))
     assert isinstance(prepared, PreparedVideo)

@@ -1,27 +1,23 @@
-"""``diffuserbench stability``: maps of where methods fail, against pairs of stresses."""
+"""Maps of where methods fail, against pairs of stresses."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Any, Literal
 
-import typer
-
-from instrument.cli.app import App, examples
-from instrument.cli.progress import progress_bar
 from instrument.files.errors import BenchError, FileError
-from instrument.tasks.task import saying_what_is_left
+from instrument.tasks.task import Desk, Done, command_line, saying_what_is_left, task
 from recon.base.declare import option
-
-app = App()
 
 
 @dataclass(frozen=True, kw_only=True)
 class StabilityOptions:
     """Which maps, how large, and where they are kept."""
 
+    names: tuple[str, ...] = option(
+        (), help="Maps; default all.", metavar="[NAME]...", label="Maps", default_words="all", positional=True
+    )
     method: tuple[str, ...] = option(
         (),
         help="Only these methods; repeatable.",
@@ -35,27 +31,27 @@ class StabilityOptions:
         help="Where maps are kept and gone on with.",
         metavar="FOLDER",
         flags=("--out", "-o"),
+        label="Result",
     )
     list_maps: bool = option(False, help="Only list maps and their methods.", flags=("--list",))
     redraw: bool = option(False, help="Only draw what stability.json holds.")
     shipped: bool = option(False, help="With --redraw: the maps that come with the program.")
-
-
-@app.command(
-    epilog=examples(
-        "diffuserbench stability --list",
-        "diffuserbench stability light --size quick",
-        "diffuserbench stability light erasures --method 'admm tv' --out maps",
-        "diffuserbench stability --size full --out stability",
-        "diffuserbench stability --redraw --out stability",
+    case: Path | None = option(
+        None,
+        help="With --redraw: mark where this reconstruction lies, the cell whose evidence is most like its.",
+        metavar="RESULT",
     )
+
+
+@task(
+    "diffuserbench stability --list",
+    "diffuserbench stability light --size quick",
+    "diffuserbench stability light erasures --method 'admm tv' --out maps",
+    "diffuserbench stability --size full --out stability",
+    "diffuserbench stability --redraw --out stability",
+    "diffuserbench stability light erasures --redraw --shipped --case reconstruction.tif",
 )
-def stability(
-    options: StabilityOptions,
-    names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="Maps; default all.", show_default=False)
-    ] = None,
-) -> None:
+def stability(desk: Desk, options: StabilityOptions) -> Done:
     """Map where methods fail: the error against pairs of stresses, with the failure boundary drawn.
 
     For each map a PNG, and stability.json with all of them. Ctrl-C keeps what is done; the same command goes
@@ -63,17 +59,18 @@ def stability(
     """
     from recon.evaluation.maps import MAPS, cells_of, map_named, run_map
 
+    names = options.names
     chosen = [map_named(name) for name in names or MAPS]
     if options.list_maps:
         for stress in chosen:
-            typer.echo(f"{stress.name:<20}{stress.title}\n{'':<20}{stress.x.label} x {stress.y.label}")
-            typer.echo(f"{'':<20}methods: {'; '.join(stress.methods)}")
-        return
+            desk.say(f"{stress.name:<20}{stress.title}\n{'':<20}{stress.x.label} x {stress.y.label}")
+            desk.say(f"{'':<20}methods: {'; '.join(stress.methods)}")
+        return Done()
     if options.redraw:
-        _redraw(options.out, [s.name for s in chosen] if names else None, shipped=options.shipped)
-        return
-    if options.shipped:
-        raise BenchError("--shipped goes with --redraw.")
+        wanted_names = [s.name for s in chosen] if names else None
+        return _redraw(desk, options, wanted_names)
+    if options.shipped or options.case is not None:
+        raise BenchError("--shipped and --case go with --redraw.")
     wanted = {s.name: _methods(s.methods, options.method) for s in chosen}
     chosen = [s for s in chosen if wanted[s.name]]
     if not chosen:
@@ -86,20 +83,25 @@ def stability(
     log = CellLog(out)
     jobs = {s.name: cells_of(s, size, wanted[s.name]) for s in chosen}
     pictures = [out / f"{s.name}.png" for s in chosen]
-    with saying_what_is_left(out / RESULT, *pictures), progress_bar() as bar:
-        task = bar.add_task("stability", total=sum(map(len, jobs.values())), note="")
+    with (
+        saying_what_is_left(out / RESULT, *pictures),
+        desk.step("stability", sum(map(len, jobs.values()))) as advance,
+    ):
+        done = 0
         for stress, picture in zip(chosen, pictures, strict=True):
             asked = set(jobs[stress.name])
             made = [c for c in log.of(stress, size) if (c.method, c.ix, c.iy) in asked]
-            bar.update(task, advance=len(made), note=stress.name)
+            done += len(made)
+            advance(done, note=stress.name)
             for cell in run_map(stress, size, methods=wanted[stress.name], known=made):
                 log.add(stress, size, cell)
-                bar.update(task, advance=1, note=f"{stress.name}: {cell.method}")
+                done += 1
+                advance(done, note=f"{stress.name}: {cell.method}")
             record = map_record(stress, size, log.of(stress, size))
-            write_stability(out, {stress.name: record}, " ".join(["diffuserbench", *sys.argv[1:]]))
+            write_stability(out, {stress.name: record}, command_line("stability", options))
             _draw(record, picture)
-            _tell(stress.name, record)
-    typer.echo(f"Wrote {', '.join(map(str, (out / RESULT, *pictures)))}")
+            _tell(desk, stress.name, record)
+    return Done((out / RESULT, *pictures))
 
 
 def _methods(offered: tuple[str, ...], asked: tuple[str, ...]) -> list[str]:
@@ -119,23 +121,58 @@ def _draw(record: dict[str, object], picture: Path) -> None:
     save_figure(map_figure(record), picture)
 
 
-def _redraw(out: Path, names: list[str] | None, *, shipped: bool) -> None:
+def _redraw(desk: Desk, options: StabilityOptions, names: list[str] | None) -> Done:
     from instrument.files.stability_file import RESULT, read_stability
     from recon.verdict.cases import SHIPPED
 
-    maps = read_stability(SHIPPED if shipped else out / RESULT)["maps"]
+    out = options.out
+    maps = read_stability(SHIPPED if options.shipped else out / RESULT)["maps"]
     if missing := [n for n in names or () if n not in maps]:
         raise BenchError(f"Not made yet: {', '.join(missing)}. Leave --redraw out to make them.")
+    verdict = None if options.case is None else _verdict_of(options.case)
     _make(out)
     for name in names or maps:
+        if verdict is not None:
+            desk.fact(name, _mark(maps[name], verdict))
         _draw(maps[name], out / f"{name}.png")
-        typer.echo(f"Drew {out / f'{name}.png'}")
+    return Done(tuple(out / f"{name}.png" for name in names or maps))
 
 
-def _tell(name: str, record: dict[str, object]) -> None:
+def _verdict_of(case: Path) -> dict[str, Any]:
+    """Return a reconstruction's verdict as it is recorded.
+
+    Raises FileError when it is none, or has none.
+    """
+    from instrument.reconstruction.stored_result import open_result
+
+    verdict: dict[str, Any] | None = open_result(case).record.get("verdict")
+    if not verdict or not verdict.get("evidence"):
+        raise FileError(case, "was not judged, so that it has no place on a map.", "Reconstruct it anew.")
+    return verdict
+
+
+def _mark(record: dict[str, Any], verdict: dict[str, Any]) -> str:
+    """Mark a map with the cell that a case is most like; return in words which it is."""
+    from instrument.evaluation.figures import label_of, ticks_of
+    from recon.verdict.likeness import most_like
+
+    like = most_like(verdict["evidence"], verdict["method"], record)
+    if like is None:
+        return f"no method of it fails as {verdict['method']} does, or its cells tell too little"
+    record["methods"][like.method]["case"] = [like.ix, like.iy]
+    place = ", ".join(
+        f"{label_of(record[axis])} {ticks_of(record[axis])[index]}"
+        for axis, index in (("x", like.ix), ("y", like.iy))
+    )
+    return (
+        f"most like {place}: severity {like.severity:.2g}; {like.distance:.1f} times all cases' scatter away"
+    )
+
+
+def _tell(desk: Desk, name: str, record: dict[str, object]) -> None:
     methods = record["methods"]
     assert isinstance(methods, dict)
     for method, result in methods.items():
         failed = [f for row in result["failure"] for f in row]
         share = sum(f is not None for f in failed)
-        typer.echo(f"{name:<20}{method:<24}{share:3d} of {len(failed)} cells fail, {result['seconds']:.0f} s")
+        desk.say(f"{name:<20}{method:<24}{share:3d} of {len(failed)} cells fail, {result['seconds']:.0f} s")

@@ -1,4 +1,4 @@
-"""``diffuserbench chart``: every setting on one problem, what it costs against how good it is."""
+"""Every setting on one problem: what it costs against how good it is."""
 
 from __future__ import annotations
 
@@ -8,13 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import typer
-
-from instrument.cli.app import App, BenchOption, examples, load_and_say
-from instrument.cli.progress import progress_bar
 from instrument.files.errors import BenchError
 from instrument.reconstruction.options import InputOptions, SourceOptions
-from instrument.tasks.task import Given, Only, saying_what_is_left
+from instrument.tasks.task import BenchFile, Desk, Done, Given, Only, bench_of, saying_what_is_left, task
 from recon.base.declare import option
 from recon.base.option_text import size as size_of
 
@@ -23,8 +19,6 @@ if TYPE_CHECKING:
     from instrument.reconstruction.job import Job
     from recon.evaluation.scored import Point
     from recon.evaluation.trial import Named, Subject
-
-app = App()
 
 _LEAST_S = 1.0
 """For settings, where photographs took all of the budget: so that each call comes further."""
@@ -141,30 +135,30 @@ class ChartOptions:
         help="For chart.png, .html, .csv, .json.",
         metavar="FOLDER",
         flags=("--out", "-o"),
+        label="Result",
         group="Time and files",
     )
 
 
-@app.command(
-    epilog=examples(
-        "diffuserbench chart --scene sparse-picture",
-        "diffuserbench chart --scene beads --size 40 --budget 120 --out beads-chart",
-        "diffuserbench chart --calibration demo/calibration --image photo.tif --z-mm 30",
-        "diffuserbench chart --psf psf.tif --image photo.tif --bin 8",
-        "diffuserbench chart --calibration axial/calibration --image photo.tif --volume",
-        "diffuserbench chart --hologram picture.png --slm 135x240 --out hologram-chart",
-        "diffuserbench chart --calibrations --out calibration-chart",
-        "diffuserbench chart --calibrations -c grid/calibration -c beads/calibration -i photo.tif --z-mm 30",
-        "diffuserbench chart --hologram near.png --hologram far.png --z-mm 0 --z-mm 40",
-    )
+@task(
+    "diffuserbench chart --scene sparse-picture",
+    "diffuserbench chart --scene beads --size 40 --budget 120 --out beads-chart",
+    "diffuserbench chart --calibration demo/calibration --image photo.tif --z-mm 30",
+    "diffuserbench chart --psf psf.tif --image photo.tif --bin 8",
+    "diffuserbench chart --calibration axial/calibration --image photo.tif --volume",
+    "diffuserbench chart --hologram picture.png --slm 135x240 --out hologram-chart",
+    "diffuserbench chart --calibrations --out calibration-chart",
+    "diffuserbench chart --calibrations -c grid/calibration -c beads/calibration -i photo.tif --z-mm 30",
+    "diffuserbench chart --hologram near.png --hologram far.png --z-mm 0 --z-mm 40",
 )
 def chart(
+    desk: Desk,
     options: ChartOptions,
     source: Annotated[SourceOptions, Only("psf", "image")],
     inputs: Annotated[InputOptions, Only("dark", "crop", "binning")],
+    bench: BenchFile,
     given: Given,
-    bench: BenchOption = None,
-) -> None:
+) -> Done:
     """Chart what every setting costs against how good it is, each in a process of its own, quick ones first.
 
     Reconstructions (of --scene, or of --image with --calibration or --psf): method, model, prior, iterations,
@@ -175,35 +169,35 @@ def chart(
     """
     subject = _subject(given)
     given.refuse(subject.title, subject.word, *subject.of_photographs)
-    if bench is not None and subject is not _HOLOGRAM:
+    if bench.bench is not None and subject is not _HOLOGRAM:
         raise BenchError(f"--bench is for holograms; it does not apply with {subject.title}.")
     from instrument.evaluation.figures import write_charts
 
     out = options.out
     began = time.monotonic()
-    problem, about = _problem(subject, options, source, inputs, bench)
+    problem, about = _problem(desk, subject, options, (source, inputs), bench)
     # Photographs of a simulated microscope are taken out of the budget.
     spent_s = time.monotonic() - began if subject is _SIMULATED else 0.0
     if about.get("simulated"):
-        typer.echo("SIMULATED   what is charted, or its input, comes from a simulation")
+        desk.say("SIMULATED   what is charted, or its input, comes from a simulation")
     out.mkdir(parents=True, exist_ok=True)
     record = out / "chart.json"
-    data = _made(problem, about, record, max(options.budget_s - spent_s, _LEAST_S))
+    data = _made(desk, problem, about, record, max(options.budget_s - spent_s, _LEAST_S))
     if not data.points:
         if not data.failed:
             raise BenchError("There was no time for any setting: give a longer --budget.")
         raise BenchError("No setting could be run: " + "; ".join(f"{k}: {v}" for k, v in data.failed.items()))
     files = write_charts(out, data)
-    _tell(data)
-    typer.echo(f"{'Wrote':<12}{', '.join(map(str, (record, *files)))}")
+    _tell(desk, data)
+    return Done((record, *files))
 
 
 def _problem(
+    desk: Desk,
     subject: _Subject,
     options: ChartOptions,
-    source: SourceOptions,
-    inputs: InputOptions,
-    bench: Path | None,
+    photographs: tuple[SourceOptions, InputOptions],
+    bench: BenchFile,
 ) -> tuple[Subject[Any], dict[str, Any]]:
     """Return what is charted, and what to say of it."""
     from instrument.evaluation.chart_problems import (
@@ -219,13 +213,14 @@ def _problem(
     z_mm = [1e-3 * z_um for z_um in options.z_um]
     if subject is _HOLOGRAM:
         return problem_of_pictures(
-            load_and_say(bench), options.hologram, z_mm, options.expansion, options.frames, options.slm
+            bench_of(desk, bench), options.hologram, z_mm, options.expansion, options.frames, options.slm
         )
     if subject is _SIMULATED:
-        return _calibrations(options.size or 90, options.out, options.budget_s)
+        return _calibrations(desk, options.size or 90, options.out, options.budget_s)
     if len(z_mm) > 1 or (z_mm and options.volume):
         raise BenchError("--z-mm is the distance of a flat scene: give it once, and without --volume.")
     z_um = options.z_um[0] if options.z_um else None
+    source, inputs = photographs
     compared = subject is _COMPARED
     jobs = {
         folder: _job(folder, source, inputs, volume=options.volume)
@@ -234,7 +229,7 @@ def _problem(
     prepared = list(jobs.values()) or [_job(None, source, inputs, volume=options.volume)]
     for job in prepared:
         for name, text in job.notes.items():
-            typer.echo(f"{name:<12}{text}")
+            desk.say(f"{name:<12}{text}")
     if compared:
         return problem_of_calibrations(jobs, z_um, volume=options.volume)
     return problem_of_job(prepared[0], z_um, volume=options.volume)
@@ -287,7 +282,7 @@ def _job(folder: Path | None, source: SourceOptions, inputs: InputOptions, *, vo
     return prepared(folder, image, inputs)
 
 
-def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Subject[Any], dict[str, Any]]:
+def _calibrations(desk: Desk, size: int, out: Path, budget_s: float) -> tuple[Subject[Any], dict[str, Any]]:
     from instrument.evaluation.bench_photographs import OutOfTimeError, photographs
     from recon.evaluation.chart_calibration import CalibrationProblem
 
@@ -298,11 +293,10 @@ def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Subject[Any], 
     def advance(done: int, total: int) -> None:
         nonlocal counted
         counted = f"{done} of {total} photographs are in {path}: the same command goes on."
-        bar.update(task, completed=done, total=total)
+        show(done, total)
 
     try:
-        with progress_bar() as bar:
-            task = bar.add_task("photographs", total=None, note="")
+        with desk.step("photographs") as show:
             taken = photographs(size, path, advance, budget_s=budget_s)
     except (KeyboardInterrupt, SystemExit) as interruption:
         interruption.add_note(counted or "Nothing was written.")
@@ -315,33 +309,32 @@ def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Subject[Any], 
     return CalibrationProblem(taken), {"bench": "simulated microscope", "simulated": True}
 
 
-def _made(problem: Subject[Any], about: dict[str, Any], record: Path, budget_s: float) -> ChartData:
+def _made(
+    desk: Desk, problem: Subject[Any], about: dict[str, Any], record: Path, budget_s: float
+) -> ChartData:
     from instrument.evaluation.chart import make_chart
 
-    with saying_what_is_left(record), progress_bar() as bar:
-        task = bar.add_task("settings", total=None, note="")
+    with saying_what_is_left(record), desk.step("settings") as advance:
 
         def on_progress(place: int, total: int, setting: Named, left_s: float) -> None:
-            bar.update(
-                task, total=total, completed=place, note=f"{setting.name}, {left_s:.0f} s of the budget left"
-            )
+            advance(place, total, note=f"{setting.name}, {left_s:.0f} s of the budget left")
 
         return make_chart(problem, about, record, budget_s=budget_s, on_progress=on_progress)
 
 
-def _tell_even(group: str, even: Sequence[Point], *, on_the_way: bool) -> None:
+def _tell_even(desk: Desk, group: str, even: Sequence[Point], *, on_the_way: bool) -> None:
     """Say what the held-out pixels cannot tell from the best setting."""
     from recon.evaluation.scored import SETTLED_ITERATIONS
 
     best, others = even[0], sorted({p.setting for p in even[1:]} - {even[0].setting})
     when = f"after {SETTLED_ITERATIONS} iterations or more" if on_the_way else group
-    typer.echo(f"{'Held out':<12}best {when}: {_told(best)}")
+    desk.say(f"{'Held out':<12}best {when}: {_told(best)}")
     cheap = "quickest" if on_the_way else "one with the fewest photographs"
     least = min(even, key=lambda p: p.seconds if on_the_way else p.images)
     if not others:
-        typer.echo(f"{'':<12}no other setting is even with it")
+        desk.say(f"{'':<12}no other setting is even with it")
         return
-    typer.echo(
+    desk.say(
         f"{'':<12}even with it, as far as these pixels tell, apart by less than twice the scatter: "
         f"{len(others)}; the {cheap}: {_told(least)}"
     )
@@ -355,25 +348,25 @@ def _told(point: Point) -> str:
     return f"{in_words(point)} (error {error:.3g} a pixel, {point.seconds:.3g} s)"
 
 
-def _tell(data: ChartData) -> None:
+def _tell(desk: Desk, data: ChartData) -> None:
     """Print the fronts, what failed, and what there was no time for."""
     score, cost = data.kind.score_of(data.points), data.kind.costs[0]
     heading = f"{'iterations':>10}{cost.key:>9}{'MiB':>8}"
     for group, front in data.fronts().items():
         name = f"Pareto front {group}".rstrip()
-        typer.echo(f"{name:<44}{heading}  {score.words}")
+        desk.say(f"{name:<44}{heading}  {score.words}")
         for p in front:
             paid, value = getattr(p, cost.key), getattr(p, score.key)
-            typer.echo(f"{p.setting:<44}{p.iterations:>10}{paid:>9.3g}{p.peak_mib:>8.3g}  {value:.3f}")
+            desk.say(f"{p.setting:<44}{p.iterations:>10}{paid:>9.3g}{p.peak_mib:>8.3g}  {value:.3f}")
     for group, even in data.even().items():
-        _tell_even(group, even, on_the_way=data.kind_name == "reconstruction")
+        _tell_even(desk, group, even, on_the_way=data.kind_name == "reconstruction")
     for why in data.about.get("left_out", ()):
-        typer.echo(f"{'Not charted':<12}{why}")
+        desk.say(f"{'Not charted':<12}{why}")
     for setting, why in data.failed.items():
-        typer.echo(f"Warning: {setting} could not be run: {why}", err=True)
+        desk.warn(f"Warning: {setting} could not be run: {why}")
     if data.missing:
         some = ", ".join(data.missing[:3]) + (", ..." if len(data.missing) > 3 else "")
-        typer.echo(
+        desk.say(
             f"No time, or not enough, for {len(data.missing)} settings ({some}): run the same command again "
             "to go on."
         )

@@ -1,0 +1,100 @@
+"""An operator's day in the desktop program by clicks and keys, step by step, at three sizes of screen.
+
+    python benchmarks/gui_day.py
+    python benchmarks/gui_day.py --size 1350x690 --folder /tmp/day
+
+Starts in an empty folder without a bench, goes on to a simulated one, calibrates, photographs, reconstructs,
+looks back, unplugs the camera (``tests/gui/day.py`` has the steps). Prints for every step its time, the
+processor time of the window's thread, and the longest stretch of that between two looks at its events. Exit
+status 1 where a step fails. Needs no screen; with one: QT_QPA_PLATFORM=xcb xvfb-run python ...
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+
+os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+sys.path.append(str(Path(__file__).parents[1]))
+
+from PySide6.QtCore import QSize, QTimer
+
+from gui.app import application
+from gui.theme import apply_theme
+from tests.gui.day import STEPS, Operator
+from tests.gui.looks import SIZES
+
+LOOK_MS = 5
+
+
+class Stalls:
+    """The longest stretch of the thread's processor time between two calls of a timer, seconds."""
+
+    def __init__(self) -> None:
+        self.longest_s = 0.0
+        self._last_s = time.thread_time()
+        self._timer = QTimer()
+        self._timer.timeout.connect(self._look)
+        self._timer.start(LOOK_MS)
+
+    def _look(self) -> None:
+        now_s = time.thread_time()
+        self.longest_s = max(self.longest_s, now_s - self._last_s)
+        self._last_s = now_s
+
+    def taken(self) -> float:
+        """Return the longest since the last call."""
+        longest_s, self.longest_s = self.longest_s, 0.0
+        return longest_s
+
+
+def main() -> int:
+    """Go through the day at each size."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--size", action="append", help="of the window, e.g. 1350x690; repeatable")
+    parser.add_argument("--folder", type=Path, help="where the day is spent; default: a temporary one")
+    given = parser.parse_args()
+    sizes = {text: QSize(*map(int, text.split("x"))) for text in given.size or ()}
+    apply_theme(application(), "dark")
+    failed = 0
+    for name, size in (sizes or SIZES).items():
+        folder = (given.folder or Path(tempfile.mkdtemp())) / name
+        folder.mkdir(parents=True, exist_ok=True)
+        failed += _day(name, size, folder)
+    return 1 if failed else 0
+
+
+def _day(name: str, size: QSize, folder: Path) -> int:
+    """Spend a day; returns how many steps failed."""
+    print(f"{name}: window {size.width()} x {size.height()}")
+    stalls, began_s = Stalls(), time.monotonic()
+    operator = Operator(folder, size)
+    failed = 0
+    for number, step in enumerate(STEPS, 1):
+        start_s, cpu_s = time.monotonic(), time.thread_time()
+        try:
+            step.do(operator)
+            came = "     "
+        except Exception:  # noqa: BLE001 - the day goes on
+            traceback.print_exc()
+            failed, came = failed + 1, "FAILS"
+        print(
+            f"{number:3} {came} {time.monotonic() - start_s:7.2f} s {time.thread_time() - cpu_s:6.2f} s CPU "
+            f"longest {1e3 * stalls.taken():4.0f} ms  {step.words}",
+            flush=True,
+        )
+    print(f"{len(STEPS)} steps, {failed} failed, {time.monotonic() - began_s:.0f} s in all\n")
+    return failed
+
+
+if __name__ == "__main__":
+    status = main()
+    sys.stdout.flush()
+    os._exit(status)  # windows of failed steps are not asked

@@ -1,0 +1,227 @@
+"""A film of the simulated animal beside the truth: cells' courses, regions found, the blood's speed."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.reconstruction.activity import Activity
+from recon.optics.animal import Animal
+from recon.streams.activity import PERCENTILE, baseline, change, fading, floor_of
+
+Floats = npt.NDArray[np.float64]
+
+CLEAR_DIAMETERS = 3.0
+"""A cell stands clear that has nothing else that glows within so many of its diameters across."""
+NEAR_PX = 2.0
+"""A region is a cell's whose place lies so near."""
+FOLLOWED = 0.9
+"""Correlation of dF/F with the truth from which a cell is followed."""
+ROI_PX = 0.8
+"""Standard deviation of the weights with which a cell's pixels count."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The animal as a film of it should show it.
+
+    Attributes
+    ----------
+    cells_px, tissue_px, vessel_px : ndarray, (n, 2)
+        Rows and columns on the reconstruction's pixels.
+    change : ndarray, (n_cells, n_frames)
+        dF/F.
+    clear : ndarray of bool, (n_cells,)
+        Which cells stand clear.
+    speed_um_s : ndarray, (n_frames,)
+        Of the blood.
+    vessel_step_um : float
+        Between places of the vessel.
+    """
+
+    cells_px: Floats
+    tissue_px: Floats
+    vessel_px: Floats
+    change: Floats
+    clear: npt.NDArray[np.bool_]
+    speed_um_s: Floats
+    vessel_step_um: float
+
+
+@dataclass(frozen=True)
+class Judged:
+    """How well a film tells what was there.
+
+    Attributes
+    ----------
+    traces : ndarray, (n_cells, n_frames)
+        dF/F at each cell's true place.
+    correlation : ndarray, (n_cells,)
+        With the truth; NaN for cells that do not flash.
+    followed_clear : float
+        Share of the clear cells that flash whose correlation is at least ``FOLLOWED``.
+    clear_active, active : int
+        How many flash, of the clear ones and of all.
+    found, on_tissue : int
+        Regions at a cell that flashes; regions at none.
+    speed_um_s : ndarray, (n_frames - 1,)
+        Of the blood, from the kymograph.
+    median_um_s, true_median_um_s : float
+    kymograph : ndarray, (n_frames, n_places)
+    """
+
+    traces: Floats
+    correlation: Floats
+    followed_clear: float
+    clear_active: int
+    active: int
+    found: int
+    on_tissue: int
+    speed_um_s: Floats
+    median_um_s: float
+    true_median_um_s: float
+    kymograph: Floats
+
+    def figures(self) -> dict[str, Any]:
+        """Return the numbers, JSON-compatible."""
+        known = self.correlation[np.isfinite(self.correlation)]
+        return {
+            "active_cells": self.active,
+            "clear_active_cells": self.clear_active,
+            "followed_share_of_clear": round(self.followed_clear, 3),
+            "median_correlation": round(float(np.median(known)), 3) if known.size else None,
+            "regions_at_active_cells": self.found,
+            "regions_elsewhere": self.on_tissue,
+            "blood_um_s": round(self.median_um_s, 1),
+            "true_blood_um_s": round(self.true_median_um_s, 1),
+        }
+
+
+def truth_of(
+    animal: Animal, times_s: Floats, centre: tuple[int, int], pixel_um: float, distance_um: float
+) -> Truth:
+    """Return what a film shall show.
+
+    Parameters
+    ----------
+    times_s : ndarray, (n_frames,)
+        Of the middle of each frame, since the animal was first seen.
+    centre : (int, int)
+        Pixel on the axis.
+    pixel_um, distance_um : float
+        Pixel pitch on the sensor, as reconstructed, and the diffuser's distance from it.
+    """
+
+    def seen(places: Floats) -> Floats:
+        sensor = -places[:, :2] * (distance_um / places[:, 2:]) / pixel_um
+        return np.column_stack([centre[0] + sensor[:, 1], centre[1] + sensor[:, 0]])
+
+    cells = animal.cells_um[:, :2]
+    apart = np.hypot(*(cells[:, None] - cells[None]).transpose(2, 0, 1))
+    np.fill_diagonal(apart, np.inf)
+    others = np.concatenate([animal.tissue_um[:, :2], animal.vessel_um[:, :2]])
+    beside = np.hypot(*(cells[:, None] - others[None]).transpose(2, 0, 1))
+    nearest = np.minimum(apart.min(axis=1), beside.min(axis=1))
+    step_s = 1e-3
+    flowed = animal.flowed_um(times_s + step_s) - animal.flowed_um(times_s - step_s)
+    return Truth(
+        cells_px=seen(animal.cells_um),
+        tissue_px=seen(animal.tissue_um),
+        vessel_px=seen(animal.vessel_um),
+        change=animal.change(times_s),
+        clear=nearest > CLEAR_DIAMETERS * animal.diameter_um,
+        speed_um_s=flowed / (2 * step_s),
+        vessel_step_um=animal.vessel_length_um / (len(animal.vessel_um) - 1),
+    )
+
+
+def judge(activity: Activity, truth: Truth, period_s: float, window: int) -> Judged:
+    """Judge a film and what was found in it.
+
+    Parameters
+    ----------
+    period_s : float
+        From frame to frame.
+    window : int
+        Frames of the sliding baseline.
+    """
+    frames = activity.frames
+    fade = fading(frames)
+    floor = floor_of(frames)
+    traces = np.zeros(truth.change.shape)
+    for trace, place in zip(traces, truth.cells_px, strict=True):
+        light = _around(frames, place)[:, None, None]
+        trace[:] = change(light, baseline(light, window, PERCENTILE, fade), floor)[:, 0, 0]
+    active = truth.change.max(axis=1) > 0.1
+    correlation = np.full(len(active), np.nan)
+    for cell in np.flatnonzero(active):
+        if traces[cell].std() > 0:
+            correlation[cell] = np.corrcoef(traces[cell], truth.change[cell])[0, 1]
+        else:
+            correlation[cell] = 0.0
+    chosen = active & truth.clear
+    followed = float(np.mean(correlation[chosen] >= FOLLOWED)) if chosen.any() else float("nan")
+    at_cell = [
+        bool(np.min(np.hypot(*(truth.cells_px[active] - region.centre).T)) <= NEAR_PX)
+        for region in activity.regions
+    ]
+    kymograph = _along(frames, truth.vessel_px)
+    speed = _speed(kymograph, truth.vessel_step_um, period_s)
+    return Judged(
+        traces=traces,
+        correlation=correlation,
+        followed_clear=followed,
+        clear_active=int(chosen.sum()),
+        active=int(active.sum()),
+        found=sum(at_cell),
+        on_tissue=len(at_cell) - sum(at_cell),
+        speed_um_s=speed,
+        median_um_s=float(np.median(speed)),
+        true_median_um_s=float(np.median(truth.speed_um_s)),
+        kymograph=kymograph,
+    )
+
+
+def _around(frames: npt.NDArray[np.float32], place: Floats) -> npt.NDArray[np.float32]:
+    """Return the light about a place in each frame, weighted by a Gaussian."""
+    row, column = np.round(place).astype(int)
+    box = np.s_[:, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
+    y, x = np.mgrid[box[1:]]
+    weight = np.exp(-((y - place[0]) ** 2 + (x - place[1]) ** 2) / (2 * ROI_PX**2))
+    light: npt.NDArray[np.float32] = np.tensordot(frames[box], (weight / weight.sum()).astype(np.float32), 2)
+    return light
+
+
+def _along(frames: npt.NDArray[np.float32], places: Floats) -> Floats:
+    """Return the light along a line in each frame, less what does not change there."""
+    from scipy import ndimage
+
+    light = np.stack([ndimage.map_coordinates(frame, places.T, order=1) for frame in frames])
+    return np.asarray(light - light.mean(axis=0), np.float64)
+
+
+def _speed(kymograph: Floats, step_um: float, period_s: float) -> Floats:
+    """Return the speed between successive frames, (n_frames - 1,): the shift that lays one on the next.
+
+    It is looked for among shifts forwards by up to a third of the line, by the correlation of what both
+    frames have, and refined to a fraction of a place by the parabola through the largest.
+    """
+    n = kymograph.shape[1]
+    lags = np.arange(0, max(n // 12, 3))
+    speeds = np.zeros(len(kymograph) - 1)
+    for t, (before, after) in enumerate(itertools.pairwise(kymograph)):
+        score = np.array(
+            [np.mean(before[: n - k] * after[k:]) / (np.std(before[: n - k]) * np.std(after[k:]) + 1e-30)
+             for k in lags]
+        )  # fmt: skip
+        best = int(np.argmax(score))
+        shift = float(best)
+        if 0 < best < len(lags) - 1:
+            bend = score[best - 1] - 2 * score[best] + score[best + 1]
+            shift += 0.5 * (score[best - 1] - score[best + 1]) / bend if bend < 0 else 0.0
+        speeds[t] = shift * step_um / period_s
+    return speeds
