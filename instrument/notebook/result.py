@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import importlib
 import sys
 import warnings
 from base64 import b64encode
@@ -221,11 +222,10 @@ def show_figure(figure: Figure) -> None:
     if ipython is not None and ipython.get_ipython() is not None:
         from io import BytesIO
 
-        from IPython.display import Image, display
-
+        shown: Any = importlib.import_module("IPython.display")
         png = BytesIO()
         figure.savefig(png, format="png")
-        display(Image(png.getvalue()))
+        shown.display(shown.Image(png.getvalue()))
         return
     import matplotlib
     from matplotlib.backends.registry import BackendFilter, backend_registry
