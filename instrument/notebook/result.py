@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import html
-import importlib
 import sys
 import warnings
 from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -222,7 +222,7 @@ def show_figure(figure: Figure) -> None:
     if ipython is not None and ipython.get_ipython() is not None:
         from io import BytesIO
 
-        shown: Any = importlib.import_module("IPython.display")
+        shown: Any = import_module("IPython.display")  # installed or not, typed or not
         png = BytesIO()
         figure.savefig(png, format="png")
         shown.display(shown.Image(png.getvalue()))
