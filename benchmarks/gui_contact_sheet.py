@@ -102,7 +102,9 @@ def _pictures(
         for theme in themes:
             window.set_theme(theme)
             QTest.qWait(RESTYLED_MS)
-            yield name, theme, window.grab().toImage(), faults(window)
+            picture = window.grab().toImage()
+            picture.setDevicePixelRatio(1.0)  # in the screen's own pixels
+            yield name, theme, picture, faults(window)
     shots._close(window)
     shutil.rmtree(own, ignore_errors=True)
 

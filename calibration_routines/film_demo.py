@@ -109,8 +109,8 @@ class FilmResult:
             f"Cells: dF/F follows the truth (correlation {FOLLOWED:g} and up) in {judged.followed_clear:.0%} "
             f"of the {judged.clear_active} that flash and stand clear; {judged.active} flash in all.",
             f"Regions: {judged.found} at cells that flash, {judged.on_tissue} elsewhere.",
-            f"Blood: {judged.mean_speed_um_s:.0f} um/s along the vessel; true: "
-            f"{judged.true_mean_speed_um_s:.0f} um/s.",
+            f"Blood: {judged.median_um_s:.0f} um/s along the vessel; true: "
+            f"{judged.true_median_um_s:.0f} um/s.",
         ]
 
 

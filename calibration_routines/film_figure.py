@@ -9,6 +9,7 @@ import numpy as np
 from calibration_routines.film_judge import FOLLOWED, Judged, Truth
 from instrument.files.atomic import whole_file
 from instrument.reconstruction.activity import Activity
+from recon.streams.activity import PERCENTILE
 
 SHOWN = 9
 """Courses drawn; more would not be told apart."""
@@ -30,17 +31,15 @@ def write_film_figure(path: Path, activity: Activity, truth: Truth, judged: Judg
     low, high = everything.min(axis=0) - MARGIN_PX, everything.max(axis=0) + MARGIN_PX
     grid = figure.add_gridspec(3, 2, height_ratios=(2.2, 2.4, 1.6))
     active = np.isfinite(judged.correlation)
+    rise = activity.frames.max(axis=0) - np.percentile(activity.frames, PERCENTILE, axis=0)
     pictures = (
         (activity.frames.mean(axis=0), "gray", "mean of the film; o cells that flash, + regions found"),
-        (
-            activity.dff.max(axis=0),
-            "inferno",
-            "largest dF/F; o cells that flash, bright: clear ones",
-        ),
+        (rise, "inferno", "largest rise of light; o cells that flash, bright: clear ones"),
     )
     for place, (picture, colours, title) in enumerate(pictures):
         axes = figure.add_subplot(grid[0, place])
-        brightest = float(np.percentile(picture, 99.7)) if place == 0 else 1.5
+        at = tuple(np.clip(np.round(truth.cells_px[active]).astype(int), 0, np.array(picture.shape) - 1).T)
+        brightest = float(np.percentile(picture[at], 80)) if place else float(np.percentile(picture, 99.7))
         axes.imshow(picture, cmap=colours, vmin=0, vmax=brightest)
         for chosen, colour in ((active & ~truth.clear, "tab:blue"), (active & truth.clear, "cyan")):
             rows, columns = truth.cells_px[chosen].T
@@ -92,7 +91,7 @@ def write_film_figure(path: Path, activity: Activity, truth: Truth, judged: Judg
     speed.set_ylabel("um/s")
     speed.legend(fontsize=8, loc="upper right")
     speed.set_title(
-        f"speed of the blood: mean {judged.mean_speed_um_s:.0f}, true {judged.true_mean_speed_um_s:.0f} um/s",
+        f"speed of the blood: median {judged.median_um_s:.0f}, true {judged.true_median_um_s:.0f} um/s",
         fontsize=10,
     )
     with whole_file(path) as temporary:

@@ -70,7 +70,7 @@ class Judged:
         Regions at a cell that flashes; regions at none.
     speed_um_s : ndarray, (n_frames - 1,)
         Of the blood, from the kymograph.
-    mean_speed_um_s, true_mean_speed_um_s : float
+    median_um_s, true_median_um_s : float
     kymograph : ndarray, (n_frames, n_places)
     """
 
@@ -82,8 +82,8 @@ class Judged:
     found: int
     on_tissue: int
     speed_um_s: Floats
-    mean_speed_um_s: float
-    true_mean_speed_um_s: float
+    median_um_s: float
+    true_median_um_s: float
     kymograph: Floats
 
     def figures(self) -> dict[str, Any]:
@@ -96,8 +96,8 @@ class Judged:
             "median_correlation": round(float(np.median(known)), 3) if known.size else None,
             "regions_at_active_cells": self.found,
             "regions_elsewhere": self.on_tissue,
-            "blood_um_s": round(self.mean_speed_um_s, 1),
-            "true_blood_um_s": round(self.true_mean_speed_um_s, 1),
+            "blood_um_s": round(self.median_um_s, 1),
+            "true_blood_um_s": round(self.true_median_um_s, 1),
         }
 
 
@@ -180,8 +180,8 @@ def judge(activity: Activity, truth: Truth, period_s: float, window: int) -> Jud
         found=sum(at_cell),
         on_tissue=len(at_cell) - sum(at_cell),
         speed_um_s=speed,
-        mean_speed_um_s=float(np.mean(speed)),
-        true_mean_speed_um_s=float(truth.speed_um_s.mean()),
+        median_um_s=float(np.median(speed)),
+        true_median_um_s=float(np.median(truth.speed_um_s)),
         kymograph=kymograph,
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import signal
 import sys
@@ -10,7 +11,7 @@ import traceback
 from pathlib import Path
 from types import FrameType, TracebackType
 
-from PySide6.QtCore import QCoreApplication, QSettings, QSize, QTimer
+from PySide6.QtCore import QCoreApplication, QSettings, QSize, QTimer, qInstallMessageHandler
 from PySide6.QtWidgets import QApplication
 
 from gui.main_window import MainWindow, theme_of
@@ -23,6 +24,7 @@ from instrument.files.errors import BenchError, in_words
 
 _FRAME = QSize(16, 40)
 """What a window manager puts round a window, at most: the first window fits the screen with it."""
+_log = logging.getLogger(__name__)
 _SIGNAL_CHECK_MS = 200
 """Python sees signals only while it runs: an idle event loop has to be woken for them."""
 
@@ -53,6 +55,7 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
     """Show the window for a bench until it is closed; returns the exit status, and which bench is next."""
     session = BenchSession(config)
     sys.excepthook = _ToLog(session)
+    qInstallMessageHandler(lambda _kind, _where, text: _log.debug("Qt: %s", text))
     waker = QTimer()
     waker.timeout.connect(lambda: None)
     waker.start(_SIGNAL_CHECK_MS)
@@ -76,6 +79,7 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
         session.join()
     finally:
         gc.unfreeze()  # of this window
+        qInstallMessageHandler(None)
         sys.excepthook = sys.__excepthook__
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
+from typing import cast
 
 from PySide6.QtCore import QEvent, QObject, QSettings, QSize, Qt
 from PySide6.QtGui import QAction, QCloseEvent, QGuiApplication, QKeyEvent, QKeySequence, QShortcut, QWindow
@@ -35,7 +36,7 @@ from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.plots import restyle_all
 from gui.widgets.step_strip import StepStrip
-from instrument.bench.config import BenchConfig
+from instrument.bench.config import BenchConfig, Kind
 
 _AREAS = {
     "top right": Qt.DockWidgetArea.RightDockWidgetArea,
@@ -229,7 +230,10 @@ class MainWindow(QMainWindow):
         self.job_progress.hide()
         self.statusBar().addWidget(self.job_progress)
         self.statusBar().addWidget(self.job_label, 1)
+        self._problem = ""
+        """The warning or error that was told last."""
         self.session.logged.connect(self._show_problem)
+        self.session.device_changed.connect(self._forget_problem)
 
     def _make_menus(self) -> None:
         view = self.menus.addMenu("&View")
@@ -354,7 +358,15 @@ class MainWindow(QMainWindow):
 
     def _show_problem(self, level: str, text: str) -> None:
         if level in ("warning", "error"):
+            self._problem = text
             self.job_label.setText(text.splitlines()[0][:200])
+
+    def _forget_problem(self, kind: str) -> None:
+        """Take a device's failure away that is over; the log keeps it."""
+        device = self.session.bench.devices.get(cast(Kind, kind))
+        mended = device is not None and self.session.is_open(kind) and device.name in self._problem
+        if mended and self.job_label.text() == self._problem.splitlines()[0][:200]:
+            self.job_label.setText("Ready")
 
     def _ask_operator(self, request: OperatorRequest) -> None:
         answers = ("Done", "Stop")

@@ -409,5 +409,5 @@ class ProcedurePanel(Panel):
         if self._said_at_end:  # it stays while nothing else is asked for
             text = "\n".join([self._said_at_end, *([text] if wrong else [])])
             wrong = wrong or bool(self.verdict.property("refused"))
-        self.verdict.setPlainText(text)
+        self.verdict.setPlainText(self.view.in_its_words(text))
         mark(self.verdict, "refused", wrong)

@@ -16,11 +16,14 @@ from PySide6.QtCore import QObject, Qt, QTimer, Signal
 from drivers.camera import Camera
 from drivers.errors import DeviceError, LimitError, StoppedError
 from drivers.frame import Frame, FrameMetadata
+from gui.background import NewestOnly
 from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, joined, words_for
 from gui.session_news import DeviceState, LogBridge, OperatorRequest, is_gone, name_of
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig, Kind
+from instrument.bench.kept import KeptWithBench
 from instrument.bench.photograph import LightState, switch_light
+from instrument.files.errors import BenchError
 from instrument.live.light_log import LightLog, light_words
 from instrument.live.live_camera import LiveCamera
 
@@ -58,6 +61,8 @@ class BenchSession(QObject):
         A panel's name and a file or folder that another panel gives it to work with.
     bench_wanted : object
         Another bench is to be opened in this one's place: its BenchConfig.
+    kept_changed
+        Something else is kept with the bench.
     opened, closed
         Every device was tried; everything was closed.
     """
@@ -70,6 +75,7 @@ class BenchSession(QObject):
     asked = Signal(object)
     handed_on = Signal(str, object)
     bench_wanted = Signal(object)
+    kept_changed = Signal()
     opened = Signal()
     closed = Signal()
     _from_thread = Signal(object)
@@ -82,6 +88,9 @@ class BenchSession(QObject):
         self.lights = LightLog(partial(light_words, self.bench))
         self.jobs = JobRunner(self)
         self.jobs.job_ended.connect(self._job_ended)
+        self.kept = KeptWithBench(config.data_folder)
+        """Presets, places, what was used last; read when the bench is opened."""
+        self._keeper = NewestOnly(self.jobs, "Keeping it with the bench", partial(self.log, "error"))
         self._states: dict[str, DeviceState] = {kind: DeviceState("closed") for kind in self.bench.devices}
         self._threads: list[threading.Thread] = []
         self._stopping = self._stop_again = False
@@ -128,6 +137,7 @@ class BenchSession(QObject):
             self._set_state(kind, DeviceState("opening"))
 
         def work(context: JobContext) -> None:
+            self._read_kept()
             for kind in self.kinds:
                 context.check()
                 self._open_one(kind)
@@ -136,6 +146,21 @@ class BenchSession(QObject):
         job.quiet = not self.kinds
         job.ended.connect(self._all_tried)
         return job
+
+    def _read_kept(self) -> None:
+        """Read what is kept with the bench, in a job's thread."""
+        try:
+            self.kept.read()
+        except BenchError as error:
+            self._in_window(self.log, "error", str(error))
+        else:
+            self._in_window(self.kept_changed.emit)
+
+    def keep(self, kind: str, name: str, value: Any) -> None:
+        """Keep a value with the bench, under a name; None: no longer."""
+        self.kept.put(kind, name, value)
+        self.kept_changed.emit()
+        self._keeper.ask(self.kept.write, lambda _: None)
 
     def reconnect(self, kind: Kind) -> None:
         """Close and open a device again; while a run goes on, say that it has to wait."""

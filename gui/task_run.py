@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -39,12 +40,15 @@ class Told:
 
 
 class WindowDesk(Desk):
-    """Keeps what a task tells, in the job's thread, until the window fetches it; lets the task wait."""
+    """Keeps what a task tells, in the job's thread, until the window fetches it; lets the task wait.
+
+    Nothing is locked: a task that tells often would keep the window waiting for its turn. What is handed over
+    is handed over in one step.
+    """
 
     def __init__(self, context: JobContext) -> None:
         self._context = context
-        self._lock = threading.Lock()
-        self._told: list[Told] = []
+        self._told: deque[Told] = deque()
         self._situation = Situation()
         self._go_on = threading.Event()
         self._go_on.set()
@@ -93,12 +97,10 @@ class WindowDesk(Desk):
             self._keeps = before
 
     def _tell(self, told: Told) -> None:
-        with self._lock:
-            self._told.append(told)
+        self._told.append(told)
 
     def _show(self, situation: Situation) -> None:
-        with self._lock:
-            self._situation = situation
+        self._situation = situation
 
     def _wait(self) -> None:
         self._go_on.wait()
@@ -109,14 +111,11 @@ class WindowDesk(Desk):
     @property
     def situation(self) -> Situation:
         """How it goes on."""
-        with self._lock:
-            return replace(self._situation, paused=not self._go_on.is_set())
+        return replace(self._situation, paused=not self._go_on.is_set())
 
     def fetch(self) -> list[Told]:
         """Return what was told since it was fetched last."""
-        with self._lock:
-            told, self._told = self._told, []
-        return told
+        return [self._told.popleft() for _ in range(len(self._told))]
 
     def pause(self, on: bool) -> None:
         """Let it wait where it next tells how far it is, or go on."""

@@ -7,10 +7,16 @@ change is about that change. Everywhere else they look for new ones.
 from __future__ import annotations
 
 import os
+import threading
+import time
+from collections.abc import Iterator
 
+# A window that matplotlib opens beside the program's own would wait for somebody to close it.
+os.environ["MPLBACKEND"] = "agg"
 # Several test processes share the cores. It is read when NumPy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 settings.register_profile(
@@ -28,3 +34,14 @@ except ImportError:
     pass  # tests/gui says so, test by test
 else:
     pytest_plugins = ["pytestqt.plugin"]
+
+
+@pytest.fixture(autouse=True)
+def _no_live_view_is_left() -> Iterator[None]:
+    """A live view that a test left on would take the cores, and memory that is counted, from all after it."""
+    before = set(threading.enumerate())
+    yield
+    end = time.monotonic() + 20
+    while left := [t for t in threading.enumerate() if t not in before and t.name == "live reconstruction"]:
+        assert time.monotonic() < end, f"left running: {left}"
+        left[0].join(0.1)

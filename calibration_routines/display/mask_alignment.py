@@ -258,7 +258,7 @@ class AlignmentProcedure(Procedure):
             home_if_needed(bench, listener)
         listener.step("aligning the mask")
         report = MaskAlignment(io, display, settings, listener).run()
-        alignment = _alignment(report, bench, display.mask.shape)
+        alignment = alignment_of(report, bench, display.mask.shape)
         bench.stop()
         figure = out.with_suffix(".png")
         save_alignment(out, alignment, _facts(report, bench))
@@ -308,7 +308,8 @@ def alignment_lines(report: AlignmentReport, *, simulated: bool) -> list[str]:
     return lines
 
 
-def _alignment(report: AlignmentReport, bench: Bench, mask_shape: tuple[int, int]) -> Alignment:
+def alignment_of(report: AlignmentReport, bench: Bench, mask_shape: tuple[int, int]) -> Alignment:
+    """Return what is kept of an alignment."""
     return Alignment(
         report.pose,
         dict(zip(NAMES, map(float, report.error), strict=True)),

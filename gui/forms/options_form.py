@@ -167,6 +167,13 @@ class OptionsForm(QWidget):
         }
         self.set_values({name: value for name, value in values.items() if name in empty})
 
+    def in_its_words(self, text: str) -> str:
+        """Return a message with the fields' labels where the terminal's has flags."""
+        for field in sorted(self.fields.values(), key=lambda f: -len(f.option.flag)):
+            if field.option.flag.startswith("--"):
+                text = text.replace(field.option.flag, f"“{field.bare_label}”")
+        return text
+
     # What applies --------------------------------------------------------------------------------
     def applies(self, name: str) -> bool:
         """Whether a field is shown for what is asked for, and goes with the others."""

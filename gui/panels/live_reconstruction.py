@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ from gui.widgets.building import Hint, button, choice, every, fill, in_row, labe
 from gui.widgets.dialogues import elided, path_field
 from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
+from instrument.bench.kept import KeptWithBench
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.files.errors import BenchError, duration
 from instrument.live.light_log import NOTHING_LIT
@@ -136,7 +138,7 @@ class LiveReconstructionPanel(Panel):
         session.run_finished.connect(self._run_finished)
         self._timer = every(self, _LOOK_MS, self.look)
         folder = session.runs_folder
-        self._load(_NO_CALIBRATION, lambda: newest_calibration(folder))
+        self._load(_NO_CALIBRATION, lambda: _last_or_newest(session.kept, folder))
 
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:
@@ -184,6 +186,10 @@ class LiveReconstructionPanel(Panel):
             return None if found is None else (found, load_calibration(found))
 
         self._reader.ask(read, self._got_calibration)
+
+    def refused(self, field: QWidget | None, why: str) -> None:
+        """Show why something was refused, in the words of the form."""
+        super().refused(field, self.options.in_its_words(why))
 
     def _refuse(self, why: str) -> None:
         self.refused(self.file, why)
@@ -247,6 +253,9 @@ class LiveReconstructionPanel(Panel):
         self.file.setText(str(self.loaded.path))
         self._show_depths(self.loaded)
         self.follower.use(self.loaded.reconstructor)
+        path = str(self.loaded.path)
+        if self.session.kept.of("live").get("calibration") != path:
+            self.session.keep("live", "calibration", path)  # the last one that worked
         self.status.setText("Waiting for a frame …")
 
     def _show_depths(self, loaded: _Loaded) -> None:
@@ -415,6 +424,14 @@ class LiveReconstructionPanel(Panel):
     def _refining_ended(self) -> None:
         self._refining = None
         self.refine_button.setText("Back to the preview" if self._holds else "Refine")
+
+
+def _last_or_newest(kept: KeptWithBench, folder: Path) -> Path | None:
+    """Return the calibration that worked last with this bench; the newest where there is none any more."""
+    with contextlib.suppress(BenchError):  # whoever opens the bench says so
+        kept.read()
+    last = kept.of("live").get("calibration")
+    return Path(last) if last and is_calibration(Path(last)) else newest_calibration(folder)
 
 
 def _calibration_of(run: Path) -> Path | None:

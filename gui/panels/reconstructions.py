@@ -12,6 +12,7 @@ import numpy.typing as npt
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QWidget
 
+from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
 from gui.forms.options_form import SuggestedName
 from gui.forms.reconstruct import CALIBRATION, PSF, ReconstructForm, SoFar, Written, reconstruct_job
@@ -121,6 +122,10 @@ class ReconstructionsPanel(Panel):
         right.setStretchFactor(0, 3)
         fill(self.body, split(self.tabs, right, sizes=[330, 840], stretch=1))
 
+    def refused(self, field: QWidget | None, why: str) -> None:
+        """Show why something was refused, in the words of the form."""
+        super().refused(field, self.form.options.in_its_words(why))
+
     # Results -------------------------------------------------------------------------------------
     def refresh(self) -> None:
         """List the results in the data folder."""
@@ -163,7 +168,8 @@ class ReconstructionsPanel(Panel):
         self.result = result
         self.heading.setText(f"<b>{result.path.name}</b>")
         self.heading.setToolTip(str(result.path))
-        self.facts.show_facts(result.facts(), result.warnings, simulated=result.simulated)
+        warnings = [self.form.options.in_its_words(warning) for warning in result.warnings]
+        self.facts.show_facts(result.facts(), warnings, simulated=result.simulated)
         self.convergence.show_histories(result.histories, result.noise_norm)
         self.export_button.setEnabled(True)
         if result.volume is not None:
@@ -355,7 +361,8 @@ class ReconstructionsPanel(Panel):
         self.follow(job)
         self.form.set_running(True)
         self.form.show_progress(0.0, words)
-        job.failed.connect(lambda why: self.form.show_progress(0.0, why.splitlines()[0]))
+        said = self.form.options.in_its_words
+        job.failed.connect(lambda why: self.form.show_progress(0.0, said(why).splitlines()[0]))
         job.ended.connect(lambda: self.form.set_running(False))
 
     def _explained(self, choice: Choice) -> None:
@@ -433,6 +440,8 @@ class ReconstructionsPanel(Panel):
         """Begin with the newest calibration where none was named."""
         if newest is not None and not self.form.text(self.form.source):
             self.form.options.set_values({self.form.source: newest})
+            name = newest.parent.name if newest.name == SWEEP.result else newest.name
+            self.form.note.setText(f"Calibration: {name}, the newest of this bench, for none was chosen.")
 
     def _look_at_depths(self) -> None:
         path = Path(self.form.text("calibration")).expanduser()

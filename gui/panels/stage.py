@@ -16,8 +16,9 @@ from gui.panel import DevicePanel, on_bench
 from gui.session import BenchSession
 from gui.widgets.building import button, fill, in_column, in_row, label, mark, share_bar
 from gui.widgets.dialogues import Question
-from gui.widgets.entry import NumberEdit
+from gui.widgets.entry import NumberEdit, grouped
 from gui.widgets.image_view import step_factor
+from gui.widgets.kept_bar import KeptBar
 from recon.base.declare import Imports
 
 _STEPS = {"um": 100.0, "mrad": 1.0}
@@ -95,11 +96,15 @@ class StagePanel(DevicePanel):
         self.setFocusProxy(self.pad)
         tip = "Find the reference of every axis: the stage moves; asks first, and reconnects after a fault"
         self.home_button = button("Home …", tip, self.ask_home)
+        self._here: dict[str, float] | None = None
+        """Where the stage said that it is."""
+        self.places = KeptBar(session, "places", "Places", lambda: self._here, self._go_to)
         self._grid = QGridLayout()
         self._grid.setHorizontalSpacing(6)
         self._grid.setColumnStretch(2, 1)
         self._step_row = in_row()
-        fill(self.body, self.state, self._grid, self._step_row, in_row((self.pad, 1), self.home_button), None)
+        pad = in_row((self.pad, 1), self.home_button)
+        fill(self.body, self.state, self._grid, self._step_row, self.places, pad, None)
         self.watch_device(self.state)
 
     # Panel ---------------------------------------------------------------------------------------
@@ -113,7 +118,7 @@ class StagePanel(DevicePanel):
     def show_device(self, is_open: bool) -> None:
         """Let the stage be moved, or not; its axes have rows from when it is first open."""
         edited = [widget for row in self.rows.values() for widget in (row.target, *row.buttons)]
-        for widget in (self.pad, *edited):
+        for widget in (self.pad, self.places, *edited):
             widget.setEnabled(is_open)
         self.home_button.setEnabled(is_open or self.session.state(self.kind).condition == "failed")
         if is_open and not self.rows and self.session.bench.stage is not None:
@@ -145,7 +150,7 @@ class StagePanel(DevicePanel):
             )
             minus.setFixedWidth(34)
             plus.setFixedWidth(34)
-            limit = label(f"{axis.lower_limit:g} … {axis.upper_limit:g}", "dim")
+            limit = label(f"{grouped(f'{axis.lower_limit:g}')} … {grouped(f'{axis.upper_limit:g}')}", "dim")
             limit.setToolTip(f"Soft limits, {unit}")
             self._grid.addWidget(label(letter, "value"), number, 0)
             self._grid.addLayout(in_column(gauge, limit, spacing=1), number, 2)
@@ -172,9 +177,10 @@ class StagePanel(DevicePanel):
 
     def _show(self, reading: tuple[dict[str, float], bool, bool]) -> None:
         position, is_homed, is_moving = reading
+        self._here = position
         for name, row in self.rows.items():
             here = position[name]
-            row.position.setText(f"{here:,.1f} {_words(row.axis.unit)}".replace(",", "\u2009"))
+            row.position.setText(f"{grouped(f'{here:.1f}')} {_words(row.axis.unit)}")
             travel = row.axis.upper_limit - row.axis.lower_limit
             row.gauge.setValue(round(_GAUGE * (here - row.axis.lower_limit) / travel) if travel else 0)
             if row.target.value is None or not row.target.hasFocus():
@@ -203,6 +209,9 @@ class StagePanel(DevicePanel):
         delta = steps * (field.value or 0.0)
         words = f"Jog {letter} by {delta:g} {_words(row.axis.unit)}"
         self._start(words, {row.axis.name: delta}, relative=True)
+
+    def _go_to(self, name: str, place: dict[str, float]) -> None:
+        self._start(f"Move to {name}", place, relative=False)
 
     def _jog_clicked(self, letter: str, sign: int, _checked: bool = False) -> None:
         self.jog(letter, sign)

@@ -163,7 +163,7 @@ class TasksPanel(Panel):
         form.refused.connect(self.refused)
         for widget in form.widgets.values():
             if isinstance(widget, QLineEdit):
-                widget.setPlaceholderText(in_form_words(widget.placeholderText(), form))
+                widget.setPlaceholderText(form.in_its_words(widget.placeholderText()))
         if TASKS[name].group == DISPLAY:
             form.set_values({"bench": self.session.config.path})
         names = None
@@ -236,7 +236,7 @@ class TasksPanel(Panel):
         self.use_button.setEnabled(False)
 
     def _told(self, told: Told) -> None:
-        text = in_form_words(told.text, self._pages[self.name].form)
+        text = self._pages[self.name].form.in_its_words(told.text)
         if told.kind == "table":
             made = table(told.headings, text, row_px=_ROW_PX)
             made.setRowCount(len(told.rows))
@@ -276,7 +276,7 @@ class TasksPanel(Panel):
             self._show(pictures[0])
 
     def _failed(self, why: str) -> None:
-        self._ended(in_form_words(why, self._pages[self.name].form))
+        self._ended(self._pages[self.name].form.in_its_words(why))
 
     def _ended(self, words: str) -> None:
         self.words.appendPlainText(words)
@@ -339,11 +339,3 @@ def _behaviour(o: Option, *, needed: bool) -> Behaviour:
         return Behaviour(browse="folder" if folder else "save")
     exists = o.kinds == (Path,)
     return Behaviour(browse="folder" if folder else "open", must_exist=exists, needed=needed)
-
-
-def in_form_words(text: str, form: OptionsForm) -> str:
-    """Return a text with the fields' labels where the terminal's has flags."""
-    for field in sorted(form.fields.values(), key=lambda f: -len(f.option.flag)):
-        if field.option.flag.startswith("--"):
-            text = text.replace(field.option.flag, f"“{field.bare_label}”")
-    return text

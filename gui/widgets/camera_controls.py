@@ -21,7 +21,8 @@ from gui.panel import Panel
 from gui.widgets.building import button, every, fill, in_row, label
 from gui.widgets.dialogues import TextWindow
 from gui.widgets.entry import Entry, NumberEdit
-from instrument.bench.camera_settings import CameraOptions, CameraState, read_camera
+from gui.widgets.kept_bar import KeptBar
+from instrument.bench.camera_settings import CameraOptions, CameraState, read_camera, restore_camera
 from instrument.bench.photograph import Lit
 from instrument.files.errors import FileError, duration, size
 from instrument.plan.abilities import SPARE_BYTES
@@ -76,7 +77,9 @@ class CameraForm(QWidget):
         self._temperature_name = label("Temperature")
         tip = "Everything that the camera reports of itself"
         self.all_button = button("All settings …", tip, self._show_all)
-        fill(self, self.form, in_row(self._temperature_name, (self.temperature, 1), self.all_button))
+        self.presets = KeptBar(self._session, "camera", "Presets", self._preset, self._use_preset)
+        last = in_row(self._temperature_name, (self.temperature, 1), self.all_button)
+        fill(self, self.form, self.presets, last)
         self._session.device_changed.connect(self._device_changed)
         every(self, _READ_BACK_MS, self.read_back)
         self._device_changed("camera")
@@ -112,6 +115,25 @@ class CameraForm(QWidget):
         else:
             self._session.log("warning", exposure.message)
             self._panel.refused(self.auto_button, exposure.message)
+
+    def _preset(self) -> dict[str, Any] | None:
+        """Return the settings as the camera read them back last."""
+        if self.state is None:
+            return None
+        now = {name: getattr(self.state, name) for name in _SET}
+        return now | {"roi": list(self.state.roi.as_tuple())}
+
+    def _use_preset(self, name: str, settings: dict[str, Any]) -> None:
+        """Bring the camera to a preset's settings; what it does not take is said."""
+
+        def work(camera: Camera) -> CameraState:
+            restore_camera(camera, settings)
+            return read_camera(camera)
+
+        start = partial(self._session.camera_job, f"Preset {name}", work, idle=True)
+        job = self._panel.begin(start, self.presets.names)
+        if job is not None:
+            job.succeeded.connect(lambda state: self._taken("exposure_ms", state))
 
     def set_region(self, region: Roi | None) -> Job | None:
         """Send a region (None: the whole sensor) to the camera."""

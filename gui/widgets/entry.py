@@ -138,6 +138,19 @@ _TIMES_MS = {"us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
 _LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZµ×%/° "
 
 
+THIN = "\u2009"
+"""Between groups of three digits."""
+
+
+def grouped(digits: str) -> str:
+    """Return a number's digits with thin spaces between thousands, from five digits before the point on."""
+    whole, point, rest = digits.partition(".")
+    bare = whole.lstrip("-")
+    if len(bare) < 5 or not bare.isdecimal():
+        return digits
+    return f"{int(whole):,}".replace(",", THIN) + point + rest
+
+
 def _factor(typed: str, unit: str) -> float | None:
     """Return what a number in a typed unit is multiplied with to be in another; None where that is none."""
     for scale in (_LENGTHS_UM, _TIMES_MS):
@@ -214,8 +227,8 @@ class NumberEdit(_Refusing):
         text = self.text().strip()
         if not text:
             return None, "" if self.placeholderText() else "A number is needed."
-        digits = text.rstrip(_LETTERS).strip()
-        typed = text[len(digits) :].strip() if digits else ""
+        digits = text.replace(THIN, "").rstrip(_LETTERS).strip()
+        typed = text.replace(THIN, "")[len(digits) :].strip() if digits else ""
         factor: float | None = 1.0 if typed in ("", self.unit) else _factor(typed, self.unit)
         try:
             number = float(digits.replace(",", "."))
@@ -311,7 +324,7 @@ class NumberEdit(_Refusing):
 
     def _text(self, number: float) -> str:
         digits = f"{number:.0f}" if self._integer else f"{number:.6g}"
-        return f"{digits} {self.unit}".strip()
+        return f"{grouped(digits)} {self.unit}".strip()
 
     def _show(self) -> None:
         text = "" if self._value is None else self._text(self._value)

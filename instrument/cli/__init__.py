@@ -84,6 +84,7 @@ COMMANDS: Mapping[str, Command] = {
     "activity": _task(RECONSTRUCTION, "activity"),
     "analyze": _task(ANALYSIS, "analyze"),
     "compare": _task(ANALYSIS, "compare"),
+    "optics": _task(ANALYSIS, "optics"),
     "chart": _task(ANALYSIS, "chart"),
     "stability": _task(ANALYSIS, "stability"),
     "refocus": _task(ANALYSIS, "refocus"),

@@ -63,10 +63,12 @@ class App(typer.Typer):
 
     def __init__(self, help_text: str = "", *, usual: str | None = None) -> None:
         class Group(typer.core.TyperGroup):
+            meant = usual
+
             def parse_args(self, context: Any, arguments: list[str]) -> list[str]:
                 named = arguments[:1] and (arguments[0] in self.commands or arguments[0] in _HELP)
-                if usual is not None and not named:
-                    arguments = [usual, *arguments]
+                if self.meant is not None and not named:
+                    arguments = [self.meant, *arguments]
                 return super().parse_args(context, arguments)
 
         super().__init__(

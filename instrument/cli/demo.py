@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from calibration_routines.demo import DemoResult, DemoSettings, run_demo
+from calibration_routines.display.demo_display import DisplayDemoSettings, run_display_demo
 from calibration_routines.film_demo import FilmSettings, run_film
 from instrument.cli.app import App, examples
 from instrument.cli.calibrate import TerminalListener
@@ -48,6 +49,20 @@ def film(settings: FilmSettings, out: OutFolder = Path("runs")) -> None:
     """
     with _Terminal(Console(highlight=False)) as listener:
         result = run_film(out, listener, settings)
+    listener.ended(result.seconds, result.files)
+    for line in result.lines():
+        typer.echo(line)
+
+
+@app.command("display", epilog=examples("diffuserbench demo display"))
+def display(settings: DisplayDemoSettings, out: OutFolder = Path("runs")) -> None:
+    """Align the mask of a SIMULATED holographic display, learn how it differs, show and photograph a picture.
+
+    The picture is computed twice, by the alignment alone and by what was learned of the display; both are
+    photographed and compared with what was wanted. Takes minutes.
+    """
+    with _Terminal(Console(highlight=False)) as listener:
+        result = run_display_demo(out, listener, settings)
     listener.ended(result.seconds, result.files)
     for line in result.lines():
         typer.echo(line)

@@ -8,6 +8,7 @@ import warnings
 from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -221,11 +222,10 @@ def show_figure(figure: Figure) -> None:
     if ipython is not None and ipython.get_ipython() is not None:
         from io import BytesIO
 
-        from IPython.display import Image, display
-
+        shown: Any = import_module("IPython.display")  # installed or not, typed or not
         png = BytesIO()
         figure.savefig(png, format="png")
-        display(Image(png.getvalue()))
+        shown.display(shown.Image(png.getvalue()))
         return
     import matplotlib
     from matplotlib.backends.registry import BackendFilter, backend_registry

@@ -97,6 +97,12 @@ TASKS: Mapping[str, TaskEntry] = {
         "two calibrations: what moved, is a new one due",
         "calibrations:compare",
     ),
+    "optics": TaskEntry(
+        CALIBRATIONS,
+        "Compare kinds of optics",
+        "objective, diffuser, lenslets side by side at equal light",
+        "optics:optics",
+    ),
     "refocus": TaskEntry(
         CALIBRATIONS,
         "Refocus a calibration",

@@ -122,10 +122,12 @@ def register_camera(
     speckle = gaussian_filter(speckle, [0.4 * s for s in samples])
     found = CameraMap((frame.shape[0], frame.shape[1]), pixels_across, np.zeros((10, 2)))
     image = gaussian_filter(np.asarray(frame, np.float32), 0.5)
+    # A small mask's speckles are large: the middle needs as many of them.
+    middle = int(np.clip(60 * pixels_across / min(display.mask.shape), 160, 400)) // 2 * 2
     # The middle first, with a wide search; then outwards with the map found so far.
     for reach, count, wide, order in ((0.08, 1, 60, 0), (0.25, 5, search, 1), (0.45, blocks, search, 3)):
         places, shifts, weights = [], [], []
-        side = 160 if count == 1 else 96
+        side = middle if count == 1 else 96
         for y in np.linspace(-reach, reach, count) if count > 1 else (0.0,):
             for x in np.linspace(-reach, reach, count) if count > 1 else (0.0,):
                 match = _match(image, speckle, found, float(y), float(x), side, wide)

@@ -123,6 +123,25 @@ def test_an_unhomed_stage_says_why_it_does_not_move(
     assert window.session.is_open("stage")
 
 
+def test_a_place_is_kept_with_the_bench_and_gone_to_again(
+    qtbot: QtBot, window: MainWindow, stage: StagePanel
+) -> None:
+    session = window.session
+    stage._home_answered(True)
+    qtbot.waitUntil(lambda: stage.state.text() == "At rest, homed", timeout=WAIT_MS)
+    here = dict(stage._here or {})
+    stage.places.names.setCurrentText("middle")
+    qtbot.mouseClick(stage.places.save_button, LEFT)
+    qtbot.waitUntil(session.kept.path.is_file, timeout=WAIT_MS)
+    stage.jog("x", 5.0)
+    qtbot.waitUntil(lambda: (stage._here or here)["x_um"] != here["x_um"], timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not session.jobs.is_busy("stage"), timeout=WAIT_MS)
+    stage.places.names.activated.emit(0)
+    qtbot.waitUntil(lambda: (stage._here or {}) == pytest.approx(here, abs=1.0), timeout=WAIT_MS)
+    qtbot.mouseClick(stage.places.remove_button, LEFT)
+    assert not stage.places.names.count()
+
+
 def test_a_stage_that_is_unplugged_is_noticed_and_the_rest_goes_on(
     qtbot: QtBot, window: MainWindow, stage: StagePanel
 ) -> None:

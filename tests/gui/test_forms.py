@@ -21,7 +21,9 @@ from instrument.bench.config_file import template
 from instrument.files.errors import BenchError, SettingsError
 from recon.base.declare import options_of
 
-AXIAL, LATERAL, VOLUME, STAGE, PHOTOGRAPH, ANGULAR, DPC, BEADS, SCREEN, SLM, ALIGNMENT = routines.values()
+AXIAL, LATERAL, VOLUME, STAGE, PHOTOGRAPH, ANGULAR, DPC, BEADS, SCREEN, SLM, ALIGNMENT, DISPLAY = (
+    routines.values()
+)
 STARTS = {"z_min_um": 60e3, "z_max_um": 150e3, "z_um": 100e3, "objective_na": 0.1, "magnification": 4.0}
 
 

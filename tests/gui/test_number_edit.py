@@ -6,7 +6,7 @@ import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
-from gui.widgets.entry import NumberEdit
+from gui.widgets.entry import NumberEdit, grouped
 
 
 def _field(qtbot: QtBot, unit: str = "ms", value: float | None = 10.0, **limits: float) -> NumberEdit:
@@ -69,3 +69,16 @@ def test_a_refused_number_is_told_with_the_limits_and_the_one_in_force(qtbot: Qt
 
 def test_the_tip_tells_the_unit_where_there_are_no_limits(qtbot: QtBot) -> None:
     assert _field(qtbot, "mm", None).toolTip() == "What it is\nin mm"
+
+
+def test_thousands_are_kept_apart_and_read_again(qtbot: QtBot) -> None:
+    assert [grouped(text) for text in ("9999", "12345.6", "-60000", "1e+06")] == [
+        "9999",
+        "12\u2009345.6",
+        "-60\u2009000",
+        "1e+06",
+    ]
+    field = NumberEdit("µm", 100000.0)
+    qtbot.addWidget(field)
+    assert field.text() == "100\u2009000 µm"
+    assert field.typed() == (100000.0, "")

@@ -22,8 +22,9 @@ def options_of(name: str, rest: list[str]) -> set[str]:
     """Return the option names of a command or, where it has some, of the subcommand that ``rest`` names."""
     parser = typer.main.get_command(COMMANDS[name].load())
     inner = getattr(parser, "commands", {})
-    if inner and rest and rest[0] in inner:
-        parser = inner[rest[0]]
+    asked = rest[0] if rest and rest[0] in inner else getattr(parser, "meant", None)
+    if asked is not None:
+        parser = inner[asked]
     return {flag for param in parser.params for flag in (*param.opts, *param.secondary_opts)} | {"--help"}
 
 

@@ -1,0 +1,65 @@
+"""Optics side by side on one scene: ``optics``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from instrument.files.atomic import require_new
+from instrument.files.errors import BenchError
+from instrument.tasks.task import Desk, Done, task
+from recon.base.declare import option
+from recon.evaluation.optics_compared import OpticsOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpticsFiles:
+    """Where the comparison goes."""
+
+    out: Path = option(
+        Path("optics.png"), help="The page (.png, .pdf, .svg); a table (.csv) beside.", flags=("--out", "-o")
+    )
+    force: bool = option(False, help="Overwrite files that exist.")
+
+
+@task(
+    "diffuserbench optics",
+    "diffuserbench optics --photons 3e4 --photons 1e6 --out optics.pdf",
+)
+def optics(desk: Desk, files: OpticsFiles, options: OpticsOptions) -> Done:
+    """Compare objective, smooth diffuser, regular and random lenslets on one scene at equal light.
+
+    All have one aperture, distance and sensor (Kuo 2020, Figs. 6.2, 6.3). A picture in the focus of the
+    lenses is photographed with few and many photons, beads in three depths once; light is propagated, and all
+    is reconstructed alike. Two minutes.
+    """
+    from instrument.evaluation.optics_figure import optics_figure
+    from instrument.files.atomic import write_text
+    from instrument.files.figures import save_figure
+    from recon.evaluation.optics_compared import compare_optics
+
+    table = files.out.with_suffix(".csv")
+    if files.out.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise BenchError(f"--out {files.out}: the page is one of .png, .pdf, .svg.")
+    for file in (files.out, table):
+        require_new(file, overwrite=files.force)
+    if len(set(options.photons)) < len(options.photons):
+        raise BenchError("--photons: a number of photons is asked for twice.")
+    with desk.step("Optics") as advance:
+        compared = compare_optics(options, advance)
+    lights = sorted(options.photons)
+    headings = ["optics", *(f"{light:g} photons" for light in lights), "beads in depth", "in the right plane"]
+    rows = [
+        [
+            name,
+            *(f"{found.psnr_db[light]:.1f} dB" for light in lights),
+            f"{found.volume_psnr_db:.1f} dB",
+            f"{found.right_depth:.0%}",
+        ]
+        for name, found in compared.found.items()
+    ]
+    desk.say("SIMULATED: light is propagated through modelled optics")
+    desk.table(headings, rows)
+    save_figure(optics_figure(compared), files.out)
+    write_text(table, "\n".join(",".join(row) for row in [headings, *rows]) + "\n")
+    return Done((files.out, table))

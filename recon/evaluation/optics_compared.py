@@ -1,0 +1,209 @@
+"""An objective, a smooth diffuser, regular and random lenslets on one scene at equal light (Kuo 2020, 6.3).
+
+All four have one aperture at one distance from one sensor, and send as many photons onto it. Photographs are
+propagated as light, each cell of the scene at its own place; PSFs are those of a point on the axis of each
+depth, without noise. Everything is reconstructed alike: by l1, as sec. 6.2 does, with one PSF a depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base import metrics
+from recon.base.declare import option
+from recon.optics.diffuser import OPTICAL_EPOXY, Diffuser, microlens_diffuser, smooth_diffuser
+from recon.optics.fall_off import no_fall_off
+from recon.optics.grid import GREEN, PixelGrid
+from recon.optics.render import render
+from recon.optics.scene import Scene, TruthGrid, bead_volume, picture
+from recon.optics.wave import WavePropagator
+from recon.reconstruction.options import Options
+from recon.reconstruction.reconstruct import reconstruct
+from recon.types import Calibration, Geometry
+
+Image = npt.NDArray[np.float32]
+
+SHAPE, PITCH_UM = (112, 112), 20.0
+APERTURE_UM, LENSLET_UM = 500.0, 125.0
+DISTANCE_UM = 3800.0
+DEPTHS_UM = (1613.0, 2000.0, 2632.0)
+"""Even in 1/z, 120 / m apart: within the axial sampling of Eq. 5.10 for these lenslets."""
+READ_NOISE_E = 1.0
+_WEIGHTS = (0.0, 1.0, 0.0)
+_HEIGHTS_UM = 1.25
+
+OPTICS = ("objective", "smooth diffuser", "regular lenslets", "random lenslets")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpticsOptions:
+    """At which light, with which scene, and how long optics are compared."""
+
+    photons: tuple[float, ...] = option(
+        (3e4, 1e5, 3e5, 1e6, 1e7),
+        help="Photons that reach the sensor from the picture; repeatable.",
+        default_words="30,000 to 10,000,000",
+        above=0,
+    )
+    volume_photons: float = option(3e5, help="Photons from the beads in depth.", above=0)
+    iterations: int = option(100, help="Iterations of every reconstruction.", least=1)
+    seed: int = option(0, help="Another one: other diffusers, beads and noise.", least=0)
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What one kind of optics made of the scenes.
+
+    Attributes
+    ----------
+    psf, photograph : ndarray, (height, width)
+        On the axis of the middle depth; of the picture at the middle one of the lights.
+    pictures : mapping of float to ndarray
+        Reconstructed from each number of photons.
+    psnr_db : mapping of float to float
+        Of the pictures against the scene.
+    volume : ndarray, (n_z, height, width)
+        The beads.
+    volume_psnr_db : float
+    right_depth : float
+        Share of the light of the beads' own pixels that came back in the beads' own plane.
+    """
+
+    psf: Image
+    photograph: Image
+    pictures: Mapping[float, Image]
+    psnr_db: Mapping[float, float]
+    volume: Image
+    volume_psnr_db: float
+    right_depth: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All optics, by :data:`OPTICS`, with the scenes: the picture, and the beads by plane."""
+
+    found: Mapping[str, Compared]
+    picture: Image
+    beads: Image
+
+
+def compare_optics(
+    options: OpticsOptions, on_progress: Callable[[float, float], object] | None = None
+) -> Comparison:
+    """Photograph and reconstruct one picture and one volume of beads through every kind of optics.
+
+    ``on_progress(done, of)`` counts reconstructions; it may raise to end the work.
+    """
+    rng = np.random.default_rng([63, options.seed])
+    width_um = 36 * PITCH_UM * DEPTHS_UM[1] / DISTANCE_UM
+    flat = picture(_spokes(), DEPTHS_UM[1], width_um)
+    spread = (24 * PITCH_UM * DEPTHS_UM[0] / DISTANCE_UM,) * 2
+    beads = bead_volume(
+        24, spread, (DEPTHS_UM[0], DEPTHS_UM[-1]), diameter_um=8.0, seed=int(rng.integers(1_000_000))
+    )
+    beads = _onto_depths(beads)
+    truth, planes = _truth(flat, None), np.stack([_truth(beads, k) for k in range(len(DEPTHS_UM))])
+    total, done = len(OPTICS) * (len(options.photons) + 1), 0
+    found = {}
+    for name in OPTICS:
+        light = WavePropagator(_diffuser(name, options.seed), DISTANCE_UM, workers=1)
+        grid = PixelGrid(SHAPE, PITCH_UM)
+        psfs = [light.psf((0.0, 0.0, z), grid, GREEN.samples(1), emission="isotropic") for z in DEPTHS_UM]
+        calibration = _calibration(np.stack(psfs))
+        middle = calibration.part([1])
+        clean = [_photographed(scene, grid, light) for scene in (flat, beads)]
+        pictures, shown = {}, {}
+        for photons in options.photons:
+            shown[photons] = _noisy(clean[0], photons, rng)
+            pictures[photons] = _solved(shown[photons], middle, options.iterations)[0]
+            done += 1
+            if on_progress is not None:
+                on_progress(done, total)
+        volume = _solved(_noisy(clean[1], options.volume_photons, rng), calibration, options.iterations)
+        done += 1
+        if on_progress is not None:
+            on_progress(done, total)
+        found[name] = Compared(
+            psfs[1],
+            shown[sorted(shown)[len(shown) // 2]],
+            pictures,
+            {n: metrics.psnr(image, truth, fit_scale=True) for n, image in pictures.items()},
+            volume,
+            metrics.psnr(volume, planes, fit_scale=True),
+            _in_right_plane(volume, planes),
+        )
+    return Comparison(found, truth, planes)
+
+
+def _diffuser(name: str, seed: int) -> Diffuser:
+    """Return the relief of one kind of optics; lenses are sharp at the middle depth."""
+    size, z = (APERTURE_UM, APERTURE_UM), DEPTHS_UM[1]
+    focus_um = 1 / (1 / z + 1 / DISTANCE_UM)
+    if name == "smooth diffuser":
+        return smooth_diffuser(size, _HEIGHTS_UM, feature_size_um=80, mean_slope_deg=2.2, seed=seed)
+    if name != "objective":
+        regular = name == "regular lenslets"
+        return microlens_diffuser(
+            size, _HEIGHTS_UM, lenslet_um=LENSLET_UM, focal_length_um=focus_um, regular=regular, seed=seed
+        )
+    # Without aberrations at the middle depth: as much glass as makes all paths from there equally long.
+    samples = (np.arange(int(APERTURE_UM / _HEIGHTS_UM)) + 0.5) * _HEIGHTS_UM - APERTURE_UM / 2
+    squared = samples[:, None] ** 2 + samples**2
+    longer = np.hypot(z, np.sqrt(squared)) - z + np.hypot(DISTANCE_UM, np.sqrt(squared)) - DISTANCE_UM
+    heights = -longer / (OPTICAL_EPOXY.index - 1)
+    return Diffuser((heights - heights.mean()).astype(np.float32), _HEIGHTS_UM, size, OPTICAL_EPOXY)
+
+
+def _spokes(n: int = 72, spokes: int = 8) -> npt.NDArray[np.float64]:
+    """Draw bright spokes on black."""
+    y, x = np.mgrid[:n, :n] - (n - 1) / 2
+    radius = np.hypot(y, x) / (n / 2)
+    return np.where((np.sin(spokes * np.arctan2(y, x)) > 0.35) & (radius > 0.2) & (radius < 0.95), 1.0, 0.0)
+
+
+def _onto_depths(scene: Scene) -> Scene:
+    """Put every bead at the nearest calibrated depth, where the camera sees it at the same place."""
+    from dataclasses import replace
+
+    depths, beads = np.array(DEPTHS_UM), scene.beads[0]
+    places = beads.positions_um.copy()
+    nearest = depths[np.abs(1 / places[:, 2:] - 1 / depths).argmin(axis=1)]
+    places[:, :2] *= (nearest / places[:, 2])[:, None]
+    places[:, 2] = nearest
+    return Scene(scene.name, beads=(replace(beads, positions_um=places),))
+
+
+def _truth(scene: Scene, plane: int | None) -> Image:
+    ranges = {} if plane is None else {"z_range_um": (0.99 * DEPTHS_UM[plane], 1.01 * DEPTHS_UM[plane])}
+    grid = TruthGrid(SHAPE, PITCH_UM, DISTANCE_UM)
+    return np.asarray(scene.true_image(grid, _WEIGHTS, **ranges), np.float32)
+
+
+def _photographed(scene: Scene, grid: PixelGrid, light: WavePropagator) -> Image:
+    return render(scene, _WEIGHTS, grid, light, no_fall_off, layer_photons=1, bead_photons=1)
+
+
+def _noisy(clean: Image, photons: float, rng: np.random.Generator) -> Image:
+    counts = rng.poisson(clean.astype(np.float64) * (photons / float(clean.sum())))
+    return np.asarray(counts + rng.normal(0, READ_NOISE_E, clean.shape), np.float32)
+
+
+def _calibration(psfs: Image) -> Calibration:
+    places = np.array([(0.0, 0.0, z) for z in DEPTHS_UM])
+    return Calibration(psfs[:, None], places, geometry=Geometry(PITCH_UM, DISTANCE_UM / 1e3))
+
+
+def _solved(counts: Image, calibration: Calibration, iterations: int) -> Image:
+    wanted = Options(model="convolution", prior="l1", iterations=iterations, judged=False)
+    return reconstruct(counts, calibration, options=wanted).volume
+
+
+def _in_right_plane(volume: Image, truth: Image) -> float:
+    """Share of the light at pixels of beads that is in their own plane."""
+    lit = truth > 0.1 * truth.max()
+    everywhere = volume * lit.any(axis=0)
+    return float(volume[lit].sum() / max(float(everywhere.sum()), 1e-30))
