@@ -51,7 +51,7 @@ FILE = "demo.json"
 GREEN = 1
 """Of red, green and blue: the light of PSFs, of the second scene and of the chart."""
 PICTURE = Path(__file__).with_name("demo_picture.jpg")
-"""A cup of coffee; photograph by Rachel Michetti, CC0 (docs/reference/demo-picture.md)."""
+"""A cup of coffee; photograph by Rachel Michetti, CC0 (docs/reference/demo.md)."""
 
 
 VOLUME_ITERATIONS = 12

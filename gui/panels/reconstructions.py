@@ -174,7 +174,7 @@ class ReconstructionsPanel(Panel):
         self.export_button.setEnabled(True)
         if result.volume is not None:
             self.viewers.setCurrentWidget(self.volume)
-            self.volume.open(result.volume, result.planes_um)
+            self.volume.open(result.volume, result.grid)
         else:
             assert result.image is not None
             self.viewers.setCurrentWidget(self.picture)

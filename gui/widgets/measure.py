@@ -13,6 +13,9 @@ from PySide6.QtWidgets import QGraphicsRectItem
 from gui.theme import colours
 from gui.widgets.image_view import ImageView
 
+_BAR_SHARE = 0.25
+"""Of a view's width, about: its scale bar."""
+
 
 class Region(NamedTuple):
     """Rows and columns of a picture."""
@@ -63,6 +66,32 @@ def round_length(most: float) -> float:
 def length_words(um: float) -> str:
     """Return a length with its unit: mm from 1 mm on."""
     return f"{um:.4g} µm" if abs(um) < 1000 else f"{um / 1000:.4g} mm"
+
+
+class LengthBar:
+    """A bar of a round length over a view, where the size of its pixels is known.
+
+    Parameters
+    ----------
+    view : ImageView
+    """
+
+    def __init__(self, view: ImageView) -> None:
+        self.bar: Any = pg.ScaleBar(1.0)
+        self.bar.setParentItem(view.box)
+        self.bar.anchor((1, 1), (1, 1), offset=(-14, -14))
+        self.bar.hide()
+
+    def place(self, width: int, pitch_um: float | None) -> None:
+        """Lay it over a picture of this width in pixels of this size; take it away where that is None."""
+        self.bar.setVisible(pitch_um is not None)
+        if pitch_um is not None:
+            length = round_length(_BAR_SHARE * width * pitch_um)
+            self.bar.size = length / pitch_um
+            self.bar.bar.setBrush(pg.mkBrush(colours().text))
+            self.bar.bar.setPen(pg.mkPen(colours().text))
+            self.bar.text.setText(length_words(length), color=colours().text)
+            self.bar.updateBar()
 
 
 class Measure(QObject):

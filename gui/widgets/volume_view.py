@@ -8,29 +8,34 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QSignalBlocker, Qt, Signal
 from PySide6.QtGui import QKeySequence, QShortcut
-from PySide6.QtWidgets import QButtonGroup, QGridLayout, QProgressBar, QSlider, QStackedWidget, QWidget
+from PySide6.QtWidgets import (
+    QButtonGroup,
+    QCheckBox,
+    QGridLayout,
+    QProgressBar,
+    QSlider,
+    QStackedWidget,
+    QWidget,
+)
 
 from gui.background import NewestOnly
 from gui.jobs import Job, JobContext, JobRunner
 from gui.theme import colours
 from gui.widgets.building import button, fill, in_row, label
 from gui.widgets.image_view import StretchedImage, whole_steps
-from gui.widgets.measure import Measure, Region, length_words, region_words, round_length
+from gui.widgets.measure import LengthBar, Measure, Region, region_words
 from gui.widgets.plots import LevelsBar, curve_pen, plot_widget
-from gui.widgets.turning_view import TurningView, middle_pitch_um
+from gui.widgets.proportions import MOST_BYTES, bytes_in_proportion, in_proportion
+from gui.widgets.turning_view import Planes, TurningView, middle_pitch_um
 from instrument.files.volumes import Plane, VolumeSource
 from instrument.reconstruction.result_figures import Projections, grey, in_colour_of_depth, project
+from recon.camera.grid import Grid, metric_grid
 
 Mode = Literal["brightest", "slices", "turning"]
 Axis = Literal["z", "y", "x"]
-Planes = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
-
-_BAR_SHARE = 0.25
-"""Of the front view's width, about: its scale bar."""
 _AXES: tuple[Axis, Axis, Axis] = ("z", "y", "x")
 
 
@@ -68,7 +73,10 @@ class VolumeView(QWidget):
         self._jobs = jobs
         self._job: Job | None = None
         self._reader = NewestOnly(jobs, "Reading a slice", self.failed.emit)
+        self._given: VolumeSource | None = None
+        self._grid: Grid | None = None
         self._source: VolumeSource | None = None
+        """What is shown: the given one, or that in true proportions."""
         self._planes: Planes | None = None
         self.projections: Projections | None = None
         self.slices: dict[Axis, Slice] = {}
@@ -76,9 +84,9 @@ class VolumeView(QWidget):
         self.point = (0, 0, 0)
         """Plane, row and column through which the slices go."""
         self.mode: Mode = "brightest"
-        self._bar: Any = None
 
         self.front, self.coloured = StretchedImage(), StretchedImage()
+        self.bar = LengthBar(self.front)
         self.side, self.top = StretchedImage(keep_aspect=False), StretchedImage(keep_aspect=False)
         self.profile = plot_widget("plane")
         self._along: Any = self.profile.plot(pen=curve_pen(0))
@@ -128,6 +136,13 @@ class VolumeView(QWidget):
         self.measure = Measure(self.front)
         self.measure_button.toggled.connect(self.measure.set_on)
         self.measure.chosen.connect(self._measured)
+        self.proportions = QCheckBox("True proportions")
+        self.proportions.setToolTip(
+            "Voxels of one size, upright: shapes and lengths as in the scene; without, a plane's voxels are "
+            "as wide as it is far away"
+        )
+        self.proportions.setEnabled(False)
+        self.proportions.toggled.connect(self._look)
         self.measured = label(role="value", selectable=True, wraps=True)
         self.measured.hide()
         group = QButtonGroup(self)
@@ -163,7 +178,7 @@ class VolumeView(QWidget):
         grid.setColumnStretch(0, 3)
         grid.setColumnStretch(1, 2)
         modes = (self.brightest_button, self.slices_button, self.turning_button)
-        bar = in_row(*modes, self.measure_button, (self.slider, 1))
+        bar = in_row(*modes, self.measure_button, self.proportions, (self.slider, 1))
         bar.addStretch()  # only where the slider is hidden
         bar.addWidget(self.plane_label)
         fill(self.views, (grid, 1))
@@ -172,48 +187,72 @@ class VolumeView(QWidget):
         fill(self, bar, self.progress, (self.stack, 1), self.measured, self.levels)
 
     # What is shown -------------------------------------------------------------------------------
-    def open(self, source: VolumeSource, planes_um: Planes | None = None) -> Job:
+    def open(self, source: VolumeSource, grid: Grid | None = None) -> Job:
         """Browse a volume, which is this view's to close; the one before is closed.
 
         Parameters
         ----------
         source : VolumeSource
-        planes_um : (ndarray, ndarray), optional
-            Depth and lateral pitch of each plane in micrometres.
+        grid : Grid, optional
+            Where its voxels lie. One that is uneven is shown in true proportions.
         """
         self.release()
-        self._source, self._planes = source, planes_um
+        if grid is not None and not (np.isfinite(grid.z_um).all() and np.isfinite(grid.pitch_um).all()):
+            grid = None
+        self._given, self._grid = source, grid
+        size = None if grid is None else bytes_in_proportion(source, grid)
+        self.proportions.setEnabled(size is not None)
+        with QSignalBlocker(self.proportions):
+            self.proportions.setChecked(size is not None and size <= MOST_BYTES)
+        job = self._look()
+        assert job is not None
+        return job
+
+    def _look(self) -> Job | None:
+        """Show the volume in true proportions, made in a job, or as it is."""
+        given, grid = self._given, self._grid
+        if given is None:
+            return None
+        self._show_no_more()
+        if grid is None or not self.proportions.isChecked():
+            return self._browse(given, grid)
+        job = self._begin(
+            f"Bringing {given.path.name} to true proportions",
+            metric_grid(grid).shape[0],
+            lambda context: in_proportion(given, grid, lambda done: context.report(done)),
+        )
+        job.succeeded.connect(lambda made: self._browse(*made) if job is self._job else None)
+        return job
+
+    def _browse(self, source: VolumeSource, grid: Grid | None) -> Job:
+        self._source, self._planes = source, None if grid is None else (grid.z_um, grid.pitch_um)
         n_z, height, width = source.shape
         self.slider.setRange(0, n_z - 1)
-        self.progress.setRange(0, n_z)
-        self.progress.setValue(0)
-        self.progress.show()
+        ratio = grid.spacing_um[0] / grid.pitch_um[0] if grid is not None and grid.is_metric else None
+        self.side.box.setAspectLocked(ratio is not None, ratio or 1)
+        self.top.box.setAspectLocked(ratio is not None, 1 / (ratio or 1))
 
         def work(context: JobContext) -> Projections:
             return project(source, lambda done, _: context.report(done))
 
-        job = self._jobs.compute(f"Looking through {source.path.name}", work)
-        job.progressed.connect(self.progress.setValue)
+        job = self._begin(f"Looking through {source.path.name}", n_z, work)
         job.succeeded.connect(lambda projections: self._take_projections(job, projections))
-        job.failed.connect(self.failed)
-        job.ended.connect(lambda: self._projecting_ended(job))
-        self._job = job
-        self._place_bar(width)
+        self.bar.place(width, None if self._planes is None else middle_pitch_um(self._planes))
         self.go_to(n_z // 2, height // 2, width // 2)
+        if self.mode == "turning":
+            self._load_renderer()
         return job
 
-    def _place_bar(self, width: int) -> None:
-        """Lay a bar of a round length over the front view, where the voxels' size is known."""
-        if self._bar is not None:
-            self.front.box.removeItem(self._bar)
-            self._bar = None
-        if (pitch_um := None if self._planes is None else middle_pitch_um(self._planes)) is not None:
-            length = round_length(_BAR_SHARE * width * pitch_um)
-            self._bar = pg.ScaleBar(length / pitch_um, brush=colours().text, pen=colours().text)
-            self._bar.text.setText(length_words(length))
-            self._bar.text.setColor(colours().text)
-            self._bar.setParentItem(self.front.box)
-            self._bar.anchor((1, 1), (1, 1), offset=(-14, -14))
+    def _begin(self, title: str, planes: int, work: Callable[[JobContext], Any]) -> Job:
+        """Start a job that tells how many planes it has read."""
+        self.progress.setRange(0, planes)
+        self.progress.setValue(0)
+        self.progress.show()
+        self._job = job = self._jobs.compute(title, work)
+        job.progressed.connect(self.progress.setValue)
+        job.failed.connect(self.failed)
+        job.ended.connect(lambda: self._reading_ended(job))
+        return job
 
     def show_front(self, front: Plane, *, keep_levels: bool) -> None:
         """Show only a front view: that of a volume in the making."""
@@ -226,11 +265,17 @@ class VolumeView(QWidget):
 
     def release(self) -> None:
         """End reading and close the volume; nothing is shown then."""
+        self._show_no_more()
+        if self._given is not None:
+            self._reader.forget(last=self._given.close)
+        self._given = self._grid = None
+        self.proportions.setEnabled(False)
+
+    def _show_no_more(self) -> None:
         if self._job is not None:
             self._job.cancel()
             self._job = None
-        if self._source is not None:
-            self._reader.forget(last=self._source.close)
+        self._reader.forget()
         self.turning.release()
         self.measure.clear()
         self.measured.clear()
@@ -361,7 +406,7 @@ class VolumeView(QWidget):
             self.projections = projections
             self.levels.set_image(projections.front)
 
-    def _projecting_ended(self, job: Job) -> None:
+    def _reading_ended(self, job: Job) -> None:
         if job is self._job:
             self.progress.hide()
 

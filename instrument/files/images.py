@@ -23,7 +23,7 @@ from instrument.files.decoding import READABLE, decode
 from instrument.files.errors import FileError
 from instrument.files.image_folders import images_in, in_order, order_in_words
 from instrument.files.named_arrays import is_zarr, read_zarr
-from instrument.files.seen import as_seen, png_bytes
+from instrument.files.seen import as_seen, levels_of, png_bytes
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
 
@@ -123,7 +123,9 @@ def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str
     """Write one image (or, as TIFF or .npy, a stack), whole or not at all.
 
     The suffix chooses the format: ``.tif`` and ``.npy`` keep any dtype, ``.png`` takes uint8 and uint16.
-    ``metadata`` goes into a TIFF's description, otherwise into a JSON file beside the image.
+    Colour of float32 is stored channel by channel, as ImageJ has it, with the levels that it is shown with.
+    ``metadata`` goes into a TIFF's description (ImageJ's info of such colour), otherwise into a JSON file
+    beside the image.
 
     Raises FileError when the suffix or the dtype does not fit, or the folder cannot be written to; OSError
     when the disk is full.
@@ -140,14 +142,7 @@ def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str
         elif suffix == ".png":
             _write_png(temporary, image)
         else:
-            is_rgb = image.ndim >= 3 and image.shape[-1] == 3
-            tifffile.imwrite(
-                temporary,
-                np.ascontiguousarray(image),
-                photometric="rgb" if is_rgb else "minisblack",
-                description=text,
-                metadata=None,
-            )
+            _write_tiff(temporary, image, text)
     if text is not None and suffix in (".png", ".npy"):
         write_text(side_car(path), text + "\n")
 
@@ -181,7 +176,7 @@ def _metadata(path: Path) -> dict[str, Any]:
                 pattern = bytes(page.tags.valueof(_CFA_PATTERN, b""))
                 if len(pattern) == 4 and max(pattern) < 3:
                     said = {"pixel_format": "Bayer" + "".join(_COLOURS[c] for c in pattern[:2])}
-                text = page.description
+                text = (tiff.imagej_metadata or {}).get("Info") or page.description
         else:
             text = reading.read_bytes(side_car(path)).decode()
         metadata = reading.parse_json(text)
@@ -301,6 +296,28 @@ def _refuse_non_finite(path: Path, array: npt.NDArray[Any], *, holes: bool) -> N
             f"(the first, {array[where]}, at index {where}).",
             "Replace them, e.g. by the mean of their neighbours.",
         )
+
+
+_BIG_TIFF_BYTES = 3_900_000_000
+
+
+def _write_tiff(path: Path, image: npt.NDArray[Any], text: str | None) -> None:
+    """Write a TIFF; ImageJ knows colour of floats only as channels, and no TIFF of over 4 GB."""
+    colour = image.ndim >= 3 and image.shape[-1] == 3
+    known = image.ndim <= 4 and image.dtype == np.float32 and image.nbytes < _BIG_TIFF_BYTES
+    if colour and known and min(image.shape[-3:-1]) > 1:
+        levels = levels_of(image.reshape(-1, *image.shape[-2:]))
+        metadata: dict[str, Any] = {"axes": "ZCYX"[4 - image.ndim :], "mode": "composite"}
+        metadata["Ranges"] = [level for white in levels.white for level in (levels.black, white)]
+        if text is not None:
+            metadata["Info"] = text
+        channels = np.ascontiguousarray(np.moveaxis(image, -1, -3))
+        tifffile.imwrite(path, channels, imagej=True, metadata=metadata)
+        return
+    photometric = "rgb" if colour else "minisblack"
+    tifffile.imwrite(
+        path, np.ascontiguousarray(image), photometric=photometric, description=text, metadata=None
+    )
 
 
 def _write_png(path: Path, image: npt.NDArray[Any]) -> None:

@@ -282,7 +282,7 @@ def _traces_csv(activity: Activity, video: VideoPictures) -> str:
     time = "time_s" if video.period_s else "frame_number"
     header = ["frame", time, *(f"region_{n}_dff" for n in range(len(activity.regions)))]
     frames = zip(activity.indices, activity.times_s, activity.traces.T, strict=True)
-    return _csv(header, ([i, f"{at:.6g}", *(f"{value:.5f}" for value in dff)] for i, at, dff in frames))
+    return _csv(header, ([i, f"{at:.12g}", *(f"{value:.5f}" for value in dff)] for i, at, dff in frames))
 
 
 def _regions_csv(activity: Activity) -> str:

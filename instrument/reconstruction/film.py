@@ -185,7 +185,7 @@ def curves_csv(film: Film, regions: Sequence[Window], courses: npt.NDArray[np.fl
     for index, at, means, changes in zip(
         film.indices, film.times_s, courses.T, relative(courses).T, strict=True
     ):
-        writer.writerow([index, f"{at:.6g}", *(f"{v:.6g}" for v in means), *(f"{v:.5f}" for v in changes)])
+        writer.writerow([index, f"{at:.12g}", *(f"{v:.6g}" for v in means), *(f"{v:.5f}" for v in changes)])
     return text.getvalue()
 
 

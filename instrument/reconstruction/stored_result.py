@@ -292,7 +292,8 @@ def _is_volume(path: Path, record: Mapping[str, Any]) -> bool:
             require_file(path)
             with tifffile.TiffFile(path) as tiff:
                 series = tiff.series[0]
-                return len(series.shape) == 4 or (len(series.shape) == 3 and "S" not in series.axes)
+                colours = "S" in series.axes or (series.axes, series.shape[0]) == ("CYX", 3)
+                return len(series.shape) == 4 or (len(series.shape) == 3 and not colours)
         except Exception:  # noqa: BLE001 - a damaged TIFF raises nearly anything
             return False  # reading it as an image then says what is wrong
     if path.suffix.lower() == ".npy":

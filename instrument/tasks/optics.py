@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
 from instrument.tasks.task import Desk, Done, task
 from recon.base.declare import option
-from recon.evaluation.optics_compared import OpticsOptions
+from recon.evaluation.optics_compared import Compared, OpticsOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,5 +62,16 @@ def optics(desk: Desk, files: OpticsFiles, options: OpticsOptions) -> Done:
     desk.say("SIMULATED: light is propagated through modelled optics")
     desk.table(headings, rows)
     save_figure(optics_figure(compared), files.out)
-    write_text(table, "\n".join(",".join(row) for row in [headings, *rows]) + "\n")
+    write_text(table, optics_csv(compared.found))
     return Done((files.out, table))
+
+
+def optics_csv(found: Mapping[str, Compared]) -> str:
+    """Return the comparison as CSV, an optics a line: plain numbers, their units in the columns' names."""
+    lights = sorted(next(iter(found.values())).psnr_db)
+    names = ["optics", *(f"psnr_db_{light:g}_photons" for light in lights), "beads_psnr_db", "share_in_plane"]
+    rows = []
+    for name, one in found.items():
+        values = [*(one.psnr_db[light] for light in lights), one.volume_psnr_db, one.right_depth]
+        rows.append([name, *(f"{value:.7g}" for value in values)])
+    return "".join(",".join(row) + "\n" for row in [names, *rows])

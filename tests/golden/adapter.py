@@ -210,6 +210,8 @@ def from_files(images: Mapping[str, npt.NDArray[Any]], *arguments: str) -> Resul
     """Reconstruct through the command line from image files (``image``, and ``psf`` or ``volume``)."""
     import tifffile
 
+    from instrument.files.images import read_image
+
     with TemporaryDirectory() as folder:
         paths = {name: Path(folder) / f"{name}.tif" for name in images}
         for name, pixels in images.items():
@@ -218,7 +220,7 @@ def from_files(images: Mapping[str, npt.NDArray[Any]], *arguments: str) -> Resul
         given = [word for name, path in paths.items() for word in (f"--{name}", str(path))]
         code, said = command("reconstruct", *given, *arguments, "--out", str(out))
         assert code == 0, said
-        return {"image": tifffile.imread(out)}
+        return {"image": read_image(out).pixels}
 
 
 def command(*words: str) -> tuple[int, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PySide6.QtCore import QPointF, Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
@@ -12,6 +13,7 @@ from pytestqt.qtbot import QtBot
 from gui.jobs import JobRunner
 from gui.widgets.volume_view import VolumeView
 from instrument.files.volumes import volume_in_memory
+from recon.camera.grid import Grid, metric_volume
 from tests.gui.conftest import WAIT_MS
 
 
@@ -23,8 +25,9 @@ def test_a_volume_is_turned_stepped_through_and_measured(qtbot: QtBot) -> None:
     qtbot.addWidget(view)
     view.resize(600, 500)
     view.show()
-    planes_um = np.linspace(1e4, 2e4, 8), np.full(8, 25.0)
-    view.open(volume_in_memory(voxels, Path("volume.npy")), planes_um)
+    grid = Grid(voxels.shape, (15, 20), np.linspace(1e4, 2e4, 8), np.full(8, 25.0))
+    view.open(volume_in_memory(voxels, Path("volume.npy")), grid)
+    assert not view.proportions.isEnabled()  # its voxels are of one size
     qtbot.waitUntil(lambda: view.projections is not None, timeout=WAIT_MS)
     view.set_mode("turning")
     canvas = view.turning.canvas
@@ -52,3 +55,47 @@ def test_a_volume_is_turned_stepped_through_and_measured(qtbot: QtBot) -> None:
     assert not view.measure.regions
     view.release()
     qtbot.waitUntil(lambda: not jobs.jobs, timeout=WAIT_MS)
+
+
+def test_a_perspective_volume_is_shown_in_true_proportions(qtbot: QtBot) -> None:
+    z_um = np.linspace(1e4, 2e4, 6)
+    voxels = np.random.default_rng(0).random((6, 30, 40), np.float32)
+    grid = Grid(voxels.shape, (15, 20), z_um, 2e-3 * z_um)
+    metric, on = metric_volume(voxels, grid)
+    jobs = JobRunner()
+    view = VolumeView(jobs)
+    qtbot.addWidget(view)
+    view.resize(700, 500)
+    view.show()
+    source = volume_in_memory(voxels, Path("volume.npy"))
+    closed: list[bool] = []
+    source.close = lambda: closed.append(True)  # type: ignore[method-assign]
+
+    def shows(front: np.ndarray) -> bool:
+        return view.projections is not None and np.allclose(view.projections.front, front, atol=1e-5)
+
+    view.open(source, grid)
+    assert view.proportions.isChecked()
+    qtbot.waitUntil(lambda: shows(metric.max(axis=0)), timeout=WAIT_MS)
+    assert view.bar.bar.text.textItem.toPlainText() == "200 µm"  # a quarter is 400
+    assert view.bar.bar.size * on.pitch_um[0] == pytest.approx(200)
+    across, down = view.top.box.viewPixelSize()
+    assert down / across == pytest.approx(on.pitch_um[0] / on.spacing_um[0], rel=0.02)
+    view.set_mode("turning")
+    qtbot.waitUntil(lambda: view.turning.renderer is not None, timeout=WAIT_MS)
+    assert view.turning.canvas.pitch_um == on.pitch_um[0]
+    assert view.turning.renderer.scale[0] == pytest.approx(on.spacing_um[0] / on.pitch_um[0])
+    view.set_mode("slices")
+    view.go_to(3, 10, 12)
+    qtbot.waitUntil(lambda: "y" in view.slices and view.slices["y"].index == 10, timeout=WAIT_MS)
+    np.testing.assert_allclose(view.slices["y"].pixels, metric[:, 10], atol=1e-5)
+    view.set_mode("turning")
+    view.proportions.click()
+    qtbot.waitUntil(lambda: shows(voxels.max(axis=0)), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: view.turning.renderer is not None, timeout=WAIT_MS)
+    assert view.turning.renderer.shape == voxels.shape
+    assert not closed
+    view.release()
+    qtbot.waitUntil(lambda: not jobs.jobs, timeout=WAIT_MS)
+    assert closed == [True]
+    assert not view.proportions.isEnabled()

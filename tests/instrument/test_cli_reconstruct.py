@@ -119,7 +119,7 @@ def test_any_format_depth_and_colour(here: Path, suffix: str, dtype: str, colour
         else:
             cv2.imwrite(str(here / f"{name}{suffix}"), image[..., ::-1] if image.ndim == 3 else image)
     assert main(["reconstruct", "--psf", f"p{suffix}", "--image", f"r{suffix}", *QUICK]) == 0
-    picture = tifffile.imread(here / "out.tif")
+    picture = read_image(here / "out.tif").pixels
     assert picture.shape == ((*SHAPE, 3) if colour else SHAPE)
     assert brightest(picture) == set(SOURCES)
     if colour:

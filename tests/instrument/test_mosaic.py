@@ -9,7 +9,7 @@ from scipy.signal import fftconvolve
 
 from instrument.cli import main
 from instrument.files.errors import BenchError, FileError
-from instrument.files.images import ImageFile, write_image
+from instrument.files.images import ImageFile, read_image, write_image
 from instrument.reconstruction.mosaic import mosaic_named, mosaic_of, reduce_mosaic, require_mosaic
 from instrument.reconstruction.preparation import Crop
 from recon.camera.factors import PATTERNS
@@ -91,7 +91,7 @@ def test_a_raw_frame_gives_a_picture_in_its_colours(files, bayer, binning, capsy
     ]
     assert main(["reconstruct", *map(str, arguments), "-o", str(out)]) == 0
     assert "GRBG" in capsys.readouterr().out
-    image = tifffile.imread(out)
+    image = read_image(out).pixels
     assert image.shape == (HEIGHT // binning, WIDTH // binning, 3)
     square = image[15 // binning : 21 // binning, 21 // binning : 27 // binning].mean(axis=(0, 1))
     assert square / square[0] == pytest.approx(COLOURS, abs=0.05)

@@ -15,6 +15,7 @@ import zarr
 from instrument.files.errors import FileError
 from instrument.files.images import read, read_image, read_stack, write_image
 from instrument.reconstruction.mosaic import mosaic_of, suspected_mosaic
+from instrument.reconstruction.stored_result import export_result, open_result
 from recon.camera.factors import PATTERNS, split_bayer
 
 RNG = np.random.default_rng(3)
@@ -69,6 +70,35 @@ def test_axes_of_imagej_and_ome(tmp_path: Path) -> None:
         read_stack(path)
     tifffile.imwrite(path, STACK[:2], ome=True, metadata={"axes": "CYX"})
     assert "its 2 channels taken as the images of a stack" in read_stack(path).notes
+
+
+def test_colour_of_floats_is_imagejs_and_comes_back(tmp_path: Path) -> None:
+    picture = RNG.random((8, 6, 3), np.float32)
+    said = {"simulated": True, "pitch": "5 µm"}
+    write_image(tmp_path / "p.tif", np.rot90(picture), said)
+    with tifffile.TiffFile(tmp_path / "p.tif") as tiff:
+        told = tiff.imagej_metadata
+        assert told is not None
+        assert (told["mode"], told["channels"]) == ("composite", 3)
+        assert json.loads(told["Info"]) == said
+        assert told["Ranges"][::2] == (0, 0, 0)
+        assert 0.9 < min(told["Ranges"][1::2]) <= max(told["Ranges"][1::2]) <= 1
+        assert tiff.series[0].axes == "CYX"
+        np.testing.assert_array_equal(tiff.asarray(), np.moveaxis(np.rot90(picture), -1, 0))
+    assert read_image(tmp_path / "p.tif").metadata == said
+    tifffile.imwrite(tmp_path / "old.tif", np.rot90(picture), photometric="rgb", metadata=None)
+    for name in ("p", "old"):
+        result = open_result(tmp_path / f"{name}.tif")
+        assert result.image is not None
+        np.testing.assert_array_equal(result.image, np.rot90(picture))
+        export_result(result, tmp_path / f"{name}-turned.tif", rotate_deg=270)
+        np.testing.assert_array_equal(read_image(tmp_path / f"{name}-turned.tif").pixels, picture)
+    for odd in (np.stack([picture, 2 * picture]), picture[:, :1], picture.astype(np.float64)):
+        write_image(tmp_path / "odd.tif", odd)
+        np.testing.assert_array_equal(read(tmp_path / "odd.tif").pixels, odd.astype(np.float32))
+    write_image(tmp_path / "counts.tif", (255 * picture).astype(np.uint8))
+    with tifffile.TiffFile(tmp_path / "counts.tif") as tiff:
+        assert (tiff.is_imagej, tiff.series[0].axes) == (False, "YXS")
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
