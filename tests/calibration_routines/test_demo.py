@@ -25,6 +25,7 @@ from instrument.bench.config import BenchConfig
 from instrument.cli import main
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import FileError
+from instrument.files.images import read_image
 from instrument.runs.run import Run, RunCondition
 
 SMALL = DemoSettings(
@@ -110,8 +111,8 @@ def test_everything_it_made_is_in_its_folder(shown: tuple[DemoResult, Troubling]
 
 def test_a_picture_shifted_or_turned_over_scores_worse(shown: tuple[DemoResult, Troubling]) -> None:
     result, _ = shown
-    truth = cv2.imread(str(result.files["ground truth, linear float32"]), cv2.IMREAD_UNCHANGED)
-    picture = cv2.imread(str(result.files["picture, linear float32"]), cv2.IMREAD_UNCHANGED)
+    truth = read_image(result.files["ground truth, linear float32"]).pixels
+    picture = read_image(result.files["picture, linear float32"]).pixels
     height, width = truth.shape[:2]
     field = scene_field((height, width), (height // 2, width // 2), (height - 8.0, width - 8.0), 1.0)
     right = compare(picture, truth, field).psnr_db
@@ -124,8 +125,8 @@ def test_pictures_stand_upright(shown: tuple[DemoResult, Troubling]) -> None:
     result, _ = shown
     original = read_picture()
     for name in ("picture", "ground truth, linear float32"):
-        image = cv2.imread(str(result.files[name]), cv2.IMREAD_UNCHANGED)[4:-4, 4:-4]  # without the margin
-        expected = cv2.resize(original[..., ::-1], image.shape[1::-1], interpolation=cv2.INTER_AREA)
+        image = read_image(result.files[name]).pixels[4:-4, 4:-4]  # without the margin
+        expected = cv2.resize(original, image.shape[1::-1], interpolation=cv2.INTER_AREA)
         assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.9
 
 
