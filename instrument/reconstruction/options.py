@@ -227,8 +227,7 @@ class OutputOptions:
     force: bool = option(False, help="Overwrite files that exist.", group=_OUTPUT)
     explain: bool = option(
         False,
-        help="Only say what auto would choose and why, what a step up or down would be, and the time and "
-        "memory that it will take.",
+        help="Only say what auto would choose and why, its time and memory, and steps up and down.",
         applies=_KEPT,
         group=_OUTPUT,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -82,5 +83,7 @@ def _of_every(run: Run, n_frames: int) -> dict[str, list[Any]]:
         "time_s": [None if one is None else (one.host_time_ns - began_ns) / 1e9 for one in noted]
     }
     every |= {name: [None if one is None else getattr(one, name) for one in noted] for name in EVERY}
-    every |= {name: [None if one is None else one.stage_position.get(name) for one in noted] for name in axes}
+    for name in axes:
+        places = [None if one is None else one.stage_position.get(name) for one in noted]
+        every[name] = [None if place is None or not isfinite(place) else place for place in places]
     return every

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import erf, eval_legendre
 
 from recon.errors import InputError
 
@@ -97,6 +96,8 @@ class Learned:
 
     def shading(self, shape: tuple[int, int]) -> tuple[Array, Array]:
         """Return what reaches the camera over the field, in FFT order, as a column and a row."""
+        from scipy.special import eval_legendre
+
         down, across = (
             np.exp(
                 sum(
@@ -124,6 +125,8 @@ def order_of(count: int) -> int:
 
 def _legendre(order: int, n: int) -> npt.NDArray[np.float64]:
     """Return a Legendre polynomial over ``n`` pixels, rms about 1."""
+    from scipy.special import eval_legendre
+
     places = (np.arange(n) + 0.5) / n * 2 - 1
     return np.asarray(np.sqrt(2 * order + 1) * eval_legendre(order, places), np.float64)
 
@@ -246,6 +249,8 @@ def _shares(sigma: float, parts: int) -> npt.NDArray[np.float64]:
 
     A phase that is constant over pixels, smoothed by a Gaussian of ``sigma`` pixels.
     """
+    from scipy.special import erf
+
     at = (np.arange(parts) + 0.5) / parts
     scale = max(sigma, 1e-6) * np.sqrt(2)
     left, right = 0.5 * (1 - erf(at / scale)), 0.5 * (1 - erf((1 - at) / scale))
