@@ -23,7 +23,8 @@ def write_film_figure(path: Path, activity: Activity, truth: Truth, judged: Judg
     figure = Figure(figsize=(13, 9.5), layout="constrained")
     figures = judged.figures()
     figure.suptitle(
-        f"SIMULATED animal, {len(activity.frames)} frames, each an instant without motion blur.\ndF/F follows the truth in "
+        f"SIMULATED animal, {len(activity.frames)} frames, each an instant without motion blur.\n"
+        f"dF/F follows the truth in "
         f"{judged.followed_clear:.0%} of the {judged.clear_active} cells that flash and stand clear "
         f"(correlation {FOLLOWED:g} or more); median of all {judged.active}: {figures['median_correlation']}"
     )

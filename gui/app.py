@@ -37,7 +37,6 @@ def run(config: BenchConfig | None) -> int:
     require_screen()
     app = application()
     settings = QSettings("diffuserbench", "diffuserbench")
-    apply_theme(app, theme_of(settings))
     status = 0
     wanted: BenchConfig | None = no_bench(working_folder()) if config is None else config
     while wanted is not None:
@@ -53,6 +52,7 @@ def working_folder() -> Path:
 
 def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple[int, BenchConfig | None]:
     """Show the window for a bench until it is closed; returns the exit status, and which bench is next."""
+    apply_theme(app, theme_of(settings))  # which the window before may have changed
     session = BenchSession(config)
     sys.excepthook = _ToLog(session)
     qInstallMessageHandler(lambda _kind, _where, text: _log.debug("Qt: %s", text))

@@ -419,6 +419,7 @@ class MainWindow(QMainWindow):
         self.job_label.setText("Closing: light off, motion stopped …")
         with ExitStack() as each:  # one that fails keeps neither the others nor the bench from their end
             each.callback(self.session.close)
+            each.callback(self.maker.shutdown)
             for panel in self._panels.values():
                 each.callback(panel.shutdown)
 

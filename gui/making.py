@@ -58,6 +58,9 @@ class PanelMaker(QObject):
                     next(slices)
             except StopIteration as made:
                 self._finish(name, made.value)
+            except Exception:
+                self._then.pop(name, None)  # it may be asked for again
+                raise
         return self.panels[name]
 
     def ask(self, name: str, then: Callable[[Panel], object] = lambda _: None) -> None:
@@ -75,6 +78,11 @@ class PanelMaker(QObject):
         job = self._session.jobs.watch(f"Opening {PANELS[name].title}", lambda _: PANELS[name].load())
         job.succeeded.connect(lambda _: self._begin(name))
         job.failed.connect(lambda why: self._failed(name, why))
+
+    def shutdown(self) -> None:
+        """Make none further; the timers of those that are half made end."""
+        while self._slices:
+            self._slices.popitem()[1].close()
 
     def _begin(self, name: str) -> None:
         if name not in self.panels:

@@ -267,8 +267,6 @@ class ProcedurePanel(Panel):
             return
         self.accepted()
         self.use_button.hide()
-        tip = "A simulated bench that serves this routine, in the place of this one"
-        self.other_button = button("", tip, self._open_other)
         self.other_button.hide()
         self.way_on.offer(None)
         self._left.forget()

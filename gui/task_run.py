@@ -118,8 +118,8 @@ class WindowDesk(Desk):
         return [self._told.popleft() for _ in range(len(self._told))]
 
     def pause(self, on: bool) -> None:
-        """Let it wait where it next tells how far it is, or go on."""
-        (self._go_on.clear if on else self._go_on.set)()
+        """Let it wait where it next tells how far it is, or go on; what is ended does not wait."""
+        (self._go_on.clear if on and not self._context.cancel.is_set() else self._go_on.set)()
 
 
 class TaskRun(QObject):

@@ -133,9 +133,11 @@ class Link:
             timeout=aiohttp.ClientTimeout(total=None, sock_connect=_CONNECT_S),
         )
         try:
-            self._hold = await self._session.ws_connect(
-                f"/api/devices/{self._kind}/hold", heartbeat=heartbeat_s, protocols=(PROTOCOL,)
-            )
+            # A server that ended may leave a socket that connects and never answers.
+            async with asyncio.timeout(_CONNECT_S + self._options.lost_after_s):
+                self._hold = await self._session.ws_connect(
+                    f"/api/devices/{self._kind}/hold", heartbeat=heartbeat_s, protocols=(PROTOCOL,)
+                )
             first = await self._hold.receive()
             if first.type is not aiohttp.WSMsgType.TEXT:
                 raise self._unreachable("it ended the connection while the device was opened")
@@ -147,7 +149,7 @@ class Link:
             raise self._refused(error.status, error.message) from error
         except (aiohttp.ClientError, OSError, TimeoutError) as error:
             await self._forget()
-            raise self._unreachable(str(error) or type(error).__name__) from error
+            raise self._unreachable(str(error) or "it does not answer in time") from error
         except BaseException:
             await self._forget()
             raise

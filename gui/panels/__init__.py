@@ -47,11 +47,15 @@ class PanelEntry(NamedTuple):
         else:
             panel = self.load()(session)
         panel.title = self.title
-        yield
-        yield from panel.parts()
-        for part in panel.findChildren(QWidget):  # what showing it first would do in one go
-            part.ensurePolished()
+        try:
             yield
+            yield from panel.parts()
+            for part in panel.findChildren(QWidget):  # what showing it first would do in one go
+                part.ensurePolished()
+                yield
+        except BaseException:  # or not wanted any more
+            Panel.shutdown(panel)  # its timers: a subclass may lack yet what it would end
+            raise
         return panel
 
 

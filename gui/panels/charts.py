@@ -59,6 +59,10 @@ class ChartsPanel(Panel):
         yield
         self.open(self.maps_path)
 
+    def take(self, what: Any) -> None:
+        """Show the maps or the chart that another panel hands on."""
+        self.open(Path(what))
+
     def open(self, path: Path) -> Job:
         """Show the maps or the chart of a file, whichever it holds."""
         job = self.follow(self.jobs.compute(f"Opening {path.name}", lambda _: _read(path)))

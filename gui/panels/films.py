@@ -157,8 +157,8 @@ class FilmsPanel(Panel):
             self.slider.setValue(0)
         self.plot.setLabel("bottom", "time (s)" if film.period_s else "frame")
         self._set_usable()
-        self._place = -1
-        self.go_to(0)
+        self._place = 0
+        self._show((0, first))
 
     def go_to(self, place: int) -> None:
         """Show a picture."""
@@ -211,6 +211,8 @@ class FilmsPanel(Panel):
     def _clear_regions(self) -> None:
         if self._curves_job is not None:
             self._curves_job.cancel()
+            self._curves_job = None
+            self.progress.hide()
         self.measure.clear()
         self.courses = np.empty((0, 0))
         self._draw_curves()

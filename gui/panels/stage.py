@@ -98,7 +98,7 @@ class StagePanel(DevicePanel):
         self.home_button = button("Home …", tip, self.ask_home)
         self._here: dict[str, float] | None = None
         """Where the stage said that it is."""
-        self.places = KeptBar(session, "places", "Places", lambda: self._here, self._go_to)
+        self.places = KeptBar(session, "places", "Places", lambda: self._here, self._go_to, "Go")
         self._grid = QGridLayout()
         self._grid.setHorizontalSpacing(6)
         self._grid.setColumnStretch(2, 1)

@@ -87,6 +87,8 @@ class TasksPanel(Panel):
         self.run.ended_early.connect(self._ended)
         self.run.failed.connect(self._failed)
         self.run.over.connect(self._over)
+        self._running = self.name
+        """The task that goes on, or went on last."""
         self._chosen()
 
     def _make_results(self) -> QWidget:
@@ -121,7 +123,13 @@ class TasksPanel(Panel):
         return str(self.choice.currentData())
 
     def choose(self, name: str, **values: Any) -> None:
-        """Choose a task and fill in some of its options, as soon as its form is there."""
+        """Choose a task and fill in some of its options, as soon as its form is there.
+
+        While one goes on no other is chosen, and the last line says so.
+        """
+        if self.run.is_running:
+            self.refused(None, f"{TASKS[self._running].title} goes on: wait for its end, or end it.")
+            return
         self._given = values
         self.choice.setCurrentIndex(self.choice.findData(name))
         self._chosen()
@@ -208,6 +216,7 @@ class TasksPanel(Panel):
         objects = self.objects()
         if objects is None:
             return
+        self._running = self.name
         page = self._pages[self.name]
         out = page.form.value("out") if page.names is not None else None
 
@@ -236,7 +245,7 @@ class TasksPanel(Panel):
         self.use_button.setEnabled(False)
 
     def _told(self, told: Told) -> None:
-        text = self._pages[self.name].form.in_its_words(told.text)
+        text = self._pages[self._running].form.in_its_words(told.text)
         if told.kind == "table":
             made = table(told.headings, text, row_px=_ROW_PX)
             made.setRowCount(len(told.rows))
@@ -264,8 +273,8 @@ class TasksPanel(Panel):
             self._told(Told("warn", done.kept))
         elif not done.good:
             mark(self.words, "refused", True)
-        page = self._pages[self.name]
-        if page.names is not None and not done.kept and TASKS[self.name].group != CHARTS:
+        page = self._pages[self._running]
+        if page.names is not None and not done.kept and TASKS[self._running].group != CHARTS:
             # What was interrupted, and a chart that has more to do, is gone on with under the same name.
             page.names.suggest(page.form.value("out").name.partition(".")[0].rstrip("-0123456789"))
         self.folder_button.setEnabled(bool(done.files))
@@ -276,7 +285,7 @@ class TasksPanel(Panel):
             self._show(pictures[0])
 
     def _failed(self, why: str) -> None:
-        self._ended(self._pages[self.name].form.in_its_words(why))
+        self._ended(self._pages[self._running].form.in_its_words(why))
 
     def _ended(self, words: str) -> None:
         self.words.appendPlainText(words)
@@ -303,7 +312,7 @@ class TasksPanel(Panel):
         """Return the name of the panel that works with a result; empty where there is none."""
         if path.name in ("chart.json", "stability.json"):
             return "charts"
-        if path.name.endswith(".ome.zarr") and TASKS[self.name].group == VIDEOS:
+        if path.name.endswith(".ome.zarr") and TASKS[self._running].group == VIDEOS:
             return "films"
         return "reconstructions" if (path / "calibration.json").is_file() else ""
 

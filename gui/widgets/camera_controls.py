@@ -77,7 +77,7 @@ class CameraForm(QWidget):
         self._temperature_name = label("Temperature")
         tip = "Everything that the camera reports of itself"
         self.all_button = button("All settings …", tip, self._show_all)
-        self.presets = KeptBar(self._session, "camera", "Presets", self._preset, self._use_preset)
+        self.presets = KeptBar(self._session, "camera", "Presets", self._preset, self._use_preset, "Use")
         last = in_row(self._temperature_name, (self.temperature, 1), self.all_button)
         fill(self, self.form, self.presets, last)
         self._session.device_changed.connect(self._device_changed)

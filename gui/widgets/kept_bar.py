@@ -1,4 +1,4 @@
-"""What is kept with the bench under names: chosen, saved under what is typed, removed."""
+"""What is kept with the bench under names: chosen, used, saved under what is typed, removed."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ from collections.abc import Callable
 from typing import Any
 
 from PySide6.QtCore import QSignalBlocker
-from PySide6.QtWidgets import QWidget
+from PySide6.QtWidgets import QComboBox, QWidget
 
 from gui.session import BenchSession
 from gui.widgets.building import button, choice, fill, narrow
 
 
 class KeptBar(QWidget):
-    """Names to choose from, and to type; Save and Remove.
+    """Names to choose from, and to type; a button that uses what is chosen; Save and Remove.
+
+    Wheel, keys and typing only choose: the stage moves by the button alone.
 
     Parameters
     ----------
@@ -25,7 +27,9 @@ class KeptBar(QWidget):
     take : callable
         Returns what is to be kept now; None where there is nothing.
     apply : callable
-        Called with a name and what is kept under it, when it was chosen.
+        Called with a name and what is kept under it, when it is to be used.
+    answer : str
+        On the button that uses it.
     """
 
     def __init__(
@@ -35,19 +39,22 @@ class KeptBar(QWidget):
         words: str,
         take: Callable[[], Any],
         apply: Callable[[str, Any], object],
+        answer: str,
     ) -> None:
         super().__init__()
         self._session, self._kind, self._take, self._apply = session, kind, take, apply
         self.names = narrow(choice((), f"{words}, kept with the bench: choose one, or type a name and save"))
         self.names.setEditable(True)
+        self.names.setInsertPolicy(QComboBox.InsertPolicy.NoInsert)
+        self.names.setCompleter(None)  # type: ignore[arg-type] # Qt takes none; its stub does not
         self.names.setAccessibleName(words)
         entry = self.names.lineEdit()
         assert entry is not None
         entry.setPlaceholderText(words)
-        self.names.activated.connect(lambda _: self._chosen())
+        self.use_button = button(answer, "Use what is kept under this name", self.use)
         self.save_button = button("Save", "Keep what is set now under this name", self.save)
         self.remove_button = button("Remove", "Keep it no longer", self.remove)
-        fill(self, (self.names, 1), self.save_button, self.remove_button, across=True)
+        fill(self, (self.names, 1), self.use_button, self.save_button, self.remove_button, across=True)
         session.kept_changed.connect(self.show_names)
         self.show_names()
 
@@ -70,8 +77,9 @@ class KeptBar(QWidget):
         self._session.keep(self._kind, self.names.currentText().strip(), None)
         self.names.setCurrentText("")
 
-    def _chosen(self) -> None:
-        name = self.names.currentText()
+    def use(self) -> None:
+        """Use what is kept under the name."""
+        name = self.names.currentText().strip()
         value = self._session.kept.of(self._kind).get(name)
         if value is not None:
             self._apply(name, value)

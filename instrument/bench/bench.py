@@ -316,6 +316,11 @@ class Bench:
         return self._lights.scene_lit
 
     @property
+    def knows_scene(self) -> bool:
+        """Whether ``scene_lit`` is known: of a scene that the operator lights, once he was asked."""
+        return self._lights.knows_scene
+
+    @property
     def source_lit(self) -> bool:
         """Whether the LEDs of [source] alone are lit, by the last pattern that the array confirmed."""
         leds = self.led_array

@@ -60,6 +60,11 @@ class Lights:
             return self._asked.get("the scene", False)
         return self.scene_switch is not None and self.scene_switch.scene_lit
 
+    @property
+    def knows_scene(self) -> bool:
+        """Whether ``scene_lit`` is known: of a scene that the operator lights, once he was asked."""
+        return not self._by_operator or "the scene" in self._asked
+
     def is_source(self, pattern: LedPattern) -> bool:
         """Whether a pattern is the point source as it is configured: these LEDs so bright, and no others."""
         lit = {led: rgb for led, rgb in pattern.levels if any(rgb)}

@@ -19,6 +19,8 @@ _LAG_NS = 30_000_000
 def light_words(bench: Bench) -> str:
     """Return what is lit now, as far as the program knows, in a few words."""
     light, pattern = light_of(bench), led_pattern(bench)
+    if light is LightState.DARK and not bench.knows_scene:
+        return "not known" if pattern is None else "LEDs dark, scene not known"
     if light is not LightState.AS_IS:
         return {LightState.SCENE: "scene", LightState.SOURCE: "point source"}.get(light, NOTHING_LIT)
     words = f"LEDs: {pattern.description}" if pattern is not None and not pattern.is_dark else ""

@@ -7,7 +7,7 @@ import io
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from instrument.files.atomic import require_new, whole_file, write_text
 from instrument.files.errors import FileError
 from instrument.files.films import as_shown, write_mp4
-from instrument.files.volumes import is_zarr_name
+from instrument.files.volumes import grid_of, is_zarr_name
 from instrument.reconstruction.video_files import (
     DEFAULT_FPS,
     SAMPLES,
@@ -25,6 +25,9 @@ from instrument.reconstruction.video_files import (
     require_video,
 )
 from instrument.runs.run import Run
+
+if TYPE_CHECKING:
+    from recon.camera.grid import Grid
 
 Window = tuple[slice, slice]
 """Rows and columns."""
@@ -88,6 +91,21 @@ class Film:
             return self._video.flat(index)
         assert self._run is not None
         return self._run.frame(index)
+
+    def whole(self, place: int) -> npt.NDArray[Any]:
+        """Return all that is kept of a picture: of a volume its planes, ([n_z,] height, width[, 3])."""
+        return self.read(place) if self._video is None else self._video.read(self.indices[place])
+
+    @property
+    def grid(self) -> Grid | None:
+        """Where its pixels lie in the object; None where no file tells of it, as of a recording."""
+        if self._video is None:
+            return None
+        facts = self._video.attributes.get("diffuserbench", {})
+        sizes = dict(zip(self._video.axes, self._video.array.shape, strict=True))
+        if "pitch_um" not in facts and "z" not in sizes:
+            return None
+        return grid_of(facts, (sizes.get("z", 1), sizes["y"], sizes["x"]))
 
     def levels(self) -> tuple[float, float]:
         """Return black and white for all pictures, from some of them."""
@@ -197,13 +215,16 @@ def _pictures(film: Film, advance: Advance | None) -> Iterator[npt.NDArray[Any]]
 
 
 def _write_zarr(film: Film, target: Path, advance: Advance | None) -> None:
+    """Write all values, each picture at its own time: those that are not there are not in the copy either."""
     about = {"of": str(film.path.resolve()), "simulated": film.simulated}
-    shape = film.read(0).shape
-    create_output(target, len(film), shape, period_s=film.period_s, grid=None, attributes=about)
+    shape, count = film.whole(0).shape, film.indices[-1] + 1
+    create_output(target, count, shape, period_s=film.period_s, grid=film.grid, attributes=about)
     try:
         made = VideoPictures(target, write=True)
-        for place, picture in enumerate(_pictures(film, advance)):
-            made.write(place, np.asarray(picture, np.float32))
+        for place, index in enumerate(film.indices):
+            made.write(index, np.asarray(film.whole(place), np.float32))
+            if advance is not None:
+                advance(place + 1, len(film))
     except BaseException:
         shutil.rmtree(target)
         raise

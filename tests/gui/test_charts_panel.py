@@ -158,7 +158,7 @@ def chart(tmp_path: Path) -> Path:
 def test_a_chart_shows_the_front_and_ranks_the_settings(
     qtbot: QtBot, panel: ChartsPanel, tmp_path: Path
 ) -> None:
-    panel.open(chart(tmp_path))
+    panel.take(chart(tmp_path))  # as the panel of tasks hands it on
     view = panel.chart
     qtbot.waitUntil(lambda: bool(view.front), timeout=WAIT_MS)
     assert panel.tabs.currentWidget() is view

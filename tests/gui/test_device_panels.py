@@ -136,7 +136,11 @@ def test_a_place_is_kept_with_the_bench_and_gone_to_again(
     stage.jog("x", 5.0)
     qtbot.waitUntil(lambda: (stage._here or here)["x_um"] != here["x_um"], timeout=WAIT_MS)
     qtbot.waitUntil(lambda: not session.jobs.is_busy("stage"), timeout=WAIT_MS)
-    stage.places.names.activated.emit(0)
+    at = dict(stage._here or {})
+    stage.places.names.activated.emit(0)  # by a wheel or a key: chosen, and nothing moves
+    assert not session.jobs.is_busy("stage")
+    assert stage._here == pytest.approx(at, abs=1.0)
+    qtbot.mouseClick(stage.places.use_button, LEFT)
     qtbot.waitUntil(lambda: (stage._here or {}) == pytest.approx(here, abs=1.0), timeout=WAIT_MS)
     qtbot.mouseClick(stage.places.remove_button, LEFT)
     assert not stage.places.names.count()

@@ -18,6 +18,7 @@ from gui.panels.films import FilmsPanel
 from gui.session import BenchSession
 from instrument.cli import main
 from instrument.reconstruction.video_files import VideoPictures, create_output
+from recon.camera.grid import Grid
 from tests.gui.conftest import WAIT_MS
 
 COUNT, LOST = 30, 7
@@ -73,7 +74,10 @@ def test_a_film_is_played_followed_and_written(
     with Image.open(tmp_path / "film.gif") as gif:
         assert sum(frame.info["duration"] for frame in ImageSequence.Iterator(gif)) == 29 * 50
     assert int(cv2.VideoCapture(str(tmp_path / "film.mp4")).get(cv2.CAP_PROP_FRAME_COUNT)) == 29
-    assert VideoPictures(tmp_path / "copy.ome.zarr").read(14)[9, 12] == 2.5
+    copy = VideoPictures(tmp_path / "copy.ome.zarr")
+    assert copy.read(15)[9, 12] == 2.5  # at its own time
+    assert len(copy) == COUNT
+    assert not copy.is_written(LOST)
     exec(panel.as_python(), {})
     handed: list[object] = []
     session.handed_on.connect(lambda name, what: handed.append((name, what)))
@@ -88,3 +92,15 @@ def test_a_film_is_played_followed_and_written(
         pass
     assert panel.film is not None  # the one before stays
     panel.shutdown()
+
+
+def test_a_video_of_volumes_is_copied_with_its_planes_and_their_places(tmp_path: Path) -> None:
+    grid = Grid((2, 4, 5), (2, 2), np.array([2e3, 3e3]), np.array([4.0, 6.0]))
+    video, copy = tmp_path / "deep.ome.zarr", tmp_path / "copy.ome.zarr"
+    create_output(video, 1, grid.shape, period_s=0.1, grid=grid, attributes={})
+    volume = np.arange(40, dtype=np.float32).reshape(grid.shape)
+    VideoPictures(video, write=True).write(0, volume)
+    assert main(["export", str(video), str(copy)]) == 0
+    made = VideoPictures(copy)
+    np.testing.assert_array_equal(made.read(0), volume)
+    assert made.attributes["diffuserbench"]["pitch_um"] == [4.0, 6.0]

@@ -109,4 +109,5 @@ def test_a_task_waits_ends_and_keeps_what_it_can(qtbot: QtBot, panel: TasksPanel
     qtbot.waitUntil(lambda: run._desk is not None, timeout=WAIT_MS)
     with qtbot.waitSignal(run.ended_early, timeout=WAIT_MS):
         run.abort()
+        run.pause()  # of what is ended: it does not wait
     assert issubclass(JobCancelledError, KeyboardInterrupt)  # what a task in the terminal sees

@@ -5,11 +5,15 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from datetime import UTC, datetime
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from drivers.frame import FrameMetadata
-from instrument.live.light_log import LightLog
+from instrument.bench.config import SceneTable, SourceTable
+from instrument.bench.source_and_scene import Lights
+from instrument.live.light_log import LightLog, light_words
 
 MS = 1_000_000
 
@@ -29,3 +33,19 @@ def test_a_frame_has_the_light_of_its_exposure_not_that_of_now(monkeypatch: pyte
         "nothing lit, then scene, then point source"
     )
     assert log.during(replace(frame, host_time_ns=-500 * MS)) == "", "before anything was known"
+
+
+def test_what_the_operator_lights_is_not_known_before_he_was_asked() -> None:
+    lights = Lights(SourceTable(), SceneTable(control="operator"), None, None, lambda _: None)
+
+    def words() -> str:
+        bench: Any = SimpleNamespace(
+            led_array=None, scene_lit=lights.scene_lit, knows_scene=lights.knows_scene
+        )
+        return light_words(bench)
+
+    assert words() == "not known"
+    lights.switch_scene(lit=False)
+    assert words() == "nothing lit"
+    lights.switch_scene(lit=True)
+    assert words() == "scene"
