@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from instrument.evaluation.chart import ChartData
 from recon.base.blocks import block_mean
+from recon.errors import InputError
 from recon.evaluation.chart_reconstruction import ChartProblem
 from recon.evaluation.scored import Point
 from recon.evaluation.trial import Setting
@@ -58,10 +59,13 @@ def chart_of(
     failed: dict[str, str] = {}
     for number, setting in enumerate(settings):
         on_progress(number / len(settings))
-        if (setting.solver, setting.prior) not in warm:
-            problem.warm_up(setting)
-            warm.add((setting.solver, setting.prior))
-        points += problem.run(setting, limit_s=budget_s / len(settings), counts=COUNTS).points
+        try:
+            if (setting.solver, setting.prior) not in warm:
+                problem.warm_up(setting)
+                warm.add((setting.solver, setting.prior))
+            points += problem.run(setting, limit_s=budget_s / len(settings), counts=COUNTS).points
+        except InputError as error:
+            failed[setting.name] = str(error)
     about = {"scene": "the photograph of the demo", "simulated": True, "pixels": list(problem.pixels)}
     return ChartData(problem.kind, about, tuple(points), failed, ())
 

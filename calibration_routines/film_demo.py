@@ -46,7 +46,10 @@ WARM_ITERATIONS = 6
 
 @dataclass(frozen=True)
 class FilmSettings:
-    """The demo's settings; everything that could flatter the result is here, in the open."""
+    """The demo's settings; the rest of its bench is in the configuration beside the film.
+
+    What flatters it: a frame is the light at one instant, so that nothing is blurred by motion.
+    """
 
     frames: int = option(200, least=40, help="Of the film, ten a second.")
     binning: int = option(

@@ -23,7 +23,8 @@ def write_film_figure(path: Path, activity: Activity, truth: Truth, judged: Judg
     figure = Figure(figsize=(13, 9.5), layout="constrained")
     figures = judged.figures()
     figure.suptitle(
-        f"SIMULATED animal, {len(activity.frames)} frames. dF/F follows the truth in "
+        f"SIMULATED animal, {len(activity.frames)} frames, each an instant without motion blur.\n"
+        f"dF/F follows the truth in "
         f"{judged.followed_clear:.0%} of the {judged.clear_active} cells that flash and stand clear "
         f"(correlation {FOLLOWED:g} or more); median of all {judged.active}: {figures['median_correlation']}"
     )
@@ -86,7 +87,7 @@ def write_film_figure(path: Path, activity: Activity, truth: Truth, judged: Judg
     speed.plot(times, judged.speed_um_s, color="tab:red", lw=0.8, label="reconstructed")
     speed.plot(activity.times_s, truth.speed_um_s, "k", lw=0.7, label="true")
     speed.set_xlim(0, min(6.0, float(times[-1])))
-    speed.set_ylim(0, 2.2 * float(truth.speed_um_s.max()))
+    speed.set_ylim(-float(truth.speed_um_s.max()), 2.2 * float(truth.speed_um_s.max()))
     speed.set_xlabel("seconds")
     speed.set_ylabel("um/s")
     speed.legend(fontsize=8, loc="upper right")

@@ -207,19 +207,18 @@ def _along(frames: npt.NDArray[np.float32], places: Floats) -> Floats:
 def _speed(kymograph: Floats, step_um: float, period_s: float) -> Floats:
     """Return the speed between successive frames, (n_frames - 1,): the shift that lays one on the next.
 
-    It is looked for among shifts forwards by up to a third of the line, by the correlation of what both
-    frames have, and refined to a fraction of a place by the parabola through the largest.
+    It is looked for among shifts of either sign by up to a twelfth of the line, by the correlation of what
+    both frames have, and refined to a fraction of a place by the parabola through the largest.
     """
     n = kymograph.shape[1]
-    lags = np.arange(0, max(n // 12, 3))
+    far = max(n // 12, 3)
+    lags = np.arange(-far, far + 1)
     speeds = np.zeros(len(kymograph) - 1)
     for t, (before, after) in enumerate(itertools.pairwise(kymograph)):
-        score = np.array(
-            [np.mean(before[: n - k] * after[k:]) / (np.std(before[: n - k]) * np.std(after[k:]) + 1e-30)
-             for k in lags]
-        )  # fmt: skip
+        both = [(before[max(-k, 0) : n - max(k, 0)], after[max(k, 0) : n - max(-k, 0)]) for k in lags]
+        score = np.array([np.mean(a * b) / (np.std(a) * np.std(b) + 1e-30) for a, b in both])
         best = int(np.argmax(score))
-        shift = float(best)
+        shift = float(lags[best])
         if 0 < best < len(lags) - 1:
             bend = score[best - 1] - 2 * score[best] + score[best + 1]
             shift += 0.5 * (score[best - 1] - score[best + 1]) / bend if bend < 0 else 0.0

@@ -23,6 +23,7 @@ from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig
 from instrument.bench.safety import StepsFailedError
 from instrument.display.hologram import (
+    Alignment,
     CaptureOptions,
     HologramResult,
     bench_display,
@@ -175,7 +176,11 @@ def compute(
 
 
 def show_on_slm(bench: Bench, computed: Computed, correction: Path | None, context: JobContext) -> None:
-    """Show a hologram: one frame stays; several follow each other until the job is cancelled."""
+    """Show a hologram: one frame stays; several follow each other until the job is cancelled.
+
+    Raises BenchError where it was computed for a display learned with another SLM calibration, or with none.
+    """
+    _aligned(computed, correction)
     io = _display_bench(bench, correction)
     frames = computed.result.hologram.slm
     io.show(frames[0])
@@ -195,8 +200,9 @@ def photograph(
     """Show a hologram, photograph it, compare it with its target, and write what was seen.
 
     Ends at once when it is cancelled; the bench is safe afterwards, however it ends, and the
-    camera's exposure as it was.
+    camera's exposure as it was. Raises BenchError as :func:`show_on_slm`.
     """
+    place = _aligned(computed, correction)
     pattern = computed.order.out
     out = free_result(pattern.parent, f"{pattern.stem}-seen", ".png")
     check_writable(out)  # before the bench is touched
@@ -213,8 +219,8 @@ def photograph(
     context.on_cancel(cancel)
     try:
         with _exposure_kept(bench.camera), control.procedure(bench):
-            if computed.order.alignment is not None:
-                bring_mask(bench, load_alignment(computed.order.alignment).stage_position)
+            if place is not None:
+                bring_mask(bench, place.stage_position)
             seen = photograph_hologram(
                 _display_bench(bench, correction, control.check),
                 list(computed.result.hologram.slm),
@@ -239,6 +245,15 @@ def _exposure_kept(camera: Camera) -> Iterator[None]:
             camera.set_exposure_ms(before_ms)
         raise
     camera.set_exposure_ms(before_ms)
+
+
+def _aligned(computed: Computed, correction: Path | None) -> Alignment | None:
+    """Return the alignment that a hologram was computed for, if any, which must fit the SLM calibration."""
+    if computed.order.alignment is None:
+        return None
+    place = load_alignment(computed.order.alignment)
+    place.require_correction(correction is not None)
+    return place
 
 
 def _display_bench(

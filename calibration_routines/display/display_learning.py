@@ -78,7 +78,7 @@ class LearningProcedure(Checked, Procedure):
         return self.patterns + 2
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
-        """Refuse a bench without SLM, files that cannot be read, a file that exists."""
+        """Refuse a bench without SLM, files that cannot be read or do not go together, a file that exists."""
         slm = require_slm(bench)
         if self.out is not None:
             require_new(self.out, overwrite=self.overwrite)
@@ -86,7 +86,9 @@ class LearningProcedure(Checked, Procedure):
             load_slm_correction(self.slm_calibration)
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
         if self.alignment is not None:
-            load_alignment(self.alignment).of(display)
+            place = load_alignment(self.alignment)
+            place.of(display)
+            place.require_correction(self.slm_calibration is not None)
         height, width = display.slm_shape
         return Outlook(
             (f"{self.patterns} random patterns of {height} x {width} pixels, {self.frames} frames",)

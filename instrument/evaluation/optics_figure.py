@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
 
+BEADS = "Beads lie at calibrated depths only; light from between them is not tested."
+"""What a page and a table of a comparison say below."""
 _COLOURS = ("#444444", "#1b7fbd", "#d9822b", "#2a9d4a")
 _MARGIN = 32
 """Pixels at each edge of the sensor's grid that the scenes leave dark."""
@@ -64,6 +66,7 @@ def optics_figure(compared: Comparison) -> Figure:
         below.annotate(name, (lights[-1], values[-1]), (6, 0), textcoords="offset points", color=colour)
     style(below, "Picture against the scene", "photons on the sensor", "PSNR, dB")
     below.margins(x=0.15)
+    figure.supxlabel(BEADS, fontsize=9)
     mark_simulated(figure, 1.0)
     return figure
 

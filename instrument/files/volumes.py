@@ -159,9 +159,10 @@ def write_volume_tiff(
     n_pages = shape[0] * (shape[3] if colour else 1)
     if origin := _origin_um(grid):
         places = {
-            "X": np.full(n_pages, origin["x"]),
-            "Y": np.full(n_pages, origin["y"]),
-            "Z": np.repeat(grid.z_um, n_pages // shape[0]),
+            axis.upper(): np.repeat(grid.z_um, n_pages // shape[0])
+            if axis == "z"
+            else np.full(n_pages, place)
+            for axis, place in origin.items()
         }
         metadata["Plane"] = {f"Position{axis}": list(map(float, where)) for axis, where in places.items()}
         metadata["Plane"] |= {f"Position{axis}Unit": ["µm"] * n_pages for axis in places}
@@ -180,10 +181,15 @@ def voxel_um(grid: Grid) -> dict[str, float]:
 
 
 def _origin_um(grid: Grid) -> dict[str, float]:
-    """Return where the first voxel's centre is: its depth, and from the axis; nothing where not known."""
+    """Return where the first voxel's centre is: its depth, and from the axis; nothing where not known.
+
+    Only the depth of a grid that is not upright: its rows and columns go against y and x.
+    """
     voxel = voxel_um(grid)
     if not voxel or (np.diff(grid.z_um) < 0).any():  # told by a step and a place, planes go away from it
         return {}
+    if not grid.upright:
+        return {"z": float(grid.z_um[0])}
     row, column = grid.centre
     return {"z": float(grid.z_um[0]), "y": -row * voxel["y"], "x": -column * voxel["x"]}
 

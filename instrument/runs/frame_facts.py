@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
+from instrument.files.volumes import EVEN
 from instrument.runs.frame_array import description_of, group_of
 from instrument.runs.run import Run
 
@@ -33,7 +34,8 @@ def z_steps_um(noted: Sequence[FrameMetadata]) -> npt.NDArray[np.float64]:
 def descriptions(run: Run, n_frames: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return what the ``zarr.json`` of a run's array and of its image hold, by what is known of its frames.
 
-    A plan's sweep along z alone has the axis z, with the median step and the first place; any other run t.
+    A plan's sweep along z alone has the axis z, with its step where steps are even, and then the place of
+    its first frame; any other run t.
     The bit depth is the window of OME's ``omero``; what OME-Zarr has no field for (exposure, black level,
     stage positions, times, light, colour filter) is in the attribute ``diffuserbench``: of every frame for
     plans, in the array's order and None for frames that are not there; what is common for recordings.
@@ -61,8 +63,10 @@ def descriptions(run: Run, n_frames: int) -> tuple[dict[str, Any], dict[str, Any
         more["omero"] = {"channels": channels}
     step, start = run.frame_period_s, None
     if steps.size:
-        step = float(np.median(np.abs(steps)))
-        start = first.stage_position["z_um"] if steps[0] > 0 else None  # a scale is positive
+        sizes = np.abs(steps)
+        step = float(np.median(sizes)) if np.ptp(sizes) <= EVEN * sizes.min() else None
+        if step is not None and steps[0] > 0 and min(run.records) == 0:  # a scale is positive
+            start = first.stage_position["z_um"]
     pitch_um = float(run.provenance["pixel_pitch_um"])
     return described, group_of(described["dimension_names"], pitch_um, run.label, step, start, more)
 

@@ -34,7 +34,7 @@ def optics(desk: Desk, files: OpticsFiles, options: OpticsOptions) -> Done:
     lenses is photographed with few and many photons, beads in three depths once; light is propagated, and all
     is reconstructed alike. Two minutes.
     """
-    from instrument.evaluation.optics_figure import optics_figure
+    from instrument.evaluation.optics_figure import BEADS, optics_figure
     from instrument.files.atomic import write_text
     from instrument.files.figures import save_figure
     from recon.evaluation.optics_compared import compare_optics
@@ -61,6 +61,7 @@ def optics(desk: Desk, files: OpticsFiles, options: OpticsOptions) -> Done:
     ]
     desk.say("SIMULATED: light is propagated through modelled optics")
     desk.table(headings, rows)
+    desk.say(BEADS)
     save_figure(optics_figure(compared), files.out)
     write_text(table, optics_csv(compared.found))
     return Done((files.out, table))

@@ -110,7 +110,8 @@ def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
     voxel_um : float, optional
         Edge of a cube. Default: as wide as the middle plane's pixels, as deep as the step beside it.
 
-    Raises InputError where depths or pitches are not known, there is one plane, or planes share a depth.
+    Raises InputError where depths or pitches are not known, there is one plane, planes share a depth, or a
+    voxel is larger than the volume.
     """
     n_z, height, width = grid.shape
     if n_z < 2:
@@ -145,6 +146,11 @@ def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
         start = int(np.ceil(low / across - 1e-6))
         sides.append((start, int(np.floor(high / across + 1e-6)) - start + 1))
     (top, rows), (left, columns) = sides
+    if count < 2 or rows < 1 or columns < 1:
+        raise InputError(
+            f"Voxels of {across:g} um are too large: two must fit into the volume's depth of {span:.4g} um, "
+            "and one across. Give a smaller edge."
+        )
     return Grid(
         (count, rows, columns),
         (-top, -left),

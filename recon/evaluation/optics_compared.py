@@ -2,7 +2,8 @@
 
 All four have one aperture at one distance from one sensor, and send as many photons onto it. Photographs are
 propagated as light, each cell of the scene at its own place; PSFs are those of a point on the axis of each
-depth, without noise. Everything is reconstructed alike: by l1, as sec. 6.2 does, with one PSF a depth.
+depth, without noise. Everything is reconstructed alike: by l1, as sec. 6.2 does, with one PSF a depth. Beads
+are drawn at calibrated depths only; light from between them, which every real sample sends, is not tested.
 """
 
 from __future__ import annotations

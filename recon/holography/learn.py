@@ -10,7 +10,6 @@ searched. Each photograph's brightness is free.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -34,7 +33,7 @@ _MIRRORED, _LAST = 2, 2
 _WORTH = 0.9
 """Of the power not explained by the description: what is left must be less, or the description stays."""
 AT_ONCE = 2
-"""Photographs that a round fits."""
+"""Photographs that a round fits at least, and that it has in memory at a time."""
 _FIRST_CROSSTALK = 0.2
 """SLM pixels: it has to be there to be felt."""
 _BELIEF = 30.0
@@ -71,8 +70,8 @@ class Lesson:
     before, after : float
         Part of those photographs' contrast that is not explained, rms.
     rounds : tuple of float
-        The same of the photographs fitted, before each round; from the sixth on the mask's depth is first
-        mirrored, then the better of the two.
+        The same after each round; from the sixth on the mask's depth is first mirrored, then the better of
+        the two.
     helps : bool
         Whether enough less is unexplained; else the display is as it was.
     """
@@ -202,7 +201,6 @@ def learn_display(
     *,
     aside: int = 3,
     on_progress: Callable[[float, str], object] | None = None,
-    cancel: threading.Event | None = None,
 ) -> Lesson:
     """Learn how a display differs from its description.
 
@@ -213,15 +211,15 @@ def learn_display(
     looks : sequence of Look
         Random phases, at least ``aside`` + 2.
     aside : int
-        So many of the last ones are not fitted; they judge.
+        So many of the last ones, at least one, are not fitted; they judge.
     on_progress : callable, optional
-        ``on_progress(share, words)``.
-    cancel : threading.Event, optional
-        Set, it ends with what was learned so far.
+        ``on_progress(share, words)``; it may raise to end the work.
 
     Raises InputError for too few photographs, and for photographs of which next to nothing is explained even
     afterwards: another mask, or one that is not aligned.
     """
+    if aside < 1:
+        raise InputError(f"At least one photograph must judge what is learned, not {aside}.")
     if len(looks) < aside + 2:
         raise InputError(f"At least {aside + 2} photographs are needed, not {len(looks)}.")
     fitted, kept = looks[:-aside], looks[-aside:]
@@ -230,23 +228,21 @@ def learn_display(
     rounds: list[float] = []
     found = [np.zeros(len(fit.scales))]
     plan = (*CUTS, *[CUTS[-1]] * (_MIRRORED + _LAST))
+    per = min(max(AT_ONCE, -(-len(fitted) // len(CUTS))), len(fitted))  # so that each is fitted in some round
     for number, cut in enumerate(plan):
         if number == len(CUTS):
             found.append(fit.mirrored(found[0]))
         elif number == len(CUTS) + _MIRRORED:
             found = [fit.best(found, fitted)]
-        some = [fitted[(number * AT_ONCE + n) % len(fitted)] for n in range(min(AT_ONCE, len(fitted)))]
+        some = [fitted[(number * per + n) % len(fitted)] for n in range(per)]
 
         def tell(share: float, number: int = number) -> None:
             if on_progress is not None:
                 done = (number + share) / len(plan)
                 on_progress(done, f"round {number + 1} of {len(plan)}")
 
-        system = _system(fit, found[-1], some, cut, tell, cancel)
-        if system is None:
-            break
-        rounds.append(system.unexplained)
-        found[-1] = _stepped(fit, found[-1], some, cut, system)
+        found[-1] = _stepped(fit, found[-1], some, cut, _system(fit, found[-1], some, cut, tell))
+        rounds.append(fit.unexplained(fit.display(found[-1]), kept))
     learned = fit.display(fit.best(found, fitted))
     after = fit.unexplained(learned, kept)
     if min(before, after) > HOPELESS:
@@ -274,44 +270,38 @@ class _System:
 
 
 def _system(
-    fit: _Fit,
-    vector: Array,
-    looks: Sequence[Look],
-    cut: float,
-    tell: Callable[[float], object],
-    cancel: threading.Event | None,
-) -> _System | None:
-    """Form the normal equations, in units of the unknowns' scales; None when it was cancelled."""
+    fit: _Fit, vector: Array, looks: Sequence[Look], cut: float, tell: Callable[[float], object]
+) -> _System:
+    """Form the normal equations, in units of the unknowns' scales."""
     n = len(vector)
     weights = fit.weights(cut)
     used = weights > 1e-3
     matrix, right = np.zeros((n, n)), np.zeros(n)
-    power = total = 0.0
+    power = 0.0
     display = fit.display(vector)
-    fit.forget()
-    here = [fit.lags(display, look.slm) for look in looks]
-    rows = [np.empty((n, int(used.sum())), np.complex64) for _ in looks]
-    for i, scale in enumerate(fit.scales):
-        if cancel is not None and cancel.is_set():
-            return None
-        step = _STEP * scale
-        moved = fit.display(vector + step * np.eye(n)[i])
-        for look, now, jacobian in zip(looks, here, rows, strict=True):
-            jacobian[i] = ((fit.lags(moved, look.slm) - now) * weights)[used] * (scale / step)
-        tell((i + 1) / n)
-    for look, now, jacobian in zip(looks, here, rows, strict=True):
-        wanted, shown = (look.lags * weights)[used], (now * weights)[used]
-        left, gain = _without(wanted, shown)
-        jacobian *= np.float32(gain / np.sqrt(_power(wanted)))
-        left /= np.float32(np.sqrt(_power(wanted)))
-        unit = shown / np.float32(np.sqrt(_power(shown)))
-        jacobian -= np.outer((jacobian @ unit.conj()).real, unit)  # brightness is free
-        flat = jacobian.view(np.float32)
-        matrix += flat @ flat.T
-        right += flat @ left.view(np.float32)
-        power += _power(left)
-        total += 1.0
-    return _System(matrix, right, power, float(np.sqrt(power / total)))
+    for first in range(0, len(looks), AT_ONCE):
+        few = looks[first : first + AT_ONCE]
+        fit.forget()
+        here = [fit.lags(display, look.slm) for look in few]
+        rows = [np.empty((n, int(used.sum())), np.complex64) for _ in few]
+        for i, scale in enumerate(fit.scales):
+            step = _STEP * scale
+            moved = fit.display(vector + step * np.eye(n)[i])
+            for look, now, jacobian in zip(few, here, rows, strict=True):
+                jacobian[i] = ((fit.lags(moved, look.slm) - now) * weights)[used] * (scale / step)
+            tell((first + len(few) * (i + 1) / n) / len(looks))
+        for look, now, jacobian in zip(few, here, rows, strict=True):
+            wanted, shown = (look.lags * weights)[used], (now * weights)[used]
+            left, gain = _without(wanted, shown)
+            jacobian *= np.float32(gain / np.sqrt(_power(wanted)))
+            left /= np.float32(np.sqrt(_power(wanted)))
+            unit = shown / np.float32(np.sqrt(_power(shown)))
+            jacobian -= np.outer((jacobian @ unit.conj()).real, unit)  # brightness is free
+            flat = jacobian.view(np.float32)
+            matrix += flat @ flat.T
+            right += flat @ left.view(np.float32)
+            power += _power(left)
+    return _System(matrix, right, power, float(np.sqrt(power / len(looks))))
 
 
 _STEP = 0.02

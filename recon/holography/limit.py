@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -85,10 +85,14 @@ def hologram_limit(
     callback, cancel
         As :func:`recon.holography.compute_hologram`.
 
-    Raises InputError for another loss or a complex SLM.
+    Raises InputError for another loss or a complex SLM, and for a display of which something was learned.
     """
     options = options or HologramOptions()
-    display = replace(display, learned=None)
+    if display.learned is not None:
+        raise InputError(
+            "The limit is known for a display as it is described, and this one was learned from photographs. "
+            "Give the alignment from align mask, without what was learned, or none."
+        )
     if options.complex_slm or options.loss != "frequency":
         raise InputError("The limit is known for a phase SLM and the loss 'frequency'.")
     model = HologramModel(display, [target], options, frames=COLUMNS)
@@ -187,7 +191,7 @@ def _below_least(apply: Callable[[Array], Array], n: int) -> float:
     Certain up to :data:`DENSE` dimensions. Beyond, Lanczos' least value after ``k`` steps from a random start
     is above the least eigenvalue by more than ``(ln(1.648 sqrt(n) / delta) / (2 k - 1))^2`` of the spectrum's
     width with a probability of at most delta, :data:`DOUBT` (Kuczynski and Wozniakowski 1992, Theorem 4.2):
-    so much is taken off.
+    so much is taken off; after so few steps that it says nothing, minus infinity is returned.
     """
     if n <= DENSE:
         dense = np.stack([apply(row) for row in np.eye(n, dtype=np.complex64)], axis=1)
@@ -206,9 +210,13 @@ def _below_least(apply: Callable[[Array], Array], n: int) -> float:
         w -= np.float32(diagonal[-1]) * v
         beta = float(np.linalg.norm(w))
         if beta <= 1e-6 * abs(diagonal[0]):
-            break
+            # All that the start has a part in was seen: no step beyond, but rounding.
+            ritz = eigvalsh_tridiagonal(diagonal, off)
+            return float(ritz[0] - 1e-5 * np.abs(ritz).max())
         off.append(beta)
         before, v = v, w / np.float32(beta)
     ritz = eigvalsh_tridiagonal(diagonal, off[: len(diagonal) - 1])
     part = (np.log(1.648 * np.sqrt(n) / DOUBT) / (2 * len(diagonal) - 1)) ** 2
+    if part >= 0.5:
+        return -np.inf
     return float(ritz[0] - part * (ritz[-1] - ritz[0]) / (1 - 2 * part))

@@ -111,6 +111,8 @@ def compute_hologram(
         raise InputError(f"The start must be {shape}, not {initial.shape}.")
     if options.phase_levels is not None and (complex_slm or method != "lbfgs"):
         raise InputError("Phase levels are of a phase SLM and need the method 'lbfgs'.")
+    if method == "nesterov" and model.wraps:
+        raise InputError("What was learned of the display jumps where phases wrap: use the method 'lbfgs'.")
     if method == "one-step":
         if complex_slm or initial is not None:
             raise InputError("The one-step method takes no start and has no form for a complex SLM.")
@@ -394,6 +396,12 @@ FINE = 32
 def _on_levels(variable: _Phase, x: Array, levels: int, watch: _Watch) -> Hologram:
     """Find phases on levels; the last record is theirs, all others are of phases that are partly rounded."""
     step = x.dtype.type(2 * np.pi / levels)
+    if variable.model.wraps:
+        # Stages would search across the jumps, and a phase that is rounded up to a whole turn jumps.
+        unrounded = replace(watch, options=replace(watch.options, psnr_db=None))
+        found = _in_turns(variable, _Lbfgs(variable, x), unrounded)
+        near = np.rint(np.mod(variable.pack(found.slm), x.dtype.type(2 * np.pi)) / step)
+        return _rounded(variable, np.minimum(near, levels - 1) * step, found.history, found.stop_reason)
     history: tuple[HologramRecord, ...] = ()
     reason = HologramStop.ITERATIONS
     stages = zip(HELD, np.cumsum(STAGES), strict=True) if levels < FINE else [(0.0, 1.0)]
@@ -411,11 +419,16 @@ def _on_levels(variable: _Phase, x: Array, levels: int, watch: _Watch) -> Hologr
         history, reason = watch.run(search, iterations, None, history)
         x = search.x
     variable.held = None
-    point, _ = variable.evaluate(np.rint(x / step) * step)
+    return _rounded(variable, np.rint(x / step) * step, history, reason)
+
+
+def _rounded(
+    variable: _Phase, x: Array, history: tuple[HologramRecord, ...], reason: HologramStop
+) -> Hologram:
     last = history[-1]
-    rounded = HologramRecord(last.iteration, last.seconds, *point)
-    slm = variable.field(np.rint(x / step) * step)
-    return Hologram(slm.astype(np.complex64), (*history[:-1], rounded), reason, last.seconds)
+    record = HologramRecord(last.iteration, last.seconds, *variable.evaluate(x)[0])
+    slm = variable.field(x).astype(np.complex64)
+    return Hologram(slm, (*history[:-1], record), reason, last.seconds)
 
 
 TURNS = ((0.25, False), (0.2, False), (0.15, False), (0.2, True), (0.2, True))
@@ -433,15 +446,16 @@ def _in_turns(variable: _Phase, search: _Lbfgs, watch: _Watch) -> Hologram:
         done += part
         model.hold(search.slm, within=within)
         going = _Lbfgs(variable, search.x)
-        history, reason = watch.run(
-            going, round(watch.options.iterations * done), watch.options.psnr_db, history
-        )
+        # What a held display reaches is shown by no SLM: the PSNR asked for is looked for once it is wrapped.
+        history, reason = watch.run(going, round(watch.options.iterations * done), None, history)
         now = model.stopped(going.slm)
         model.hold(None)
         search = _Lbfgs(variable, variable.pack(now))
         if search.point.loss < best.loss:
             best, slm = search.point, now
         history = (*history[:-1], replace(history[-1], loss=best.loss, psnr_db=best.psnr_db))
+        if watch.options.psnr_db is not None and best.psnr_db >= watch.options.psnr_db:
+            reason = HologramStop.QUALITY
         if reason not in (HologramStop.ITERATIONS, HologramStop.CONVERGED):
             break
     return Hologram(slm.astype(np.complex64), history, reason, history[-1].seconds)

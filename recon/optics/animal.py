@@ -42,7 +42,7 @@ class Animal:
     ----------
     cells_um, tissue_um : ndarray, (n, 3)
     rest, glow : ndarray, (n,)
-        Light of the cells at rest, and of the tissue; mean about 1.
+        Light of the cells at rest, mean about 1, and of the spots of tissue, mean about 0.5.
     onsets_s, sizes : tuple of ndarray
         Of each cell: when its transients begin, and their dF/F.
     vessel_um : ndarray, (n, 3)
@@ -170,7 +170,7 @@ def draw_animal(z_um: float, height_um: float, seed: int = 0) -> Animal:
 
 
 def _vessel(length_um: float, width_um: float, z_um: float) -> Floats:
-    """Return the vessel: a shallow wave along the animal, places a third of a cell apart."""
+    """Return the vessel: a shallow wave along the animal, places about half a cell apart."""
     x = np.linspace(-0.45, 0.45, 4000) * length_um
     y = 0.12 * width_um * np.sin(2 * np.pi * x / length_um)
     along = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])

@@ -140,7 +140,8 @@ class MemoryMeter:
 
     def peak_mib(self) -> float:
         """Return the most so far beyond what was taken at the start, without what was taken aside."""
-        return max(self._most, _status_mib("VmHWM") - self._before)
+        now = _status_mib("VmHWM") - self._before
+        return now if now != now else max(self._most, now)  # NaN has to stay one
 
     @contextmanager
     def aside(self) -> Iterator[None]:

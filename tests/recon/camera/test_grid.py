@@ -69,6 +69,7 @@ def test_equal_voxels_stay_as_they_are():
         (replace(GRID, z_um=np.r_[Z_UM[:6], Z_UM[5]]), None, "same depth"),
         (Grid((1, 9, 9), (4, 4), Z_UM[:1], Z_UM[:1]), None, "one plane"),
         (GRID, -3.0, "above 0"),
+        (GRID, 1e5, "too large"),
     ],
 )
 def test_what_cannot_be_brought_to_equal_voxels_is_refused(grid, voxel_um, words):

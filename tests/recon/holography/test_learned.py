@@ -11,6 +11,7 @@ from recon.errors import InputError
 from recon.holography import DcTerm, Display, HologramModel, Target, compute_hologram, random_mask
 from recon.holography.learn import Look, learn_display
 from recon.holography.learned import Learned
+from recon.holography.optimise import HologramStop
 
 SHAPE, K = (24, 32), 2
 PLAIN = Display(
@@ -86,6 +87,21 @@ def test_errors_are_found_again_and_holograms_are_better_for_it():
     assert shown[1] > shown[0] + 3
 
 
+def test_the_psnr_asked_for_and_levels_are_of_what_the_display_shows():
+    model = HologramModel(wrong(), [TARGET])
+    found = compute_hologram(model, iterations=200, psnr_db=24)
+    assert found.stop_reason is HologramStop.QUALITY
+    assert model.evaluate(found.slm).seen_psnr_db >= 24
+    rounded = compute_hologram(model, iterations=100, phase_levels=256)
+    assert rounded.history[-1].psnr_db > 24
+    assert (
+        np.abs(rounded.phase_rad * 256 / (2 * np.pi) - np.rint(rounded.phase_rad * 256 / (2 * np.pi))).max()
+        < 1e-3
+    )
+    with pytest.raises(InputError, match="use the method 'lbfgs'"):
+        compute_hologram(model, method="nesterov")
+
+
 def test_a_display_that_is_as_described_loses_nothing_and_another_mask_is_refused():
     lesson = learn_display(PLAIN, looks_of(PLAIN, 5, noise=0.05))
     assert not lesson.helps
@@ -95,3 +111,5 @@ def test_a_display_that_is_as_described_loses_nothing_and_another_mask_is_refuse
         learn_display(PLAIN, looks_of(other, 5))
     with pytest.raises(InputError, match="At least 5 photographs"):
         learn_display(PLAIN, looks_of(PLAIN, 4))
+    with pytest.raises(InputError, match="must judge"):
+        learn_display(PLAIN, looks_of(PLAIN, 4), aside=0)

@@ -19,6 +19,7 @@ from recon.holography import (
     hologram_limit,
     random_mask,
 )
+from recon.holography.learned import Learned
 from recon.holography.limit import COLUMNS, DENSE, _below_least, _gap
 
 SHAPE, K = (12, 16), 4
@@ -78,6 +79,8 @@ def test_no_eigenvalue_is_below_what_lanczos_tells_even_where_the_least_is_alone
     for few in (np.array([-1.0]), np.array([-1.0, -0.99, -0.98])):
         values = np.concatenate([few, np.linspace(-0.97, 3.0, DENSE)]).astype(np.float32)
         assert -1.1 < _below_least(lambda x, values=values: values * x, len(values)) <= -1.0
+    # Lanczos ends at once where all eigenvalues are one.
+    assert _below_least(lambda x: -x, DENSE + 1) == pytest.approx(-1.0, abs=1e-4)
 
 
 def test_it_can_be_interrupted_and_is_a_bound_all_the_same():
@@ -88,3 +91,5 @@ def test_it_can_be_interrupted_and_is_a_bound_all_the_same():
     assert early.bound_db > hologram_limit(display, Target(picture(), white=1.0)).reached_db
     with pytest.raises(InputError, match="loss 'frequency'"):
         hologram_limit(display, Target(picture()), HologramOptions(loss="none"))
+    with pytest.raises(InputError, match="learned from photographs"):
+        hologram_limit(display.taught(Learned.nothing(display)), Target(picture()))
