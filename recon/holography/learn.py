@@ -3,7 +3,9 @@
 The unknowns are few and smooth; a photograph of random phases has as many numbers as the SLM has pixels. The
 Jacobian is made of differences of the model itself: a photograph each for every unknown. Small lags come
 first: a wavefront error enters them by its differences over short ways only, so that errors of several
-radians are still on the right side of the valley. Each photograph's brightness is free.
+radians are still on the right side of the valley. A mask that is too deep and one that is too shallow lie in
+two valleys, between which the little light that passes a mask undiffracted changes its sign: both are
+searched. Each photograph's brightness is free.
 """
 
 from __future__ import annotations
@@ -25,8 +27,12 @@ from recon.holography.target import ORDER, Target
 
 Array = npt.NDArray[Any]
 
-CUTS = (0.25, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0)
+CUTS = (0.25, 0.5, 1.0, 1.0, 1.0)
 """Of the eye's cut-off, up to which lags count, round by round."""
+_MIRRORED, _LAST = 2, 2
+"""Rounds from the other valley, and from the better of the two."""
+_WORTH = 0.9
+"""Of the power not explained by the description: what is left must be less, or the description stays."""
 AT_ONCE = 2
 """Photographs that a round fits."""
 _FIRST_CROSSTALK = 0.2
@@ -65,8 +71,10 @@ class Lesson:
     before, after : float
         Part of those photographs' contrast that is not explained, rms.
     rounds : tuple of float
-        The same of the photographs fitted, before each round.
+        The same of the photographs fitted, before each round; from the sixth on the mask's depth is first
+        mirrored, then the better of the two.
     helps : bool
+        Whether enough less is unexplained; else the display is as it was.
     """
 
     display: Display
@@ -139,6 +147,13 @@ class _Fit:
             nodes = self.start.displacement
         return replace(self.start, displacement=nodes).taught(Learned(**values))
 
+    def mirrored(self, vector: Array) -> Array:
+        """Return the unknowns with a mask as much too deep as it was too shallow."""
+        at = sum(u.count for u in self.unknowns[: [u.name for u in self.unknowns].index("mask_depth")])
+        other = vector.copy()
+        other[at] = 2 * (1 - self.learned.mask_depth) - vector[at]
+        return other
+
     def lags(self, display: Display, slm: Array) -> Array:
         """Return what a display shows of a pattern, at the lags of the photographs."""
         if display is not self.model.display:
@@ -176,6 +191,10 @@ class _Fit:
             parts.append(_power(left) / _power(wanted))
         return float(np.sqrt(np.mean(parts)))
 
+    def best(self, vectors: Sequence[Array], looks: Sequence[Look]) -> Array:
+        """Return the unknowns that explain photographs best."""
+        return min(vectors, key=lambda vector: self.unexplained(self.display(vector), looks))
+
 
 def learn_display(
     display: Display,
@@ -208,30 +227,35 @@ def learn_display(
     fitted, kept = looks[:-aside], looks[-aside:]
     fit = _Fit(display, looks)
     before = fit.unexplained(display, kept)
-    vector = np.zeros(len(fit.scales))
-    rounds = []
-    for number, cut in enumerate(CUTS):
+    rounds: list[float] = []
+    found = [np.zeros(len(fit.scales))]
+    plan = (*CUTS, *[CUTS[-1]] * (_MIRRORED + _LAST))
+    for number, cut in enumerate(plan):
+        if number == len(CUTS):
+            found.append(fit.mirrored(found[0]))
+        elif number == len(CUTS) + _MIRRORED:
+            found = [fit.best(found, fitted)]
         some = [fitted[(number * AT_ONCE + n) % len(fitted)] for n in range(min(AT_ONCE, len(fitted)))]
 
         def tell(share: float, number: int = number) -> None:
             if on_progress is not None:
-                done = (number + share) / len(CUTS)
-                on_progress(done, f"round {number + 1} of {len(CUTS)}")
+                done = (number + share) / len(plan)
+                on_progress(done, f"round {number + 1} of {len(plan)}")
 
-        system = _system(fit, vector, some, cut, tell, cancel)
+        system = _system(fit, found[-1], some, cut, tell, cancel)
         if system is None:
             break
         rounds.append(system.unexplained)
-        vector = _stepped(fit, vector, some, cut, system)
-    found = fit.display(vector)
-    after = fit.unexplained(found, kept)
+        found[-1] = _stepped(fit, found[-1], some, cut, system)
+    learned = fit.display(fit.best(found, fitted))
+    after = fit.unexplained(learned, kept)
     if min(before, after) > HOPELESS:
         raise InputError(
             f"The photographs are not this display's: {1 - before**2:.0%} of their contrast was explained "
             f"before, {1 - after**2:.0%} after learning. Align the mask (align mask), and give its alignment."
         )
-    helps = after < before
-    return Lesson(found if helps else display, before, after, tuple(rounds), helps)
+    helps = after**2 < _WORTH * before**2
+    return Lesson(learned if helps else display, before, after, tuple(rounds), helps)
 
 
 HOPELESS = 0.8
