@@ -25,7 +25,10 @@ _STRIDE = 4
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """What lies in a bench's folder: the newest of each, None where there is none."""
+    """What lies in a bench's folder: the newest of each, None where there is none.
+
+    ``stale``: the photograph is newer than the result.
+    """
 
     calibration: Path | None = None
     photograph: Path | None = None
@@ -33,6 +36,7 @@ class Made:
     alignment: Path | None = None
     hologram: Path | None = None
     surface: Path | None = None
+    stale: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,13 +93,15 @@ class Step:
 def made_in(runs: Path) -> Made:
     """Return what lies in a folder of runs; reads it, so for a job."""
     results = find_results(runs)
+    photograph = _newest(runs, "photographs/*.tif", "*_photograph/photograph.tif")
     return Made(
         calibration=newest_calibration(runs),
-        photograph=_newest(runs, "photographs/*.tif", "*_photograph/photograph.tif"),
+        photograph=photograph,
         result=results[0] if results else None,
         alignment=_newest(runs, "*align*.json", "*/*align*.json"),
         hologram=_newest(runs, "holograms/*.png"),
         surface=_newest(runs, "*/dpc.json"),
+        stale=photograph is not None and bool(results) and _is_newer(photograph, results[0]),
     )
 
 
@@ -158,7 +164,7 @@ def _way_of(config: BenchConfig) -> str:
 def _photographed(facts: Facts, routine: str, calibrate: str) -> tuple[Step, ...]:
     """Return the way from the light to a reconstruction."""
     made = facts.made
-    stale = made.result is None or (made.photograph is not None and _is_newer(made.photograph, made.result))
+    stale = made.result is None or made.stale
     photograph = "" if made.photograph is None else made.photograph.name
     return (
         _exposed(facts, later=made.calibration is not None or made.photograph is not None),

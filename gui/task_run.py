@@ -58,16 +58,18 @@ class WindowDesk(Desk):
 
     # In the job's thread -------------------------------------------------------------------------
     def say(self, text: str) -> None:
-        """Keep it."""
+        """Keep it; where nothing tells how far it is, this is where it waits and ends."""
         self._tell(Told("say", text))
+        self._wait()
 
     def warn(self, text: str) -> None:
         """Keep it."""
         self._tell(Told("warn", text))
 
     def table(self, headings: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> None:
-        """Keep it."""
+        """Keep it; wait and end as in ``say``."""
         self._tell(Told("table", title, tuple(headings), tuple(map(tuple, rows))))
+        self._wait()
 
     @contextmanager
     def step(self, what: str, total: float | None = None, *, done: int = 0) -> Iterator[Advance]:

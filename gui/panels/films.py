@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from gui.widgets.dialogues import choose_path
 from gui.widgets.image_view import ImageView
 from gui.widgets.measure import Measure
 from gui.widgets.plots import LevelsBar, curve_colour, curve_pen, plot_widget
-from instrument.reconstruction.film import Film, curves, relative, write_film
+from instrument.reconstruction.film import Film, curves, relative, slowed, write_film
 from recon.base.declare import Imports, expression
 
 _FASTEST_MS = 20
@@ -52,6 +53,8 @@ class FilmsPanel(Panel):
         self.courses: npt.NDArray[np.float64] = np.empty((0, 0))
         """Means of the regions, (n_regions, n_pictures), as far as they were read."""
         self._place = 0
+        self._step = 1
+        """Pictures from one that is shown to the next."""
         self._curves_job: Job | None = None
         self._opening: Job | None = None
 
@@ -192,14 +195,16 @@ class FilmsPanel(Panel):
         self.play_button.setText("Hold" if playing else "Play")
         if self.film is not None and playing:
             speed = float(self.speed.currentText().split()[0])
-            self._timer.start(max(round(1000 / self.film.fps / speed), _FASTEST_MS))
+            period_ms = 1000 / self.film.fps / speed
+            self._step = max(math.ceil(_FASTEST_MS / period_ms), 1)
+            self._timer.start(round(self._step * period_ms))
         else:
             self._timer.stop()
 
     def _next(self) -> None:
-        """Go on by a picture, round at the end; a picture that is still read holds the film up."""
+        """Go on, round at the end; a picture that is still read holds the film up."""
         if self.film is not None and self.isVisible() and not self._reader.is_reading:
-            self.go_to((self._place + 1) % len(self.film))
+            self.go_to((self._place + self._step) % len(self.film))
 
     # Regions -------------------------------------------------------------------------------------
     def _set_regions(self, on: bool) -> None:
@@ -277,6 +282,8 @@ class FilmsPanel(Panel):
         self.progress.show()
         job.progressed.connect(lambda share: self.progress.setValue(round(1000 * share)))
         job.succeeded.connect(lambda path: self.session.log("info", f"Wrote {path}"))
+        if words := slowed(target, film.fps):
+            job.succeeded.connect(lambda _: self.session.log("warning", words))
         job.ended.connect(self.progress.hide)
         return job
 

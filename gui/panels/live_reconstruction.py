@@ -194,6 +194,7 @@ class LiveReconstructionPanel(Panel):
     def _refuse(self, why: str) -> None:
         self.refused(self.file, why)
         if self.loaded is None:
+            self.hint.say(self.options.in_its_words(why))
             self.status.setText(_NO_CALIBRATION)
 
     def _got_calibration(self, read: tuple[Path, Calibration] | None) -> None:

@@ -311,7 +311,7 @@ class ReconstructionsPanel(Panel):
         self.job = job = self.jobs.compute(f"Reconstructing {request.image.name}", do)
         self._begun(job, "Reading …")
         self._close_result()
-        self._show_nothing(f"{request.image.name} is being read …")
+        self._show_nothing(f"{request.image.name} is being read …", busy=True)
         self._opening, self._first_picture = None, True
         self.heading.setText(f"<b>{request.image.name}</b>: in the making")
         job.progressed.connect(lambda so_far: self._progressed(so_far, volume=volume))
@@ -320,9 +320,9 @@ class ReconstructionsPanel(Panel):
             ended.connect(lambda _, words=words: self._not_reconstructed(request.image.name, words))
         return job
 
-    def _show_nothing(self, words: str) -> None:
+    def _show_nothing(self, words: str, *, busy: bool = False) -> None:
         """Take what was shown of another result away."""
-        self.empty.say(words)
+        self.empty.say(words, busy=busy)
         self.viewers.setCurrentWidget(self.empty)
         self.place.clear()
         self.facts.show_facts([])

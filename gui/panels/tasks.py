@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,7 +37,7 @@ from instrument.tasks import CHARTS, DISPLAY, TASKS, VIDEOS
 from instrument.tasks.task import WRITTEN, Desk, Done, Task
 from recon.base.declare import Imports, Option, expression
 
-_FOLDERS = ("FOLDER", "RUN", "CALIBRATION", "OLD", "NEW", "VIDEO|RUN", "SHEET")
+_FOLDERS = ("FOLDER", "RUN", "CALIBRATION", "OLD", "NEW", "VIDEO|RUN", "RUN|RESULT", "SHEET")
 """What an option is called that names a folder."""
 _PICTURES = (".png", ".jpg", ".svg")
 _ROW_PX = 26
@@ -89,6 +90,10 @@ class TasksPanel(Panel):
         self.run.over.connect(self._over)
         self._running = self.name
         """The task that goes on, or went on last."""
+        self._out: Path | None = None
+        """Its result."""
+        self._calibrations: Sequence[Path] = ()
+        """Which of the files that it wrote are calibrations."""
         self._chosen()
 
     def _make_results(self) -> QWidget:
@@ -164,7 +169,10 @@ class TasksPanel(Panel):
 
     def _made(self, name: str, task: Task) -> _Page:
         options = [o for _, offered in task.parts.values() for o in offered]
-        special = {o.name: _behaviour(o, needed=o.name in task.needed) for o in options if _names_files(o)}
+        out = next((o for o in options if o.name == "out"), None)
+        place = task.out or (None if out is None or not isinstance(out.default, Path) else out.default)
+        needed = (*task.needed, *(() if place is None else ("out",)))  # what has a name in the terminal
+        special = {o.name: _behaviour(o, needed=o.name in needed) for o in options if _names_files(o)}
         form = OptionsForm(options, special)
         if task.subject:
             form.show_for(task.subject)
@@ -175,8 +183,6 @@ class TasksPanel(Panel):
         if TASKS[name].group == DISPLAY:
             form.set_values({"bench": self.session.config.path})
         names = None
-        out = next((o for o in options if o.name == "out"), None)
-        place = task.out or (None if out is None or not isinstance(out.default, Path) else out.default)
         if place is not None:
             suffix = "".join(place.suffixes).replace(".pdf", ".png")  # what can be shown beside the form
             names = SuggestedName(self.jobs, form, self.session.runs_folder / "results", suffix)
@@ -192,11 +198,18 @@ class TasksPanel(Panel):
 
         def made() -> dict[str, object]:
             return {
-                parameter: cls(**{o.name: page.form.value(o.name) for o in offered})
+                parameter: cls(**{o.name: self._value(page.form, o.name) for o in offered})
                 for parameter, (cls, offered) in page.task.parts.items()
             }
 
         return self.asked(made)
+
+    def _value(self, form: OptionsForm, name: str) -> Any:
+        """Return an option's value; the bench of a hologram's chart is the window's, where none is given."""
+        value = form.value(name)
+        if name == "bench" and value is None and "hologram" in form.fields and form.value("hologram"):
+            return self.session.config.path
+        return value
 
     def as_python(self) -> str:
         """Return lines that carry out the task as the form stands."""
@@ -218,12 +231,15 @@ class TasksPanel(Panel):
             return
         self._running = self.name
         page = self._pages[self.name]
-        out = page.form.value("out") if page.names is not None else None
+        self._out = out = page.form.value("out") if page.names is not None else None
+        self._calibrations = ()
 
         def do(desk: Desk) -> Done:
             if page.names is not None and out is not None:
                 page.names.make_room(out)
-            return page.task.carry_out(desk, **objects)
+            done = page.task.carry_out(desk, **objects)
+            self._calibrations = [path for path in done.files if (path / "calibration.json").is_file()]
+            return done
 
         self._clear()
         self.run_bar.set_running(True)
@@ -274,9 +290,14 @@ class TasksPanel(Panel):
         elif not done.good:
             mark(self.words, "refused", True)
         page = self._pages[self._running]
-        if page.names is not None and not done.kept and TASKS[self._running].group != CHARTS:
+        if (
+            page.names is not None
+            and self._out is not None
+            and not done.kept
+            and TASKS[self._running].group != CHARTS
+        ):
             # What was interrupted, and a chart that has more to do, is gone on with under the same name.
-            page.names.suggest(page.form.value("out").name.partition(".")[0].rstrip("-0123456789"))
+            page.names.suggest(re.sub(r"-\d+$", "", self._out.name.partition(".")[0]))
         self.folder_button.setEnabled(bool(done.files))
         self.use_button.setEnabled(any(map(self._panel_for, done.files)))
         self.run_bar.show_end("Ended early" if done.kept else "Done", complete=not done.kept)
@@ -314,7 +335,7 @@ class TasksPanel(Panel):
             return "charts"
         if path.name.endswith(".ome.zarr") and TASKS[self._running].group == VIDEOS:
             return "films"
-        return "reconstructions" if (path / "calibration.json").is_file() else ""
+        return "reconstructions" if path in self._calibrations else ""
 
     def _open(self, path: Path) -> None:
         QDesktopServices.openUrl(QUrl.fromLocalFile(str(path)))
@@ -345,6 +366,6 @@ def _behaviour(o: Option, *, needed: bool) -> Behaviour:
     """Return how a path is chosen: what is written by a new name, what is read by what is there."""
     folder = o.declaration.metavar.removesuffix("...") in _FOLDERS
     if o.name in WRITTEN:
-        return Behaviour(browse="folder" if folder else "save")
+        return Behaviour(browse="folder" if folder else "save", needed=needed)
     exists = o.kinds == (Path,)
     return Behaviour(browse="folder" if folder else "open", must_exist=exists, needed=needed)

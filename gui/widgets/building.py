@@ -165,10 +165,10 @@ class Hint(QWidget):
             parts.append(in_row(None, quiet, None))
         fill(self, None, *parts, None, margins=(16, 8, 16, 8), spacing=10)
 
-    def say(self, words: str) -> None:
-        """Say something else, to which nothing is to be done here."""
+    def say(self, words: str, *, busy: bool = False) -> None:
+        """Say something else; ``busy``: nothing is to be done here meanwhile, and there is no button."""
         self.words.setText(words)
-        self.button.hide()
+        self.button.setVisible(not busy)
 
 
 def label(

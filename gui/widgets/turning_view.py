@@ -104,9 +104,14 @@ class TurningView(QWidget):
         self._job = job = self._jobs.compute(f"Reading {source.path.name} for views from any side", work)
         job.progressed.connect(self.progress.setValue)
         job.succeeded.connect(lambda read: self._take(job, read, pitch_um))
-        job.failed.connect(self.failed)
+        job.failed.connect(lambda why: self._not_read(job, why))
         job.ended.connect(self.progress.hide)
         return job
+
+    def _not_read(self, job: Job, why: str) -> None:
+        if job is self._job:
+            self._job = None  # it can be opened again
+        self.failed.emit(why)
 
     def release(self) -> None:
         """End reading; nothing is shown then."""
@@ -132,7 +137,10 @@ class TurningView(QWidget):
         by_depth = self.hues.isChecked()
         self.canvas.set_looks(*self._looks, by_depth=by_depth)
         renderer = self.canvas.renderer
-        words = [f"blue {self._ends[0]}, red {self._ends[1]}"] if by_depth else []
+        hues = f"blue {self._ends[0]}, red {self._ends[1]}"
+        if spares_hues(self._looks[1]):
+            hues = "the red map does not show depth"
+        words = [hues] if by_depth else []
         if renderer is not None and renderer.reduced > 1:
             words.append(f"means of {renderer.reduced} x {renderer.reduced} voxels")
         self.legend.setText("; ".join(words))

@@ -23,7 +23,7 @@ from PySide6.QtWidgets import (
 
 from gui.background import NewestOnly
 from gui.jobs import Job, JobContext, JobRunner
-from gui.theme import colours
+from gui.theme import colours, spares_hues
 from gui.widgets.building import button, fill, in_row, label
 from gui.widgets.image_view import StretchedImage, whole_steps
 from gui.widgets.measure import LengthBar, Measure, Region, region_words
@@ -437,11 +437,12 @@ class VolumeView(QWidget):
         self._draw(self.side, np.ascontiguousarray(p.side.T), levels)
         self._draw(self.coloured, self._coloured(p), (0.0, 1.0))
         first, last = (self._depth_words(z) or f", plane {z + 1}" for z in (0, len(p.top) - 1))
+        hues = f"depth as colour: blue{first}, red{last}".replace("blue, ", "blue ").replace("red, ", "red ")
         self._name(
             "x–y, brightest over depth",
             "z–y, brightest over x",
             "x–z, brightest over y",
-            f"depth as colour: blue{first}, red{last}".replace("blue, ", "blue ").replace("red, ", "red "),
+            "the red map does not show depth" if spares_hues(self.levels.colour_map) else hues,
         )
 
     def _name(self, *titles: str) -> None:
@@ -493,7 +494,7 @@ class VolumeView(QWidget):
     def _coloured(self, p: Projections) -> Plane:
         low, high = self.levels.levels
         shown = in_colour_of_depth(p.front - np.float32(low), p.deepest, len(p.top), max(high - low, 1e-12))
-        if self.levels.colour_map == "red":  # for eyes used to the dark: no channel but red
+        if spares_hues(self.levels.colour_map):  # for eyes used to the dark: no channel but red
             shown[..., 0] = shown.max(axis=-1)
             shown[..., 1:] = 0
         return shown.astype(np.float32)

@@ -134,16 +134,20 @@ def solvers(_folder: Path) -> str:
     from recon.base.metrics import psnr
     from recon.reconstruction.solvers import SOLVERS
 
-    scene, found = _scene(), {}
+    scene, found, left_out = _scene(), {}, []
     for name in SOLVERS:
         try:
             picture = reconstruct(scene.measurement, scene.calibration, solver=name, noise=scene.noise)
         except InputError:
-            continue  # for volumes, or in need of what is not here
+            left_out.append(name)  # for volumes, or in need of what is not here
+            continue
         found[name] = psnr(picture.image, scene.truth)
         if not found[name] > LEAST_DB:
             raise BrokenError(f"{name}: {found[name]:.1f} dB from the truth; {LEAST_DB:g} and more expected.")
-    return ", ".join(f"{name} {db:.1f} dB" for name, db in found.items())
+    if not found:
+        raise BrokenError(f"every solver refuses a picture: {', '.join(left_out)}.")
+    said = ", ".join(f"{name} {db:.1f} dB" for name, db in found.items())
+    return f"{said}; not tried on a picture: {', '.join(left_out)}" if left_out else said
 
 
 def files(folder: Path) -> str:
@@ -234,6 +238,9 @@ def selftest(
             except (BrokenError, BenchError, DeviceError, InputError, OSError) as error:
                 broken.append(name)
                 said = f"BROKEN: {error}"
+            except Exception as error:  # noqa: BLE001 - a broken package fails in its own ways
+                broken.append(name)
+                said = f"BROKEN: {type(error).__name__}: {error}"
         typer.echo(f"{time.monotonic() - began_s:5.1f} s  {said}")
     if broken:
         typer.echo(f"Does not work: {', '.join(broken)}.", err=True)

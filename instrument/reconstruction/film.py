@@ -36,6 +36,10 @@ FILM_SUFFIXES = (".mp4", ".gif", ".ome.zarr", ".csv")
 BASELINE_PERCENTILE = 20.0
 _GIF_MS = 10
 """What a GIF's times are told in."""
+_GIF_FASTEST_MS = 2 * _GIF_MS
+"""Shown faster by no browser."""
+_GIF_BYTES = 2**30
+"""All pictures of a GIF are in memory, a byte a pixel, before the first is written."""
 
 
 class Film:
@@ -185,10 +189,26 @@ def write_film(
     low, high = film.levels() if levels is None else levels
     shown = (as_shown(picture, low, high) for picture in _pictures(film, advance))
     if name.endswith(".gif"):
+        height, width = film.read(0).shape[:2]
+        if (needed := len(film) * height * width) > _GIF_BYTES:
+            raise FileError(
+                target,
+                f"a GIF of {len(film)} pictures of {height} x {width} takes {needed / 2**30:.1f} GiB of "
+                f"memory; {_GIF_BYTES / 2**30:g} is the most.",
+                "Write it as .mp4.",
+            )
         _write_gif(target, shown, fps or film.fps)
     else:
         write_mp4(target, shown, fps or film.fps)
     return target
+
+
+def slowed(target: Path, fps: float) -> str:
+    """Return that a film plays slower than it is to, where its format knows no shorter times; else empty."""
+    most = 1000 / _GIF_FASTEST_MS
+    if target.suffix.lower() != ".gif" or fps <= most:
+        return ""
+    return f"{target.name}: a GIF shows {most:g} pictures a second at most; it plays at {most / fps:.2g} x."
 
 
 def curves_csv(film: Film, regions: Sequence[Window], courses: npt.NDArray[np.float64]) -> str:
@@ -231,12 +251,12 @@ def _write_zarr(film: Film, target: Path, advance: Advance | None) -> None:
 
 
 def _write_gif(target: Path, shown: Iterator[npt.NDArray[np.uint8]], fps: float) -> None:
-    """Write a GIF that plays without end; one picture at a time in memory."""
+    """Write a GIF that plays without end."""
     from PIL import Image  # of Matplotlib's own needs
 
     frames = (Image.fromarray(picture).quantize(256) for picture in shown)
     first = next(frames)
-    duration_ms = max(round(1000 / fps / _GIF_MS) * _GIF_MS, 2 * _GIF_MS)  # shown faster by no browser
+    duration_ms = max(round(1000 / fps / _GIF_MS) * _GIF_MS, _GIF_FASTEST_MS)
     with whole_file(target) as temporary:
         first.save(
             temporary,

@@ -163,11 +163,10 @@ class Renderer:
     def along_depth(self, rows: slice, columns: slice) -> npt.NDArray[np.float32]:
         """Return the mean of a window of the volume in each plane, float32, (n_z,); rows of the volume."""
         b = self.reduced
-        inside = self._copies[0][
-            :,
-            rows.start // b : max(-(-rows.stop // b), rows.start // b + 1),
-            columns.start // b : max(-(-columns.stop // b), columns.start // b + 1),
-        ]
+        n_rows, n_columns = self._copies[0].shape[1:]
+        top, left = min(rows.start // b, n_rows - 1), min(columns.start // b, n_columns - 1)
+        bottom, right = max(-(-rows.stop // b), top + 1), max(-(-columns.stop // b), left + 1)
+        inside = self._copies[0][:, top:bottom, left:right]
         means: npt.NDArray[np.float32] = inside.mean(axis=(1, 2), dtype=np.float32)
         return means * np.float32(self.white / _FULL)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from instrument.files.errors import BenchError, FileError
 from instrument.files.volumes import is_zarr_name, uneven_steps
-from instrument.reconstruction.film import Film, Window, open_video, write_film
+from instrument.reconstruction.film import Film, Window, open_video, slowed, write_film
 from instrument.runs.export import export as export_run
 from instrument.runs.inspection import verify as verify_run
 from instrument.runs.run import Run
@@ -163,6 +163,8 @@ def _export_film(desk: Desk, options: ExportOptions) -> Done:
             raise BenchError(f"--region: the pictures have {height} x {width} pixels.")
     with desk.step("Pictures") as advance:
         write_film(film, options.out, fps=options.frames_per_s, regions=options.regions, advance=advance)
+    if words := slowed(options.out, options.frames_per_s or film.fps):
+        desk.warn(f"Warning: {words}")
     return Done((options.out,))
 
 

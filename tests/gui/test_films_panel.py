@@ -17,6 +17,7 @@ from gui.panel import whole
 from gui.panels.films import FilmsPanel
 from gui.session import BenchSession
 from instrument.cli import main
+from instrument.reconstruction.film import slowed
 from instrument.reconstruction.video_files import VideoPictures, create_output
 from recon.camera.grid import Grid
 from tests.gui.conftest import WAIT_MS
@@ -54,6 +55,7 @@ def test_a_film_is_played_followed_and_written(
     qtbot.waitUntil(lambda: panel.words.text() == "1.050 s, picture 21 of 29", timeout=WAIT_MS)
     panel.speed.setCurrentText("4 x")
     panel.play_button.click()
+    assert panel._step * 1000 / panel._timer.interval() == 80  # pictures a second
     qtbot.waitUntil(lambda: panel.slider.value() < 20, timeout=WAIT_MS)  # round at the end
     panel.play_button.click()
     assert not panel._timer.isActive()
@@ -97,6 +99,7 @@ def test_a_film_is_played_followed_and_written(
 def test_a_video_of_volumes_is_copied_with_its_planes_and_their_places(tmp_path: Path) -> None:
     grid = Grid((2, 4, 5), (2, 2), np.array([2e3, 3e3]), np.array([4.0, 6.0]))
     video, copy = tmp_path / "deep.ome.zarr", tmp_path / "copy.ome.zarr"
+    assert "plays at 0.5 x" in slowed(tmp_path / "film.gif", 100.0)
     create_output(video, 1, grid.shape, period_s=0.1, grid=grid, attributes={})
     volume = np.arange(40, dtype=np.float32).reshape(grid.shape)
     VideoPictures(video, write=True).write(0, volume)

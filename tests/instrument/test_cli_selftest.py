@@ -34,8 +34,14 @@ def test_what_does_not_work_is_named(
     monkeypatch.setattr(PRIORS, "_foreign", dict(PRIORS._foreign))
     PRIORS.register(NamedPrior("halved", "Wrong.", Halved))
     monkeypatch.setattr(selftest, "LEAST_DB", 99.0)
-    assert main(["test", "priors", "solvers"]) == 1
+
+    def no_module(_: object) -> str:
+        raise ImportError("no such symbol")
+
+    monkeypatch.setattr(selftest, "PARTS", {**selftest.PARTS, "files": no_module})
+    assert main(["test", "priors", "solvers", "files"]) == 1
     said = capsys.readouterr()
     assert "BROKEN: halved: the prox costs" in said.out
     assert "BROKEN: admm" in said.out
-    assert "Does not work: priors, solvers." in said.err
+    assert "BROKEN: ImportError: no such symbol" in said.out
+    assert "Does not work: priors, solvers, files." in said.err
