@@ -160,6 +160,11 @@ class LiveFollower:
         """How it does; None while nothing runs."""
         return None if self._view is None else self._view.status
 
+    def end(self) -> None:
+        """Ask the view to end after the picture in progress; returns at once."""
+        if (view := self._view) is not None:
+            view.end()
+
     def stop(self) -> None:
         """End the view and wait for the picture in progress."""
         with self._changing:

@@ -345,6 +345,7 @@ class LiveReconstructionPanel(Panel):
             self._call_old("the preview is off")
 
     def _end_preview(self) -> None:
+        self.follower.end()  # when the window closes, the job may not be begun any more
         self.session.jobs.watch("Ending the preview", lambda _: self.follower.stop())
 
     def hideEvent(self, event: QHideEvent) -> None:  # noqa: N802 - Qt's name
