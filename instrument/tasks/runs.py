@@ -130,8 +130,8 @@ def export(desk: Desk, options: ExportOptions, given: Given) -> Done:
         return _export_film(desk, options)
     if _is_result(options.run):
         return _export_result(desk, options, given)
-    given.refuse("a run", "run")
     found, out = Run.open(options.run), options.out
+    given.refuse("a run", "run")
     wanted = set(range(found.n_frames)[options.frames or slice(None)])
     if options.label is not None:
         wanted &= {step.index for step in found.steps(options.label)}
