@@ -75,7 +75,7 @@ def _figure(done: DemoResult, viewer: Viewer, picture: Float, truth: Float) -> F
     figure = Figure(figsize=(14.0, 11.2), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
     outer = figure.add_gridspec(
-        3, 1, height_ratios=[2.75, 2.6, 3.2], hspace=0.26, left=0.035, right=0.985, top=0.925, bottom=0.055
+        3, 1, height_ratios=[2.75, 2.6, 3.2], hspace=0.26, left=0.048, right=0.985, top=0.925, bottom=0.055
     )
     pictures = outer[0].subgridspec(1, 4, wspace=0.06)
     for column, panel in enumerate(_pictures(done, viewer, picture, truth)):
@@ -89,7 +89,7 @@ def _figure(done: DemoResult, viewer: Viewer, picture: Float, truth: Float) -> F
     draw_chart(axes, done.chart.points, SECONDS, done.chart.kind.scores[0], colours_of(done.chart))
     axes.set_title("Speed against accuracy (green, half the pixels)", fontsize=13, color=INK, loc="left")
     draw_facts(figure.add_subplot(bottom[0, 2]), _facts(done, truth))
-    figure.text(0.035, 0.97, "Photographs without a lens", fontsize=17, color=INK, weight="bold", va="center")
+    figure.text(0.048, 0.97, "Photographs without a lens", fontsize=17, color=INK, weight="bold", va="center")
     mark_simulated(figure, 0.97)
     return figure
 
