@@ -183,13 +183,11 @@ def voxel_um(grid: Grid) -> dict[str, float]:
 def _origin_um(grid: Grid) -> dict[str, float]:
     """Return where the first voxel's centre is: its depth, and from the axis; nothing where not known.
 
-    Only the depth of a grid that is not upright: its rows and columns go against y and x.
+    Along rows and columns as they are stored: of a grid that is not upright these go against y and x.
     """
     voxel = voxel_um(grid)
     if not voxel or (np.diff(grid.z_um) < 0).any():  # told by a step and a place, planes go away from it
         return {}
-    if not grid.upright:
-        return {"z": float(grid.z_um[0])}
     row, column = grid.centre
     return {"z": float(grid.z_um[0]), "y": -row * voxel["y"], "x": -column * voxel["x"]}
 

@@ -227,7 +227,7 @@ class OutputOptions:
     force: bool = option(False, help="Overwrite files that exist.", group=_OUTPUT)
     explain: bool = option(
         False,
-        help="Only say what auto would choose and why, its time and memory, and steps up and down.",
+        help="Only say what auto would choose, why, its cost, and a step up and down.",
         applies=_KEPT,
         group=_OUTPUT,
     )

@@ -67,7 +67,7 @@ def test_live_picture_state_and_stop(browser: Any, server: BenchServer, tmp_path
     browser.get(f"{server.url}/#{TOKEN}")
     until(lambda: text("age").startswith("Live: frame"))
     assert TOKEN not in browser.current_url
-    assert "SIMULATED" in text("state")
+    until(lambda: "SIMULATED" in text("state"))  # asked for now and then
     assert "operated by\nnobody" in text("state")
     assert browser.execute_script("return document.getElementById('picture').width") == 320
 
