@@ -47,6 +47,7 @@ def _shell() -> Iterator[Any]:
     import matplotlib
     from IPython.core.interactiveshell import InteractiveShell
     from IPython.core.pylabtools import select_figure_formats
+    from matplotlib import pyplot
     from traitlets.config import Config
 
     class Shell(InteractiveShell):  # type: ignore[misc]
@@ -55,14 +56,13 @@ def _shell() -> Iterator[Any]:
     backend, style = matplotlib.get_backend(), dict(matplotlib.rcParams)
     config = Config({"HistoryManager": {"enabled": False}, "InteractiveShell": {"colors": "nocolor"}})
     shown, shell = sys.displayhook, Shell.instance(config=config)
+    pyplot.close("all")  # a cell shows every figure that is open
     try:
         shell.enable_matplotlib("inline")
         select_figure_formats(shell, {"png"})
         matplotlib.rcParams["savefig.dpi"] = 72
         yield shell
     finally:
-        from matplotlib import pyplot
-
         pyplot.close("all")
         pyplot.switch_backend(backend)
         matplotlib.rcParams.update(style)

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from instrument.cli import chart as module
+from instrument.cli import COMMANDS
 from instrument.reconstruction.job import Job
+from instrument.tasks import chart as module
 from recon import Calibration, NoiseModel
 from recon.evaluation.chart_reconstruction import ChartProblem
 from recon.evaluation.scored import Curve, Point
@@ -41,7 +42,7 @@ def quick(monkeypatch):
 
 
 def run(*arguments):
-    return CliRunner().invoke(module.app, [str(a) for a in arguments])
+    return CliRunner().invoke(COMMANDS["chart"].load(), [str(a) for a in arguments])
 
 
 def test_a_chart_is_written_and_gone_on_with(quick, tmp_path):
@@ -361,10 +362,11 @@ GROUPS = ("as an extended scene (tv)", "as a sparse scene (l1)")
 @pytest.mark.parametrize(
     ("names", "said"), [("ab", "even with it, as far as"), ("a", "no other setting is even")]
 )
-def test_whether_a_setting_is_even_with_the_best_is_said(capsys, names, said):
+def test_whether_a_setting_is_even_with_the_best_is_said(names, said):
     even = [Point(n, 40, 1.0, held_out=1.0, held_out_parts=(1.0,) * 4, images=3.0) for n in names]
-    module._tell_even(GROUPS[0], even, on_the_way=False)
-    first, second = capsys.readouterr().out.splitlines()
+    lines = []
+    module._tell_even(SimpleNamespace(say=lines.append), GROUPS[0], even, on_the_way=False)
+    first, second = lines
     assert first.startswith(f"Held out    best {GROUPS[0]}: a")
     assert second.strip().startswith(said)
     assert ("scatter: 1; the one with the fewest photographs: a" in second) == (len(names) > 1)
