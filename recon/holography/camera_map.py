@@ -63,8 +63,8 @@ class CameraMap:
 
         if 2 * band.cutoff > self.pixels_across:
             raise InputError(
-                f"The camera has {self.pixels_across:.0f} pixels across the field of view; to see all that this "
-                f"display shows, {ceil(2 * band.cutoff)} are needed. Bin it less, or take a longer lens before it."
+                f"The camera has {self.pixels_across:.0f} pixels across the field of view; to see all that "
+                f"this display shows, {ceil(2 * band.cutoff)} are needed. Bin it less, or take a longer lens."
             )
         least = [max(2 * reach + 2, reach + self.pixels_across / 2) for reach in band.radius]
         shape = (fast_length(ceil(least[0])), fast_length(ceil(least[1]), real=True))
