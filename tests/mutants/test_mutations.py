@@ -22,7 +22,7 @@ class A:
 
 
 def least(values):
-    logging.info("%s", 1 + 1)
+    assert values, 1 + 1
     return min(values) - 1.0
 '''
 
