@@ -52,7 +52,7 @@ def test_a_bar_says_what_is_left_and_what_is_compiled() -> None:
     bar = Progress()
     bar.add_task("Finding the exposure", total=None, note="", expected_s=60.0)
     task = bar.tasks[0]
-    assert str(_Left().render(task)) .endswith(" left, as last time")
+    assert str(_Left().render(task)).endswith(" left, as last time")
     task.fields["expected_s"] = 0.0
     assert "longer than last time" in str(_Left().render(task))
     bar.update(task.id, total=10, completed=3)
