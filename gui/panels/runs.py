@@ -33,6 +33,7 @@ from gui.widgets.building import (
     text_view,
 )
 from gui.widgets.image_view import ImageView, usual_levels
+from gui.widgets.orientation import follow_orientation
 from instrument.bench.photograph import Progress
 from instrument.files.errors import count
 from instrument.runs.inspection import RunSummary, Verification, run_paths, summary, verify
@@ -197,6 +198,7 @@ class RunsPanel(Panel):
 
     def _make_details(self) -> None:
         self.view = ImageView()
+        follow_orientation(self.session, "frames", self.view.orient)
         self.slider = QSlider(Qt.Orientation.Horizontal)
         self.slider.setToolTip("Frame of the run (arrow keys)")
         self.slider.setAccessibleName("Frame of the run")

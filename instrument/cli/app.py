@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
 import os
 import signal
@@ -65,9 +66,24 @@ class App(typer.Typer):
         class Group(typer.core.TyperGroup):
             meant = usual
 
+            def names_none(self, first: list[str]) -> bool:
+                """Whether there is no command's name to be read, right or wrong."""
+                return not first or (first[0].startswith("-") and first[0] not in _HELP)
+
+            def get_command(self, context: Any, name: str) -> Any:
+                """Find a command; one that there is not is answered with those that there are."""
+                found = super().get_command(context, name)
+                if found is None and not context.resilient_parsing:
+                    near = difflib.get_close_matches(name, self.commands, 1)
+                    hint = f" Did you mean {near[0]}?" if near else ""
+                    known = ", ".join(self.commands)
+                    raise BenchError(
+                        f"{context.command_path}: there is no {name!r}; there are {known}.{hint}"
+                    )
+                return found
+
             def parse_args(self, context: Any, arguments: list[str]) -> list[str]:
-                named = arguments[:1] and (arguments[0] in self.commands or arguments[0] in _HELP)
-                if self.meant is not None and not named:
+                if self.meant is not None and self.names_none(arguments[:1]):
                     arguments = [self.meant, *arguments]
                 return super().parse_args(context, arguments)
 
