@@ -112,7 +112,8 @@ class Operator:
         self.wait(self.panel(name).isVisible)
 
     def types(self, field: Any, text: str) -> None:
-        """Type into a field and press Return."""
+        """Type into a field that takes keys, and press Return."""
+        self.wait(field.isEnabled)
         field.setFocus()
         field.selectAll()
         QTest.keyClicks(field, text)
