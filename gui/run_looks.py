@@ -13,6 +13,7 @@ import numpy.typing as npt
 from calibration_routines.plan_procedures import can_go_on
 from calibration_routines.psf.sweep_plan import SWEEP
 from drivers.frame import FrameMetadata
+from gui.widgets.entry import quantity
 from gui.widgets.image_view import usual_levels
 from instrument.bench.photograph import Progress, read_snapshot
 from instrument.files.images import read_image
@@ -100,7 +101,7 @@ def _picture(what: str, image: npt.NDArray[Any], metadata: FrameMetadata) -> Pic
 def _axis_words(axis: str, value: float) -> str:
     """Return an axis' name without its unit, and its value with it: ``x 100 µm``."""
     name, _, unit = axis.rpartition("_")
-    return f"{name} {value:g} {unit.replace('um', 'µm')}" if name else f"{axis} {value:g}"
+    return f"{name} {quantity(value, unit, 6)}" if name else f"{axis} {value:g}"
 
 
 def _about_photograph(path: Path) -> list[str]:

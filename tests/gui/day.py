@@ -367,7 +367,7 @@ def _(o: Operator) -> None:
 @step("beyond its limits it does not go")
 def _(o: Operator) -> None:
     target = o.panel("stage").rows["x_um"].target
-    o.types(target, "9999999")
+    o.types(target, "9999999 um")
     o.wait(lambda: target.property("refused"))
 
 
@@ -559,6 +559,7 @@ def _(o: Operator) -> None:
 def _(o: Operator) -> None:
     slider = o.panel("runs").slider
     o.wait(lambda: slider.maximum() > 0)
+    o.keys(KEY.Key_Home, on=slider)
     o.keys(KEY.Key_Right, on=slider)
     assert slider.value() == 1
 
