@@ -61,7 +61,7 @@ def look_into(path: Path, *, read: bool = False, on_progress: Progress | None = 
         if read:
             about.insert(2, f"{looked.frames} frames read back: {'sound' if looked.is_sound else 'DAMAGED'}")
         return Opened(
-            path, run, sorted(run.records), about, can_go_on(run, looked), (path / SWEEP.result).is_dir()
+            path, run, sorted(run.records), about, can_go_on(run, looked), SWEEP.kept(path).is_dir()
         )
     except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is shown
         return str(error)
@@ -137,7 +137,7 @@ def _about_run(run: Run, looked: Verification) -> list[str]:
 
 
 def _calibration_lines(run: Path) -> list[str]:
-    file = run / SWEEP.result / "calibration.json"
+    file = SWEEP.kept(run) / "calibration.json"
     if not file.is_file():
         return ["A sweep without its calibration: Resume makes it."]
     try:

@@ -274,7 +274,7 @@ class RunsPanel(Panel):
 
     def _use(self) -> None:
         if (opened := self.opened) is not None:
-            what = opened.path if opened.run is None else opened.path / SWEEP.result
+            what = opened.path if opened.run is None else SWEEP.kept(opened.path)
             self.session.handed_on.emit("reconstructions", what)
 
     def _play(self) -> None:
