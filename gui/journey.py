@@ -10,6 +10,7 @@ from drivers.frame import Frame
 from gui.session import BenchSession
 from gui.session_news import OwnFiles, name_of
 from instrument.bench.config import BenchConfig
+from instrument.files.atomic import DOUBTFUL
 from instrument.files.calibration_file import newest_calibration
 from instrument.reconstruction.stored_result import find_results
 
@@ -106,7 +107,8 @@ def made_in(runs: Path) -> Made:
 
 
 def _newest(folder: Path, *patterns: str) -> Path | None:
-    found = [(file.stat().st_mtime, file) for pattern in patterns for file in folder.glob(pattern)]
+    files = [file for pattern in patterns for file in folder.glob(pattern)]
+    found = [(file.stat().st_mtime, file) for file in files if not file.name.startswith(DOUBTFUL)]
     return max(found)[1] if found else None
 
 

@@ -68,7 +68,7 @@ class LivePanel(Panel):
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
         session = self.session
-        self.picture = LivePicture()
+        self.picture = LivePicture(session)
         yield
         self.picture.region_sent.connect(self.send_region)
         self.form = CameraForm(self)

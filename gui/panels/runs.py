@@ -33,6 +33,7 @@ from gui.widgets.building import (
     text_view,
 )
 from gui.widgets.image_view import ImageView, usual_levels
+from gui.widgets.orientation import follow_orientation
 from instrument.bench.photograph import Progress
 from instrument.files.errors import count
 from instrument.runs.inspection import RunSummary, Verification, run_paths, summary, verify
@@ -197,6 +198,7 @@ class RunsPanel(Panel):
 
     def _make_details(self) -> None:
         self.view = ImageView()
+        follow_orientation(self.session, "frames", self.view.orient)
         self.slider = QSlider(Qt.Orientation.Horizontal)
         self.slider.setToolTip("Frame of the run (arrow keys)")
         self.slider.setAccessibleName("Frame of the run")
@@ -289,7 +291,7 @@ class RunsPanel(Panel):
 
     def _use(self) -> None:
         if self.opened is not None:
-            self.session.handed_on.emit("reconstructions", self.opened.path / SWEEP.result)
+            self.session.handed_on.emit("reconstructions", SWEEP.kept(self.opened.path))
 
     def _play(self) -> None:
         if self.opened is not None:
@@ -333,9 +335,7 @@ def _look_into(path: Path, *, read: bool = False, on_progress: Progress | None =
         about = _about(run, looked)
         if read:
             about.insert(2, f"{looked.frames} frames read back: {'sound' if looked.is_sound else 'DAMAGED'}")
-        return _Opened(
-            run, sorted(run.records), about, can_go_on(run, looked), (path / SWEEP.result).is_dir()
-        )
+        return _Opened(run, sorted(run.records), about, can_go_on(run, looked), SWEEP.kept(path).is_dir())
     except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is shown
         return str(error)
 
@@ -391,7 +391,7 @@ def _about(run: Run, looked: Verification) -> list[str]:
 
 
 def _calibration_lines(run: Path) -> list[str]:
-    file = run / SWEEP.result / "calibration.json"
+    file = SWEEP.kept(run) / "calibration.json"
     if not file.is_file():
         return ["A sweep without its calibration: Resume makes it."]
     try:

@@ -523,8 +523,8 @@ def _(o: Operator) -> None:
 @step("it is turned")
 def _(o: Operator) -> None:
     panel = o.panel("reconstructions")
-    o.click(panel.picture.turn)
-    assert panel.picture.turned_deg == 90
+    panel.picture.turn.menu().actions()[0].trigger()
+    o.wait(lambda: panel.picture.orientation.quarters == 1)
 
 
 @step("it is exported as a picture")
