@@ -370,8 +370,8 @@ class SpotCamera:
 
     def _single(self, slm: Array, spots: Sequence[Spot], window: int) -> tuple[Array, float]:
         """Read spots made by the whole SLM; returns brightness and the noise of an amplitude."""
-        lobes = [self._across / n for n in self.display.mask.shape]
-        found, around = self._look(slm, spots, (window, window), self.maker.ideal(len(spots)), lobes)
+        ideal = self.maker.ideal(len(spots))
+        found, around = self._look(slm, spots, (window, window), ideal, self.lobes_px)
         return found, float(np.sqrt(around / 2))
 
     def _look(
@@ -403,6 +403,11 @@ class SpotCamera:
         whole = all(spot.section is None for spot in spots)
         self._on_look(SpotLook(frame, rows, columns, tuple(spots), brightness / ideal, whole))
         return brightness, float(np.median(around))
+
+    @property
+    def lobes_px(self) -> list[float]:
+        """Half widths of a spot of the whole SLM along rows and columns, camera pixels."""
+        return [self._across / n for n in self.display.mask.shape]
 
     def _spot_area(self) -> float:
         """Camera pixels in the area of a spot."""
