@@ -66,6 +66,24 @@ def _is_content(folder: Path) -> bool:
     return folder.is_dir() and not any((folder / own).exists() for own in ("state.json", "calibration.json"))
 
 
+DOUBTFUL = "doubtful_"
+"""Before the name of a result that is not to be relied on."""
+
+
+def named_by_worth(path: Path, *, doubted: bool, overwrite: bool = True) -> Path:
+    """Return where a result goes that was to go to ``path``: a doubted one never under a good one's name.
+
+    Without ``overwrite`` a number is put behind a doubtful name that is taken.
+    """
+    if not doubted:
+        return path
+    named, number = path.with_name(DOUBTFUL + path.name), 1
+    while named.exists() and not overwrite:
+        number += 1
+        named = path.with_name(f"{DOUBTFUL}{path.stem}-{number}{path.suffix}")
+    return named
+
+
 @contextlib.contextmanager
 def whole_file(path: Path | str) -> Iterator[Path]:
     """Give a temporary path beside ``path``; what is written there takes its place when the block ends.
