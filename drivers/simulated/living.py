@@ -73,7 +73,9 @@ class LivingLight:
 
         cells = of(animal.cells_um)
         cells *= np.float32(photons) * animal.rest[:, None, None].astype(np.float32)
-        tissue = np.tensordot(animal.glow.astype(np.float32), of(animal.tissue_um), 1)
+        tissue = np.zeros(self._grid.shape, np.float32)
+        for glow, (x, y, z) in zip(animal.glow, animal.tissue_um, strict=True):
+            tissue += np.float32(glow) * psf((float(x), float(y), float(z)))
         blood = np.float32(BLOOD * photons) * of(animal.vessel_um)
         return cells, np.float32(photons) * tissue, blood
 

@@ -306,6 +306,8 @@ class SimulatedWorld(Surroundings):
     def _alive(self, animal: Animal, seen: Rgb, binning: int) -> Image:
         with self._lock:
             if (seen, binning) not in self._living:
+                # Large, and a camera has one binning at a time.
+                self._living = {key: light for key, light in self._living.items() if key[1] == binning}
                 self._living[seen, binning] = LivingLight(self, animal, seen, binning)
             return self._living[seen, binning].at(self.alive_s)
 
@@ -343,6 +345,7 @@ class SimulatedWorld(Surroundings):
         with self._lock:
             self._scene, self.animal = scene, None
             self._scene_number += 1
+            self._living.clear()
             for key in [key for key in self._cache if key[0] == "scene"]:
                 del self._cache[key]
 

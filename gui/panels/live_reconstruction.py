@@ -24,6 +24,7 @@ from gui.widgets.building import Hint, button, choice, every, fill, in_row, labe
 from gui.widgets.dialogues import elided, path_field
 from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
+from gui.widgets.orientation import OrientationButton, follow_orientation
 from instrument.bench.kept import KeptWithBench
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.files.errors import BenchError, duration
@@ -90,6 +91,7 @@ class LiveReconstructionPanel(Panel):
         """Make the widgets."""
         session = self.session
         self.view = ImageView()
+        follow_orientation(session, "results", self.view.orient)
         self.file, self.browse_button = path_field(
             "calibration folder",
             "A calibration, or a run that holds one",
@@ -123,6 +125,8 @@ class LiveReconstructionPanel(Panel):
         tip = "Prior, solver, camera model, background; how frames are binned"
         self.options_button = button("Options", tip, checkable=True)
         self.options_button.toggled.connect(folded.setVisible)
+        tip = "Turn and mirror reconstructed pictures, in every panel."
+        self.turn_button = OrientationButton(session, "results", tip)
         self.status = label(_NO_CALIBRATION, "dim", wraps=True)
         yield
         self.hint = Hint(
@@ -132,7 +136,7 @@ class LiveReconstructionPanel(Panel):
         )
         first = in_row((self.file, 1), self.browse_button, self.plane)
         switches = (self.run_button, self.refine_button, self.options_button)
-        second = in_row(*switches, None, label("within"), self.budget)
+        second = in_row(*switches, self.turn_button, None, label("within"), self.budget)
         fill(self.body, first, (self.view, 1), (self.hint, 1), self.status, second, (folded, 1))
         yield
         session.run_finished.connect(self._run_finished)

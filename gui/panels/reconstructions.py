@@ -77,7 +77,7 @@ class ReconstructionsPanel(Panel):
         self.form.stopped.connect(self._stop)
         self.form.refused.connect(self.refused)
         yield
-        self.picture = PictureView()
+        self.picture = PictureView(session)
         yield
         self.volume = VolumeView(self.jobs)
         self.volume.failed.connect(lambda why: self.refused(None, why))
@@ -110,13 +110,13 @@ class ReconstructionsPanel(Panel):
         self.refresh()
 
     def _arrange(self) -> Iterator[None]:
-        buttons = in_row(self.open_button, self.refresh_button, self.export_button)
+        buttons = in_row(self.open_button, self.refresh_button)
         results = fill(QWidget(), (self.list, 1), buttons, margins=(0, 6, 0, 0))
         self.tabs = tabs({"Results": results, "Reconstruct": self.form})
         yield
         below = split(self.facts, self.convergence, sizes=[330, 330])
         yield
-        top = fill(QWidget(), in_row(self.heading, (self.place, 1)), (self.viewers, 1))
+        top = fill(QWidget(), in_row(self.heading, (self.place, 1), self.export_button), (self.viewers, 1))
         yield
         right = split(top, below, sizes=[520, 170], down=True, stretch=1)
         right.setStretchFactor(0, 3)
@@ -244,7 +244,7 @@ class ReconstructionsPanel(Panel):
         if views is not None and not views:
             self.refused(None, "The volume's views are still being read. Export them when they are shown.")
             return None
-        turned = self.picture.turned_deg
+        orientation = self.picture.orientation
 
         def write(context: JobContext) -> list[Path]:
             with protecting(result.inputs):
@@ -253,7 +253,7 @@ class ReconstructionsPanel(Panel):
         def write_views(context: JobContext) -> list[Path]:
             if views is None:
                 advance = partial(_report_share, context)
-                export_result(result, target, rotate_deg=turned, overwrite=overwrite, advance=advance)
+                export_result(result, target, orientation=orientation, overwrite=overwrite, advance=advance)
                 return [target]
             for path, pixels in views.items():
                 if path.exists() and not overwrite:

@@ -25,6 +25,7 @@ from gui.session import BenchSession
 from gui.widgets.building import fill, label, split, tabs
 from gui.widgets.dialogues import elided
 from gui.widgets.image_view import ImageView, usual_levels
+from gui.widgets.orientation import follow_orientation
 from gui.widgets.sweep_views import PathPlot, Picture, PsfPictures, PsfTable
 from instrument.bench.photograph import Snapshot
 from instrument.files.errors import BenchError, FileError, SettingsError, count
@@ -84,6 +85,7 @@ class SweepsPanel(ProcedurePanel):
         """Make the widgets."""
         self.path = PathPlot()
         self.frame = ImageView()
+        follow_orientation(self.session, "frames", self.frame.orient)
         yield
         self.frame_words = label("No frame yet.", "dim", yields=True)
         self.psfs = PsfTable()

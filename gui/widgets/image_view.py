@@ -10,11 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QEvent, QObject, QPointF, QRectF, Qt, Signal
-from PySide6.QtGui import QKeyEvent, QResizeEvent
+from PySide6.QtGui import QKeyEvent, QResizeEvent, QTransform
 from PySide6.QtWidgets import QLabel, QWidget
 
 from gui.theme import colours, grey_indices, indices_of, spares_hues, table
 from gui.widgets.building import fill
+from instrument.files.orientation import AS_IT_IS, Orientation
 from instrument.live.frame_view import SATURATED, fill_indices, index_table
 
 Image = npt.NDArray[Any]
@@ -30,6 +31,34 @@ def usual_levels(image: Image) -> tuple[float, float]:
     """Return the values that an image is shown with: nearly the least and largest of every fourth pixel."""
     low, high = np.percentile(image[::4, ::4], (0.1, 99.9))
     return float(low), float(max(high, low + 1))
+
+
+class _TurnedGraphics(pg.GraphicsView):  # type: ignore[misc]
+    """Graphics that are turned and mirrored as a whole: what lies over a picture goes with it."""
+
+    def __init__(self, background: str) -> None:
+        self.orientation = AS_IT_IS
+        super().__init__(background=background)
+
+    def orient(self, orientation: Orientation) -> None:
+        """Turn and mirror what is shown."""
+        self.orientation = orientation
+        self.resizeEvent(None)
+
+    def resizeEvent(self, event: QResizeEvent | None) -> None:  # noqa: N802 - Qt's name
+        """Give the scene the room that there is, its width along the picture's."""
+        if self.closed:
+            return
+        width, height = self.width(), self.height()
+        if self.orientation.quarters % 2:
+            width, height = height, width
+        self.setRange(QRectF(0, 0, width, height), padding=0, disableAutoPixel=False)
+
+    def updateMatrix(self, propagate: bool = True) -> None:  # noqa: N802 - pyqtgraph's name
+        """Turn what is shown, beside what pyqtgraph does."""
+        super().updateMatrix(propagate)
+        a, b, c, d = self.orientation.matrix
+        self.setTransform(QTransform(a, c, b, d, 0, 0))
 
 
 class ImageView(QWidget):
@@ -66,7 +95,7 @@ class ImageView(QWidget):
     def __init__(self, colour_map: str | None = None, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         pg.setConfigOptions(imageAxisOrder="row-major")
-        self.graphics = pg.GraphicsView(background=colours().window)
+        self.graphics = _TurnedGraphics(colours().window)
         self.box: Any = pg.ViewBox(lockAspect=True, invertY=True, enableMenu=False)
         self.graphics.setCentralItem(self.box)
         self.item: Any = pg.ImageItem()
@@ -121,6 +150,13 @@ class ImageView(QWidget):
             self.item.setLookupTable(table(name))
         elif spares_hues(before) != spares_hues(name):
             self.show_image(self.image, *self._levels)
+
+    def orient(self, orientation: Orientation) -> None:
+        """Turn and mirror what is shown; places under the mouse stay those of the picture."""
+        if orientation != self.graphics.orientation:
+            self.graphics.orient(orientation)
+            self.keys.step_of = orientation.step_of
+            self.whole()
 
     def restyle(self) -> None:
         """Take over the background and the colour map of the theme in use."""
@@ -220,8 +256,9 @@ class ImageView(QWidget):
 
     def _step(self, image: Image) -> int:
         """Return how many pixels along each axis fall on one of the screen."""
-        width = max(1.0, self.graphics.width() * self.devicePixelRatioF())
-        height = max(1.0, self.graphics.height() * self.devicePixelRatioF())
+        room = self.graphics.range  # its width along the picture's, however it is turned
+        width = max(1.0, room.width() * self.devicePixelRatioF())
+        height = max(1.0, room.height() * self.devicePixelRatioF())
         (left, right), (top, bottom) = self.box.viewRange()
         step = int(min((right - left) / width, (bottom - top) / height))
         return max(1, min(step, int(image.shape[0]), int(image.shape[1])))
@@ -371,7 +408,7 @@ class ArrowKeys(QObject):
     Signals
     -------
     moved : float, float
-        Steps to the right and down.
+        Steps to the right and down of the picture, however it is turned.
     resized : float, float
         The same with Alt.
     acted : bool
@@ -393,6 +430,8 @@ class ArrowKeys(QObject):
 
     def __init__(self, widget: QWidget) -> None:
         super().__init__(widget)
+        self.step_of: Callable[[float, float], tuple[float, float]] = lambda across, down: (across, down)
+        """What a step to the right and down on the screen is in the picture."""
         widget.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         widget.installEventFilter(self)
 
@@ -409,7 +448,7 @@ class ArrowKeys(QObject):
             scale = step_factor(event)
             across, down = ARROWS[key]
             signal = self.resized if held & Qt.KeyboardModifier.AltModifier else self.moved
-            signal.emit(across * scale, down * scale)
+            signal.emit(*self.step_of(across * scale, down * scale))
             return True
         if held & (Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.AltModifier):
             return False  # shortcuts

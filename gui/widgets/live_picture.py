@@ -9,9 +9,11 @@ from PySide6.QtCore import QObject, QPointF, QSignalBlocker, Signal
 from PySide6.QtWidgets import QWidget
 
 from drivers.frame import Frame
+from gui.session import BenchSession
 from gui.theme import NAMES, colours
 from gui.widgets.building import button, choice, fill, in_row
 from gui.widgets.image_view import ImageView, whole_steps
+from gui.widgets.orientation import OrientationButton, follow_orientation
 from gui.widgets.plots import HistogramPlot, curve_pen, plot_widget
 from instrument.live.frame_view import (
     FrameFigures,
@@ -189,6 +191,10 @@ class LivePicture(QWidget):
 
     ``histogram`` stands beside it: the panel has a place for it.
 
+    Parameters
+    ----------
+    session : BenchSession
+
     Signals
     -------
     region_sent
@@ -204,7 +210,7 @@ class LivePicture(QWidget):
 
     region_sent = Signal()
 
-    def __init__(self, parent: QWidget | None = None) -> None:
+    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.frame: Frame | None = None
         self._measured: Frame | None = None
@@ -255,6 +261,9 @@ class LivePicture(QWidget):
                 switch.toggled.connect(switched)
             switch.toggled.connect(lambda _: self._arrows_for())
         fit = button("Fit", "Show the whole image (wheel zooms, dragging moves)", self.view.whole)
+        tip = "Turn and mirror what the camera sees, in every panel; files stay as the sensor has them."
+        self.turn_button = OrientationButton(session, "frames", tip)
+        follow_orientation(session, "frames", self.view.orient)
         tools = in_row(
             self.colour_map,
             self.stretch,
@@ -263,6 +272,7 @@ class LivePicture(QWidget):
             self.region_button,
             self.apply_region,
             fit,
+            self.turn_button,
             None,
             spacing=6,
         )

@@ -14,10 +14,14 @@ from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QCheckBox, QGridLayout, QTextBrowser, QWidget
 
+from gui.session import BenchSession
 from gui.theme import colours
 from gui.widgets.building import button, choice, fill, in_row, label
+from gui.widgets.entry import quantity
 from gui.widgets.image_view import ImageView
+from gui.widgets.orientation import OrientationButton, follow_orientation
 from gui.widgets.plots import LevelsBar, curve_pen, legend, plot_widget
+from instrument.files.orientation import AS_IT_IS, Orientation
 from recon.solvers.base import IterationRecord
 
 
@@ -56,17 +60,17 @@ class FactsView(QTextBrowser):
 class PictureView(QWidget):
     """Shows one picture, (height, width) or (height, width, 3), or what was found beside it."""
 
-    def __init__(self, parent: QWidget | None = None) -> None:
+    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.picture: npt.NDArray[np.float32] | None = None
         self.beside: dict[str, npt.NDArray[np.float32]] = {}
-        self.turned_deg = 0
+        self.orientation = AS_IT_IS
         self.pitch_um: float | None = None
         self.image = _ScaledImage()
         self.levels = LevelsBar()
         self.levels.changed.connect(self._show)
-        tip = "Turn the picture counter-clockwise; a picture on the sensor's grid is upside down"
-        self.turn = button("Turn 90°", tip, self.turn_by_90)
+        tip = "Turn and mirror pictures, exports alike; one on the sensor's grid is upside down."
+        self.turn = OrientationButton(session, "results", tip)
         tip = "Show the whole picture (the wheel zooms, dragging moves)"
         self.whole = button("Whole", tip, self.image.whole)
         tip = (
@@ -78,12 +82,13 @@ class PictureView(QWidget):
         self.image.setMinimumSize(70, 50)
         self.hovered = self.image.hovered
         fill(self, (self.image, 1), in_row(self.which, None, self.whole, self.turn), self.levels)
+        follow_orientation(session, "results", self._orient)
 
     @property
     def shown(self) -> npt.NDArray[np.float32] | None:
         """The picture, or what is shown instead, as it is turned now."""
         values = self._values
-        return None if values is None else np.rot90(values, self.turned_deg // 90)
+        return None if values is None else self.orientation.apply(values)
 
     @property
     def _values(self) -> npt.NDArray[np.float32] | None:
@@ -113,9 +118,8 @@ class PictureView(QWidget):
             self.levels.set_image(values)
             self._show()
 
-    def turn_by_90(self) -> None:
-        """Turn it counter-clockwise; exports are turned alike."""
-        self.turned_deg = (self.turned_deg + 90) % 360
+    def _orient(self, orientation: Orientation) -> None:
+        self.orientation = orientation
         self._show()
 
     def _show(self) -> None:
@@ -138,11 +142,7 @@ class _ScaledImage(ImageView):
             return words
         height, width = self.image.shape[:2]
         x_um, y_um = ((p - n // 2) * self.pitch_um for p, n in ((column, width), (row, height)))
-        return f"{words}   ({_length(x_um)}, {_length(y_um)} from the middle)"
-
-
-def _length(um: float) -> str:
-    return f"{um:.3g} µm" if abs(um) < 1000 else f"{um / 1000:.3g} mm"
+        return f"{words}   ({quantity(x_um, 'um', 3)}, {quantity(y_um, 'um', 3)} from the middle)"
 
 
 Histories = tuple[tuple[IterationRecord, ...], ...]

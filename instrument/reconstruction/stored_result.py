@@ -14,6 +14,7 @@ import numpy.typing as npt
 from instrument.files.atomic import refuse_input, whole_file
 from instrument.files.errors import FileError, size
 from instrument.files.images import read_image, write_image
+from instrument.files.orientation import AS_IT_IS, Orientation
 from instrument.files.reading import parse_json, read_bytes, require_file
 from instrument.files.seen import as_seen
 from instrument.files.volumes import (
@@ -369,7 +370,7 @@ def export_result(
     result: StoredResult,
     target: Path | str,
     *,
-    rotate_deg: int = 0,
+    orientation: Orientation = AS_IT_IS,
     overwrite: bool = False,
     advance: Advance | None = None,
 ) -> None:
@@ -383,8 +384,8 @@ def export_result(
     target : Path
         A picture: ``.tif`` and ``.npy`` (float32) or ``.png`` (8 bit, as the preview). A volume: ``.tif``
         (OME-TIFF), ``.npy`` or ``.ome.zarr``, all plane by plane.
-    rotate_deg : int
-        A multiple of 90 by which a picture is turned counter-clockwise.
+    orientation : Orientation
+        How a picture is turned and mirrored.
     advance : callable, optional
         ``advance(planes done, planes)``; may raise to end the work.
     """
@@ -401,7 +402,7 @@ def export_result(
         raise FileError(target, "exists already and was left as it is.")
     if result.volume is None:
         assert result.image is not None
-        image = np.ascontiguousarray(np.rot90(result.image, rotate_deg // 90))
+        image = np.ascontiguousarray(orientation.apply(result.image))
         write_image(target, as_seen(image) if target.suffix.lower() == ".png" else image)
         return
     source, grid = result.volume, result.grid

@@ -56,9 +56,16 @@ class CameraMap:
 
         As ``HologramModel.lags``, in the image's unit. The camera is read by cubic splines, so finely that
         what it sees does not alias into the band, and the mean over its pixels is undone.
+
+        Raises InputError where the camera's pixels are too coarse for the band.
         """
         from scipy.ndimage import map_coordinates, spline_filter
 
+        if 2 * band.cutoff > self.pixels_across:
+            raise InputError(
+                f"The camera has {self.pixels_across:.0f} pixels across the field of view; to see all that "
+                f"this display shows, {ceil(2 * band.cutoff)} are needed. Bin it less, or take a longer lens."
+            )
         least = [max(2 * reach + 2, reach + self.pixels_across / 2) for reach in band.radius]
         shape = (fast_length(ceil(least[0])), fast_length(ceil(least[1]), real=True))
         y, x = ((np.arange(n) - n // 2) / n for n in shape)

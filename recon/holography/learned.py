@@ -12,7 +12,7 @@ In the symbols of :mod:`recon.holography.model`, with ``phi`` the phase that a p
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import pi
+from math import ceil, pi
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -96,16 +96,15 @@ class Learned:
 
     def shading(self, shape: tuple[int, int]) -> tuple[Array, Array]:
         """Return what reaches the camera over the field, in FFT order, as a column and a row."""
+        return self.shading_at(*(np.fft.fftfreq(n) for n in shape))
+
+    def shading_at(self, y: Array, x: Array) -> tuple[Array, Array]:
+        """Return what reaches the camera from places in fractions of the field, 0 its middle: by y, by x."""
         from scipy.special import eval_legendre
 
         down, across = (
-            np.exp(
-                sum(
-                    c * eval_legendre(n, 2 * np.fft.fftfreq(m))
-                    for n, c in zip(_SHADE_ORDERS, row, strict=True)
-                )
-            )
-            for row, m in zip(self.shade, shape, strict=True)
+            np.exp(sum(c * eval_legendre(n, 2 * at) for n, c in zip(_SHADE_ORDERS, row, strict=True)))
+            for row, at in zip(self.shade, (y, x), strict=True)
         )
         return down, across
 
@@ -245,23 +244,24 @@ def _near(pattern: Array, anchor: Array) -> Array:
 
 
 def _shares(sigma: float, parts: int) -> npt.NDArray[np.float64]:
-    """Return what samples of a pixel have of its neighbours and of itself, (3, parts), sum 1.
+    """Return what samples of a pixel have of its neighbours and, in the middle, of itself, (2 n + 1, parts).
 
-    A phase that is constant over pixels, smoothed by a Gaussian of ``sigma`` pixels.
+    A phase that is constant over pixels, smoothed by a Gaussian of ``sigma`` pixels; of each sample the sum
+    is 1, what lies beyond the last neighbour is given to it.
     """
-    from scipy.special import erf
+    from scipy.special import ndtr
 
-    at = (np.arange(parts) + 0.5) / parts
-    scale = max(sigma, 1e-6) * np.sqrt(2)
-    left, right = 0.5 * (1 - erf(at / scale)), 0.5 * (1 - erf((1 - at) / scale))
-    return np.stack([left, 1 - left - right, right])
+    reach = max(1, ceil(3 * sigma - 0.5))
+    borders = np.arange(-reach + 1, reach + 1)[:, None] - (np.arange(parts) + 0.5) / parts
+    below = ndtr(borders / max(sigma, 1e-6))
+    return np.diff(below, axis=0, prepend=0, append=1)
 
 
 def _spread(values: Array, shares: Array, axis: int) -> Array:
-    """Sample pixels' values finer along an axis, each sample a mean of its pixel and the two beside it."""
+    """Sample pixels' values finer along an axis, each sample a mean of its pixel and those beside it."""
     values = np.moveaxis(values, axis, 0)
-    padded = np.concatenate([values[:1], values, values[-1:]])
-    n = len(values)
+    reach, n = len(shares) // 2, len(values)
+    padded = np.concatenate([values[:1]] * reach + [values] + [values[-1:]] * reach)
     mixed = sum(share[None, :, None] * padded[k : k + n, None] for k, share in enumerate(shares))
     return np.asarray(np.moveaxis(np.asarray(mixed).reshape(n * shares.shape[1], -1), 0, axis))
 
@@ -269,11 +269,11 @@ def _spread(values: Array, shares: Array, axis: int) -> Array:
 def _gathered(values: Array, shares: Array, axis: int) -> Array:
     """Apply the adjoint of :func:`_spread`."""
     values = np.moveaxis(values, axis, 0)
-    n = len(values) // shares.shape[1]
+    reach, n = len(shares) // 2, len(values) // shares.shape[1]
     blocks = values.reshape(n, shares.shape[1], -1)
-    padded = np.zeros((n + 2, blocks.shape[2]), values.dtype)
+    padded = np.zeros((n + 2 * reach, blocks.shape[2]), values.dtype)
     for k, share in enumerate(shares):
         padded[k : k + n] += np.tensordot(share, blocks, (0, 1))
-    padded[1] += padded[0]
-    padded[-2] += padded[-1]
-    return np.asarray(np.moveaxis(padded[1:-1], 0, axis))
+    padded[reach] += padded[:reach].sum(axis=0)
+    padded[-reach - 1] += padded[-reach:].sum(axis=0)
+    return np.asarray(np.moveaxis(padded[reach:-reach], 0, axis))

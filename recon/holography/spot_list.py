@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from recon.errors import InputError
 from recon.holography.display import Display
+from recon.holography.learned import Panel
 from recon.holography.optimise import Hologram, HologramRecord, HologramStop
 from recon.holography.options import HologramOptions
 
@@ -107,7 +108,7 @@ class SpotField:
     Parameters
     ----------
     display : Display
-        Its mask, displacement and DC term are part of it.
+        Its mask, displacement and DC term are part of it, and what was learned of it.
     spots : SpotList
     """
 
@@ -116,7 +117,10 @@ class SpotField:
 
         self._kernels = _kernels
         self.display, self.spots = display, spots
-        self._table = display.mask.response(display.wavelength_nm).astype(np.complex64)
+        learned = display.learned
+        self._panel = None if learned is None else Panel(display, np.complex64)
+        depth = 1.0 if learned is None else learned.mask_depth
+        self._table = display.mask.response(display.wavelength_nm / depth).astype(np.complex64)
         nodes = display.displacement
         self._nodes = None if nodes is None else np.ascontiguousarray(nodes, np.float32)
         self._field = np.zeros(display.mask.shape, np.complex64)
@@ -131,12 +135,17 @@ class SpotField:
             hy, hx = (h.astype(np.complex64) for h in display.defocus(float(z_mm)))
             self._planes.append(((hy, hx), down, groups, across))
         self.envelope = np.prod(np.sinc(display.mask_fill * nu) ** 2, axis=1)
-        """Intensity of the mask pixels' diffraction at each spot, (n,)."""
+        """Intensity of the mask pixels' diffraction and the vignetting at each spot, (n,)."""
+        if learned is not None:
+            self.envelope *= np.prod(learned.shading_at(nu[:, 0], nu[:, 1]), axis=0)
 
     def at_spots(self, slm: Array) -> npt.NDArray[np.complex64]:
         """Return the field at each spot, complex64 (n,), of an SLM field (height, width); 1 for all light."""
         display = self.display
-        pattern = np.ascontiguousarray(display.dc.modulated * slm + display.dc.amplitude, np.complex64)
+        if self._panel is None:
+            pattern = np.ascontiguousarray(display.dc.modulated * slm + display.dc.amplitude, np.complex64)
+        else:
+            pattern = self._panel.field(np.asarray(slm, np.complex64)[None])[0]
         found = np.empty(len(self.spots), np.complex64)
         for defocus, down, groups, across in self._planes:
             self._fill(pattern, defocus)
@@ -147,15 +156,20 @@ class SpotField:
 
     def back(self, coefficients: Array) -> npt.NDArray[np.complex64]:
         """Return the adjoint: the SLM field, complex64 (height, width), that adds up at the spots."""
-        out = np.zeros(self.display.slm_shape, np.complex64)
+        panel = self._panel
+        out = np.zeros(self.display.slm_shape if panel is None else panel.shape, np.complex64)
         for defocus, down, groups, across in self._planes:
             lines = np.stack([coefficients[g] @ w.conj() for g, w in zip(groups, across, strict=True)])
             np.matmul(down.conj().T, lines.astype(np.complex64), out=self._field)
             self._gather(out, defocus)
-        return out
+        return np.asarray(out if panel is None else panel.collected(out), np.complex64)
+
+    @property
+    def _factor(self) -> int:
+        return self.display.factor if self._panel is None else self._panel.factor
 
     def _fill(self, pattern: Array, defocus: tuple[Array, Array]) -> None:
-        mask, k, rows = self.display.mask.levels, self.display.factor, self._field.shape[0]
+        mask, k, rows = self.display.mask.levels, self._factor, self._field.shape[0]
         hy, hx = defocus
         if self._nodes is None:
             self._kernels.fill(self._field, pattern, mask, self._table, hy, hx, k, 0, rows)
@@ -165,7 +179,7 @@ class SpotField:
             )
 
     def _gather(self, out: Array, defocus: tuple[Array, Array]) -> None:
-        mask, k = self.display.mask.levels, self.display.factor
+        mask, k = self.display.mask.levels, self._factor
         hy, hx = defocus
         if self._nodes is None:
             self._kernels.gather(out, self._field, mask, self._table, hy, hx, k, 0, len(out))

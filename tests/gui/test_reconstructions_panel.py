@@ -334,9 +334,11 @@ def test_export_writes_values_and_views(qtbot: QtBot, panel: ReconstructionsPane
 
     panel.open(tmp_path / "p.tif")
     qtbot.waitUntil(lambda: panel.result is not None, timeout=WAIT_MS)
-    qtbot.mouseClick(panel.picture.turn, Qt.MouseButton.LeftButton)
+    turns = {action.text(): action for action in panel.picture.turn.menu().actions()}
+    turns["Turn left"].trigger()
+    turns["Mirror left and right"].trigger()
     export("out.npy")
-    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.rot90(picture))
+    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.rot90(picture)[:, ::-1])
     export("out.png")
     assert read_image(tmp_path / "out.png").pixels.shape == (30, 20, 3)
     panel.open(tmp_path / "v.npy")

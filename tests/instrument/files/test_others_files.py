@@ -14,6 +14,7 @@ import zarr
 
 from instrument.files.errors import FileError
 from instrument.files.images import read, read_image, read_stack, write_image
+from instrument.files.orientation import Orientation
 from instrument.reconstruction.mosaic import mosaic_of, suspected_mosaic
 from instrument.reconstruction.stored_result import export_result, open_result
 from recon.camera.factors import PATTERNS, split_bayer
@@ -91,7 +92,7 @@ def test_colour_of_floats_is_imagejs_and_comes_back(tmp_path: Path) -> None:
         result = open_result(tmp_path / f"{name}.tif")
         assert result.image is not None
         np.testing.assert_array_equal(result.image, np.rot90(picture))
-        export_result(result, tmp_path / f"{name}-turned.tif", rotate_deg=270)
+        export_result(result, tmp_path / f"{name}-turned.tif", orientation=Orientation(quarters=3))
         np.testing.assert_array_equal(read_image(tmp_path / f"{name}-turned.tif").pixels, picture)
     for odd in (np.stack([picture, 2 * picture]), picture[:, :1], picture.astype(np.float64)):
         write_image(tmp_path / "odd.tif", odd)

@@ -6,12 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from recon.errors import InputError
-from recon.holography import DcTerm, Display, HologramModel, Target, compute_hologram, random_mask
+from recon.holography import (
+    DcTerm,
+    Display,
+    HologramModel,
+    SpotList,
+    Target,
+    compute_hologram,
+    random_mask,
+)
 from recon.holography.learn import Look, learn_display
-from recon.holography.learned import Learned
+from recon.holography.learned import Learned, Panel
 from recon.holography.optimise import HologramStop
+from recon.holography.spot_list import SpotField
 
 SHAPE, K = (24, 32), 2
 PLAIN = Display(
@@ -57,7 +67,7 @@ def looks_of(display: Display, count: int, noise: float = 0.01) -> list[Look]:
     return looks
 
 
-@pytest.mark.parametrize("crosstalk_px", [0.0, 0.2])
+@pytest.mark.parametrize("crosstalk_px", [0.0, 0.2, 1.0])
 def test_the_gradient_is_that_of_differences(crosstalk_px):
     model = HologramModel(wrong(crosstalk_px), [TARGET], dtype=np.complex128, frames=2)
     phases = np.random.default_rng(2).uniform(0.1, 6.0, (2, *SHAPE))
@@ -69,6 +79,31 @@ def test_the_gradient_is_that_of_differences(crosstalk_px):
             moved[at] += step
             losses.append(model.evaluate(np.exp(1j * moved)).loss)
         assert gradient[at] == pytest.approx((losses[0] - losses[1]) / 2e-5, rel=2e-3, abs=1e-9)
+
+
+def test_cross_talk_is_a_gaussian_also_over_several_pixels():
+    display = wrong(1.3)
+    phases = np.random.default_rng(4).uniform(2.5, 3.5, SHAPE)
+    shown = Panel(display, np.complex128)._phases(np.exp(1j * phases))
+    assert shown.shape == (4 * SHAPE[0], 4 * SHAPE[1])
+    # Twenty places in a pixel, the middle one of five is a sample.
+    each = np.ones((20, 20))
+    smooth = gaussian_filter(
+        np.kron(phases, each), 20 * display.learned.crosstalk_px, mode="nearest", truncate=6
+    )
+    assert np.abs(shown - smooth[2::5, 2::5]).max() < 0.003
+
+
+def test_spots_see_what_was_learned_as_pictures_do():
+    display = wrong()
+    slm = np.exp(1j * np.random.default_rng(3).uniform(0, 2 * np.pi, SHAPE)).astype(np.complex64)
+    light = HologramModel(display, [TARGET]).intensity(slm[None])
+    at = np.random.default_rng(4).integers(4, min(light.shape) - 4, (40, 2))
+    spots = SpotList((at - np.array(light.shape) // 2) / light.shape + 0.5, np.ones(40), np.zeros(40))
+    field = SpotField(display, spots)
+    seen = np.abs(field.at_spots(slm)) ** 2 * field.envelope
+    wanted = light[at[:, 0], at[:, 1]]
+    assert seen / seen.mean() == pytest.approx(wanted / wanted.mean(), rel=2e-3, abs=1e-4)
 
 
 def test_errors_are_found_again_and_holograms_are_better_for_it():

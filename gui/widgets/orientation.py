@@ -1,0 +1,65 @@
+"""Turning and mirroring pictures, kept with the bench: all of a kind alike, in every panel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Literal
+
+from PySide6.QtWidgets import QMenu, QPushButton
+
+from gui.session import BenchSession
+from instrument.files.orientation import AS_IT_IS, Orientation
+
+Kind = Literal["frames", "results"]
+_KEPT = "orientation"
+
+
+def follow_orientation(session: BenchSession, kind: Kind, show: Callable[[Orientation], object]) -> None:
+    """Have something called with how pictures of a kind are turned, now and whenever that changes."""
+
+    def changed() -> None:
+        show(Orientation.of(session.kept.of(_KEPT).get(kind)))
+
+    session.kept_changed.connect(changed)
+    changed()
+
+
+class OrientationButton(QPushButton):
+    """A button with a menu that turns and mirrors all pictures of a kind.
+
+    Parameters
+    ----------
+    session : BenchSession
+    kind : str
+        ``"frames"``: pictures of the camera, wherever they are shown; ``"results"``: reconstructed ones.
+    tip : str
+    """
+
+    def __init__(self, session: BenchSession, kind: Kind, tip: str) -> None:
+        super().__init__("Turn")
+        self._session, self._kind = session, kind
+        self.orientation = AS_IT_IS
+        self._tip = tip
+        menu = QMenu(self)
+        for words, turn in (
+            ("Turn left", lambda now: now.turned(1)),
+            ("Turn right", lambda now: now.turned(3)),
+            ("Mirror left and right", lambda now: now.flipped(upright=False)),
+            ("Mirror top and bottom", lambda now: now.flipped(upright=True)),
+            ("As it is", lambda _: AS_IT_IS),
+        ):
+            menu.addAction(words).triggered.connect(partial(self._turn, turn))
+        self.setMenu(menu)
+        follow_orientation(session, kind, self._show)
+
+    def _turn(self, turn: Callable[[Orientation], Orientation], _checked: bool = False) -> None:
+        made = turn(self.orientation)
+        kept = {"quarters": made.quarters, "mirrored": made.mirrored}
+        self._session.keep(_KEPT, self._kind, kept if made != AS_IT_IS else None)
+
+    def _show(self, orientation: Orientation) -> None:
+        self.orientation = orientation
+        now = orientation.words or "as it is"
+        self.setToolTip(f"{self._tip} Kept with the bench. Now: {now}.")
+        self.setText(f"Turn ({orientation.words})" if orientation.words else "Turn")
