@@ -15,13 +15,14 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, find_camera
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import Alignment, CaptureOptions, bench_display
-from instrument.files.images import write_image
+from instrument.display.hologram import Alignment, CaptureOptions, bench_display, prepare_target
+from instrument.display.hologram_files import CHANNELS
+from instrument.files.errors import BenchError
+from instrument.files.images import Pixels, write_image
 from instrument.files.slm_image import phase_levels, write_slm_image
-from recon.holography import Display, HologramModel, Scores, Target, compute_hologram
+from recon.holography import Display, HologramModel, HologramOptions, Scores, Target, compute_hologram
 from recon.holography.camera_map import CameraMap
 from recon.holography.judge import compare, low_pass
-from recon.holography.options import Envelope
 from recon.holography.target import Band, make_band
 
 Array = npt.NDArray[Any]
@@ -176,14 +177,24 @@ def display_of_pattern(
 
     ``size`` is the SLM's shape and pitch in micrometres. Errors as ``bench_display``.
     """
-    display = bench_display(config, size, expansion=facts.get("expansion"))
+    display = bench_display(
+        config, size, expansion=facts.get("expansion"), wavelength_nm=facts.get("wavelength_nm")
+    )
     return display if alignment is None else alignment.of(display)
 
 
-def envelope_of_pattern(facts: Mapping[str, Any]) -> Envelope:
-    """Return how a pattern's target treated the mask pixels' envelope, by the facts beside the pattern."""
-    envelope: Envelope = facts.get("metrics_computed_for", {}).get("envelope", "shade")
-    return envelope
+def target_of_pattern(picture: Pixels, display: Display, facts: Mapping[str, Any]) -> Target:
+    """Return a picture as a pattern shows it: colour, fit, tone, envelope by the facts beside the pattern.
+
+    Raises BenchError where the pattern is one colour of several and the picture has none.
+    """
+    said = facts.get("options", {})
+    taken = {name: said[name] for name in ("fit", "srgb", "lift", "envelope") if name in said}
+    if (colour := facts.get("colour")) in CHANNELS:
+        if picture.ndim != 3 or picture.shape[2] != len(CHANNELS):
+            raise BenchError(f"The pattern is the {colour} of a picture in colour; the one wanted is grey.")
+        picture = picture[..., CHANNELS.index(colour)]
+    return prepare_target(picture, display, HologramOptions(**taken), share=facts.get("field_share", 1.0))
 
 
 def photograph_hologram(

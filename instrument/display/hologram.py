@@ -125,6 +125,7 @@ def prepare_target(
     options: HologramOptions | None = None,
     *,
     z_mm: float = 0.0,
+    share: float = 1.0,
 ) -> Target:
     """Turn a picture into a target over the whole field of view, which is square.
 
@@ -134,6 +135,8 @@ def prepare_target(
         Intensity; 0 is black, an integer type's greatest value (float: the maximum) is white.
     options : HologramOptions
         Its ``fit``, ``srgb``, ``lift`` and ``envelope``.
+    share : float
+        Part of the field that the picture fills, along each axis; around it is black.
     """
     options = options or HologramOptions()
     image = options.lift + (1 - options.lift) * field_picture(pixels, fit=options.fit, srgb=options.srgb)
@@ -144,7 +147,19 @@ def prepare_target(
     if options.envelope == "shade":
         ey, ex = (np.fft.fftshift(e) for e in display.envelope((image.shape[0], image.shape[1])))
         image = image * ey[:, None] * ex
+    if share < 1:
+        # The middle, where indices n // 2 are, stays the middle.
+        around = [(round(n / share) // 2 - n // 2, n) for n in image.shape]
+        image = np.pad(image, [(a, max(round(n / share) - n - a, 0)) for a, n in around])
     return Target(image, z_mm, white=1.0)
+
+
+def colour_shares(wavelengths_nm: Sequence[float]) -> list[float]:
+    """Return which part of its field each colour's picture fills so that all are of one size.
+
+    The field of view is as wide as the wavelength is long, so that of the shortest is what all have.
+    """
+    return [min(wavelengths_nm) / nm for nm in wavelengths_nm]
 
 
 def field_picture(
