@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help demo charts docs test lint format types clean
+.PHONY: help demo charts docs test mutants lint format types clean
 
 help: ## what one can make
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -31,6 +31,9 @@ docs: $(STAMP) ## the site of all documentation, with search, gallery and refere
 
 test: $(STAMP) lint types ## every check and every test
 	$(BIN)/python -m pytest -n 2
+
+mutants: $(STAMP) ## change the program a little again and again, and see whether a test notices (half an hour)
+	$(BIN)/python -m tests.mutants
 
 lint: $(STAMP) ## style, imports between the rooms
 	$(BIN)/ruff check .

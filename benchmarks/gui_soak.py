@@ -1,17 +1,20 @@
 """A long day in short: live view, live reconstruction, jogging, and runs that start and stop.
 
 The whole window on the simulated bench, offscreen. Every few seconds something is done as an operator does:
-the stage is jogged, an LED lit, a photograph taken, a recording started and ended, a plan run, STOP pressed.
+the stage is jogged, an LED lit, a photograph taken, a recording started and ended, a sweep run, STOP pressed.
 Written: a figure of memory, frame rates and latency over time, and all samples as JSON. Fails (status 1) when
-memory grows, a warning or an error is logged, or the frame rate does not hold.
+memory grows by more than 20 MB after the first ten minutes, a turn of the window's thread takes more than 250
+ms of its own processor time, an LED shines after a run or STOP, a file, thread or piece of shared memory is
+left, a warning or an error is logged, or the frame rate does not hold.
 
-    python benchmarks/gui_soak.py --minutes 30
+    python benchmarks/gui_soak.py --minutes 120
     python benchmarks/gui_soak.py --minutes 2 --figure /tmp/soak.png
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gc
 import json
 import os
@@ -20,6 +23,7 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 import warnings
 from collections import Counter
 from datetime import UTC, datetime
@@ -32,6 +36,8 @@ import numpy as np
 from PySide6.QtCore import QSettings, Qt
 from PySide6.QtTest import QTest
 
+from benchmarks.gui_stalls import Turns
+from drivers.simulated.led_array import SimulatedLedArray
 from gui.app import application
 from gui.main_window import MainWindow
 from gui.panels.led_array import LedPanel
@@ -77,12 +83,23 @@ label = "soak plan"
 label = "scene"
 scene_lit = true
 repeats = 6
+[[parts]]
+label = "sweep"
+light = "source"
+positions = { kind = "points", points_um = [[0, 0, 20e3], [0, 0, 30e3], [5e3, 0, 25e3]] }
 """
 SAMPLE_S = 10.0
-SETTLING = 0.2
-"""Of the time at the beginning, in which caches fill and the solver is timed: not judged."""
-MOST_GROWTH_MB = 25.0
-"""Over the judged time: the noise of a process of several hundred MB with two allocators."""
+SETTLING, SETTLING_S = 0.3, 600.0
+"""The beginning, when caches fill and the solver is timed: this share, at most so long; not judged."""
+MOST_GROWTH_MB = 20.0
+"""Over the judged time."""
+LASTING = Counter(
+    {f"{pool}_{n}": 1 for pool in ("asyncio", "recon") for n in range(8)}
+    | {"zarr_io": 1, "closing at exit": 1, "anon_inode": 3, "socket": 2}
+)
+"""What a process has once for all its time: zarr's loop and threads, recon's threads, the end's own."""
+MOST_STALL_MS = 250.0
+"""Of the window's thread's own processor time, in one turn of its event loop."""
 LEAST_RATE = 0.8
 """Of the first half's frames on the screen, which the second half has to show."""
 
@@ -105,14 +122,15 @@ def main() -> int:
             soak.run(60 * arguments.minutes)
         finally:
             soak.close()
-    findings = soak.judge()
+        findings = soak.judge() + soak.left()
     out = arguments.out or arguments.figure.with_suffix(".json")
     facts = {"date": datetime.now(UTC).isoformat(), "minutes": arguments.minutes, "findings": findings}
-    out.write_text(json.dumps({**facts, "done": soak.done, "samples": soak.samples}) + "\n")
+    facts |= {"done": soak.done, "stalls_ms": soak.stalls_ms, "samples": soak.samples}
+    out.write_text(json.dumps(facts) + "\n")
     draw(soak.samples, soak.done, arguments.minutes, arguments.figure)
     print(f"Done: {', '.join(f'{n} {what}' for what, n in sorted(soak.done.items()))}")
     print(f"Wrote {arguments.figure} and {out}")
-    for finding in findings or ["Memory flat, no warnings, frame rate held."]:
+    for finding in findings or ["Memory flat, no stall or warning, nothing left on, frame rate held."]:
         print(finding)
     return 1 if findings else 0
 
@@ -125,10 +143,12 @@ class Soak:
         self.samples: list[dict[str, Any]] = []
         self.done: Counter[str] = Counter()
         self.complaints: list[str] = []
+        self.stalls_ms: list[float] = []
+        self._before = held()
         warnings.simplefilter("always")
         warnings.showwarning = self._warned
         threading.excepthook = lambda what: self.complaints.append(f"thread: {what.exc_value!r}")
-        sys.excepthook = lambda _kind, error, _trace: self.complaints.append(f"window: {error!r}")
+        sys.excepthook = self._raised
         (folder / "plan.toml").write_text(PLAN)
         self.session = BenchSession(parse_config(BENCH, folder / "bench.toml"))
         self.session.logged.connect(self._logged)
@@ -149,10 +169,12 @@ class Soak:
         self.preview.load()
         until(lambda: self.preview._shown is not None)
         self.window.show_panel("stage")
-        stage = self.session.bench.stage
+        stage, self.array = self.session.bench.stage, self.session.bench.led_array
         assert stage is not None
-        homing = self.session.device_job("home", lambda _: stage.home(), {"stage"})
+        assert isinstance(self.array, SimulatedLedArray)
+        homing = self.session.jobs.device("home", lambda _: stage.home(), {"stage"})
         until(lambda: homing.is_over)
+        self.turns = Turns()
         self._n_shown = 0
         show = self.live.picture.view.show_image
 
@@ -177,6 +199,7 @@ class Soak:
         began_s = time.monotonic()
         next_sample_s, next_action_s = began_s + SAMPLE_S, began_s + 3.0
         self._mark()
+        self.turns.fetch()
         while (now_s := time.monotonic()) - began_s < seconds:
             QTest.qWait(20)
             if now_s >= next_sample_s:
@@ -226,6 +249,7 @@ class Soak:
 
         job = session.exclusive_job("A plan", work)
         until(lambda: job.is_over)
+        self._dark("a run")
         QTest.mouseClick(self.live.light_buttons.buttons()[0], Qt.MouseButton.LeftButton)
         self._clear_runs()
 
@@ -239,6 +263,7 @@ class Soak:
         """STOP, then light again."""
         QTest.keyClick(self.window, Qt.Key.Key_Escape)
         until(lambda: not self.session._stopping)
+        self._dark("STOP")
         QTest.mouseClick(self.live.light_buttons.buttons()[0], Qt.MouseButton.LeftButton)
 
     # Samples -------------------------------------------------------------------------------------
@@ -248,6 +273,8 @@ class Soak:
         live, preview = self.session.live.status(), self.preview.follower.status
         picture = self.preview.follower.newest()
         seconds = now - self._marked_s
+        turns = self.turns.fetch()
+        self.stalls_ms += [round(ms) for ms in turns if ms > MOST_STALL_MS]
         self.samples.append(
             {
                 "s": round(at_s, 1),
@@ -259,23 +286,37 @@ class Soak:
                 "latency_ms": None if preview is None else preview.latency_median_ms,
                 "pictures_per_s": None if preview is None else preview.pictures_per_s,
                 "binning": None if picture is None else picture.picture.binning,
+                "longest_turn_ms": turns[0] if turns else 0.0,
                 "threads": threading.active_count(),
+                "files": len(held()["file"]),
                 "objects": len(gc.get_objects()),
                 "cpu_share": (time.process_time() - self._marked_cpu_s) / seconds,
                 "complaints": len(self.complaints),
             }
         )
         self._mark()
+        self.turns.fetch()  # the sample itself is not the window's doing
 
     def judge(self) -> list[str]:
         """Return what is not as it should be."""
         findings = [f"Logged: {text}" for text in self.complaints[:20]]
-        judged = [s for s in self.samples if s["s"] >= SETTLING * self.samples[-1]["s"]]
+        settled_s = min(SETTLING_S, SETTLING * self.samples[-1]["s"])
+        judged = [s for s in self.samples if s["s"] >= settled_s]
         t, memory = (np.array([s[name] for s in judged]) for name in ("s", "memory_mb"))
         growth = float(np.polyfit(t, memory, 1)[0] * (t[-1] - t[0])) if len(judged) > 2 else 0.0
         print(f"Memory {memory[0]:.0f} to {memory[-1]:.0f} MB, trend {growth:+.1f} MB over the judged time")
         if growth > MOST_GROWTH_MB:
             findings.append(f"Memory grew by {growth:.0f} MB.")
+        longest = sorted((s["longest_turn_ms"] for s in self.samples), reverse=True)[:3]
+        print(f"Longest turns of the window's thread, ms of its CPU: {[round(ms) for ms in longest]}")
+        if self.stalls_ms:
+            findings.append(f"{len(self.stalls_ms)} turns over {MOST_STALL_MS:.0f} ms: {self.stalls_ms[:10]}")
+        third = max(len(judged) // 3, 1)
+        for what in ("threads", "files"):
+            begin, end = (min(s[what] for s in part) for part in (judged[:third], judged[-third:]))
+            print(f"{what.capitalize()}: {begin} in the first third, {end} in the last (the least of each)")
+            if end > begin:
+                findings.append(f"{what.capitalize()} grew from {begin} to {end}.")
         half = len(judged) // 2
         first, second = (
             float(np.median([s["screen_per_s"] for s in part])) for part in (judged[:half], judged[half:])
@@ -293,11 +334,28 @@ class Soak:
         until(lambda: self.session.is_closed)
         self.session.join()
 
+    def left(self) -> list[str]:
+        """Return what the closed session has left open, running or on."""
+        gc.collect()
+        after = held()
+        lit = [] if self.leds_are_dark() else ["The LED array shines after the end."]
+        new = {what: after[what] - names - LASTING for what, names in self._before.items()}
+        print(f"Left after the end: { {what: sum(names.values()) for what, names in new.items()} }")
+        return lit + [f"Left: {what} {name}" for what, names in new.items() for name in names.elements()]
+
+    def leds_are_dark(self) -> bool:
+        """Whether the simulated LED array is dark, whatever it says."""
+        return bool(self.array._pattern.is_dark)
+
     # Pieces --------------------------------------------------------------------------------------
     def _panel(self, name: str, kind: Any) -> Any:
         panel = self.window.show_panel(name)
         assert isinstance(panel, kind)
         return panel
+
+    def _dark(self, after: str) -> None:
+        if not self.leds_are_dark():
+            self.complaints.append(f"an LED shines after {after}")
 
     def _mark(self) -> None:
         self._marked_s, self._marked_cpu_s, self._n_shown = time.perf_counter(), time.process_time(), 0
@@ -309,7 +367,9 @@ class Soak:
             bench.scene_off()
             dark = bench.snap(4).image.astype(np.float32)
             bench.source_on()
+            bench.camera.set_exposure_ms(4.0)  # at 10 ms the brightest pixels are full
             psf = np.clip(bench.snap(4).image - dark.mean() - 3, 0, None)
+            bench.camera.set_exposure_ms(10.0)
             bench.source_off()
             bench.scene_on()
         place = np.array([[0.0, 0.0, 1e5]])
@@ -325,8 +385,27 @@ class Soak:
         if level in ("warning", "error") and text != "STOP":
             self.complaints.append(f"{level}: {text}")
 
+    def _raised(self, kind: type[BaseException], error: BaseException, trace: Any) -> None:
+        self.complaints.append(f"window: {error!r}")
+        traceback.print_exception(kind, error, trace)
+
     def _warned(self, message: Warning | str, category: type[Warning], *_rest: Any, **_named: Any) -> None:
         self.complaints.append(f"{category.__name__}: {message}")
+
+
+def held() -> dict[str, Counter[str]]:
+    """Return what the process has open and running: files, threads, shared memory, by name."""
+    files: Counter[str] = Counter()
+    for entry in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):  # the one that lists them is closed by now
+            files[str(entry.readlink()).partition(":[")[0]] += 1
+    shared = Path("/dev/shm")
+    mine = [p.name for p in shared.iterdir() if p.stat().st_uid == os.getuid()] if shared.is_dir() else []
+    return {
+        "file": files,
+        "thread": Counter(thread.name for thread in threading.enumerate()),
+        "shared memory": Counter(mine),
+    }
 
 
 def resident_mb() -> float:
@@ -335,12 +414,12 @@ def resident_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def until(done: Any, timeout_s: float = 120.0) -> None:
+def until(done: Any, timeout_s: float = 300.0) -> None:
     """Let the window work until something is done."""
     deadline_s = time.monotonic() + timeout_s
     while not done():
         if time.monotonic() > deadline_s:
-            raise SystemExit("Waited two minutes in vain.")
+            raise SystemExit("Waited five minutes in vain.")
         QTest.qWait(20)
 
 
@@ -354,7 +433,8 @@ def draw(samples: list[dict[str, Any]], done: dict[str, int], minutes: float, pa
     t = [s["s"] / 60 for s in samples]
     figure, axes = plt.subplots(3, 1, figsize=(9, 7), sharex=True, constrained_layout=True)
     axes[0].plot(t, [s["memory_mb"] for s in samples], color="#2b6cb0")
-    axes[0].axvspan(0, SETTLING * t[-1], color="#000000", alpha=0.05, lw=0, label="not judged")
+    settled = min(SETTLING_S / 60, SETTLING * t[-1])
+    axes[0].axvspan(0, settled, color="#000000", alpha=0.05, lw=0, label="not judged")
     most_mb = max(s["memory_mb"] for s in samples)
     axes[0].set(ylabel="memory (MB)", ylim=(0, 1.15 * most_mb))
     axes[0].legend(loc="lower left")

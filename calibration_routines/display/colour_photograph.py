@@ -124,8 +124,9 @@ def photograph_colours(
         finally:
             io.light(on=False)
         count = max(capture.seen.shape) if not seen else len(seen[0])
-        seen.append(_middle(capture.seen, pattern.share, count))
-        wanted.append(_middle(capture.wanted, pattern.share, count))
+        share = pattern.share if target.window is None else 1.0  # what is seen of a window is all picture
+        seen.append(_middle(capture.seen, share, count))
+        wanted.append(_middle(capture.wanted, share, count))
         scores.append(compare(seen[-1], wanted[-1], 1.0))
         saturated.append(capture.saturated_fraction)
     return ColourCapture(

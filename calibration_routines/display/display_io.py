@@ -22,7 +22,7 @@ from instrument.bench.bench import Bench
 from instrument.bench.sequence import Wire, take_sequence
 from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError
-from instrument.files.slm_image import SlmCorrection, phase_levels
+from instrument.files.slm_image import SlmCorrection, field_levels
 from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.writer import dated_name, free_name
 from recon.holography import Display
@@ -85,9 +85,10 @@ class DisplayBench:
         self._dark: tuple[tuple[float, ...], Array | float] | None = None
 
     def show(self, field: Array) -> None:
-        """Show the phase of an SLM field, complex (height, width) in binned pixels."""
+        """Show an SLM field, complex (height, width) in binned pixels: its phase, or what mirrors send."""
         self._check()
-        self.slm.display(self.correction.apply(phase_levels(np.angle(field), self.binning)))
+        levels = field_levels(field, self.binning, mirrors=self.slm.mirrors)
+        self.slm.display(levels if self.slm.mirrors else self.correction.apply(levels))
 
     def show_levels(self, levels: npt.NDArray[np.uint8]) -> None:
         """Show grey levels as they are, uncorrected, (height, width) of the whole SLM."""
@@ -221,15 +222,18 @@ def find_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:
     return found, _inner_mean(frame, found)
 
 
-def random_brightness(io: DisplayBench, display: Display, camera: CameraMap, mean_per_ms: float) -> float:
+def random_brightness(
+    io: DisplayBench, display: Display, camera: CameraMap, mean_per_ms: float | None = None
+) -> float:
     """Return counts a millisecond of the mean intensity of random phases.
 
     A blank SLM adds up with light that is not modulated, so that its picture is brighter or darker than that
-    of any hologram; ``mean_per_ms``, from :func:`find_camera`, only sets the exposure.
+    of any hologram; ``mean_per_ms``, from :func:`find_camera`, only sets the exposure (the camera's own).
     """
     phases = np.random.default_rng(0).uniform(0, 2 * np.pi, display.slm_shape)
     io.show(np.exp(1j * phases))
-    return _inner_mean(io.photograph(io.exposure_ms(mean_per_ms)), camera)
+    own_ms = io.bench.camera.exposure_ms
+    return _inner_mean(io.photograph(own_ms if mean_per_ms is None else io.exposure_ms(mean_per_ms)), camera)
 
 
 def _inner_mean(frame: Array, camera: CameraMap) -> float:
@@ -417,8 +421,8 @@ class SpotCamera:
 
     def _single(self, slm: Array, spots: Sequence[Spot], window: int) -> tuple[Array, float]:
         """Read spots made by the whole SLM; returns brightness and the noise of an amplitude."""
-        lobes = [self._across / n for n in self.display.mask.shape]
-        found, around = self._look(slm, spots, (window, window), self.maker.ideal(len(spots)), lobes)
+        ideal = self.maker.ideal(len(spots))
+        found, around = self._look(slm, spots, (window, window), ideal, self.lobes_px)
         return found, float(np.sqrt(around / 2))
 
     def _look(
@@ -450,6 +454,11 @@ class SpotCamera:
         whole = all(spot.section is None for spot in spots)
         self._on_look(SpotLook(frame, rows, columns, tuple(spots), brightness / ideal, whole))
         return brightness, float(np.median(around))
+
+    @property
+    def lobes_px(self) -> list[float]:
+        """Half widths of a spot of the whole SLM along rows and columns, camera pixels."""
+        return [self._across / n for n in self.display.mask.shape]
 
     def _spot_area(self) -> float:
         """Camera pixels in the area of a spot."""

@@ -277,6 +277,7 @@ class DisplaySlm(SimulatedSlm):
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         super().__init__(options, shared)
+        self.mirrors = self.world.options.mirrors
         self.world.mount_slm(self)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
 import os
 import signal
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drivers.errors import DeviceError, LimitError
+from instrument.cli import kept_times
 from instrument.cli.options import USAGE_ERROR, GroupedCommand, flat
 from instrument.files.errors import BenchError, OperatorNeededError, in_words
 from recon.base.declare import option
@@ -65,9 +67,24 @@ class App(typer.Typer):
         class Group(typer.core.TyperGroup):
             meant = usual
 
+            def names_none(self, first: list[str]) -> bool:
+                """Whether there is no command's name to be read, right or wrong."""
+                return not first or (first[0].startswith("-") and first[0] not in _HELP)
+
+            def get_command(self, context: Any, name: str) -> Any:
+                """Find a command; one that there is not is answered with those that there are."""
+                found = super().get_command(context, name)
+                if found is None and not context.resilient_parsing:
+                    near = difflib.get_close_matches(name, self.commands, 1)
+                    hint = f" Did you mean {near[0]}?" if near else ""
+                    known = ", ".join(self.commands)
+                    raise BenchError(
+                        f"{context.command_path}: there is no {name!r}; there are {known}.{hint}"
+                    )
+                return found
+
             def parse_args(self, context: Any, arguments: list[str]) -> list[str]:
-                named = arguments[:1] and (arguments[0] in self.commands or arguments[0] in _HELP)
-                if self.meant is not None and not named:
+                if self.meant is not None and self.names_none(arguments[:1]):
                     arguments = [self.meant, *arguments]
                 return super().parse_args(context, arguments)
 
@@ -116,9 +133,12 @@ def open_and_say(bench: BenchConfig | Path | None, *, as_is: bool = False) -> Be
     With ``as_is`` nobody is asked: what the operator would have to do is said, and taken for done.
     """
     from instrument.bench.bench import open_bench
+    from instrument.cli.progress import one_task
 
-    config = load_and_say(bench) if bench is None or isinstance(bench, Path) else bench
-    opened = open_bench(config, ask=_taken_for_done if as_is else operator())
+    with one_task("Opening the bench"):
+        config = load_and_say(bench) if bench is None or isinstance(bench, Path) else bench
+        opened = open_bench(config, ask=_taken_for_done if as_is else operator())
+    kept_times.about(opened.label)  # whichever command: its devices take the time
     typer.echo(f"Bench: {opened.label}", err=True)
     return opened
 
@@ -168,6 +188,7 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
     for chatty in ("numba", "numcodecs", "matplotlib", "asyncio"):  # numba prints 30,000 lines a kernel
         logging.getLogger(chatty).setLevel(logging.WARNING)
     _end_on_signals()
+    kept_times.about(name)
     try:
         # Not through typer's own main, which would answer Ctrl-C itself before a word is said about it.
         parser = typer.main.get_command(command.load())

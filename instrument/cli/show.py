@@ -134,31 +134,35 @@ def show(
 
 def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -> None:
     """Put patterns on the SLM; hold them, or photograph what they show."""
-    import numpy as np
-
     from calibration_routines.display.colour_photograph import colour_patterns
     from calibration_routines.display.display_io import DisplayBench, bring_mask
     from instrument.display.hologram import load_alignment
-    from instrument.files.images import side_car
-    from instrument.files.slm_image import SLM_PHASE, levels_phase, load_slm_correction, read_slm_image
+    from instrument.files.slm_image import (
+        is_of_mirrors,
+        levels_field,
+        load_slm_correction,
+        mismatch,
+        read_slm_image,
+    )
 
-    beside = side_car(what[0])
-    spots = beside.exists() and "spots" in SLM_PHASE.read(beside)
+    read = [read_slm_image(path) for path in what]
+    spots = "spots" in read[0][1]
     options.check(len(what), spots=spots)
     correction = load_slm_correction(options.slm_calibration) if options.slm_calibration else None
     place = load_alignment(options.alignment) if options.alignment else None
     if place is not None:
         place.require_correction(correction is not None)
-    read = [read_slm_image(path) for path in what]
     with naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
         if opened.slm is None:
             raise BenchError(f"{opened.label} has no [slm].")
-        for path, (levels, _) in zip(what, read, strict=True):
+        for path, (levels, facts) in zip(what, read, strict=True):
             if levels.shape != opened.slm.shape:
                 raise FileError(path, f"is {levels.shape} pixels, the SLM {opened.slm.shape}.")
+            if facts and (words := mismatch(opened.slm, mirrors=is_of_mirrors(facts))):
+                raise FileError(path, f"cannot be shown: {words}")
         bring_mask(opened, place.stage_position if place else {})
         binning, own_nm = opened.config.display.slm_binning, opened.config.display.wavelength_nm
-        fields = [np.exp(1j * levels_phase(levels, binning)) for levels, _ in read]
+        fields = [levels_field(levels, binning, mirrors=opened.slm.mirrors) for levels, _ in read]
         colours = colour_patterns(fields, [facts for _, facts in read], own_nm)
         lights = [
             DisplayBench(
@@ -246,6 +250,7 @@ def _capture(
     """Photograph, say how good it is, write."""
     from calibration_routines.display.hologram_photograph import (
         display_of_pattern,
+        options_of_pattern,
         photograph_hologram,
         target_of_pattern,
         write_capture,
@@ -259,6 +264,7 @@ def _capture(
     assert opened.slm is not None
     slm = opened.slm.shape, opened.slm.pixel_pitch_um
     display = display_of_pattern(opened.config, slm, facts, place)
+    computed = options_of_pattern(facts)
     found = photograph_hologram(
         io,
         fields,
@@ -266,6 +272,7 @@ def _capture(
         target_of_pattern(read_image(options.target).pixels, display, facts),
         options,
         progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
+        computed=computed,
     )
     mark = " (SIMULATED)" if found.simulated else ""
     typer.echo(f"camera registered to {found.camera_residual_px:.2f} px{mark}")

@@ -18,14 +18,14 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config import BenchConfig
 from instrument.bench.config_file import TEMPLATES, load_config, parse_config, template
 from instrument.bench.source_and_scene import Ask
-from instrument.files.calibration_file import load_calibration
+from instrument.files.calibration_file import is_calibration, load_calibration
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, read
 from instrument.notebook.result import Result
 from instrument.reconstruction.job import Job, find_calibration, job_from_files, job_with
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import refocused, volume_job
-from instrument.runs.run import Run
+from instrument.runs.run import Run, is_run
 from recon.base.checks import as_channels
 from recon.base.declare import options_of, require, with_overrides
 from recon.reconstruction import reconstruct as one_door
@@ -52,8 +52,12 @@ def calibration(folder: Path | str) -> Calibration:
 
 
 def run(folder: Path | str) -> Run:
-    """Open a run for reading; raises RunError where there is none."""
-    return Run.open(folder)
+    """Open a run for reading, by its folder or that of the calibration in it.
+
+    Raises RunError where there is none.
+    """
+    folder = Path(folder)
+    return Run.open(folder.parent if is_calibration(folder) and is_run(folder.parent) else folder)
 
 
 def bench(config: BenchConfig | Path | str | None = None, *, ask: Ask | None = None) -> Bench:

@@ -228,30 +228,38 @@ def require_distance(z_um: float) -> None:
 def refocused(job: Job, z_um: float) -> Job:
     """Return the job with a PSF for a depth that its calibration does not contain, and a note that says so.
 
-    Where the calibration has the depth the job is returned as it is. Where depths, or the distance from
-    diffuser to sensor, are not known, as with a PSF image, no PSF can be refocused: a note says so, and the
-    reconstruction takes the PSF as it is, or the nearest one.
+    Where the calibration has the depth the job is returned as it is. Where it has several, but the distance
+    from diffuser to sensor is not known, the nearest is taken, and a note says so.
 
-    Raises BenchError when ``z_um`` is no distance.
+    Raises BenchError when ``z_um`` is no distance, or there is one PSF that nothing can bring there.
     """
     require_distance(z_um)
-    calibration = job.calibration
+    calibration, asked = job.calibration, f"{z_um / 1e3:g} mm"
     z = calibration.source_positions_um[:, 2]
+    as_it_is = "Leave the distance (--z-mm, z_um) out to take the PSF as it is, or give a calibration"
     if not bool((z > 0).all()):
-        return _as_measured(job, z_um, "at what depth it was measured is not known")
+        raise BenchError(
+            f"The PSF is not known to be of any depth, so it cannot be brought to {asked}. {as_it_is} with "
+            "the depths of its PSFs."
+        )
     if calibration.geometry.diffuser_distance_mm is None:
         if np.isclose(z, z_um).any():
             return job
-        return _as_measured(
-            job, z_um, "the diffuser's distance from the sensor is not known; the nearest is taken"
-        )
+        if len(members_of_depths(calibration.source_positions_um)) == 1:
+            raise BenchError(
+                f"The calibration has one depth, {z[0] / 1e3:g} mm, and the diffuser's distance from the "
+                f"sensor is not known, so it cannot be brought to {asked}. {as_it_is} of several depths."
+            )
+        why = "the diffuser's distance from the sensor is not known; the nearest is taken"
+        said, read = f"not refocused to {asked}: {why}", job.notes.get("PSF")
+        return replace(job, notes={**job.notes, "PSF": f"{read}, {said}" if read else said})
     calibration, made = at_depth(calibration, z_um)
     if made is None:
         return job
     return replace(
         job,
         calibration=calibration,
-        notes={**job.notes, "PSF": f"refocused to {z_um / 1e3:g} mm: {made}"},
+        notes={**job.notes, "PSF": f"refocused to {asked}: {made}"},
         provenance={
             **job.provenance,
             "refocused": {
@@ -262,10 +270,3 @@ def refocused(job: Job, z_um: float) -> Job:
             },
         },
     )
-
-
-def _as_measured(job: Job, z_um: float, why: str) -> Job:
-    """Return the job with a note that its PSF was not refocused."""
-    said = f"not refocused to {z_um / 1e3:g} mm: {why}"
-    read = job.notes.get("PSF")
-    return replace(job, notes={**job.notes, "PSF": f"{read}, {said}" if read else said})

@@ -32,15 +32,20 @@ def reconstruct_photograph(
 ) -> Done:
     """Reconstruct, tell, write. ``explain``: only say what with."""
     if output.explain:
-        job = request.prepare()
-        _tell_choice(desk, request.explain(job))
+        with desk.step("reading"):
+            job = request.prepare()
+        with desk.step("choosing"):
+            choice = request.explain(job)
+        _tell_choice(desk, choice)
         with desk.step("the first iterations"):
-            desk.fact("Will take", str(request.forecast(job)))
+            told = request.forecast(job)
+        desk.fact("Will take", str(told))
         return Done()
     outputs.check(0, overwrite=output.force)
     is_volume = isinstance(request, VolumeRequest)
     with saying_what_is_left(*outputs.files()):
-        job = request.prepare()
+        with desk.step("reading"):
+            job = request.prepare()
         planes = len(job.calibration.psfs) if is_volume else 1
         outputs.check(planes * job.measurement.size, overwrite=output.force)
         _tell_job(desk, job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench")
@@ -53,12 +58,13 @@ def reconstruct_photograph(
 
             result = request.solve(job, cancel=cancel, keeper=keeper, on_stage=stage)
         _tell(desk, result)
-        if is_volume:
-            write_volume(outputs, result, job)
-            if steps := uneven_steps(result.grid.z_um):
-                desk.say(f"{'Planes':<12}{steps} Each plane's depth is in {outputs.record.name}.")
-        else:
-            _write_picture(outputs, result, job, int(output.rotate_deg))
+        with desk.step("writing"):
+            if is_volume:
+                write_volume(outputs, result, job)
+            else:
+                _write_picture(outputs, result, job, int(output.rotate_deg))
+        if is_volume and (steps := uneven_steps(result.grid.z_um)):
+            desk.say(f"{'Planes':<12}{steps} Each plane's depth is in {outputs.record.name}.")
         for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
             desk.fact(name, text)
     return _ended(outputs, result, what)

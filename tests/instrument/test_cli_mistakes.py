@@ -12,6 +12,7 @@ from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.files.images import write_image
 from recon.evaluation.scene import make_scene
+from recon.types import Calibration
 
 RECONSTRUCT = ["reconstruct", "--out", "o.tif"]
 PAIR = [*RECONSTRUCT, "--psf", "psf.tif", "--image", "photo.tif"]
@@ -42,6 +43,10 @@ MISTAKES: list[tuple[list[str], str]] = [
     ([*PAIR, "--erasures", "1"], "a share from 0 to below 1"),
     ([*PAIR, "--solver", "wiener", "--iterations", "3"], "one shot"),
     ([*PAIR, "--z-mm", "-3"], "above 0"),
+    ([*PAIR, "--z-mm", "30"], "cannot be brought to 30 mm"),
+    ([*RECONSTRUCT, "--calibration", "near", "--image", "photo.tif", "--z-mm", "30"], "has one depth, 20 mm"),
+    (["demo", "nothing"], "there are camera, film, display"),
+    (["plan", "shwo"], "Did you mean show?"),
     ([*PAIR, "--figure", "o.gif"], ".png, .pdf or .svg"),
     (["reconstruct", *PAIR[3:], "--out", "/proc/o.tif"], "Choose another place"),
     (["reconstruct", *PAIR[3:], "--out", "o.jpg"], "must end in .tif"),
@@ -86,6 +91,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for z in range(2):
         write_image(folder / "plain" / f"psf{z}.tif", psf)
     save_calibration(scene.calibration, folder / "cal")
+    save_calibration(Calibration(scene.calibration.psfs[:1], np.array([[0, 0, 2e4]])), folder / "near")
     (folder / "text.tif").write_text("psf")
     (folder / "empty.tif").touch()
     return folder

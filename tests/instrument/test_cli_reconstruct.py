@@ -430,16 +430,13 @@ def test_what_is_about_psf_images_is_refused_with_a_calibration(
 
 
 @pytest.mark.usefixtures("here")
-def test_a_psf_image_is_said_not_to_be_refocused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_psf_image_has_no_distance(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["reconstruct", "--psf", "psf.tif", "--image", "raw.tif", "--method", "wiener"]
-    words += ["--out", "out.tif"]
-    assert main([*words, "--z-mm", "40"]) == 0
-    assert "not refocused to 40 mm" in capsys.readouterr().out
-    assert main([*words, "--force"]) == 0
-    assert "refocused" not in capsys.readouterr().out
     for z_mm in ("-4", "0", "nan", "inf"):
-        assert main([*words, "--force", "--z-mm", z_mm]) == 2
+        assert main([*words, "--z-mm", z_mm]) == 2
         assert "--z-mm must be a number, above 0 (mm), not" in capsys.readouterr().err
+    assert main([*words, "--z-mm", "40"]) == 2
+    assert "Leave the distance (--z-mm, z_um) out" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("here")

@@ -1,0 +1,113 @@
+"""Change the program a little, again and again, and see whether a test notices: ``make mutants``.
+
+    python -m tests.mutants                       a sample of every area, 30 minutes at most
+    python -m tests.mutants solvers --sample 50   so many of each area that is named
+    python -m tests.mutants --list                what can be changed, and do nothing
+
+A mutant is one small mistake in one function: ``<`` for ``<=``, ``+`` for ``-``, a call or a ``raise`` left
+out, a number changed, a condition negated. First each test runs once and is watched: which lines it comes
+to. Then each mutant is put into a process of its own in which everything is loaded already, and the quickest
+tests that come to its line run until one fails (*noticed*), or all pass (*lived*). What hangs is noticed.
+Compiled kernels, module constants and words are not changed; a test that runs the program in a process of
+its own does not see a mutant. Some processes have no mutant in them: tests that fail there are failing by
+themselves, and the figures are worth less.
+
+Those that cannot be noticed, since they are equal to what was there, stand in tests/mutants/equal.toml with
+the reason. Exit status 1 when less than 95 % of the others were noticed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import sys
+import tomllib
+from collections import Counter
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from tests.mutants.areas import AREAS
+from tests.mutants.mutations import Mutant, mutants_of
+from tests.mutants.session import Fate, Trials
+
+ROOT = Path(__file__).parents[2]
+ENOUGH = 0.95
+NO_MUTANT_EVERY = 25
+
+
+def known_equal() -> dict[str, str]:
+    """Return the mutants that no test can notice, each with the reason."""
+    listed = tomllib.loads(Path(__file__).with_name("equal.toml").read_text())["equal"]
+    return {mutant["name"]: mutant["why"] for mutant in listed}
+
+
+def drawn(areas: list[str], sample: int, seed: int) -> list[tuple[str, Mutant]]:
+    """Return a sample of each area's mutants, the areas in turn."""
+    found: list[tuple[float, str, Mutant]] = []
+    equal = known_equal()
+    for area in areas:
+        rng = random.Random(f"{seed} {area}")
+        every = [mutant for path in AREAS[area][0] for mutant in mutants_of(Path(path), ROOT)]
+        those = [mutant for mutant in every if mutant.name not in equal]
+        some = rng.sample(those, min(sample, len(those)))
+        found += [(number / len(some), area, mutant) for number, mutant in enumerate(some)]
+    return [(area, mutant) for _, area, mutant in sorted(found, key=lambda one: one[0])]
+
+
+def table(fates: list[tuple[str, Mutant, Fate]]) -> float:
+    """Print what became of the mutants, and those that lived; return the share that was noticed."""
+    for area, mutant, fate in fates:
+        if fate != "noticed":
+            print(f"{area}: {fate}: {mutant.path}:{mutant.lines[1]} {mutant.function}: {mutant.what}")
+    print(f"{'area':<12}{'tried':>7}{'noticed':>9}{'lived':>7}{'no test':>9}{'share':>8}")
+    counts = Counter((area, fate) for area, _, fate in fates)
+    areas = list(dict.fromkeys(area for area, _, _ in fates))
+    sums: Counter[str] = Counter()
+    for area in [*sorted(areas, key=list(AREAS).index), "all"]:
+        n = sums if area == "all" else Counter({fate: counts[area, fate] for fate in get_args(Fate)})
+        sums += n if area != "all" else Counter()
+        tried = sum(n.values())
+        share = n["noticed"] / max(tried, 1)
+        print(f"{area:<12}{tried:>7}{n['noticed']:>9}{n['lived']:>7}{n['no test']:>9}{share:>8.0%}")
+    return share
+
+
+def main() -> int:
+    """Try mutants as the command line says; 1 when too few were noticed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("area", nargs="*", choices=[*AREAS, []], help="what is changed [default: all]")
+    parser.add_argument("--sample", type=int, default=60, help="mutants of each area")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=30.0, help="no mutant is begun after so long")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
+    parser.add_argument("--only", default="", help="only mutants in whose name this stands")
+    parser.add_argument("--list", action="store_true", help="print the sample and end")
+    options = parser.parse_args()
+    areas = options.area or list(AREAS)
+    chosen = [one for one in drawn(areas, options.sample, options.seed) if options.only in one[1].name]
+    if options.list:
+        for area, mutant in chosen:
+            print(f"{area}: {mutant.name}")
+        return 0
+    tests = sorted({test for area in areas for test in AREAS[area][1]})
+    modules = sorted({path for area in areas for path in AREAS[area][0]})
+    trials = Trials(ROOT, modules, chosen, options.jobs, 60 * options.minutes, NO_MUTANT_EVERY)
+    os.environ["CI"] = "1"  # property tests try the same examples every time
+    os.chdir(ROOT)
+    failed = pytest.main(["-q", "-s", "-m", "not slow", "-p", "no:cacheprovider", *tests], plugins=[trials])
+    if failed:
+        return int(failed)
+    share = table(trials.fates)
+    n = len(trials.fates)
+    print(f"{share:.1%} of {n} noticed (seed {options.seed}); {len(known_equal())} are known to be equal.")
+    print(f"Without a mutant: {trials.alone} processes, {trials.failed_alone} failed.")
+    if left := len(chosen) - n - trials.not_possible:
+        print(f"{left} were not tried for want of time.")
+    return int(share < ENOUGH)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

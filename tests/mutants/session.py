@@ -1,0 +1,285 @@
+"""Tests in processes that hold everything loaded, watched or with a mutant in them."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import hashlib
+import importlib
+import os
+import pickle
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from types import FrameType, FunctionType
+from typing import Any, Literal
+
+import pytest
+
+from tests.mutants.mutations import Mutant
+
+MOST_TESTS_S = 8.0
+"""Of the tests of one mutant together, as they took when they were watched."""
+MOST_WATCHED_S = 8.0
+"""A test that took longer is not asked."""
+_WATCH_LIMIT_S = 900.0
+_KEPT = Path("build/mutants.pickle")
+
+Line = tuple[str, int]
+Fate = Literal["noticed", "lived", "no test"]
+
+
+@dataclass
+class Watched:
+    """A test's time in seconds, and the lines that it came to, as it ran once."""
+
+    seconds: float
+    passed: bool
+    lines: frozenset[Line]
+
+
+@dataclass
+class _Child:
+    process: int
+    answer: Path
+    ends_s: float
+
+
+class Trials:
+    """A plugin that runs the collected tests for each mutant instead of once.
+
+    Parameters
+    ----------
+    root : Path
+        Of the repository.
+    modules : sequence of str
+        That are changed, relative to it.
+    mutants : sequence of (str, Mutant)
+        Each with its area.
+    jobs : int
+        Processes at a time.
+    seconds : float
+        After which no mutant is begun, counted from the first.
+    alone_every : int
+        After so many mutants a process without one.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        modules: Sequence[str],
+        mutants: Sequence[tuple[str, Mutant]],
+        jobs: int,
+        seconds: float,
+        alone_every: int,
+    ) -> None:
+        self._root, self._modules, self._mutants = root, modules, mutants
+        self._jobs, self._seconds, self._alone_every = jobs, seconds, alone_every
+        self.fates: list[tuple[str, Mutant, Fate]] = []
+        self.alone = self.failed_alone = self.not_possible = 0
+        self._failed = False
+        self._folder = Path(tempfile.mkdtemp(prefix="mutants-"))
+        self._number = 0
+
+    # What pytest calls -------------------------------------------------------------------------
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """Watch each test, then try each mutant."""
+        began_s = time.monotonic()
+        for module in self._modules:  # what is imported when it is used, too
+            importlib.import_module(module.removesuffix(".py").replace("/", "."))
+        gc.collect()
+        self._functions = defaultdict(list)
+        for function in gc.get_objects():
+            if type(function) is FunctionType:
+                code = function.__code__
+                self._functions[code.co_filename, code.co_qualname, code.co_firstlineno].append(function)
+        assert threading.active_count() == 1, "a process with threads cannot be doubled"
+        watched = self._watch(session)
+        bad = [name for name, test in watched.items() if not test.passed]
+        print(f"{len(watched)} tests watched in {time.monotonic() - began_s:.0f} s; not used: {bad}")
+        self._try_all(session, watched, began_s + self._seconds)
+        shutil.rmtree(self._folder, ignore_errors=True)
+        return True
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Remember that a test failed."""
+        self._failed |= report.failed
+
+    # Watching ----------------------------------------------------------------------------------
+    def _watch(self, session: pytest.Session) -> dict[str, Watched]:
+        kept = pickle.loads(_KEPT.read_bytes()) if _KEPT.is_file() else {}
+        changed = b"".join((self._root / module).read_bytes() for module in self._modules)
+        watched: dict[str, Watched] = {}
+        children: list[tuple[_Child, str]] = []
+        for path, group in groupby(session.items, key=lambda item: item.path):
+            items = list(group)
+            key = hashlib.sha256(changed + path.read_bytes()).hexdigest()
+            if key not in kept:
+                self._wait_for(children, self._jobs - 1, kept)
+                children.append((self._fork(lambda items=items: self._watched(items), _WATCH_LIMIT_S), key))
+        self._wait_for(children, 0, kept)
+        for path, _ in groupby(session.items, key=lambda item: item.path):
+            watched |= kept.get(hashlib.sha256(changed + path.read_bytes()).hexdigest(), {})
+        _KEPT.parent.mkdir(exist_ok=True)
+        _KEPT.write_bytes(pickle.dumps(kept))
+        return watched
+
+    def _wait_for(self, children: list[tuple[_Child, str]], most: int, kept: dict[str, Any]) -> None:
+        while len(children) > most:
+            for child, key in list(children):
+                done, answer = self._done(child)
+                if done:
+                    children.remove((child, key))
+                    kept[key] = answer or {}
+            time.sleep(0.02)
+
+    def _watched(self, items: list[pytest.Item]) -> dict[str, Watched]:
+        """Run tests one after another, and note the lines of the changed modules that each comes to."""
+        files = {str(self._root / module) for module in self._modules}
+        lines: set[Line] = set()
+
+        def local(frame: FrameType, event: str, _: object) -> Any:
+            if event == "line":
+                lines.add((frame.f_code.co_filename, frame.f_lineno))
+            return local
+
+        def trace(frame: FrameType, _event: str, _arg: object) -> Any:
+            return local if frame.f_code.co_filename in files else None
+
+        found = {}
+        for item, after in zip(items, [*items[1:], None], strict=True):
+            lines.clear()
+            self._failed = False
+            began_s = time.process_time(), time.monotonic()
+            threading.settrace(trace)
+            sys.settrace(trace)
+            try:
+                item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
+            finally:
+                sys.settrace(None)
+                threading.settrace(None)  # type: ignore[arg-type]
+            seconds = max(time.process_time() - began_s[0], 0.2 * (time.monotonic() - began_s[1]))
+            found[item.nodeid] = Watched(seconds, not self._failed, frozenset(lines))
+        return found
+
+    # Trying ------------------------------------------------------------------------------------
+    def _try_all(self, session: pytest.Session, watched: dict[str, Watched], until_s: float) -> None:
+        items = {item.nodeid: item for item in session.items}
+        usable = sorted(
+            ((test.seconds, name) for name, test in watched.items() if name in items and test.passed)
+        )
+        children: list[tuple[_Child, str, Mutant | None]] = []
+        for number, (area, mutant) in enumerate(self._mutants):
+            if time.monotonic() > until_s:
+                break
+            chosen, total_s = [], 0.0
+            reached = {(str(self._root / mutant.path), line) for line in range(*_span(mutant.lines))}
+            for seconds, name in usable:
+                if seconds < MOST_WATCHED_S and reached & watched[name].lines:
+                    if chosen and total_s + seconds > MOST_TESTS_S:
+                        break
+                    chosen.append(items[name])
+                    total_s += seconds
+            if not chosen:
+                self.fates.append((area, mutant, "no test"))
+                continue
+            limit_s = 60.0 + 20.0 * total_s
+            with_none = [None] if number % self._alone_every == 0 else []
+            for what in (mutant, *with_none):
+                self._gather(children, self._jobs - 1)
+                child = self._fork(lambda what=what, chosen=chosen: self._tried(what, chosen), limit_s)
+                children.append((child, area, what))
+        self._gather(children, 0)
+
+    def _gather(self, children: list[tuple[_Child, str, Mutant | None]], most: int) -> None:
+        while len(children) > most:
+            for one in list(children):
+                child, area, mutant = one
+                done, answer = self._done(child)
+                if not done:
+                    continue
+                children.remove(one)
+                if mutant is None:
+                    self.alone += 1
+                    self.failed_alone += answer is not True
+                elif answer == "not possible":
+                    self.not_possible += 1
+                else:
+                    self.fates.append((area, mutant, "lived" if answer is True else "noticed"))
+                    if answer is True:
+                        print(f"lived: {mutant.name}", flush=True)
+            time.sleep(0.01)
+
+    def _tried(self, mutant: Mutant | None, items: list[pytest.Item]) -> bool | str:
+        """Run tests with a mutant until one fails; whether it lived."""
+        if mutant is not None:
+            file = str(self._root / mutant.path)
+            functions = self._functions[file, mutant.function, mutant.first_line]
+            if not functions:
+                return "not possible"
+            try:
+                code = mutant.code(Path(file))
+                for function in functions:
+                    function.__code__ = code
+            except (ValueError, SyntaxError):  # another closure, or a statement where it may not stand
+                return "not possible"
+        for item, after in zip(items, [*items[1:], None], strict=True):
+            item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
+            if self._failed:
+                return False
+        return True
+
+    # Processes ---------------------------------------------------------------------------------
+    def _fork(self, work: Callable[[], object], limit_s: float) -> _Child:
+        """Do something in a process of its own, with its own temporary folder."""
+        self._number += 1
+        answer = self._folder / str(self._number)
+        sys.stdout.flush()
+        process = os.fork()
+        if process:
+            return _Child(process, answer, time.monotonic() + limit_s)
+        try:
+            os.setpgid(0, 0)
+            null = os.open(os.devnull, os.O_RDWR)
+            for handle in (0, 1, 2):
+                os.dup2(null, handle)
+            resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s), int(limit_s) + 5))
+            own = self._folder / f"{self._number}.tmp"
+            own.mkdir()
+            tempfile.tempdir = os.environ["TMPDIR"] = str(own)
+            self._config._tmp_path_factory._basetemp = own  # type: ignore[attr-defined]
+            made = work()
+            answer.with_suffix(".part").write_bytes(pickle.dumps(made))
+            answer.with_suffix(".part").replace(answer)
+        finally:
+            os.kill(os.getpid(), signal.SIGKILL)  # no thread that a mutant left keeps it
+        raise AssertionError
+
+    def _done(self, child: _Child) -> tuple[bool, Any]:
+        """Return whether a process ended, and what it answered: None where it did not."""
+        ended, _ = os.waitpid(child.process, os.WNOHANG)
+        if not ended and time.monotonic() < child.ends_s:
+            return False, None
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(child.process, signal.SIGKILL)
+        if not ended:
+            os.waitpid(child.process, 0)
+        return True, pickle.loads(child.answer.read_bytes()) if child.answer.is_file() else None
+
+    def pytest_configure(self, config: pytest.Config) -> None:
+        """Keep what knows the temporary folders."""
+        self._config = config
+
+
+def _span(lines: tuple[int, int]) -> tuple[int, int]:
+    return min(lines), max(lines) + 1

@@ -1,0 +1,56 @@
+"""Mutants are small, are the code that they say, and leave alone what only says something."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.mutants.__main__ import known_equal
+from tests.mutants.areas import AREAS
+from tests.mutants.mutations import mutants_of
+
+TEXT = '''
+class A:
+    @property
+    def large(self) -> bool:
+        """Whether it is."""
+        if not self.there:
+            raise ValueError(f"{1 + 1} things")
+        return self.size > 3 and self.open
+
+    def __repr__(self):
+        return 1 + 1
+
+
+def least(values):
+    assert values, 1 + 1
+    return min(values) - 1.0
+'''
+
+
+def test_mutants_of_a_text_are_the_code_that_they_say(tmp_path: Path) -> None:
+    (tmp_path / "a.py").write_text(TEXT)
+    found = {mutant.what: mutant for mutant in mutants_of(Path("a.py"), tmp_path)}
+    assert set(found) == {
+        "not self.there -> self.there",
+        "raise ValueError(f'{1 + 1} things') -> pass",
+        "self.size > 3 and self.open -> self.size > 3 or self.open",
+        "self.size > 3 -> self.size >= 3",
+        "self.size > 3 -> self.size <= 3",
+        "self.size > 3 -> self.size > 4",
+        "min(values) - 1.0 -> min(values) + 1.0",
+        "min(values) - 1.0 -> min(values) - 2.0",
+        "min(values) -> max(values)",
+    }
+
+    def least(values: list[int]) -> float:
+        return float(values[0])
+
+    least.__code__ = found["min(values) -> max(values)"].code(tmp_path / "a.py")
+    assert least([1, 5]) == 4.0
+    assert found["self.size > 3 -> self.size >= 3"].function == "A.large"
+
+
+def test_what_is_said_to_be_equal_is_still_in_the_program() -> None:
+    root = Path(__file__).parents[2]
+    names = {m.name for paths, _ in AREAS.values() for path in paths for m in mutants_of(Path(path), root)}
+    assert not set(known_equal()) - names
