@@ -418,7 +418,7 @@ class Dlpc900Slm(Slm):
     def _load(
         self, images: Sequence[Sequence[bytes]], definitions: Sequence[bytes], shown: int, began: int | None
     ) -> None:
-        """Section 5.3 of the guide: stop, define, configure, load; ``shown``: patterns until the end, or 0."""
+        """Stop, define, configure, load (section 5.3); ``shown``: patterns until the end, or 0."""
         self._require()
         self._displayed = self._uploaded = self._before = None
         self._link.write(Command.START_STOP, bytes([commands.STOP]))
