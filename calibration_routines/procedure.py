@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from instrument.bench.bench import Bench
+from instrument.files.atomic import DOUBTFUL, named_by_worth
 from instrument.files.errors import BenchError, FileError, SettingsError
 from instrument.files.record import RecordFormat, plain
 from instrument.plan import Plan, PlanEstimate, Step, estimate
@@ -143,6 +144,13 @@ class Outcome:
     """What the routine returned: ``SweepCalibration``, ``AngularResponse``, ``DiffuserSurface``,
     ``BeadCalibration``, ``SlmCalibration``, ``AlignmentReport`` or ``Run``."""
 
+    def __post_init__(self) -> None:
+        """Say of a result that is kept under a doubtful name that it is (:func:`named_by_worth`)."""
+        kept = [path.name for path in (self.calibration, *self.files) if path is not None]
+        if doubtful := [name for name in kept if name.startswith(DOUBTFUL)]:
+            words = f"Not to be relied on, hence kept as {doubtful[0]}."
+            object.__setattr__(self, "verdict", (*self.verdict, words))
+
 
 class Listener:
     """Follows how a procedure goes on, in the thread that carries it out; override what is of interest."""
@@ -231,8 +239,13 @@ class Purpose(Generic[T]):
         return (Path(run) / self.file).is_file()
 
     def place(self, run: Path, *, doubted: bool) -> Path:
-        """Return where the result of a run goes; one that is wrong as a whole not under a good one's name."""
-        return run / (f"doubtful_{self.result}" if doubted else self.result)
+        """Return where the result of a run goes (:func:`named_by_worth`)."""
+        return named_by_worth(run / self.result, doubted=doubted)
+
+    def kept(self, run: Path) -> Path:
+        """Return where the result of a run is: under a doubtful name where that is what there is."""
+        doubtful = self.place(run, doubted=True)
+        return doubtful if doubtful.exists() else self.place(run, doubted=False)
 
     def lacks_result(self, run: Path) -> bool:
         """Whether they are, and the result is not there yet."""

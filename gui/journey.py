@@ -10,6 +10,8 @@ from drivers.frame import Frame
 from gui.session import BenchSession
 from gui.session_news import OwnFiles, name_of
 from instrument.bench.config import BenchConfig
+from instrument.bench.photograph import PHOTOGRAPHS
+from instrument.files.atomic import DOUBTFUL
 from instrument.files.calibration_file import newest_calibration
 from instrument.reconstruction.stored_result import find_results
 
@@ -93,7 +95,7 @@ class Step:
 def made_in(runs: Path) -> Made:
     """Return what lies in a folder of runs; reads it, so for a job."""
     results = find_results(runs)
-    photograph = _newest(runs, "photographs/*.tif", "*_photograph/photograph.tif")
+    photograph = _newest(runs, f"{PHOTOGRAPHS}/*.tif", "*_photograph/photograph.tif")
     return Made(
         calibration=newest_calibration(runs),
         photograph=photograph,
@@ -106,7 +108,8 @@ def made_in(runs: Path) -> Made:
 
 
 def _newest(folder: Path, *patterns: str) -> Path | None:
-    found = [(file.stat().st_mtime, file) for pattern in patterns for file in folder.glob(pattern)]
+    files = [file for pattern in patterns for file in folder.glob(pattern)]
+    found = [(file.stat().st_mtime, file) for file in files if not file.name.startswith(DOUBTFUL)]
     return max(found)[1] if found else None
 
 

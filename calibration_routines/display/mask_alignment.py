@@ -42,9 +42,11 @@ from calibration_routines.display.mask_search import (
 )
 from calibration_routines.display.mask_stage import MaskStage, PlacementCost
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine, home_if_needed
+from calibration_routines.scatter import STEADY, Scatter
 from instrument.bench.bench import Bench
 from instrument.display.hologram import Alignment, bench_display, save_alignment
-from instrument.files.atomic import require_new
+from instrument.files.atomic import named_by_worth, require_new
+from instrument.files.record import plain
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
 from recon.errors import InputError
@@ -56,6 +58,9 @@ from recon.holography.sections import SmoothField
 __all__ = ["AlignmentFailedError", "AlignmentReport", "AlignmentSettings", "MaskAlignment"]
 
 Array = npt.NDArray[Any]
+
+_SURE = 5.0  # standard deviations
+_APART_PX = 0.5  # mask pixels
 
 
 @dataclass(slots=True)
@@ -87,9 +92,32 @@ class AlignmentReport:
     camera: CameraMap
     brightness_per_ms: float
     """Camera counts a millisecond for the mean intensity."""
+    scatter: Scatter = STEADY
+    """Of pictures of the blank SLM."""
+    apart_px: float = 0.0
+    """Distance of the shifts that spots of the whole SLM and of its sections tell, mask pixels."""
+    lobe_px: float = float("inf")
+    """Half width of a spot, camera pixels."""
     log: list[str] = field(default_factory=list)
     efficiencies: list[tuple[int, float]] = field(default_factory=list)
     """Frames taken and efficiency after each step."""
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What is wrong with light and place, in words."""
+        found = []
+        if self.scatter.motion_px > self.lobe_px:
+            found.append(
+                f"the picture shakes by {self.scatter.motion_px:.2f} pixels from frame to frame, more than a "
+                f"spot's half width ({self.lobe_px:.2f}): clamp camera and lenses, take the table off what "
+                "vibrates, and align again."
+            )
+        if self.apart_px > max(_SURE * float(np.hypot(*self.error[:2])), _APART_PX):
+            found.append(
+                f"spots of the whole SLM and of its sections tell shifts {self.apart_px:.2f} mask pixels "
+                "apart: something moved or the light changed meanwhile. Align again."
+            )
+        return tuple(found)
 
     def displacement(self, mask_shape: tuple[int, int]) -> npt.NDArray[np.float64]:
         """Return the displacement field for :class:`recon.holography.Display`."""
@@ -155,7 +183,9 @@ class MaskAlignment:
         deep = [NAMES.index(name) for name in ("z_um", "pitch_mrad", "yaw_mrad")]
         values, error = pose.vector(), smooth.error.copy()
         values[deep], error[deep] = last.pose.vector()[deep], last.error[deep]
+        apart = float(np.hypot(*(last.pose.vector() - values)[:2]))
         pose = Pose(*(float(v) for v in values))
+        scatter = session.scatter()
         return AlignmentReport(
             pose,
             error,
@@ -169,6 +199,9 @@ class MaskAlignment:
             session.display.mask.shape,
             session.spots.camera,
             session.spots.mean_per_ms,
+            scatter,
+            apart,
+            min(session.spots.lobes_px),
             session.log,
             session.efficiencies,
         )
@@ -260,6 +293,8 @@ class AlignmentProcedure(Procedure):
         report = MaskAlignment(io, display, settings, listener).run()
         alignment = alignment_of(report, bench, display.mask.shape)
         bench.stop()
+        doubted = bool(report.findings)
+        out = named_by_worth(out, doubted=doubted, overwrite=settings.overwrite)
         figure = out.with_suffix(".png")
         save_alignment(out, alignment, _facts(report, bench))
         from instrument.display.hologram_files import (
@@ -277,7 +312,7 @@ class AlignmentProcedure(Procedure):
         )
         return Outcome(
             verdict=tuple(alignment_lines(report, simulated=alignment.simulated)),
-            good=True,
+            good=not doubted,
             calibration=out,
             files=(figure,),
             result=report,
@@ -287,8 +322,9 @@ class AlignmentProcedure(Procedure):
 def alignment_lines(report: AlignmentReport, *, simulated: bool) -> list[str]:
     """Return what was found and what it costs, in lines."""
     mark = " (SIMULATED)" if simulated else ""
+    lines = [f"Quality: {words}" for words in report.findings]
     spots = f"spots at {100 * report.efficiency:.0f} % of the ideal"
-    lines = [f"Aligned with {report.frames} frames{mark}: {spots}"]
+    lines += [f"Aligned with {report.frames} frames{mark}: {spots}"]
     for name, value, error in zip(NAMES, report.pose.vector(), report.error, strict=True):
         if name != "cubic":  # part of the smooth rest
             lines.append(f"  {name:<12}{value:+10.4f} +- {error:.4f}")
@@ -330,6 +366,8 @@ def _facts(report: AlignmentReport, bench: Bench) -> dict[str, Any]:
         "repeatability_db": None if np.isnan(report.repeatability_db) else report.repeatability_db,
         "axis_directions": report.directions,
         "camera_residual_px": report.camera.residual_px,
+        "scatter": plain(report.scatter),
+        "findings": list(report.findings),
         "log": report.log,
     }
 

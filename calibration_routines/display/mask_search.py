@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, SpotCamera
 from calibration_routines.procedure import Checked, Listener, Size
+from calibration_routines.scatter import Scatter, scatter_of
 from instrument.files.errors import BenchError
 from recon.base.declare import RARE, option
 from recon.holography import Display
@@ -26,6 +27,10 @@ from recon.holography.spots import PoseProbe, depth_um
 
 ALIGNMENT_FILE = "alignment.json"
 """Where the command line writes it."""
+
+
+STEADY_FRAMES = 5
+"""Pictures of the blank SLM at the end, by which flicker and motion are told."""
 
 
 class AlignmentFailedError(BenchError):
@@ -93,7 +98,7 @@ class AlignmentSettings(Checked):
     @property
     def last_frames(self) -> int:
         """Frames of the last measurements, sections and pose; kept in reserve by what comes before."""
-        return self.section_pictures + self.refinements + 2
+        return self.section_pictures + self.refinements + 2 + STEADY_FRAMES
 
 
 class AlignmentSession:
@@ -127,6 +132,16 @@ class AlignmentSession:
         """Blank SLM: register the camera, and learn how bright the mean intensity is."""
         self.spots.register()
         self.say(f"camera registered to {self.spots.camera.residual_px:.2f} px")
+
+    def scatter(self) -> Scatter:
+        """Photograph the blank SLM some times in a row; return how light and place change meanwhile."""
+        self.io.show(np.ones(self.display.slm_shape, complex))
+        frames = []
+        for _ in range(STEADY_FRAMES):
+            self._enough()
+            frames.append(self.io.photograph(self.io.exposure_ms(self.spots.mean_per_ms)))
+        scatter, _ = scatter_of(np.asarray(frames, np.float32))
+        return replace(scatter, frames=1)  # a hypothesis has one picture
 
     def check(self, efficiency: float, floor: float = 0.3) -> None:
         """Fail where spots are too dim to be believed."""

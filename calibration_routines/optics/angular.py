@@ -235,9 +235,8 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     file = save_response(response, ANGULAR.place(run.path, doubted=bool(response.findings)))
     picture = file.with_suffix(".png")
     save_figure(response_figure(response), picture)
-    kept = [f"Not to be relied on, hence kept as {file.name}."] if response.findings else []
     return Outcome(
-        verdict=(*response_lines(response), *kept),
+        verdict=tuple(response_lines(response)),
         good=not response.findings,
         runs=(run.path,),
         files=(file, picture),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -12,7 +12,12 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.optics.photograph import photograph
+from calibration_routines.optics.photograph import (
+    PHOTOGRAPH_FILE,
+    Photograph,
+    photograph,
+    photograph_findings,
+)
 from calibration_routines.procedure import (
     MM,
     CalibrationError,
@@ -28,9 +33,10 @@ from calibration_routines.psf.analysis import binned
 from calibration_routines.psf.exposure import expose_scene
 from calibration_routines.psf.sampling import known
 from instrument.bench.bench import Bench
-from instrument.files.atomic import require_new
+from instrument.files.atomic import named_by_worth, require_new
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError, OperatorNeededError
+from instrument.files.images import write_image
 from instrument.runs.run_control import RunControl
 from instrument.runs.writer import dated_name, free_name
 from recon.base.declare import RARE, option
@@ -172,14 +178,27 @@ class BeadCalibration:
 
     calibration: Calibration
     result: BlindResult
+    runs: tuple[Path, ...] = ()
+    """Of the photographs, each with what was solved; none where they came from files."""
+    findings: tuple[str, ...] = ()
+    """What is wrong with the photographs, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class BeadPhotographs:
+    """What was photographed of slides of beads."""
+
+    images: Floats
+    """(n_images, height, width): dark frame subtracted, colours averaged, binned."""
+    runs: tuple[Path, ...] = ()
+    findings: tuple[str, ...] = ()
+    """What is wrong with place and other light in them."""
 
 
 def photograph_slides(
     bench: Bench, slides: BeadSlides, folder: Path | None, control: RunControl, listener: Listener
-) -> Floats:
+) -> BeadPhotographs:
     """Photograph a slide of beads several times, moved in between by the simulated world or the operator.
-
-    Returns float32, (n_images, height, width): dark frame subtracted, colours averaged, binned.
 
     Raises OperatorNeededError when the slide has to be moved by hand and nobody can be asked;
     CalibrationError when an image saturates.
@@ -192,7 +211,7 @@ def photograph_slides(
             "Photograph it with snap, and give the images: calibrate beads FILE FILE ..."
         )
     exposure_ms: float | None = None
-    images = []
+    photographs: list[Photograph] = []
     for number in range(slides.images):
         control.check()
         if changer is not None:
@@ -217,8 +236,14 @@ def photograph_slides(
                 f"Photograph {number + 1} saturates in {taken.saturated_pixels} pixels: dim the light or "
                 "spread the beads, and start again."
             )
-        images.append(taken.measurement)
-    return mean_images(images)
+        facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "binning": slides.binning}
+        write_image(taken.run.path / PHOTOGRAPH_FILE, taken.measurement, facts | {"dark": "taken off"})
+        photographs.append(taken)
+    return BeadPhotographs(
+        mean_images([one.measurement for one in photographs]),
+        tuple(one.run.path for one in photographs),
+        photograph_findings(photographs),
+    )
 
 
 def calibrate_beads(
@@ -342,7 +367,7 @@ class BeadProcedure(Procedure):
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Photograph, solve, and save the calibration."""
         geometry = binned(bench.geometry, self.slides.binning)
-        facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
+        facts: dict[str, Any] = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
         listener.step("photographing bead slides")
         taken = photograph_slides(bench, self.slides, folder, control, listener)
         listener.step("blind deconvolution")
@@ -351,7 +376,9 @@ class BeadProcedure(Procedure):
             control.check()
             listener.share(done, 1.0)
 
-        solved = calibrate_beads(taken, self.slides, geometry, provenance=facts, progress=solving)
+        facts |= {"runs": [run.name for run in taken.runs]}
+        solved = calibrate_beads(taken.images, self.slides, geometry, provenance=facts, progress=solving)
+        solved = replace(solved, runs=taken.runs, findings=taken.findings)
         out = self.slides.out or free_name(folder or bench.config.data_folder, dated_name("bead calibration"))
         return save_beads(solved, self.slides, out)
 
@@ -373,8 +400,16 @@ def psf_lines(slides: BeadSlides, geometry: Geometry, shape: tuple[int, ...]) ->
 
 def save_beads(solved: BeadCalibration, slides: BeadSlides, out: Path) -> Outcome:
     """Save a calibration from bead images."""
-    path = save_calibration(solved.calibration, out, overwrite=slides.overwrite)
-    return Outcome(verdict=tuple(bead_lines(solved)), good=True, calibration=path, result=solved)
+    doubted = bool(solved.findings)
+    named = named_by_worth(out, doubted=doubted, overwrite=slides.overwrite)
+    path = save_calibration(solved.calibration, named, overwrite=slides.overwrite)
+    return Outcome(
+        verdict=(*(f"Quality: {words}" for words in solved.findings), *bead_lines(solved)),
+        good=not doubted,
+        runs=solved.runs,
+        calibration=path,
+        result=solved,
+    )
 
 
 def bead_lines(done: BeadCalibration) -> list[str]:

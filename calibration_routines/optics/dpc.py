@@ -32,7 +32,7 @@ from calibration_routines.psf.exposure import expose_light
 from calibration_routines.scatter import Scatter, pooled
 from drivers.led_array import LedArray
 from instrument.bench.bench import Bench
-from instrument.files.atomic import whole_file
+from instrument.files.atomic import named_by_worth, whole_file
 from instrument.files.errors import BenchError
 from instrument.files.figures import save_figure
 from instrument.files.record import RecordFormat, plain
@@ -184,14 +184,15 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     surface = DiffuserSurface(
         height, phase, optics.pitch_um, slope, deflection, record.bench, record.simulated
     )
-    with whole_file(run.path / HEIGHT_FILE) as heights:
-        np.save(heights, surface.height_um)
     file = DPC.place(run.path, doubted=bool(findings))
+    height_file = named_by_worth(run.path / HEIGHT_FILE, doubted=bool(findings))
+    with whole_file(height_file) as heights:
+        np.save(heights, surface.height_um)
     picture = file.with_suffix(".png")
     facts = {
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
         **plain(record),
-        "height_file": HEIGHT_FILE,
+        "height_file": height_file.name,
         "pitch_um": surface.pitch_um,
         "figures": surface.figures,
         "findings": list(findings),

@@ -39,6 +39,7 @@ from calibration_routines.psf.psf_quality import MAX_CLIPPED, measure_psf
 from calibration_routines.psf.sweep_plan import DARK, PSF
 from calibration_routines.scatter import STEADY, Scatter, pooled
 from instrument.bench.bench import Bench
+from instrument.files.atomic import named_by_worth
 from instrument.files.errors import SettingsError
 from instrument.files.images import write_image
 from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints, check
@@ -67,8 +68,20 @@ class Photograph:
     run: Run
     scatter: Scatter = STEADY
     """Of the frames; where they shook they were put onto one another."""
-    findings: tuple[str, ...] = ()
-    """What is wrong with light and place, in words."""
+    ambient: float = 0.0
+    """Share of its mean light by which the last dark frames are brighter than the first."""
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What is wrong with light and place, in words; its brightness is its own."""
+        return photograph_findings([self])
+
+
+def photograph_findings(taken: Sequence[Photograph]) -> tuple[str, ...]:
+    """Return what is wrong with light and place of photographs whose brightness is each one's own."""
+    scatter = replace(pooled([one.scatter for one in taken]), flicker=0.0)
+    other = max((one.ambient for one in taken), key=abs)
+    return (*scatter.findings("photograph"), *ambient_findings(other))
 
 
 def photograph_plan(exposure_ms: float, average: int, dark_frames: int) -> Plan:
@@ -132,10 +145,7 @@ def photograph(
         saturated_pixels=int(np.count_nonzero(saturated)),
         run=run,
         scatter=steady.scatter,
-        findings=(
-            *replace(steady.scatter, flicker=0.0).findings("photograph"),  # its brightness is its own
-            *ambient_findings(ambient),
-        ),
+        ambient=ambient,
     )
 
 
@@ -320,13 +330,14 @@ class PhotographProcedure(Checked, Procedure):
             control=control,
             listener=listener,
         )
-        file = taken.run.path / PHOTOGRAPH_FILE
+        good = taken.saturated_pixels == 0 and not taken.findings
+        file = named_by_worth(taken.run.path / PHOTOGRAPH_FILE, doubted=not good)
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "binning": self.binning}
         write_image(file, taken.measurement, facts | {"exposure_ms": taken.exposure_ms, "dark": "taken off"})
         words = f"Photograph: {taken.exposure_ms:.4g} ms, {taken.saturated_pixels} saturated pixels"
         return Outcome(
             verdict=(*(f"Quality: {finding}" for finding in taken.findings), words),
-            good=taken.saturated_pixels == 0 and not taken.findings,
+            good=good,
             runs=(taken.run.path,),
             files=(file,),
             result=taken,

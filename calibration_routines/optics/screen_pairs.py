@@ -222,8 +222,9 @@ def solve_pairs(
             "stray": solved.stray[kept].tolist(),
         },
         {"pairs": str(options.pairs.resolve()), "simulated": pairs.simulated},
+        _doubts,
     )
-    findings = _findings(calibration.quality)
+    findings = [*_left_out(calibration.quality), *_doubts(calibration.quality)]
     verdict = (*_lines(calibration), *(f"Quality: {finding}" for finding in findings))
     return Outcome(verdict=verdict, good=not findings, calibration=path, result=calibration)
 
@@ -238,16 +239,19 @@ def _lines(calibration: Calibration) -> list[str]:
     return lines + psf_lines(quality)
 
 
-def _findings(quality: Mapping[str, Any]) -> list[str]:
-    findings = []
-    if quality["foreign"]:
-        findings += [
-            f"left out: {', '.join(quality['foreign'])}, as the others fit far better without. Is that "
-            "the picture that was photographed, neither flipped nor shifted?"
-        ]
-    if any(one["psnr_db"] < one["even_db"] + POOR_DB for one in quality["left_out"]):
-        findings += [
-            "photographs left out are hardly reconstructed: do photographs and pictures belong together, are "
-            "the pictures neither flipped nor shifted, and is one of their pixels one of the photographs'?"
-        ]
-    return findings
+def _left_out(quality: Mapping[str, Any]) -> list[str]:
+    if not quality["foreign"]:
+        return []
+    return [
+        f"left out: {', '.join(quality['foreign'])}, as the others fit far better without. Is that "
+        "the picture that was photographed, neither flipped nor shifted?"
+    ]
+
+
+def _doubts(quality: Mapping[str, Any]) -> list[str]:
+    if not any(one["psnr_db"] < one["even_db"] + POOR_DB for one in quality["left_out"]):
+        return []
+    return [
+        "photographs left out are hardly reconstructed: do photographs and pictures belong together, are "
+        "the pictures neither flipped nor shifted, and is one of their pixels one of the photographs'?"
+    ]

@@ -16,6 +16,7 @@ from calibration_routines.optics.screen_pictures import ScreenMap, ScreenTone
 from calibration_routines.procedure import MM, CalibrationError, Checked, Listener, Outcome, Purpose
 from calibration_routines.psf.analysis import binned, channels_first, dark_model, replace_hot
 from instrument.bench.bench import Bench
+from instrument.files.atomic import named_by_worth
 from instrument.files.calibration_file import save_calibration
 from instrument.files.record import RecordFormat
 from instrument.files.slm_image import read_slm_levels
@@ -232,6 +233,7 @@ def solve_screen(
         binned(record.geometry, asked.binning),
         quality,
         made,
+        findings_of,
     )
     return ScreenCalibration(calibration, path, tone, tuple(findings_of(calibration.quality)))
 
@@ -244,13 +246,14 @@ def saved(
     geometry: Geometry,
     quality: dict[str, Any],
     made: dict[str, Any],
+    doubts: Callable[[Mapping[str, Any]], Sequence[str]],
 ) -> tuple[Calibration, Path]:
     """Save a PSF from known pictures as a calibration.
 
     Parameters
     ----------
     path : Path
-        Its folder; CalibrationError as ``save_calibration``.
+        Its folder, where nothing makes it doubtful; CalibrationError as ``save_calibration``.
     solved : PicturePsf
     judged : sequence of LeftOut
         How pictures fare that it was not made from.
@@ -259,6 +262,8 @@ def saved(
     geometry : Geometry
     quality, made : dict
         What is to be kept besides, of how good it is and where it comes from.
+    doubts : callable
+        Says of the whole quality why the PSF is not to be relied on.
     """
     calibration = Calibration(
         psfs=solved.psf[None],
@@ -277,7 +282,8 @@ def saved(
             **made,
         },
     )
-    return calibration, save_calibration(calibration, path)
+    named = named_by_worth(path, doubted=bool(doubts(calibration.quality)), overwrite=False)
+    return calibration, save_calibration(calibration, named)
 
 
 def psf_lines(quality: Mapping[str, Any]) -> list[str]:

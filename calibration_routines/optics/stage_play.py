@@ -247,7 +247,7 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     listener.step("analysing")
     record = STAGE.read(run.path)
     found = judged(run, record)
-    file = run.path / STAGE.result
+    file = STAGE.place(run.path, doubted=bool(found.scatter.findings()))
     _RESULT.write(file, plain(found) | {"play": found.play, "findings": list(found.findings)})
     return Outcome(
         verdict=tuple(stage_lines(found)),

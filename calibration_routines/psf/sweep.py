@@ -302,6 +302,7 @@ class _TakenSweep:
         exposures = replace(record.exposures, exposures_ms=exposures_ms)
         findings = [q.findings for q in analysis.quality] + [stage.findings for stage in analysis.stages]
         findings.append(analysis.findings)
+        doubted = any(findings) or bool(drift and drift.findings)
         calibration = Calibration(
             psfs=analysis.psfs,
             source_positions_um=np.array(sweep.points_um),
@@ -314,11 +315,11 @@ class _TakenSweep:
                 "scatter": plain(analysis.scatter) | {"findings": list(analysis.findings)},
                 "late_hot_pixels": self.dark.late_hot,
                 "mount": None if analysis.mount is None else plain(analysis.mount),
-                "good": not any(findings) and not (drift and drift.findings),
+                "good": not doubted,
             },
             provenance=self._provenance(exposures, analysis.reference_exposure_ms),
         )
-        path = save_calibration(calibration, self.run.path / SWEEP.result)
+        path = save_calibration(calibration, SWEEP.place(self.run.path, doubted=doubted))
         return SweepCalibration(
             calibration,
             path,

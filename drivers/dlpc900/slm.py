@@ -68,6 +68,7 @@ class Dlpc900Slm(Slm):
     """
 
     Options = Dlpc900Options
+    mirrors = True
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         self.options = options = Dlpc900Options.of(options)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import whole_folder
+from instrument.files.atomic import DOUBTFUL, whole_folder
 from instrument.files.errors import FileError
 from instrument.files.reading import folder_bytes, require_plausible
 from instrument.files.record import RecordFormat
@@ -124,8 +124,13 @@ def calibrated_depths_um(folder: Path | str) -> tuple[float, ...]:
 
 
 def newest_calibration(runs: Path) -> Path | None:
-    """Return the folder of the calibration that was written last below a folder of runs."""
-    found = [file for pattern in (f"*/{_JSON}", f"*/*/{_JSON}") for file in runs.glob(pattern)]
+    """Return the folder of the calibration that was written last below a folder of runs, no doubtful one."""
+    found = [
+        file
+        for pattern in (f"*/{_JSON}", f"*/*/{_JSON}")
+        for file in runs.glob(pattern)
+        if not file.parent.name.startswith(DOUBTFUL)
+    ]
     return max(found, key=lambda file: file.stat().st_mtime).parent if found else None
 
 

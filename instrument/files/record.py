@@ -83,6 +83,14 @@ class RecordFormat:
         write_text(path, self.text(fields, indent=indent))
 
     # Reading -------------------------------------------------------------------------------------
+    def is_of(self, path: Path) -> bool:
+        """Return whether a file is a record that names this format; :meth:`read` says what else is wrong."""
+        try:
+            found = parse_json(read_bytes(path, error=self.error))
+        except ValueError:
+            return False
+        return isinstance(found, dict) and found.get("format") == self.name
+
     def read(self, path: Path) -> Fields:
         """Return a record's fields, brought up to date.
 

@@ -54,7 +54,8 @@ def test_pictures_that_do_not_belong_to_their_photographs_are_told_of(pairs: Pat
     (pairs / "keep.npy").replace(pairs / "truth_4.npy")
     done = solve(PairFiles(pairs=pairs), ScreenOptions(judged=1), tmp_path / "calibration")
     assert not done.good
-    assert "belong together" in done.verdict[-1]
+    assert "belong together" in done.verdict[-2]
+    assert done.calibration == tmp_path / "doubtful_calibration"
 
 
 def _remove(folder: Path) -> None:

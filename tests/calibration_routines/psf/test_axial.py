@@ -18,10 +18,12 @@ from calibration_routines import (
     expose_sweep,
     sweep_plan,
 )
+from calibration_routines.psf.sweep_plan import SWEEP as SWEEP_RUN
+from calibration_routines.psf.sweep_procedure import sweep_outcome
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
-from instrument.files.calibration_file import load_calibration
+from instrument.files.calibration_file import load_calibration, newest_calibration
 from instrument.files.errors import BenchError, SettingsError
 from instrument.runs.run import RunCondition
 from instrument.runs.runner import RunStatus
@@ -129,6 +131,10 @@ def test_without_retakes_the_slip_is_reported(bench: Bench, tmp_path: Path) -> N
     assert len(done.findings) == 1
     assert "z = 85.71 mm: the pattern lies" in done.findings[0]
     assert load_calibration(done.path).quality["good"] is False
+    assert done.path.name == "doubtful_calibration"
+    assert SWEEP_RUN.kept(done.path.parent) == done.path
+    assert newest_calibration(tmp_path) is None
+    assert sweep_outcome(done).verdict[-1] == "Not to be relied on, hence kept as doubtful_calibration."
 
 
 def test_a_plane_that_saturates_is_taken_again_with_a_shorter_exposure(bench: Bench, tmp_path: Path) -> None:
