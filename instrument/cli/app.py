@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drivers.errors import DeviceError, LimitError
+from instrument.cli import kept_times
 from instrument.cli.options import USAGE_ERROR, GroupedCommand, flat
 from instrument.files.errors import BenchError, OperatorNeededError, in_words
 from recon.base.declare import option
@@ -132,9 +133,12 @@ def open_and_say(bench: BenchConfig | Path | None, *, as_is: bool = False) -> Be
     With ``as_is`` nobody is asked: what the operator would have to do is said, and taken for done.
     """
     from instrument.bench.bench import open_bench
+    from instrument.cli.progress import one_task
 
-    config = load_and_say(bench) if bench is None or isinstance(bench, Path) else bench
-    opened = open_bench(config, ask=_taken_for_done if as_is else operator())
+    with one_task("Opening the bench"):
+        config = load_and_say(bench) if bench is None or isinstance(bench, Path) else bench
+        opened = open_bench(config, ask=_taken_for_done if as_is else operator())
+    kept_times.about(opened.label)  # whichever command: its devices take the time
     typer.echo(f"Bench: {opened.label}", err=True)
     return opened
 
@@ -184,6 +188,7 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
     for chatty in ("numba", "numcodecs", "matplotlib", "asyncio"):  # numba prints 30,000 lines a kernel
         logging.getLogger(chatty).setLevel(logging.WARNING)
     _end_on_signals()
+    kept_times.about(name)
     try:
         # Not through typer's own main, which would answer Ctrl-C itself before a word is said about it.
         parser = typer.main.get_command(command.load())

@@ -42,6 +42,7 @@ from calibration_routines.psf.sweep_watch import SweepEvent
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import other_bench_for
 from instrument.bench.safety import StepsFailedError
+from instrument.cli import kept_times
 from instrument.cli.app import App, BenchOption, examples, load_and_say, open_and_say
 from instrument.cli.progress import keys, progress_bar
 from instrument.files.errors import BenchError, duration, size
@@ -217,17 +218,23 @@ class TerminalListener(Listener):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.pause()
+    def __exit__(self, *error: Any) -> None:
+        self._open.__exit__(*error)
+        self._bar = None
 
     def step(self, words: str) -> None:
-        """Begin a bar of its own."""
+        """Begin a bar of its own, which goes by what the step took last time until it tells its share."""
         self.pause()
-        self._words = words
         if words.startswith("homing"):
             typer.echo("Homing the stage.", err=True)
+        self._open.enter_context(kept_times.kept(words))
+        self._begin(words)
+
+    def _begin(self, words: str) -> None:
+        self._words = words
         bar = self._open.enter_context(progress_bar())
-        self._bar = bar, bar.add_task(words[:1].upper() + words[1:], total=None, note="")
+        said, expected_s = words[:1].upper() + words[1:], kept_times.expected_s(words)
+        self._bar = bar, bar.add_task(said, total=None, note="", expected_s=expected_s)
 
     def pause(self) -> None:
         """Take the bar away, for lines to be printed."""
@@ -257,7 +264,7 @@ class TerminalListener(Listener):
         self.pause()
         print_lines(self._console, lines)
         if words:
-            self.step(words)
+            self._begin(words)
 
     def frame(self, status: RunStatus) -> None:
         """Advance the bar."""

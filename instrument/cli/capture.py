@@ -163,10 +163,13 @@ def _expose(bench: Bench, light: LightState) -> None:
     can_switch = {LightState.SCENE: bench.can_switch_scene, LightState.SOURCE: bench.can_switch_source}
     if can_switch.get(light, False):
         switch_light(bench, LightState.DARK)
-        dark = bench.camera.snap()
-        hot = hot_pixels(dark.image, dark.full_scale)
+        with one_task("Looking for hot pixels"):
+            dark = bench.camera.snap()
+            hot = hot_pixels(dark.image, dark.full_scale)
         switch_light(bench, light)
-    typer.echo(auto_expose(bench.camera, hot=hot).message)
+    with one_task("Finding the exposure"):
+        found = auto_expose(bench.camera, hot=hot)
+    typer.echo(found.message)
 
 
 def _report(target: Path, taken: Snapshot, light: LightState) -> None:

@@ -1,4 +1,8 @@
-"""Long commands: a progress bar on stderr with the time left (none where it is no terminal), Ctrl-C, keys."""
+"""Long commands: a progress bar on stderr with the time left (none where it is no terminal), Ctrl-C, keys.
+
+A step that cannot say how far it is goes by what it took last time (:mod:`instrument.cli.kept_times`).
+What is compiled is said beside the bar.
+"""
 
 from __future__ import annotations
 
@@ -10,33 +14,96 @@ import termios
 import threading
 import tty
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from types import FrameType
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
+    Task,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
+from rich.text import Text
 
+from instrument.cli import kept_times
+from instrument.files.errors import duration
 from instrument.tasks.task import Advance
 
 
+class _Count(MofNCompleteColumn):
+    """How much is done of how much; nothing where nobody can say."""
+
+    def render(self, task: Task) -> Text:
+        return Text() if task.total is None else super().render(task)
+
+
+class _Left(TimeRemainingColumn):
+    """The time left: by what is done; else by what such a step took last time."""
+
+    def render(self, task: Task) -> Text:
+        if task.total is not None:
+            return Text("left ") + super().render(task)
+        expected_s = task.fields.get("expected_s")
+        if expected_s is None or task.elapsed is None:
+            return Text()
+        if task.elapsed > expected_s:
+            return Text(f"longer than last time, {duration(expected_s)}")
+        return Text(f"about {duration(expected_s - task.elapsed)} left, as last time")
+
+
+class _Note(ProgressColumn):
+    """The task's note, or what is being compiled; asked often, it hears of numba when that is there."""
+
+    def __init__(self) -> None:
+        super().__init__(Column(no_wrap=True, overflow="ellipsis"))
+
+    def render(self, task: Task) -> Text:
+        _listen()
+        return Text(f"compiling {_compiled[-1]} (once)" if _compiled else task.fields["note"])
+
+
+_compiled: list[str] = []
+_heard: list[Any] = []
+
+
+def _listen() -> None:
+    """Hear of what numba compiles, from when it is imported on."""
+    if _heard or "numba.core.event" not in sys.modules:
+        return
+    from numba.core import event
+
+    class Compilations(event.Listener):
+        def on_start(self, event: Any) -> None:
+            _compiled.append(event.data["dispatcher"].py_func.__name__.strip("_"))
+
+        def on_end(self, event: Any) -> None:
+            del _compiled[-1:]
+
+    _heard.append(Compilations())
+    event.register("numba:compile", _heard[0])  # type: ignore[no-untyped-call]
+
+
 def progress_bar() -> Progress:
-    """Return a bar to be used as a context; tasks may have a field ``note``, shown at the end of the line."""
+    """Return a bar to be used as a context.
+
+    Tasks have a field ``note``, shown at the end of the line, and may have ``expected_s``: how long they will
+    take where they do not say how far they are.
+    """
     console = Console(stderr=True)
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
-        MofNCompleteColumn(),
+        _Count(),
         TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        _Left(),
+        _Note(),
         console=console,
         transient=True,
         disable=not console.is_terminal,
@@ -62,11 +129,15 @@ def first_interrupt_cancels() -> Iterator[threading.Event]:
 
 @contextmanager
 def one_task(
-    description: str, total: float | None = None, *, done: int = 0, note: str = ""
+    description: str, total: float | None = None, *, done: int = 0, note: str = "", size: float = 1.0
 ) -> Iterator[Advance]:
-    """Show the bar of a single task while the block runs; gives what advances it."""
-    with progress_bar() as bar:
-        task = bar.add_task(description, total=total, completed=done, note=note)
+    """Show the bar of a single task while the block runs; gives what advances it.
+
+    Without a total it takes as long as last time, in proportion to ``size``.
+    """
+    with progress_bar() as bar, kept_times.kept(description, size) if total is None else nullcontext():
+        expected_s = kept_times.expected_s(description, size) if total is None else None
+        task = bar.add_task(description, total=total, completed=done, note=note, expected_s=expected_s)
 
         def advance(done: float, total: float | None = None, *, note: str | None = None) -> None:
             bar.update(task, completed=done, total=total)

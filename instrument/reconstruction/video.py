@@ -33,7 +33,7 @@ from instrument.reconstruction.video_files import (
 )
 from instrument.reconstruction.video_job import VideoJob, VideoPlan
 from instrument.reconstruction.video_work import BlockReport, CancelledError, cluster, in_process, on_cluster
-from instrument.runs.run import Run
+from instrument.runs.run import Run, is_run
 from recon.base.declare import inapplicable
 from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.measurement import Floats, Measurement
@@ -112,8 +112,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
     video.
     """
     _check(request)
-    run = Run.open(request.run)
-    require_video(run)
+    run = _recording(request.run)
     frames = tuple(sorted(run.records))
     picture = _first_picture(request, run, frames[0])
     assert picture.reduction is not None
@@ -238,6 +237,21 @@ def _check(request: VideoRequest) -> None:
         raise BenchError(f"{names}: not for a video. Leave it out.")
 
 
+def _recording(path: Path) -> Run:
+    """Open what is to be reconstructed; raises FileError where it is no video of a scene."""
+    if path.exists() and not is_run(path):
+        found = "a file" if path.is_file() else "a folder that no run was written to"
+        raise FileError(
+            path,
+            f"is {found}: --video takes the folder of a recording.",
+            "'diffuserbench record' makes one, 'diffuserbench list' shows them; a single photograph is "
+            "reconstructed by --image without --video.",
+        )
+    run = Run.open(path)
+    require_video(run)
+    return run
+
+
 def _first_picture(request: VideoRequest, run: Run, index: int) -> Job:
     """Prepare the first frame as a photograph would be."""
     # What is saturated differs from frame to frame; pixels can only be left out of all.
@@ -247,13 +261,18 @@ def _first_picture(request: VideoRequest, run: Run, index: int) -> Job:
     with tempfile.TemporaryDirectory() as folder:
         image = Path(folder) / f"{run.path.name} frame {index}.npy"
         np.save(image, run.frame(index))
-        job = PictureRequest(
+        asked = PictureRequest(
             image=image,
             psf=request.psf,
             calibration=request.calibration,
             inputs=inputs,
             options=replace(request.options, iterations=None),
-        ).prepare()
+        )
+        try:
+            job = asked.prepare()
+        except FileError as error:  # of a file that nobody else knows
+            problem = error.problem.replace(str(image), image.stem)
+            raise FileError(run.path if error.path == image else error.path, problem, error.remedy) from error
     return replace(job, simulated=job.simulated or run.is_simulated)
 
 

@@ -81,7 +81,8 @@ def activity(
                 f"some of what is active is missed: reconstruct it with --warm {WARM_ITERATIONS}."
             )
         free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        found = find_activity(pictures, settings, free_bytes=free)
+        with desk.step("looking for activity"):
+            found = find_activity(pictures, settings, free_bytes=free)
         desk.fact("Frames", f"{len(found.indices)} of {pictures.path}")
         taken_out = ", taken out" if settings.align else ""
         desk.fact("Motion", f"up to {found.motion.largest_px:.2f} pixels{taken_out}")
@@ -103,7 +104,9 @@ def activity(
                 "Warning: no region found: nothing is active here, or too weakly. A lower --correlation or "
                 "more light may show it."
             )
-        return Done(tuple(write_activity(found, pictures, out, settings)))
+        with desk.step("writing"):
+            written = write_activity(found, pictures, out, settings)
+        return Done(tuple(written))
 
 
 def _fading(share: float) -> str:

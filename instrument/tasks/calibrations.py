@@ -105,7 +105,8 @@ def analyze(desk: Desk, files: AnalysisFiles, settings: AnalysisSettings, noise:
     folder = find_calibration(files.calibration)
     if folder != files.calibration:
         desk.say(f"{'Analyses':<28}{folder}")
-    measured = load_calibration(folder)
+    with desk.step("reading"):
+        measured = load_calibration(folder)
     settings = replace(settings, noise=noise)
     if measured_response is not None:
         cutoff = (measured_response.along_y.cut_off_deg, measured_response.along_x.cut_off_deg)
@@ -120,8 +121,9 @@ def analyze(desk: Desk, files: AnalysisFiles, settings: AnalysisSettings, noise:
                 on_progress=lambda _what, share: advance(share * 100, 100),
             )
         title, subtitle = _titles(measured, folder)
-        figure = draw_analysis(analysis, title, subtitle, simulated=simulated)
-        save_figure(figure, out)
+        with desk.step("drawing"):
+            figure = draw_analysis(analysis, title, subtitle, simulated=simulated)
+            save_figure(figure, out)
         described = {
             "calibration": str(folder.resolve()),
             "simulated": simulated,
@@ -175,7 +177,8 @@ def compare(desk: Desk, options: CompareOptions) -> Done:
     if out is not None:
         require_new(out, overwrite=options.force)
     folders = [find_calibration(folder) for folder in (options.old, options.new)]
-    first, second = (load_calibration(folder) for folder in folders)
+    with desk.step("reading"):
+        first, second = (load_calibration(folder) for folder in folders)
     for name, folder, calibration in (("Old", folders[0], first), ("New", folders[1], second)):
         desk.say(f"{name:<5}{folder}")
         if source := calibration.provenance.get("refocused_from"):
@@ -184,7 +187,8 @@ def compare(desk: Desk, options: CompareOptions) -> Done:
                 f"was computed from {source}, not measured: it cannot tell what moved.",
                 "Compare the calibrations that were measured.",
             )
-    found = compare_calibrations(first, second)
+    with desk.step("comparing"):
+        found = compare_calibrations(first, second)
     rows: list[Sequence[str]] = []
     for c in found.changes:
         turned = "?" if c.rotation_deg is None else f"{c.rotation_deg:+.3f}°"
@@ -229,12 +233,20 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
     if "points" in given and options.response is None:
         raise BenchError("--points is how many places --response makes: give --response too.")
     folder = find_calibration(options.calibration)
-    measured = load_calibration(folder)
-    made = [refocused(measured, z, deflection_deg=options.deflection_deg) for z in options.z_um]
-    fields = [refocus_field(measured, one.z_um) for one in made]
+    with desk.step("reading"):
+        measured = load_calibration(folder)
+    made, fields = [], []
+    with desk.step("refocusing", len(options.z_um)) as advance:
+        for done, z_um in enumerate(options.z_um, 1):
+            made.append(refocused(measured, z_um, deflection_deg=options.deflection_deg))
+            fields.append(refocus_field(measured, z_um))
+            advance(done)
     if options.response is not None:
         response = load_response(options.response).fall_off()
-        fields = [two_part(field, response, points=options.points) for field in fields]
+        with desk.step("points over the field", len(fields)) as advance:
+            for place, field in enumerate(fields):
+                fields[place] = two_part(field, response, points=options.points)
+                advance(place + 1)
     new = replace(
         fields[0],
         psfs=np.concatenate([field.psfs for field in fields]),

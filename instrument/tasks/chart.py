@@ -187,7 +187,8 @@ def chart(
         if not data.failed:
             raise BenchError("There was no time for any setting: give a longer --budget.")
         raise BenchError("No setting could be run: " + "; ".join(f"{k}: {v}" for k, v in data.failed.items()))
-    files = write_charts(out, data)
+    with desk.step("drawing"):
+        files = write_charts(out, data)
     _tell(desk, data)
     return Done((record, *files))
 

@@ -9,6 +9,7 @@ from typing import Annotated
 from instrument.files.errors import BenchError
 from instrument.files.volumes import uneven_steps
 from instrument.reconstruction.checkpointing import checkpoint_for, settle_checkpoint
+from instrument.reconstruction.forecast import Foretold
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned, solve_patterned
@@ -32,33 +33,41 @@ def reconstruct_photograph(
 ) -> Done:
     """Reconstruct, tell, write. ``explain``: only say what with."""
     if output.explain:
-        job = request.prepare()
-        _tell_choice(desk, request.explain(job))
+        with desk.step("reading"):
+            job = request.prepare()
+        with desk.step("choosing"):
+            choice = request.explain(job)
+        _tell_choice(desk, choice)
         with desk.step("the first iterations"):
-            desk.fact("Will take", str(request.forecast(job)))
+            told = request.forecast(job)
+        desk.fact("Will take", str(told))
         return Done()
     outputs.check(0, overwrite=output.force)
     is_volume = isinstance(request, VolumeRequest)
     with saying_what_is_left(*outputs.files()):
-        job = request.prepare()
+        with desk.step("reading"):
+            job = request.prepare()
         planes = len(job.calibration.psfs) if is_volume else 1
         outputs.check(planes * job.measurement.size, overwrite=output.force)
         _tell_job(desk, job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench")
         keeper = checkpoint_for(output.checkpoint, job, request)
         what = "volume" if is_volume else "picture"
         with desk.interruptible() as cancel, desk.step(what, 100) as advance:
+            foretold = Foretold(lambda words: desk.fact("Will take", words))
 
             def stage(share: float, what: str) -> None:
                 advance(round(100 * share), note=what)
+                foretold.stage(share, what)
 
-            result = request.solve(job, cancel=cancel, keeper=keeper, on_stage=stage)
+            result = request.solve(job, watch=foretold.watch, cancel=cancel, keeper=keeper, on_stage=stage)
         _tell(desk, result)
-        if is_volume:
-            write_volume(outputs, result, job)
-            if steps := uneven_steps(result.grid.z_um):
-                desk.say(f"{'Planes':<12}{steps} Each plane's depth is in {outputs.record.name}.")
-        else:
-            _write_picture(outputs, result, job, int(output.rotate_deg))
+        with desk.step("writing"):
+            if is_volume:
+                write_volume(outputs, result, job)
+            else:
+                _write_picture(outputs, result, job, int(output.rotate_deg))
+        if is_volume and (steps := uneven_steps(result.grid.z_um)):
+            desk.say(f"{'Planes':<12}{steps} Each plane's depth is in {outputs.record.name}.")
         for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
             desk.fact(name, text)
     return _ended(outputs, result, what)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from instrument.files.errors import duration
+from instrument.files.errors import FileError, duration, os_reason
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.video import (
     PreparedVideo,
@@ -80,7 +82,8 @@ def make_video(desk: Desk, request: VideoRequest, *, force: bool) -> Done:
     if prepared.resumed:
         desk.fact("Resumed", f"{_frames_done(prepared)} frames are done already")
     began_s, before = time.monotonic(), _frames_done(prepared)
-    complete = _solve(desk, prepared)
+    with _told_what_is_kept(prepared):
+        complete = _solve(desk, prepared)
     seconds, done = time.monotonic() - began_s, _frames_done(prepared)
     if done > before:
         rate = (done - before) / seconds
@@ -91,7 +94,8 @@ def make_video(desk: Desk, request: VideoRequest, *, force: bool) -> Done:
     if unlit := prepared.job.unlit():
         share = f"{unlit} of {len(plan.frames)} frames"
         desk.warn(f"Warning: {share} hold nothing but noise: was the scene lit?")
-    return Done(tuple(finish_video(prepared)))
+    with _told_what_is_kept(prepared):
+        return Done(tuple(finish_video(prepared)))
 
 
 def _solve(desk: Desk, prepared: PreparedVideo) -> bool:
@@ -108,6 +112,20 @@ def _solve(desk: Desk, prepared: PreparedVideo) -> bool:
             advance(done, note=f"{rate:.1f} frames/s")
 
         return solve_video(prepared, on_progress, cancel)
+
+
+@contextlib.contextmanager
+def _told_what_is_kept(prepared: PreparedVideo) -> Iterator[None]:
+    """Say with what the system refused (a full disk) how much of the video there is."""
+    try:
+        yield
+    except OSError as error:
+        done, total = _frames_done(prepared), len(prepared.job.plan.frames)
+        raise FileError(
+            error.filename or prepared.request.out,
+            f"{os_reason(error)} {done} of {total} frames are in {prepared.request.out}:",
+            "the same command goes on with the rest.",
+        ) from error
 
 
 def _frames_done(prepared: PreparedVideo) -> int:

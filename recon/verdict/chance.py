@@ -1,14 +1,18 @@
 """The chance that a reconstruction has failed, by what the data alone tell.
 
-A logistic regression on the logarithms of the evidence and their squares, fitted to reconstructions of scenes
-whose truth is known. How far a place lies from the middle of those, in their own scatter, tells
-whether they know anything of it.
+Two regressions on the logarithms of the evidence, fitted to reconstructions of scenes whose truth is known,
+and the mean of what they say, in logits. One tells whether it failed by their steps and squares: each number
+has its own share, so that it can be blamed, and none that is known to do harm does good, though among the
+cases it may come with what does. The other tells how badly (the logarithm of the severity) by their products
+as well, for what only comes together, and a logistic curve makes a chance of it. They err in different
+places. How far a place lies from the middle of the cases, in their own scatter, tells whether they know
+anything of it.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -18,6 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
+Parts = npt.NDArray[np.int_]
+Regress = Callable[[Floats, Floats, float], Floats]
 
 SHIPPED = Path(__file__).with_name("chances.json")
 """The regressions that come with the program, by group of methods."""
@@ -59,11 +65,20 @@ FOLDS, SPLITS = 10, 4
 PENALTIES, BENT = (1.0, 2.0, 4.0, 8.0), 4.0
 """Of the coefficients' squares, that with which cases left out are the least surprising, and how much greater
 it is for those of the squared steps."""
+JOINT_PENALTIES, JOINT_BENT = (10.0, 30.0, 100.0, 300.0), 2.0
+"""The same of the severity's regression, of squares and products: that with which it is missed by least."""
+SEVERE = (0.5, 2.0)
+"""Severities beyond which more or less makes no difference."""
 ALLOWED = 0.04
 """Share of failures among those called reliable that the threshold is set for; of unseen 5 % are allowed."""
 HIGHEST = 0.3
 """Chance of failing up to which anything may be called reliable."""
-STEPS = 30
+BETTER: Mapping[str, int] = {
+    **{"detail": 1, "signal": 1, "dimming": 1, "height": 1},
+    **{"unexplained": -1, "load": -1, "similarity": -1, "erased": -1, "saturated": -1, "ambiguity": -1},
+    **{"peaks": -1, "ends": -1, "unsettled": -1, "residual": -1, "missed": -1},
+}
+"""Whether more of it is better (1) or worse (-1), all else equal; of others neither is known."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +94,9 @@ class Chances:
     typical: Floats
     """(n_features,): the median of the good cases."""
     coefficients: Floats
-    """(1 + 2 n_features,): of :func:`_terms`."""
+    """(1 + 2 n_features,): of :func:`_terms`, for the logarithm of the odds."""
+    joint: Floats
+    """(1 + n_features (n_features + 3) / 2,): of :func:`_joint_terms`, likewise, by the severity."""
     precision: Floats
     """(n_features, n_features): inverse of the cases' scatter, in units of ``spread``."""
     far: float
@@ -91,21 +108,28 @@ class Chances:
 
     def chance(self, places: Floats) -> Floats:
         """Return the chance of failing at places (..., n_features)."""
-        steps = np.clip((places - self.centre) / self.spread, -MOST, MOST)
-        return np.asarray(_logistic(_terms(steps) @ self.coefficients))
+        steps = self._steps(places)
+        return _logistic((_terms(steps) @ self.coefficients + _joint_terms(steps) @ self.joint) / 2)
+
+    def blame(self, places: Floats) -> Floats:
+        """Return the chance of failing by the regression in which each number has its own share."""
+        return _logistic(_terms(self._steps(places)) @ self.coefficients)
+
+    def _steps(self, places: Floats) -> Floats:
+        return np.asarray(np.clip((places - self.centre) / self.spread, -MOST, MOST))
 
     def distance(self, place: Floats) -> float:
         """Return how far a place (n_features,) is from the cases' middle."""
         step = (place - self.centre) / self.spread
         return float(np.sqrt(step @ self.precision @ step))
 
-    def no_better_than_any(self, place: Floats, better: Mapping[str, int]) -> Floats:
+    def no_better_than_any(self, place: Floats) -> Floats:
         """Return a place moved to the best case's where it is better: more light than the most is as good."""
         moved = place.copy()
         for index, name in enumerate(self.features):
-            if better.get(name, 0) > 0:
+            if BETTER.get(name, 0) > 0:
                 moved[index] = min(moved[index], self.best[index, 1])
-            elif better.get(name, 0) < 0:
+            elif BETTER.get(name, 0) < 0:
                 moved[index] = max(moved[index], self.best[index, 0])
         return moved
 
@@ -157,7 +181,13 @@ def value_of(name: str, coordinate: float) -> float:
     return float(np.exp(coordinate)) - FLOOR.get(name, LEAST)
 
 
-def fitted(features: Sequence[str], places: Floats, severities: Floats, scenes: npt.ArrayLike) -> Chances:
+def fitted(
+    features: Sequence[str],
+    places: Floats,
+    severities: Floats,
+    scenes: npt.ArrayLike,
+    decides: npt.NDArray[np.bool_] | None = None,
+) -> Chances:
     """Fit the regression to cases.
 
     Parameters
@@ -169,17 +199,32 @@ def fitted(features: Sequence[str], places: Floats, severities: Floats, scenes: 
     scenes : array_like of int, (n,)
         Those of one scene are left out together when the threshold is set: that with at most
         :data:`ALLOWED` of failures among those below it.
+    decides : ndarray of bool, (n,), optional
+        Of which the chance decides whether they are called reliable: the threshold counts these, if any.
     """
     centre, spread = places.mean(axis=0), np.maximum(places.std(axis=0), ALIKE)
     steps = (places - centre) / spread
-    terms, failed = _terms(np.clip(steps, -MOST, MOST)), (severities >= 1).astype(np.float64)
+    near, failed = np.clip(steps, -MOST, MOST), (severities >= 1).astype(np.float64)
+    terms, joint, severe = _terms(near), _joint_terms(near), np.log(np.clip(severities, *SEVERE))
     groups, group = np.unique(scenes, return_inverse=True)
     rng = np.random.default_rng(0)
     folds = [rng.permutation(len(groups))[group] % FOLDS for _ in range(SPLITS)]
-    chances = {p: np.mean([_left_out(terms, failed, fold, p) for fold in folds], 0) for p in PENALTIES}
-    penalty = min(chances, key=lambda p: -float(np.sum(np.log(np.abs(1 - failed - chances[p])))))
-    unseen = chances[penalty]
+    signs = np.array([-BETTER.get(name, 0) for name in features])
+
+    def regressed(terms: Floats, failed: Floats, strength: float) -> Floats:
+        return _regressed(terms, failed, strength, signs)
+
+    odds = {p: _left_out(regressed, terms, failed, folds, p) for p in PENALTIES}
+    penalty = min(odds, key=lambda p: _surprise(odds[p], failed))
+    told = {p: _left_out(_ridge, joint, severe, folds, p) for p in JOINT_PENALTIES}
+    joint_penalty = min(told, key=lambda p: float(np.sum((told[p] - severe) ** 2)))
+    offset, slope = _curve(told[joint_penalty], failed)
+    by_severity = slope * _ridge(joint, severe, joint_penalty)
+    by_severity[0] += offset
+    unseen = _logistic((odds[penalty] + offset + slope * told[joint_penalty]) / 2)
     order = np.argsort(unseen)
+    if decides is not None and decides.any():
+        order = order[decides[order]]
     share = np.cumsum(failed[order]) / np.arange(1, len(order) + 1)
     among = np.flatnonzero((share <= ALLOWED) & (unseen[order] <= HIGHEST))
     scatter = steps.T @ steps / len(steps) + BLUNT * np.eye(len(features))
@@ -192,7 +237,8 @@ def fitted(features: Sequence[str], places: Floats, severities: Floats, scenes: 
         spread,
         np.stack([places.min(axis=0), places.max(axis=0)], axis=1),
         np.median(good if len(good) else places, axis=0),
-        _regressed(terms, failed, penalty),
+        regressed(terms, failed, penalty),
+        by_severity,
         precision,
         float(distances.max()),
         float(unseen[order][among[-1]]) if len(among) else 0.0,
@@ -206,38 +252,69 @@ def _terms(steps: Floats) -> Floats:
     return np.concatenate([np.ones((*steps.shape[:-1], 1)), steps, steps**2], axis=-1)
 
 
+def _joint_terms(steps: Floats) -> Floats:
+    """Return 1, the steps, their squares and products: (..., n) to (..., 1 + n + n (n + 1) / 2)."""
+    one, other = np.triu_indices(steps.shape[-1])
+    products = steps[..., one] * steps[..., other]
+    return np.concatenate([np.ones((*steps.shape[:-1], 1)), steps, products], axis=-1)
+
+
 def _logistic(logits: Floats) -> Floats:
     return np.asarray(1 / (1 + np.exp(-np.clip(logits, -50, 50))))
 
 
-def _left_out(terms: Floats, failed: Floats, fold: npt.NDArray[np.int_], penalty: float) -> Floats:
-    """Return the chance of failing of each case by the regression on those of other folds."""
-    chance = np.zeros(len(failed))
-    for k in np.unique(fold):
-        others = fold != k
-        chance[~others] = _logistic(terms[~others] @ _regressed(terms[others], failed[others], penalty))
-    return chance
+def _surprise(logits: Floats, failed: Floats) -> float:
+    return float(np.sum(np.logaddexp(0, logits) - failed * logits))
 
 
-def _regressed(terms: Floats, failed: Floats, strength: float) -> Floats:
-    """Return the ridge regression's coefficients by Newton's method; steps are halved until it descends."""
-    penalty = np.concatenate([[1e-3], strength * np.repeat([1.0, BENT], terms.shape[1] // 2)])
+def _left_out(
+    regress: Regress, terms: Floats, wanted: Floats, folds: Sequence[Parts], penalty: float
+) -> Floats:
+    """Return what regressions on the other parts say of each case, the mean over partings."""
+    told = np.zeros(len(wanted))
+    for fold in folds:
+        for k in np.unique(fold):
+            others = fold != k
+            told[~others] += terms[~others] @ regress(terms[others], wanted[others], penalty) / len(folds)
+    return told
 
-    def objective(at: Floats) -> float:
+
+def _ridge(terms: Floats, wanted: Floats, strength: float) -> Floats:
+    """Return the coefficients of a linear ridge regression on :func:`_joint_terms`."""
+    n = int((2 * terms.shape[1]) ** 0.5) - 1  # of (n + 1) (n + 2) / 2 terms
+    penalty = strength * np.repeat([0.0, 1.0, JOINT_BENT], [1, n, terms.shape[1] - 1 - n])
+    return np.asarray(np.linalg.solve(terms.T @ terms + np.diag(penalty), terms.T @ wanted))
+
+
+def _curve(told: Floats, failed: Floats) -> tuple[float, float]:
+    """Return offset and slope of the logistic curve from what was told to the chance (Platt, 1999)."""
+    from scipy.optimize import minimize
+
+    found = minimize(lambda c: _surprise(c[0] + c[1] * told, failed), [0.0, 1.0], method="Nelder-Mead").x
+    return float(found[0]), float(found[1])
+
+
+def _regressed(terms: Floats, failed: Floats, strength: float, signs: npt.NDArray[np.int_]) -> Floats:
+    """Return the coefficients of a logistic ridge regression on :func:`_terms`.
+
+    A feature of sign 1 never lowers the chance within :data:`MOST`, one of -1 never lifts it: what is fitted
+    are the slopes at both ends, of that sign or none, of which the coefficients are mean and difference.
+    """
+    from scipy.optimize import minimize
+
+    n = len(signs)
+    penalty = np.concatenate([[1e-3], strength * np.repeat([1.0, BENT], n)])
+    of_slopes = np.eye(1 + 2 * n)
+    mean, bend = np.eye(n) / 2, np.eye(n) / (4 * MOST)
+    of_slopes[1:, 1:] = np.block([[mean, mean], [-bend, bend]])
+
+    def objective(slopes: Floats) -> tuple[float, Floats]:
+        at = of_slopes @ slopes
         logits = terms @ at
-        likelihood = np.sum(np.logaddexp(0, logits) - failed * logits)
-        return float(likelihood + penalty @ at**2 / 2)
+        slope = terms.T @ (_logistic(logits) - failed) + penalty * at
+        return _surprise(logits, failed) + float(penalty @ at**2) / 2, of_slopes.T @ slope
 
-    found = np.zeros(terms.shape[1])
-    value = objective(found)
-    for _ in range(STEPS):
-        chance = _logistic(terms @ found)
-        slope = terms.T @ (chance - failed) + penalty * found
-        curvature = (terms * (chance * (1 - chance))[:, None]).T @ terms + np.diag(penalty)
-        step = np.linalg.solve(curvature, slope)
-        while (new := objective(found - step)) > value and np.abs(step).max() > 1e-9:
-            step /= 2
-        found, gained, value = found - step, value - new, new
-        if gained < 1e-6:
-            break
-    return found
+    ends = [(0.0 if sign > 0 else None, 0.0 if sign < 0 else None) for sign in signs]
+    bounds = [(None, None), *ends, *ends]
+    found = minimize(objective, np.zeros(1 + 2 * n), jac=True, method="L-BFGS-B", bounds=bounds).x
+    return np.asarray(of_slopes @ found)

@@ -17,7 +17,7 @@ import numpy as np
 
 from recon.verdict.calibration_check import CalibrationCheck, Fit
 from recon.verdict.cases import OF_VOLUMES, group_of
-from recon.verdict.chance import Chances, place_of, shipped_chances, value_of
+from recon.verdict.chance import BETTER, Chances, Floats, place_of, shipped_chances, value_of
 from recon.verdict.evidence import DIVERGED, Evidence
 
 
@@ -74,79 +74,63 @@ WITHOUT_LIGHT: Mapping[str, str] = {
     "peaks": "A stronger prior (--tau) would help; a scene of so many points is too dense",
 }
 """What else helps where more light would relieve as well, by stress."""
-STRESSES: Mapping[str, tuple[int, str, str]] = {
+STRESSES: Mapping[str, tuple[str, str]] = {
     "detail": (
-        1,
         "Little light: the picture's details stand {value:.2g} times above the noise",
         "More light would help (exposure, brighter scene, several frames averaged), or larger pixels (--bin)",
     ),
     "signal": (
-        1,
         "Little contrast: the measurement varies by {value:.2g} times its noise",
         "More light would help, or less background light",
     ),
     "unexplained": (
-        -1,
         "{value:.0%} of the measurement's contrast is not explained by the model beyond noise",
         "Check that depth and colour are those of the calibration, that nothing moved since (diffuserbench "
         "compare), and that background is subtracted; more PSFs over the field may help (--model local)",
     ),
     "load": (
-        -1,
         "{value:.2g} unknowns for each measured pixel",
         "A sparser scene, fewer depths, more pixels, or a prior that fits the scene better would help",
     ),
     "similarity": (
-        -1,
         "PSFs of neighbouring depths are {value:.0%} alike",
         "Fewer depths would help, or a longer range of depths",
     ),
     "dimming": (
-        1,
         "The farthest points are {value:.0%} as bright on the sensor as the nearest",
         "A shorter range of depths would help, or one reconstruction for the far part by itself",
     ),
     "erased": (
-        -1,
         "{value:.0%} of the pixels are not used",
         "Use more pixels: expose shorter if they are saturated",
     ),
     "saturated": (
-        -1,
         "{value:.0%} of the pixels used are at full scale",
         "Leave them out (--erasures saturated), or better, expose shorter",
     ),
     "ambiguity": (
-        -1,
         "The PSF repeats itself: moved by some pixels it is {value:.0%} alike",
         "A diffuser with elements at random places would help",
     ),
     "height": (
-        1,
         "The points found stand {value:.2g} times above the noise",
         "More light would help (exposure, brighter scene, several frames averaged)",
     ),
     "peaks": (
-        -1,
         "The result is grainy: {value:.2g} bright points for each thousand pixels",
         "More light or a stronger prior (--tau) would help; a scene of so many points is too dense",
     ),
     "ends": (
-        -1,
         "The outermost depths hold {value:.2g} times their share of the light",
         "Calibrating beyond the scene on both sides, or subtracting the background, would help: light that "
         "fits nowhere gathers there",
     ),
     "unsettled": (
-        -1,
         "The iterations were ended while the picture still changed",
         "More iterations or more time would help",
     ),
 }
-"""By evidence: whether more of it is better, what is said, what would help."""
-
-
-BETTER: Mapping[str, int] = {name: better for name, (better, *_) in STRESSES.items()}
+"""By evidence: what is said, what would help."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,15 +226,20 @@ def verdict_on(evidence: Evidence, method: str, chances: Chances | None = None) 
     chances = chances or shipped_chances().get(group_of(method) or "")
     if chances is None:
         return Verdict(Region.UNKNOWN, method, None, (), numbers, decided=NO_CASES.format(method=method))
-    chance, distance = _known(chances, numbers)
+    place = _place(chances, numbers)
+    chance, distance = float(chances.chance(place)), chances.distance(place)
     region, decided = _region(numbers, chance, chances, far=not distance <= chances.far)
 
-    def gain(relieved: Mapping[str, float]) -> float:
-        other, nearer = _known(chances, relieved)
-        # Those stresses first without which it would be nearest to the cases, or the chance lowest.
-        return distance - nearer if region is Region.UNKNOWN else chance - other
+    blamed = float(chances.blame(place))
 
-    least = 0.0 if region is Region.UNKNOWN else NAMED * chance
+    def gain(relieved: Mapping[str, float]) -> float:
+        # Those stresses first without which it would be nearest to the cases, or the chance lowest.
+        lifted = _place(chances, relieved)
+        if region is Region.UNKNOWN:
+            return distance - chances.distance(lifted)
+        return blamed - float(chances.blame(lifted))
+
+    least = 0.0 if region is Region.UNKNOWN else NAMED * blamed
     findings = tuple(f for f in _relieved(chances, numbers, gain) if f.gain > least)
     findings = _clipped_first(findings, numbers)
     if decided in (STILL_CHANGING, FIRST_ITERATIONS) or numbers["unsettled"] >= UNFINISHED:
@@ -262,10 +251,9 @@ def verdict_on(evidence: Evidence, method: str, chances: Chances | None = None) 
     return Verdict(region, method, chance, findings, numbers, basis, decided)
 
 
-def _known(chances: Chances, numbers: Mapping[str, float]) -> tuple[float, float]:
-    """Return the chance of failing, and how far the numbers are from the cases."""
-    place = chances.no_better_than_any(place_of(numbers, chances.features), BETTER)
-    return float(chances.chance(place)), chances.distance(place)
+def _place(chances: Chances, numbers: Mapping[str, float]) -> Floats:
+    """Return where numbers lie among the cases."""
+    return chances.no_better_than_any(place_of(numbers, chances.features))
 
 
 def _region(
@@ -283,11 +271,17 @@ def _region(
         return Region.UNKNOWN, ""
     if chance > chances.reliable:
         return Region.OUTSIDE if chance >= LOST else Region.NEAR, ""
+    decided = withheld(numbers)
+    return (Region.NEAR if decided else Region.INSIDE), decided
+
+
+def withheld(numbers: Mapping[str, float]) -> str:
+    """Say why a reconstruction is not called reliable, whatever similar cases are; "" where nothing is."""
     if numbers["unsettled"] >= UNSETTLED:
-        return Region.NEAR, STILL_CHANGING
+        return STILL_CHANGING
     if numbers["unexplained"] >= MOST_UNEXPLAINED or residual_of(numbers) >= MOST_RESIDUAL:
-        return Region.NEAR, UNEXPLAINED.format(residual=_residual(numbers))
-    return Region.INSIDE, ""
+        return UNEXPLAINED.format(residual=_residual(numbers))
+    return ""
 
 
 def unlike_any(verdict: Verdict) -> bool:
@@ -325,7 +319,7 @@ def _relieved(
     lacking = {
         name: float(typical - here) * BETTER[name]
         for name, typical, here in zip(chances.features, chances.typical, place, strict=True)
-        if name in BETTER
+        if name in STRESSES
     }
     lit = {name: numbers[name] for name in OF_LIGHT if name in lacking}
     dimmest = None if residual_of(numbers) >= ABOVE_NOISE else max(lit, key=lambda name: lacking[name])
@@ -345,7 +339,7 @@ def _relieved(
 
 def _named(stress: str, findings: tuple[Finding, ...], numbers: Mapping[str, float]) -> Finding:
     """Return the finding of a stress; one that is not among the findings gains nothing."""
-    _, words, help_ = STRESSES[stress]
+    words, help_ = STRESSES[stress]
     gain = next((f.gain for f in findings if f.stress == stress), 0.0)
     return Finding(stress, numbers[stress], gain, words.format(value=numbers[stress]), help_)
 

@@ -2,6 +2,23 @@
 
 from __future__ import annotations
 
+_RUNS = tuple(
+    f"tests/instrument/runs/test_{name}.py"
+    for name in (
+        "acquisition_simulated",
+        "damage",
+        "fault_injection",
+        "frame_metadata",
+        "interrupt",
+        "recorder",
+        "resume",
+        "runner",
+        "store",
+        "store_order",
+        "timed",
+    )
+)
+"""Not test_signals.py: its programs are processes of their own."""
 AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "safety": (
         (
@@ -28,7 +45,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "instrument/runs/acquire.py",
             "instrument/runs/timed.py",
         ),
-        ("tests/instrument/runs",),
+        _RUNS,
     ),
     "store": (
         (
@@ -43,7 +60,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "instrument/files/atomic.py",
             "instrument/files/record.py",
         ),
-        ("tests/instrument/runs", "tests/instrument/files/test_record.py"),
+        (*_RUNS, "tests/instrument/files/test_record.py"),
     ),
     "drops": (("drivers/common/drops.py",), ("tests/drivers/test_drops.py",)),
     "streams": (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import pickle
@@ -515,6 +516,8 @@ def test_turned_cropped_binned(recording: Path, tmp_path: Path) -> None:
         ({"out": Path("v.tif")}, "OME-Zarr"),
         ({"out": Path("/nowhere/v.ome.zarr")}, "does not exist"),
         ({"run": Path("/nowhere")}, "no such folder"),
+        ({"run": Path(__file__)}, "is a file: --video takes the folder of a recording"),
+        ({"run": Path(__file__).parent}, "no run was written to"),
         ({"psf": None}, "--psf"),
     ],
 )
@@ -542,9 +545,35 @@ def test_the_command(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["reconstruct", "--video"]) == 2
 
 
+def test_a_full_disk_is_said_with_what_is_kept_and_the_video_goes_on(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    psf, out = str(recording.parent / "psf.npy"), str(tmp_path / "v.ome.zarr")
+    given = ["--psf", psf, "--dark", "20", "--bin", "2", "--iterations", "2", "--block", "4", "--out", out]
+    write = VideoPictures.write
+
+    def until_full(self: VideoPictures, index: int, picture: np.ndarray) -> None:
+        if index > 4:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(self, index, picture)
+
+    monkeypatch.setattr("instrument.reconstruction.video_work.get_threads", lambda: 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(VideoPictures, "write", until_full)
+        assert main(["reconstruct", str(recording), "--video", *given]) == 2
+    said = capsys.readouterr().err
+    assert "no space left" in said
+    assert f"4 of 10 frames are in {out}: the same command goes on" in said
+    assert main(["reconstruct", str(recording), "--video", *given]) == 0
+    assert "4 frames are done already" in capsys.readouterr().out
+
+
 def test_a_calibration_of_another_camera_is_said(recording: Path, tmp_path: Path) -> None:
     assert prepare_video(request(recording, tmp_path)).doubt() == ""
     other = tmp_path / "other.npy"
+    np.save(other, np.eye(8, dtype=np.float32))
+    with pytest.raises(FileError, match=r"the image [^/]*recording frame 0 is 40 x 52"):
+        prepare_video(replace(request(recording, tmp_path, psf=other), out=tmp_path / "o.ome.zarr"))
     np.save(other, np.load(recording.parent / "psf.npy")[::-1, ::-1])
     wrong = replace(request(recording, tmp_path, psf=other), out=tmp_path / "o.ome.zarr")
     doubt = prepare_video(wrong).doubt()

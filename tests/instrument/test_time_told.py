@@ -1,0 +1,69 @@
+"""Long steps say how long they take: by what they did, or by what they took last time; and what compiles."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+from rich.progress import Progress
+
+from instrument.cli import kept_times
+from instrument.cli.progress import _Left, _Note
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(kept_times, "WORTH_S", 0.0)
+    return kept_times.place()
+
+
+def test_a_step_is_expected_to_take_as_long_as_last_time(cache: Path) -> None:
+    kept_times.about("snap")
+    assert kept_times.expected_s("reading") is None
+    with kept_times.kept("reading", size=2.0):
+        time.sleep(0.02)
+    told = kept_times.expected_s("reading", size=4.0)
+    assert told is not None
+    assert told >= 0.04
+    kept_times.about("another command")
+    assert kept_times.expected_s("reading") is None
+    kept_times.about("snap")
+    with pytest.raises(OSError, match="lost"), kept_times.kept("reading"):
+        raise OSError("lost")
+    assert kept_times.expected_s("reading", size=4.0) == told
+    for damaged in ("", "[]", '{"snap: reading": [0, 1]}', '{"snap: reading": "soon"}'):
+        cache.write_text(damaged)
+        assert kept_times.expected_s("reading") is None
+
+
+def test_the_oldest_times_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_times, "MOST", 2)
+    for name in ("a", "b", "a", "c"):
+        with kept_times.kept(name):
+            pass
+    assert [kept_times.expected_s(name) is None for name in ("a", "b", "c")] == [False, True, False]
+
+
+def test_a_bar_says_what_is_left_and_what_is_compiled() -> None:
+    from numba.core import event
+
+    bar = Progress()
+    bar.add_task("Finding the exposure", total=None, note="", expected_s=60.0)
+    task = bar.tasks[0]
+    assert str(_Left().render(task)).endswith(" left, as last time")
+    task.fields["expected_s"] = 0.0
+    assert "longer than last time" in str(_Left().render(task))
+    bar.update(task.id, total=10, completed=3)
+    assert str(_Left().render(task)).startswith("left ")
+    column = _Note()
+    assert not str(column.render(task))
+
+    class Kernel:
+        @staticmethod
+        def py_func() -> None: ...
+
+    with event.trigger_event("numba:compile", data={"dispatcher": Kernel}):
+        assert str(column.render(task)) == "compiling py_func (once)"
+    assert not str(column.render(task))
