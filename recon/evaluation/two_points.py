@@ -34,8 +34,10 @@ ten are promised."""
 LARGEST_PX = 100_000
 """Of larger sensors the middle is taken, with as little noise as makes up for the light beyond."""
 PICTURES, PAIRS = 4, 16
-"""Pictures that are reconstructed, and pairs in each, half of them along each axis; where there is no room for
-so many, up to three times as many pictures."""
+"""Pictures that are reconstructed, and pairs in each, half of them along each axis.
+
+Where there is no room for so many, up to three times as many pictures.
+"""
 _RANGE = 3.0  # of the first distances, largest over smallest
 _ABOUT = 1.3  # of later distances about what was found, to both sides
 _CELL_PX = 20  # for a pair, at least; more where its points lie farther apart
