@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import csv
 import os
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,8 @@ from recon.holography.target import FIRST_ORDER
 PICTURES = ("portrait", "relief", "leaves")
 DC = DcTerm(0.1, 0.6)
 LIGHTS = (0.7, 0.4, 0.2, 0.1, 0.03, 0.01)
+FRAMES = {1: (1, 8, 24), 4: (1, 8), 16: (1,)}
+"""Of mirrors, by expansion."""
 MOVES = 6
 """Frames of the moving image; the first is computed cold."""
 
@@ -123,16 +126,15 @@ def windowed(name: str, shape: tuple[int, int]) -> Target:
     return Target(image, white=1.0, window=FIRST_ORDER)
 
 
-def mirrors(slm: tuple[int, int], iterations: int) -> list[tuple[str, float]]:
+def mirrors(slm: tuple[int, int], iterations: int) -> Iterator[tuple[str, float]]:
     """Patterns of mirrors beside a phase SLM's, 8 and 24 frames too: quality, and light in the picture."""
-    lines = []
     for q in (1, 4, 16):
         display = Display(slm, no_mask(slm)) if q == 1 else display_of(slm, q)
-        ways: list[dict[str, Any]] = [{"mirrors": "optimised", "frames": n} for n in (1, 8, 24)]
+        ways: list[dict[str, Any]] = [{"mirrors": "optimised", "frames": n} for n in FRAMES[q]]
         ways.insert(0, {})
         if q == 1:
             ways[1:1] = [{"window": True}]
-            ways += [{"mirrors": kind, "frames": n} for kind in ("lee", "off-axis") for n in (1, 8, 24)]
+            ways += [{"mirrors": kind, "frames": n} for kind in ("lee", "off-axis") for n in FRAMES[q]]
         for way in ways:
             options = {name: value for name, value in way.items() if name != "window"}
             found = []
@@ -150,8 +152,7 @@ def mirrors(slm: tuple[int, int], iterations: int) -> list[tuple[str, float]]:
             kind = f"mirrors, {way['mirrors']}, {way['frames']} frame(s)" if options else "phase SLM"
             kind += ", whole field" if not way else ", in the window" if not options else ""
             least = min(db for db, _ in found)
-            lines.append((f"{q}x, {kind}, {light:.3f} of the light (worst {least:.2f} dB)", float(db)))
-    return lines
+            yield f"{q}x, {kind}, {light:.3f} of the light (worst {least:.2f} dB)", float(db)
 
 
 def moved(name: str, shape: tuple[int, int], quarters: int) -> Target:
