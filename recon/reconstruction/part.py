@@ -74,6 +74,8 @@ class Part:
         What takes a smooth background out of the data, where one is estimated.
     tau, weight : float or None
         Of the prior: relative to ``max |A^H b|``, and absolute; set by :meth:`weigh`.
+    held : float
+        How many times what noise asks for the weight is, where the table's least decided; else 1.
     """
 
     def __init__(self, problem: Problem, channels: slice) -> None:
@@ -85,7 +87,7 @@ class Part:
         self.storage = memory.Storage()
         self.plan: memory.MemoryPlan | None = None
         self.tau: float | None = None
-        self.weight = 0.0
+        self.weight, self.held = 0.0, 1.0
         self._removed: BackgroundRemoval | None = None
         self._usual: Array = np.zeros((1, 1, 1), self.dtype)
         self.removal = (
@@ -306,7 +308,10 @@ class Part:
         peak = self.peak()
         if tau is None and times_noise is not None and peak > 0:
             tau = times_noise / peak
-        self.tau = default_tau(name, self.problem.camera_class, peak) if tau is None else float(tau)
+        if tau is None:
+            tau, of_noise = default_tau(name, self.problem.camera_class, peak)
+            self.held = tau / of_noise if of_noise > 0 else 1.0
+        self.tau = float(tau)
         self.weight = self.tau * peak
 
     def peak(self) -> float:
