@@ -132,7 +132,7 @@ class Part:
 
     def _make_camera(self) -> LinearOperator:
         problem, depths = self.problem, self.problem.levelled[0]
-        if problem.together:
+        if problem.together or (problem.smooth and problem.solver.flat):
             plane = Convolution(
                 self._own(depths.central)[0] / self._energy[:, None, None],
                 problem.sensor_shape,
@@ -244,21 +244,28 @@ class Part:
     @property
     def operator(self) -> LinearOperator:
         """The camera with everything that happens to its data."""
-        return self._with_data(self.camera)
+        seen = self._seen(self.camera)
+        return seen if self.removal is None else self.removal @ seen
 
     @property
     def picture_operator(self) -> LinearOperator:
         """The same of one plane for solvers of pictures, whose objects are (n_channels, height, width)."""
+        camera = self.picture_camera
+        return camera if self.removal is None else self.removal @ camera
+
+    @property
+    def picture_camera(self) -> LinearOperator:
+        """The same without what takes out a background."""
         camera = self.camera
         if isinstance(camera, Reshaped):
-            return self._with_data(camera.own)
+            return self._seen(camera.own)
         channels, _, *shape = camera.domain_shape
-        return self._with_data(Reshaped(camera, (channels, *shape)))
+        return self._seen(Reshaped(camera, (channels, *shape)))
 
-    def _with_data(self, operator: LinearOperator) -> LinearOperator:
-        if not self.valid.all():
-            operator = Erasures(self.valid, self.data.shape, dtype=self.dtype) @ operator
-        return operator if self.removal is None else self.removal @ operator
+    def _seen(self, operator: LinearOperator) -> LinearOperator:
+        if self.valid.all():
+            return operator
+        return Erasures(self.valid, self.data.shape, dtype=self.dtype) @ operator
 
     @property
     def solved_data(self) -> Array:
