@@ -19,6 +19,7 @@ from gui.widgets.dialogues import Question
 from gui.widgets.entry import NumberEdit, grouped, quantity
 from gui.widgets.image_view import step_factor
 from gui.widgets.kept_bar import KeptBar
+from instrument.plan import Plan
 from recon.base.declare import Imports
 
 _STEPS = {"um": 100.0, "mrad": 1.0}
@@ -99,12 +100,25 @@ class StagePanel(DevicePanel):
         self._here: dict[str, float] | None = None
         """Where the stage said that it is."""
         self.places = KeptBar(session, "places", "Places", lambda: self._here, self._go_to, "Go")
+        tip = "Make a plan that takes a frame of the lit scene at every place: look at it, then start it"
+        self.all_button = button("Photograph all places…", tip, self.photograph_all)
+        session.kept_changed.connect(self._places_changed)
+        self._places_changed()
         self._grid = QGridLayout()
         self._grid.setHorizontalSpacing(6)
         self._grid.setColumnStretch(2, 1)
         self._step_row = in_row()
         pad = in_row((self.pad, 1), self.home_button)
-        fill(self.body, self.state, self._grid, self._step_row, self.places, pad, None)
+        fill(
+            self.body,
+            self.state,
+            self._grid,
+            self._step_row,
+            self.places,
+            in_row(None, self.all_button),
+            pad,
+            None,
+        )
         self.watch_device(self.state)
 
     # Panel ---------------------------------------------------------------------------------------
@@ -212,6 +226,24 @@ class StagePanel(DevicePanel):
 
     def _go_to(self, name: str, place: dict[str, float]) -> None:
         self._start(f"Move to {name}", place, relative=False)
+
+    def _places_changed(self) -> None:
+        self.all_button.setEnabled(bool(self.session.kept.of("places")))
+
+    def photograph_all(self) -> None:
+        """Hand a plan on that takes a frame at every place that is kept."""
+        kept = self.session.kept.of("places")
+        parts = [
+            {
+                "label": name.replace("/", "-"),
+                "positions": {"kind": "stage", "points": [place]},
+                "scene_lit": True,
+            }
+            for name, place in sorted(kept.items())
+        ]
+        plan = self.asked(lambda: Plan.checked({"label": "places", "parts": parts}, "the places"))
+        if plan is not None:
+            self.session.handed_on.emit("sweeps", plan)
 
     def _jog_clicked(self, letter: str, sign: int, _checked: bool = False) -> None:
         self.jog(letter, sign)

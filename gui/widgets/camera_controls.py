@@ -19,7 +19,7 @@ from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
 from gui.widgets.building import button, every, fill, in_row, label
-from gui.widgets.dialogues import TextWindow
+from gui.widgets.device_settings import DeviceSettings
 from gui.widgets.entry import Entry, NumberEdit
 from gui.widgets.kept_bar import KeptBar
 from instrument.bench.camera_settings import CameraOptions, CameraState, read_camera, restore_camera
@@ -77,7 +77,7 @@ class CameraForm(QWidget):
         self.temperature = label("–")
         self.temperature.setToolTip("Of the sensor or camera, degrees Celsius, where it has a thermometer")
         self._temperature_name = label("Temperature")
-        tip = "Everything that the camera reports of itself"
+        tip = "Everything that the camera reports of itself; its own settings can be changed there"
         self.all_button = button("All settings …", tip, self._show_all)
         self.presets = KeptBar(self._session, "camera", "Presets", self._preset, self._use_preset, "Use")
         last = in_row(self._temperature_name, (self.temperature, 1), self.all_button)
@@ -223,7 +223,7 @@ class CameraForm(QWidget):
     def _show_all(self) -> None:
         if self.state is not None:
             lines = "\n".join(f"{name} = {value}" for name, value in sorted(self.state.settings.items()))
-            TextWindow("Settings of the camera, as read back", lines, self).show()
+            DeviceSettings(self._session, "camera", lines, self).show()
 
 
 _DISK_MS = 5000

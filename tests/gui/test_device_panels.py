@@ -16,6 +16,7 @@ from gui.panel import Panel
 from gui.panels.led_array import LedPanel
 from gui.panels.slm import SlmPanel
 from gui.panels.stage import StagePanel
+from gui.panels.sweeps import SweepsPanel
 from gui.widgets.dialogues import Question
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
@@ -142,7 +143,19 @@ def test_a_place_is_kept_with_the_bench_and_gone_to_again(
     assert stage._here == pytest.approx(at, abs=1.0)
     qtbot.mouseClick(stage.places.use_button, LEFT)
     qtbot.waitUntil(lambda: (stage._here or {}) == pytest.approx(here, abs=1.0), timeout=WAIT_MS)
+    session.keep("places", "off/left", at)
+    qtbot.mouseClick(stage.all_button, LEFT)
+    qtbot.waitUntil(lambda: "sweeps" in window.maker.panels, timeout=WAIT_MS)
+    sweeps = window.maker.panels["sweeps"]
+    assert isinstance(sweeps, SweepsPanel)
+    qtbot.waitUntil(lambda: sweeps.run_bar.start_button.isEnabled(), timeout=WAIT_MS)
+    plan = sweeps.procedure().plan  # type: ignore[union-attr]
+    assert [part.label for part in plan.parts] == ["middle", "off-left"]
+    assert plan.parts[0].positions.points[0] == pytest.approx(here, abs=1.0)  # type: ignore[union-attr]
+    assert all(part.scene_lit for part in plan.parts)
+    session.keep("places", "off/left", None)
     qtbot.mouseClick(stage.places.remove_button, LEFT)
+    assert not stage.all_button.isEnabled()
     assert not stage.places.names.count()
 
 

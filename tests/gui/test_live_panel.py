@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor
+from PySide6.QtWidgets import QComboBox, QLineEdit
 from pytestqt.qtbot import QtBot
 
+from drivers.device import OwnSetting
+from drivers.errors import LimitError
 from gui.main_window import MainWindow
 from gui.panels.live import LivePanel
 from gui.panels.runs import RunsPanel
+from gui.widgets.device_settings import DeviceSettings
 from gui.widgets.image_view import ImageView
 from instrument.bench.photograph import LightState
 from instrument.files.images import read_image
@@ -403,3 +407,35 @@ def test_saturated_pixels_keep_their_colour_however_small_they_are_shown(
         for x in range(picture.width())
     )
     assert reds > 0
+
+
+def test_a_cameras_own_settings_are_set_where_all_are_shown(
+    qtbot: QtBot, live: LivePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = {"Fan": "Off", "Trim": "3"}
+
+    def set_own(name: str, value: str) -> str:
+        if value == "9":
+            raise LimitError("camera", "takes no Trim '9'.", "It takes 0 to 5.")
+        now[name] = value
+        return value
+
+    own = {"Fan": OwnSetting("Off", "Off, On", ("Off", "On")), "Trim": OwnSetting("3", "0 to 5")}
+    monkeypatch.setattr(live.session.bench.camera, "own_settings", lambda: own)
+    monkeypatch.setattr(live.session.bench.camera, "set_own", set_own)
+    qtbot.waitUntil(live.form.isEnabled, timeout=WAIT_MS)
+    qtbot.mouseClick(live.form.all_button, Qt.MouseButton.LeftButton)
+    (shown,) = live.findChildren(DeviceSettings)
+    assert "exposure" in shown.view.toPlainText()
+    qtbot.waitUntil(lambda: set(shown.fields) == {"Fan", "Trim"}, timeout=WAIT_MS)
+    fan, trim = shown.fields["Fan"], shown.fields["Trim"]
+    assert isinstance(fan, QComboBox)
+    assert isinstance(trim, QLineEdit)
+    qtbot.keyClick(fan, Qt.Key.Key_Down)
+    qtbot.waitUntil(lambda: now["Fan"] == "On" and "On now" in shown.note.text(), timeout=WAIT_MS)
+    trim.setText("9")
+    qtbot.keyClick(trim, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: "0 to 5" in shown.note.text(), timeout=WAIT_MS)
+    assert trim.property("refused")
+    assert now["Trim"] == "3"
+    shown.close()
