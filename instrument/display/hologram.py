@@ -379,7 +379,8 @@ class Alignment:
         displacement = self.pose.displacement(self.mask_shape) + self.rest
         if self.learned is None:
             return replace(display, displacement=displacement)
-        return replace(display, displacement=displacement).taught(self.learned)
+        turns = display.mask.design_wavelength_nm / display.wavelength_nm
+        return replace(display, displacement=displacement).taught(self.learned.at(turns))
 
     def require_correction(self, given: bool) -> None:
         """Refuse to show a pattern otherwise than what was learned of the display.
