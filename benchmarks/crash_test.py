@@ -81,7 +81,7 @@ RUN = "RUN"
 PROMISE = struct.Struct("<HI")
 FINISHING = 0xFFFF
 """In place of a promised frame's number: the run's end is being written."""
-IMPATIENT_S = 120.0
+IMPATIENT_S = 600.0
 FAMILIES = ("instrument.cli", "instrument.tasks", "instrument.reconstruction", "calibration_routines")
 """Imported before anything is forked, so that no process is killed while it imports them."""
 

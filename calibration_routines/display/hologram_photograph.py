@@ -16,13 +16,20 @@ import numpy.typing as npt
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.spot_photograph import registered_camera
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import Alignment, CaptureOptions, bench_display, within
-from instrument.files.images import write_image
+from instrument.display.hologram import (
+    Alignment,
+    CaptureOptions,
+    bench_display,
+    prepare_target,
+    within,
+)
+from instrument.display.hologram_files import CHANNELS
+from instrument.files.errors import BenchError
+from instrument.files.images import Pixels, write_image
 from instrument.files.slm_image import field_levels, is_of_mirrors, write_slm_image
 from recon.holography import Display, HologramModel, HologramOptions, Scores, Target, compute_hologram
 from recon.holography.camera_map import CameraMap
 from recon.holography.judge import compare, low_pass
-from recon.holography.options import Envelope
 from recon.holography.target import Band, make_band
 
 Array = npt.NDArray[Any]
@@ -184,17 +191,30 @@ def display_of_pattern(
 
     ``size`` is the SLM's shape and pitch in micrometres. Errors as ``bench_display``.
     """
-    display = bench_display(config, size, expansion=facts.get("expansion"))
+    display = bench_display(
+        config, size, expansion=facts.get("expansion"), wavelength_nm=facts.get("wavelength_nm")
+    )
     return display if alignment is None else alignment.of(display)
 
 
 def options_of_pattern(facts: Mapping[str, Any]) -> HologramOptions:
-    """Return how a pattern was computed, by the facts beside it: its envelope; mirrors and their light."""
-    envelope: Envelope = facts.get("metrics_computed_for", {}).get("envelope", "shade")
-    if not is_of_mirrors(facts):
-        return HologramOptions(envelope=envelope)
-    said = facts["options"]
-    return HologramOptions(envelope=envelope, mirrors=said["mirrors"], light=said["light"])
+    """Return how a pattern was computed, by the facts beside it: fit, tone, envelope, mirrors' light."""
+    names = ("fit", "srgb", "lift", "envelope", *(("mirrors", "light") if is_of_mirrors(facts) else ()))
+    said = facts.get("options", {})
+    return HologramOptions(**{name: said[name] for name in names if name in said})
+
+
+def target_of_pattern(picture: Pixels, display: Display, facts: Mapping[str, Any]) -> Target:
+    """Return a picture as a pattern shows it: colour, size and :func:`options_of_pattern`.
+
+    Raises BenchError where the pattern is one colour of several and the picture has none.
+    """
+    if (colour := facts.get("colour")) in CHANNELS:
+        if picture.ndim != 3 or picture.shape[2] != len(CHANNELS):
+            raise BenchError(f"The pattern is the {colour} of a picture in colour; the one wanted is grey.")
+        picture = picture[..., CHANNELS.index(colour)]
+    share = facts.get("field_share", 1.0)
+    return prepare_target(picture, display, options_of_pattern(facts), share=share)
 
 
 def photograph_hologram(

@@ -106,7 +106,11 @@ def hologram(
             for channel, display in enumerate(displays):
                 targets = [
                     prepare_target(
-                        _channel(picture, channel if inputs.color else None), display, options, z_mm=z
+                        _channel(picture, channel if inputs.color else None),
+                        display,
+                        options,
+                        z_mm=z,
+                        share=writer.shares[channel],
                     )
                     for picture, z in zip(planes, depths, strict=True)
                 ]

@@ -37,7 +37,7 @@ from recon.holography.judge import compare
 from recon.holography.learned import Learned
 from recon.holography.options import Fit
 from recon.holography.pose import NODES, Pose
-from recon.holography.target import FIRST_ORDER, Window, make_band
+from recon.holography.target import EVERYWHERE, FIRST_ORDER, Window, make_band
 
 if TYPE_CHECKING:
     from drivers.slm import Slm
@@ -137,6 +137,7 @@ def prepare_target(
     options: HologramOptions | None = None,
     *,
     z_mm: float = 0.0,
+    share: float = 1.0,
 ) -> Target:
     """Turn a picture into a target over the whole field of view, which is square.
 
@@ -146,6 +147,8 @@ def prepare_target(
         Intensity; 0 is black, an integer type's greatest value (float: the maximum) is white.
     options : HologramOptions
         Its ``fit``, ``srgb``, ``lift`` and ``envelope``.
+    share : float
+        Part of the field that the picture fills, along each axis; around it is black.
     """
     options = options or HologramOptions()
     image = options.lift + (1 - options.lift) * field_picture(pixels, fit=options.fit, srgb=options.srgb)
@@ -159,6 +162,9 @@ def prepare_target(
     if options.envelope == "shade":
         ey, ex = (np.fft.fftshift(e) for e in display.envelope((image.shape[0], image.shape[1])))
         image = image * ey[:, None] * ex
+    if share < 1:
+        image = _placed(image, EVERYWHERE.shrunk(share))
+        window = None if window is None else window.shrunk(share)
     return Target(image, z_mm, white=1.0, window=window)
 
 
@@ -172,6 +178,14 @@ def _placed(image: Image, window: Window) -> Image:
     size = (columns.stop - columns.start, rows.stop - rows.start)
     field[rows, columns] = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
     return field
+
+
+def colour_shares(wavelengths_nm: Sequence[float]) -> list[float]:
+    """Return which part of its field each colour's picture fills so that all are of one size.
+
+    The field of view is as wide as the wavelength is long, so that of the shortest is what all have.
+    """
+    return [min(wavelengths_nm) / nm for nm in wavelengths_nm]
 
 
 def field_picture(
@@ -365,7 +379,8 @@ class Alignment:
         displacement = self.pose.displacement(self.mask_shape) + self.rest
         if self.learned is None:
             return replace(display, displacement=displacement)
-        return replace(display, displacement=displacement).taught(self.learned)
+        turns = display.mask.design_wavelength_nm / display.wavelength_nm
+        return replace(display, displacement=displacement).taught(self.learned.at(turns))
 
     def require_correction(self, given: bool) -> None:
         """Refuse to show a pattern otherwise than what was learned of the display.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.display.hologram import HologramResult
+from instrument.display.hologram import HologramResult, colour_shares
 from instrument.files.atomic import require_new, write_text
 from instrument.files.errors import BenchError, FileError
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
@@ -97,6 +97,11 @@ class HologramFiles:
         figure = hologram_figure(result, title=f"Hologram {patterns[0].stem}", facts=lines)
         save_figure(figure, self.preview(number, channel))
 
+    @property
+    def shares(self) -> list[float]:
+        """Which part of its field each colour's picture fills."""
+        return colour_shares([display.wavelength_nm for display in self.displays])
+
     def display_facts(self, channel: int) -> dict[str, Any]:
         """Return what a pattern was computed for, JSON-compatible."""
         display = self.displays[channel]
@@ -106,6 +111,8 @@ class HologramFiles:
             "slm_shape": list(display.slm_shape),
             "slm_pitch_um": display.slm_pitch_um,
             "wavelength_nm": display.wavelength_nm,
+            "field_share": round(self.shares[channel], 6),
+            "colour": CHANNELS[channel] if len(self.displays) > 1 else None,
             "dc_power": display.dc.power,
             "mask_fill": display.mask_fill,
         }

@@ -43,6 +43,15 @@ class SlmCorrection:
         if self.phase_of_level_rad.shape != (256,) or not np.isfinite(self.phase_of_level_rad).all():
             raise ValueError("phase_of_level_rad must be 256 finite numbers.")
 
+    def at(self, turns: float) -> SlmCorrection:
+        """Return the correction at another wavelength, where every phase is ``turns`` times as large.
+
+        The same optical path at every wavelength: a liquid crystal's dispersion is left out, and measured by
+        ``calibrate slm`` at that wavelength.
+        """
+        flat = None if self.flatness_rad is None else self.flatness_rad * turns
+        return SlmCorrection(self.phase_of_level_rad * turns, flat)
+
     def apply(self, levels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
         """Return the levels that show ideal ``levels`` ((height, width), 256 a turn) best on this SLM."""
         table = self._nearest()

@@ -122,10 +122,17 @@ class Window:
         height, width = shape[:2]
         return _between(self.top, self.bottom, height), _between(self.left, self.right, width)
 
+    def shrunk(self, share: float) -> Window:
+        """Return it in a field of which this one is the middle, a ``share`` along each axis."""
+        sides = (self.top, self.left, self.bottom, self.right)
+        return Window(*(0.5 + share * (side - 0.5) for side in sides))
+
 
 def _between(first: float, last: float, n: int) -> slice:
     return slice(ceil((first - 0.5) * n + n // 2), ceil((last - 0.5) * n + n // 2))
 
+
+EVERYWHERE = Window(0.0, 0.0, 1.0, 1.0)
 
 FIRST_ORDER = Window(0.05, 0.55, 0.45, 0.95)
 """Where mirrors show a picture: away from the twin (opposite), and from the light that no mirror deflects, in

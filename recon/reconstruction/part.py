@@ -21,6 +21,7 @@ from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import window_of
 from recon.reconstruction.weights import default_tau, is_weighted, kind_of, penalty_of
 from recon.solvers import memory
+from recon.solvers.splitting import SensorData
 
 BACKGROUND_FREQUENCIES = (5, 5)
 """Lowest DCT frequencies that belong to the background (Kuo 2020, sec. 6.2)."""
@@ -262,6 +263,11 @@ class Part:
     def solved_data(self) -> Array:
         """The data that belong to :attr:`operator`."""
         return self.data if self.removal is None else self.removal.forward(self.data)
+
+    @property
+    def sensor_data(self) -> SensorData:
+        """The same for solvers that take a background out themselves."""
+        return SensorData(self.data, self.valid[0], self.removal)
 
     @property
     def prior(self) -> Prior:

@@ -122,7 +122,7 @@ def _admm_refuses(problem: Problem) -> str | None:
 def _admm(part: Part, start: Array | None) -> Solver:
     from recon.camera.convolution import Convolution
     from recon.solvers.admm import Admm
-    from recon.solvers.splitting import Room, SensorData, Tuning
+    from recon.solvers.splitting import Room, Tuning
     from recon.solvers.tv_admm_volume import volume_solver
 
     problem, camera = part.problem, part.camera
@@ -130,11 +130,10 @@ def _admm(part: Part, start: Array | None) -> Solver:
         return Admm(part.picture_operator, part.data, part.prior, initial=_of_picture(start))
     if not isinstance(camera, Convolution):
         return _varying_admm(part, camera, start)
-    data = SensorData(part.data, part.valid[0], part.removal)
     prior = part.prior_on(problem.axis_weights, (False, True, True))
     tuning = Tuning(drop_empty=problem.options.drop_empty)
     room = Room(part.namespace, part.storage, keep_state=False)
-    return volume_solver(camera, data, prior, initial=start, tuning=tuning, room=room)
+    return volume_solver(camera, part.sensor_data, prior, initial=start, tuning=tuning, room=room)
 
 
 def _of_picture(start: Array | None) -> Array | None:
@@ -143,11 +142,9 @@ def _of_picture(start: Array | None) -> Array | None:
 
 def _varying_admm(part: Part, camera: LinearOperator, start: Array | None) -> Solver:
     from recon.solvers.operator_admm import OperatorAdmm
-    from recon.solvers.splitting import SensorData
 
-    data = SensorData(part.data, part.valid[0], part.removal)
     prior = part.prior_on(part.mean_axis_weights, (False,) * 3)
-    return OperatorAdmm(camera, part.central, data, prior, initial=start)
+    return OperatorAdmm(camera, part.central, part.sensor_data, prior, initial=start)
 
 
 def _sensor_admm(part: Part, start: Array | None) -> Solver:

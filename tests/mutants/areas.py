@@ -35,6 +35,8 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/drivers/test_answers.py",
             "tests/drivers/test_checked.py",
             "tests/drivers/test_simulated_faults.py",
+            "tests/instrument/runs/test_acquisition_simulated.py",
+            "tests/instrument/runs/test_timed.py",
         ),
     ),
     "runner": (
@@ -103,6 +105,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/drivers/test_stage_axes.py",
             "tests/drivers/test_port_stages.py",
             "tests/drivers/test_pixels.py",
+            "tests/drivers/test_simulated_contracts.py",
             "tests/drivers/test_apt.py",
             "tests/drivers/test_grbl.py",
             "tests/drivers/test_grbl_protocol.py",
