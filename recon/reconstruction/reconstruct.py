@@ -164,6 +164,7 @@ def held_out_error(
     offered = SOLVERS.named(result.solver)
     if offered.accepts(seen) is not None:
         offered = SOLVERS.named("admm")
+    seen = replace(seen, options=replace(seen.options, solver=offered.name))
     rules = rules_of(seen, offered)
     if not offered.one_step:
         rules = replace(rules, iterations=max(len(result.history) // SHARE, LEAST))

@@ -44,6 +44,8 @@ class OfferedSolver:
         Whether it has no iterations: limits do not apply to it.
     cost : float
         Rough time that a picture takes, relative to the first solver's.
+    flat : bool
+        Whether it takes pictures through one PSF alone: its camera is of one plane.
     suits : callable
         ``suits(problem)`` tells whether it is to be preferred to those before it where it takes a problem.
     """
@@ -56,6 +58,7 @@ class OfferedSolver:
     prior: str = "tv"
     one_step: bool = False
     cost: float = 1.5
+    flat: bool = False
     suits: Callable[[Problem], bool] = lambda _: False
 
     def accepts(self, problem: Problem) -> str | None:
@@ -150,7 +153,14 @@ def _varying_admm(part: Part, camera: LinearOperator, start: Array | None) -> So
 def _sensor_admm(part: Part, start: Array | None) -> Solver:
     from recon.solvers.sensor_admm import SensorAdmm
 
-    return SensorAdmm(part.picture_operator, part.data, part.prior, initial=_of_picture(start))
+    operator, initial = part.picture_camera, _of_picture(start)
+    return SensorAdmm(operator, part.data, part.prior, initial=initial, background=part.removal)
+
+
+def _sensor_refuses(problem: Problem) -> str | None:
+    if problem.smooth and not problem.valid.all():
+        return "it estimates no background where pixels are erased"
+    return _plain_only(replace(problem, smooth=False)) or _by_name(problem, splitting_priors())
 
 
 def _fista(part: Part, start: Array | None) -> Solver:
@@ -230,9 +240,10 @@ def _offered() -> tuple[OfferedSolver, ...]:
             name="admm-sensor",
             help="Splitting with the data term solved on the sensor, for dense pictures of many pixels.",
             make=_sensor_admm,
-            refuses=lambda problem: _plain_only(problem) or _by_name(problem, splitting_priors()),
+            refuses=_sensor_refuses,
             cost=2.0,
-            suits=lambda problem: problem.data[0].size >= MANY_PIXELS,
+            flat=True,
+            suits=lambda problem: problem.smooth or problem.data[0].size >= MANY_PIXELS,
         ),
         OfferedSolver(
             name="fista",
