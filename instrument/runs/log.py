@@ -71,6 +71,8 @@ class FrameRecord:
             raise TypeError(f"region {metadata.roi} and binning {metadata.binning!r} are no whole numbers")
         if metadata.binning < 1:
             raise ValueError(f"there is no binning {metadata.binning}")
+        if not (isinstance(bits := metadata.significant_bits, int) and 1 <= bits <= 64):
+            raise ValueError(f"no pixel has {bits!r} bits")
         return cls(
             index=int(line["index"]),
             n_bytes=int(line["n_bytes"]),

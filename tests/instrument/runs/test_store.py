@@ -15,7 +15,7 @@ from ome_zarr_models.v05 import Image
 from drivers.frame import FrameMetadata
 from instrument.files.atomic import write_json
 from instrument.plan import Part, Plan
-from instrument.runs.log import AppendOnlyLog, BadLine, read_lines
+from instrument.runs.log import AppendOnlyLog, BadLine, FrameRecord, read_lines
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_files import RunError
 from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
@@ -210,3 +210,11 @@ def test_what_is_no_run_is_refused_in_words(tmp_path: Path) -> None:
     (path / "provenance.json").write_text("{")
     with pytest.raises(RunError, match="damaged"):
         Run.open(path)
+
+
+@pytest.mark.parametrize("bits", [12.5, 0, 10**9, "12"])
+def test_a_line_with_a_number_of_bits_that_no_pixel_has_is_none(bits: object) -> None:
+    line = FrameRecord(0, 4, 0, 1, metadata()).to_json()
+    assert FrameRecord.from_json(line).metadata == metadata()
+    with pytest.raises(ValueError, match="no pixel has"):
+        FrameRecord.from_json({**line, "metadata": {**line["metadata"], "significant_bits": bits}})
