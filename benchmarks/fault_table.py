@@ -3,8 +3,9 @@
     python benchmarks/fault_table.py                       every call, every fault, all work: hours
     python benchmarks/fault_table.py --every 7 run snap    a sample
 
-Each trial is a process of its own that carries out a command of the terminal on the simulated bench. The
-device call with the trial's number (counted at the driver, whoever makes it)
+Each trial is a process of its own that carries out a command of the terminal on the simulated bench, or a
+live session of eight pictures from Python. The device call with the trial's number (counted at the driver,
+whoever makes it)
 
 =========  =======================================================================================
 exception  raises an error that is no DeviceError, as a faulty driver's does
@@ -51,31 +52,53 @@ import numpy as np
 from benchmarks.crash_test import BENCH, PLAN, runs_in
 from drivers.camera import Camera
 from drivers.device import Device
-from drivers.errors import DeviceLostError
+from drivers.errors import DeviceError, DeviceLostError
 from drivers.led_array import LedArray
 from drivers.simulated.camera import SimulatedCamera
+from drivers.simulated.display import DisplayStage
 from drivers.simulated.led_array import SimulatedLedArray
 from drivers.simulated.slm import SimulatedSlm
 from drivers.simulated.stage import SimulatedStage
 from drivers.slm import Slm
 from drivers.stage import Stage
+from instrument.bench.bench import open_bench
+from instrument.bench.config_file import load_config, template
 from instrument.cli import main
+from instrument.files.errors import BenchError
+from instrument.live.live import live_view
 from instrument.runs.inspection import verify
 from instrument.runs.run import Run, RunCondition
+from recon.types import Calibration
 
-DRIVERS = {SimulatedCamera: Camera, SimulatedStage: Stage, SimulatedLedArray: LedArray, SimulatedSlm: Slm}
+DRIVERS = {
+    SimulatedCamera: Camera,
+    SimulatedStage: Stage,
+    DisplayStage: Stage,
+    SimulatedLedArray: LedArray,
+    SimulatedSlm: Slm,
+}
 """Each with the interface whose methods are called."""
 FAULTS = ("exception", "hang", "nan", "garbage", "unplugged")
+_ALIGN = ["align", "mask", "--reach", "8", "--depth-um", "100", "--spots", "25", "--moves", "1"]
 WORK = {
     "run": ["run", "plan.json", "--out", "runs"],
     "record": ["record", "--source", "--frames", "6", "--out", "runs"],
     "snap": ["snap", "--source", "--out", "a.tif", "--force"],
     "sweep": ["calibrate", "axial", "--z-min", "20", "--average", "1", "--dark-frames", "1", "--out", "runs"],
+    "align": [*_ALIGN, "--sections", "2x2", "--section-pictures", "2", "--bench", "display.toml", "--force"],
+    "live": ["live"],
 }
-SOON_S = 1.0
+DISPLAY = {
+    "shape = [360, 640]": "shape = [200, 280]",
+    "shift_um = [120.0, -70.0]": "shift_um = [31.0, -42.0]",
+    "z_um = 300.0": "z_um = 60.0",
+    "relay_distortion_um = 3.0": "relay_distortion_um = 0.0",
+}
+"""What makes the display's bench small."""
+SOON_S = 2.0
 """What the waits for a device that hangs are shortened to."""
 HELD_UP_S, END_S = 7.0, 25.0
-"""When a trial gets Ctrl-C, and when it is killed."""
+"""When a trial gets Ctrl-C, and when it is killed, beside three times what the work takes without a fault."""
 
 
 @dataclass(frozen=True)
@@ -159,9 +182,10 @@ class Faulty:
         return changed(method(device, *args, **named), math.nan if self.fault == "nan" else 9.9e9)
 
     def lit(self) -> bool:
-        """Whether the LED array shines, whatever it says."""
-        array = self.devices.get("led_array")
-        return array is not None and not array._pattern.is_dark  # type: ignore[attr-defined]
+        """Whether the LED array or the scene shines, whatever they say."""
+        array, camera = self.devices.get("led_array"), self.devices.get("camera")
+        shines = array is not None and not array._pattern.is_dark  # type: ignore[attr-defined]
+        return shines or (camera is not None and camera.world.scene_lit)  # type: ignore[attr-defined]
 
     def moving(self) -> bool:
         """Whether the stage moves, whatever it says."""
@@ -203,9 +227,29 @@ def prepare(folder: Path) -> None:
     folder.mkdir()
     (folder / "bench.toml").write_text(BENCH + '[slm]\ndriver = "simulated"\n')
     (folder / "plan.json").write_text(PLAN.to_json())
+    display = template("display")
+    for large, small in DISPLAY.items():
+        display = display.replace(large, small)
+    (folder / "display.toml").write_text(display)
 
 
-def trial(work: str, number: int, fault: str, folder: Path) -> tuple[Outcome, list[str]]:
+def live() -> int:
+    """Show eight live pictures of the lit scene; the exit code and words are as the terminal's."""
+    psf = np.random.default_rng(1).random((1, 1, 64, 96)).astype(np.float32) ** 8
+    calibration = Calibration(psf, np.array([[0.0, 0.0, 1e5]]))
+    try:
+        with open_bench(load_config(Path("bench.toml"))) as bench:
+            bench.scene_on()
+            with live_view(bench, calibration, budget_ms=20.0) as view:
+                for _ in zip(range(8), view, strict=False):
+                    pass
+    except (DeviceError, BenchError) as error:
+        sys.stderr.write("\n".join((str(error), *getattr(error, "__notes__", ()))) + "\n")
+        return 1
+    return 0
+
+
+def trial(work: str, number: int, fault: str, folder: Path, longer_s: float) -> tuple[Outcome, list[str]]:
     """Carry out one command in a process of its own, with one fault."""
     prepare(folder)
     process = os.fork()
@@ -217,8 +261,9 @@ def trial(work: str, number: int, fault: str, folder: Path) -> tuple[Outcome, li
                 os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT), handle)
             faulty = Faulty(number, fault)
             faulty.install()
-            soon()
-            code = main(WORK[work])
+            if fault == "hang":
+                soon()
+            code = live() if work == "live" else main(WORK[work])
             (folder / "state").write_bytes(pickle.dumps((faulty.calls, faulty.lit(), faulty.moving())))
         except BaseException:  # noqa: BLE001 - shown, and the process ends here whatever it was
             traceback.print_exc()
@@ -226,7 +271,7 @@ def trial(work: str, number: int, fault: str, folder: Path) -> tuple[Outcome, li
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(code)
-    status, held_up = _wait(process)
+    status, held_up = _wait(process, longer_s)
     said = (folder / "err").read_text() if (folder / "err").is_file() else ""
     calls, lit, moving = [], True, True
     if (folder / "state").is_file():
@@ -243,14 +288,14 @@ def trial(work: str, number: int, fault: str, folder: Path) -> tuple[Outcome, li
     return outcome, calls
 
 
-def _wait(process: int) -> tuple[int, bool]:
+def _wait(process: int, longer_s: float) -> tuple[int, bool]:
     """Wait for a trial; after some time Ctrl-C, and SIGKILL."""
     began_s, held_up = time.monotonic(), False
     while True:
         done, status = os.waitpid(process, os.WNOHANG)
         if done:
             return status, held_up
-        passed_s = time.monotonic() - began_s
+        passed_s = time.monotonic() - began_s - longer_s
         if passed_s > HELD_UP_S and not held_up:
             held_up = True
             os.kill(process, signal.SIGINT)
@@ -273,14 +318,16 @@ def _run_in(folder: Path) -> str:
 
 def table(work: str, faults: list[str], every: int, seed: int, folder: Path) -> Counter[str]:
     """Print a row for each fault at each chosen call; return how often each judgement was made."""
-    whole, calls = trial(work, -1, "none", folder)
+    began_s = time.monotonic()
+    whole, calls = trial(work, -1, "none", folder, 600.0)
+    longer_s = 3 * (time.monotonic() - began_s)
     if whole.code != 0 or whole.light != "off":
         raise SystemExit(f"{work} itself failed ({whole.code}):\n{whole.said}")
     first = random.Random(seed).randrange(every)
     counts: Counter[str] = Counter()
     for number in range(first, len(calls), every):
         for fault in faults:
-            found, _ = trial(work, number, fault, folder)
+            found, _ = trial(work, number, fault, folder, longer_s)
             counts[found.judged] += 1
             words = [line for line in found.said.splitlines() if "SIMULATED" not in line and line.strip()]
             sentence = next((line.strip() for line in words if "(simulated):" in line), "".join(words[:1]))

@@ -2,6 +2,7 @@
 
     python benchmarks/recording.py                   # 1280 x 1024 at 60 frames/s for 60 s, then the limits
     python benchmarks/recording.py --seconds 20 --no-limits
+    python benchmarks/recording.py --many 100000     # processor time to open and to describe so many frames
 
 The simulated camera shows frames that were rendered beforehand, so that what is measured is the way from the
 driver to the disk: copy into the ring, checksum, file, sync, log. Each case is a process of its own; its peak
@@ -21,12 +22,17 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
+from instrument.runs.frame_facts import descriptions
+from instrument.runs.log import log_line
 from instrument.runs.recorder import record
+from instrument.runs.run import Run
+from instrument.runs.run_files import LOG
 
 SIZES = {"0.3 MP": (480, 640), "1.3 MP": (1024, 1280), "5 MP": (2048, 2560)}
 BENCH = """
@@ -124,6 +130,22 @@ def _lost(found: dict[str, Any]) -> str:
     return f"lost {found['by_device']} by the camera's ring, {found['not_written']} by the disk"
 
 
+def many(n_frames: int, parent: Path) -> tuple[float, float]:
+    """Return what a log of so many frames takes to be opened, and to be described; processor seconds."""
+    folder = Path(tempfile.mkdtemp(dir=parent))
+    with open_bench(parse_config(BENCH.format(height=64, width=64, rate=30), None)) as bench:
+        run = record(bench, folder, n_frames=2, label="benchmark")
+    with (run.path / LOG).open("ab") as log:
+        log.writelines(log_line(replace(run.records[1], index=i).to_json()) for i in range(2, n_frames))
+    began_s = _cpu_s()
+    run = Run.open(run.path)
+    opened_s = _cpu_s()
+    descriptions(run, n_frames)
+    described_s = _cpu_s()
+    shutil.rmtree(folder)
+    return opened_s - began_s, described_s - opened_s
+
+
 def main() -> None:
     """Run the benchmark as the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -132,8 +154,13 @@ def main() -> None:
     parser.add_argument("--probe-seconds", type=float, default=6.0, help="of each step of the bisection")
     parser.add_argument("--no-limits", action="store_true", help="only the long recording")
     parser.add_argument("--folder", type=Path, default=Path(), help="disk to record to")
+    parser.add_argument("--many", type=int, help="only: open and describe a recording of so many frames")
     parser.add_argument("--case", nargs=6, help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.many:
+        opened_s, described_s = many(options.many, options.folder)
+        print(f"{options.many} frames: opened in {opened_s:.2f}, described in {described_s:.2f} more CPU s")
+        return
     if options.case:
         height, width, rate, seconds, n_buffers, folder = options.case
         size, buffers = (int(height), int(width)), int(n_buffers) or None

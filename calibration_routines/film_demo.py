@@ -15,7 +15,7 @@ import numpy as np
 
 from calibration_routines.demo import Stages, state_of, told_in, world_of
 from calibration_routines.film_figure import write_film_figure
-from calibration_routines.film_judge import FOLLOWED, Judged, Truth, judge, truth_of
+from calibration_routines.film_judge import FOLLOWED, ROI_UM, Judged, Truth, judge, truth_of
 from calibration_routines.procedure import Listener
 from calibration_routines.psf.sweep import calibrate_sweep
 from calibration_routines.psf.sweep_options import LateralSweep
@@ -111,7 +111,8 @@ class FilmResult:
         return [
             f"Cells: dF/F follows the truth (correlation {FOLLOWED:g} and up) in {judged.followed_clear:.0%} "
             f"of the {judged.clear_active} that flash and stand clear; {judged.active} flash in all.",
-            f"Regions: {judged.found} at cells that flash, {judged.on_tissue} elsewhere.",
+            f"Regions: {judged.found} at cells that flash, {judged.on_tissue} at what is static, "
+            f"{judged.elsewhere} where nothing is.",
             f"Blood: {judged.median_um_s:.0f} um/s along the vessel; true: "
             f"{judged.true_median_um_s:.0f} um/s.",
         ]
@@ -149,7 +150,8 @@ def _run(place: Path, listener: Listener, settings: FilmSettings, stages: Stages
         video, model = _reconstructed(place, calibration, run, settings, stages)
     listener.said(f"Camera model: {model}")
     with stage("find what is active"):
-        chosen = ActivitySettings()
+        pixel_um = video.attributes["diffuserbench"]["pitch_um"][0]
+        chosen = ActivitySettings(align=True, smooth_px=ROI_UM / pixel_um)
         activity = find_activity(video, chosen)
         written = write_activity(activity, video, place / "activity", chosen)
     with stage("compare with the truth"):

@@ -21,8 +21,8 @@ NEAR_PX = 2.0
 """A region is a cell's whose place lies so near."""
 FOLLOWED = 0.9
 """Correlation of dF/F with the truth from which a cell is followed."""
-ROI_PX = 0.8
-"""Standard deviation of the weights with which a cell's pixels count."""
+ROI_UM = 12.0
+"""Standard deviation of the weights with which a cell's surroundings count: about the cell's diameter."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,8 @@ class Truth:
         Of the blood.
     vessel_step_um : float
         Between places of the vessel.
+    roi_px : float
+        ``ROI_UM`` on the reconstruction's pixels.
     """
 
     cells_px: Floats
@@ -50,6 +52,7 @@ class Truth:
     clear: npt.NDArray[np.bool_]
     speed_um_s: Floats
     vessel_step_um: float
+    roi_px: float
 
 
 @dataclass(frozen=True)
@@ -66,8 +69,10 @@ class Judged:
         Share of the clear cells that flash whose correlation is at least ``FOLLOWED``.
     clear_active, active : int
         How many flash, of the clear ones and of all.
-    found, on_tissue : int
-        Regions at a cell that flashes; regions at none.
+    found, on_tissue, elsewhere : int
+        Regions at a cell that flashes; at a cell that does not, or at static tissue; where nothing is.
+    cells_found : int
+        Cells that flash and have a region.
     speed_um_s : ndarray, (n_frames - 1,)
         Of the blood, from the kymograph.
     median_um_s, true_median_um_s : float
@@ -81,6 +86,8 @@ class Judged:
     active: int
     found: int
     on_tissue: int
+    elsewhere: int
+    cells_found: int
     speed_um_s: Floats
     median_um_s: float
     true_median_um_s: float
@@ -95,7 +102,9 @@ class Judged:
             "followed_share_of_clear": round(self.followed_clear, 3),
             "median_correlation": round(float(np.median(known)), 3) if known.size else None,
             "regions_at_active_cells": self.found,
-            "regions_elsewhere": self.on_tissue,
+            "active_cells_with_a_region": self.cells_found,
+            "regions_on_what_is_static": self.on_tissue,
+            "regions_elsewhere": self.elsewhere,
             "blood_um_s": round(self.median_um_s, 1),
             "true_blood_um_s": round(self.true_median_um_s, 1),
         }
@@ -136,6 +145,7 @@ def truth_of(
         clear=nearest > CLEAR_DIAMETERS * animal.diameter_um,
         speed_um_s=flowed / (2 * step_s),
         vessel_step_um=animal.vessel_length_um / (len(animal.vessel_um) - 1),
+        roi_px=ROI_UM / (pixel_um * float(animal.cells_um[:, 2].mean()) / distance_um),
     )
 
 
@@ -154,7 +164,7 @@ def judge(activity: Activity, truth: Truth, period_s: float, window: int) -> Jud
     floor = floor_of(frames)
     traces = np.zeros(truth.change.shape)
     for trace, place in zip(traces, truth.cells_px, strict=True):
-        light = _around(frames, place)[:, None, None]
+        light = _around(frames, place, truth.roi_px)[:, None, None]
         trace[:] = change(light, baseline(light, window, PERCENTILE, fade), floor)[:, 0, 0]
     active = truth.change.max(axis=1) > 0.1
     correlation = np.full(len(active), np.nan)
@@ -165,10 +175,15 @@ def judge(activity: Activity, truth: Truth, period_s: float, window: int) -> Jud
             correlation[cell] = 0.0
     chosen = active & truth.clear
     followed = float(np.mean(correlation[chosen] >= FOLLOWED)) if chosen.any() else float("nan")
-    at_cell = [
-        bool(np.min(np.hypot(*(truth.cells_px[active] - region.centre).T)) <= NEAR_PX)
-        for region in activity.regions
-    ]
+    static = np.concatenate([truth.cells_px[~active], truth.tissue_px])
+    centres = [region.centre for region in activity.regions]
+    away = [np.hypot(*(truth.cells_px[active] - centre).T) for centre in centres]
+    at_cell = [bool(distance.min() <= NEAR_PX) for distance in away]
+    on_tissue = sum(
+        bool(np.min(np.hypot(*(static - centre).T)) <= NEAR_PX)
+        for centre, at in zip(centres, at_cell, strict=True)
+        if not at
+    )
     kymograph = _along(frames, truth.vessel_px)
     speed = _speed(kymograph, truth.vessel_step_um, period_s)
     return Judged(
@@ -178,7 +193,9 @@ def judge(activity: Activity, truth: Truth, period_s: float, window: int) -> Jud
         clear_active=int(chosen.sum()),
         active=int(active.sum()),
         found=sum(at_cell),
-        on_tissue=len(at_cell) - sum(at_cell),
+        on_tissue=on_tissue,
+        elsewhere=len(at_cell) - sum(at_cell) - on_tissue,
+        cells_found=len({int(d.argmin()) for d, at in zip(away, at_cell, strict=True) if at}),
         speed_um_s=speed,
         median_um_s=float(np.median(speed)),
         true_median_um_s=float(np.median(truth.speed_um_s)),
@@ -186,12 +203,13 @@ def judge(activity: Activity, truth: Truth, period_s: float, window: int) -> Jud
     )
 
 
-def _around(frames: npt.NDArray[np.float32], place: Floats) -> npt.NDArray[np.float32]:
+def _around(frames: npt.NDArray[np.float32], place: Floats, roi_px: float) -> npt.NDArray[np.float32]:
     """Return the light about a place in each frame, weighted by a Gaussian."""
     row, column = np.round(place).astype(int)
-    box = np.s_[:, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
+    reach = int(3 * roi_px) + 1
+    box = np.s_[:, max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
     y, x = np.mgrid[box[1:]]
-    weight = np.exp(-((y - place[0]) ** 2 + (x - place[1]) ** 2) / (2 * ROI_PX**2))
+    weight = np.exp(-((y - place[0]) ** 2 + (x - place[1]) ** 2) / (2 * roi_px**2))
     light: npt.NDArray[np.float32] = np.tensordot(frames[box], (weight / weight.sum()).astype(np.float32), 2)
     return light
 

@@ -20,6 +20,7 @@ from instrument.files.errors import BenchError, FileError, SettingsError
 from instrument.files.record import RecordFormat, plain
 from instrument.plan import Plan, PlanEstimate, Step, estimate
 from instrument.runs.acquire import abilities_of, prepare
+from instrument.runs.pace import pace_of
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Runner, RunStatus, discarded
@@ -422,6 +423,9 @@ def outlook_of(
         words.append("The stage is homed first, every axis to its reference: its way must be free.")
     if bench.trigger_source is not None:
         words.append(TimedSteps(bench, plan).words())
+    pace = pace_of(plan, abilities, folder or bench.config.data_folder, bench.config.text)
+    if pace is not None:
+        words.append(pace.words(plan, abilities))
     return Outlook(tuple(words), plan, estimate(plan, abilities), abilities.free_bytes, path=path)
 
 

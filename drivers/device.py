@@ -11,6 +11,8 @@ from typing import ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict
 
+from drivers.errors import LimitError
+
 BUSES = ("USB", "HID", "serial", "video", "GenICam", "display")
 """The buses that are looked at, in the order in which they are listed; a driver may bring others."""
 
@@ -64,6 +66,17 @@ def _toml(value: object) -> str:
 
 
 Setting = str | int | float | bool | tuple[float, ...] | tuple[int, ...] | tuple[str, ...] | None
+
+
+@dataclass(frozen=True, slots=True)
+class OwnSetting:
+    """A setting that is one device's own, beyond what all of its kind have."""
+
+    value: Setting
+    takes: str
+    """What it can be set to, in words."""
+    choices: tuple[str, ...] = ()
+    """All that it can be set to, where that is a list."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,6 +212,20 @@ class Device(ABC):
     @abstractmethod
     def settings(self) -> Mapping[str, Setting]:
         """All settings as the device reports them now, with units in the names; needs an open device."""
+
+    def own_settings(self) -> Mapping[str, OwnSetting]:
+        """Return the settings that :meth:`set_own` changes, by the device's own names; needs an open device.
+
+        Those that the driver itself looks after (exposure, gain ...) are not among them.
+        """
+        return {}
+
+    def set_own(self, name: str, value: str) -> Setting:
+        """Set one of :meth:`own_settings`, as a person writes it; returns what it reads afterwards.
+
+        Raises LimitError: no such setting, or a value that it does not take.
+        """
+        raise LimitError(self.name, f"has no setting {name!r} that can be changed to {value!r}.")
 
     def __enter__(self) -> Self:
         self.open()

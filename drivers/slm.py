@@ -19,7 +19,15 @@ def read_only(levels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 
 class Slm(PlaysSequences[npt.NDArray[np.uint8]]):
-    """A spatial light modulator that shows 8-bit grey levels. It is blank (all zero) after ``open``."""
+    """A spatial light modulator that shows 8-bit grey levels. It is blank (all zero) after ``open``.
+
+    Attributes
+    ----------
+    mirrors : bool
+        Whether a level is how much light a pixel sends, 255 all of it; else it is a phase.
+    """
+
+    mirrors: bool = False
 
     @property
     @abstractmethod

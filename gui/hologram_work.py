@@ -31,7 +31,7 @@ from instrument.display.hologram import (
     load_alignment,
     prepare_target,
 )
-from instrument.display.hologram_files import HologramFiles
+from instrument.display.hologram_files import HologramFiles, drawn_pattern
 from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
@@ -166,8 +166,8 @@ def compute(
         share = record.iteration / max(options.iterations, 1)
         if options.time_s is not None:
             share = max(share, record.seconds / options.time_s)
-        phase = np.mod(np.angle(np.asarray(slm).reshape(-1, *display.slm_shape)[0]), 2 * np.pi)
-        return Progress(min(share, 1.0), tuple(history), phase.astype(np.float32))
+        drawn = drawn_pattern(np.asarray(slm).reshape(-1, *display.slm_shape)[0])
+        return Progress(min(share, 1.0), tuple(history), drawn)
 
     result = compute_and_judge(display, targets, options, callback=watch, cancel=context.cancel)
     if write:
@@ -227,6 +227,7 @@ def photograph(
                 computed.display,
                 computed.target,
                 CaptureOptions(average=average),
+                computed=computed.order.options,
             )
             bench.stop()
     except EndedEarlyError as error:

@@ -10,6 +10,7 @@ from drivers.frame import Frame
 from gui.session import BenchSession
 from gui.session_news import OwnFiles, name_of
 from instrument.bench.config import BenchConfig
+from instrument.bench.photograph import PHOTOGRAPHS
 from instrument.files.atomic import DOUBTFUL
 from instrument.files.calibration_file import newest_calibration
 from instrument.reconstruction.stored_result import find_results
@@ -94,7 +95,7 @@ class Step:
 def made_in(runs: Path) -> Made:
     """Return what lies in a folder of runs; reads it, so for a job."""
     results = find_results(runs)
-    photograph = _newest(runs, "photographs/*.tif", "*_photograph/photograph.tif")
+    photograph = _newest(runs, f"{PHOTOGRAPHS}/*.tif", "*_photograph/photograph.tif")
     return Made(
         calibration=newest_calibration(runs),
         photograph=photograph,

@@ -10,6 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration_routines.display.colour_photograph import (
+    ColourCapture,
+    ColourPattern,
+    photograph_colours,
+)
 from calibration_routines.display.display_io import DisplayBench, require_slm
 from calibration_routines.display.display_learning import (
     ASIDE,
@@ -17,15 +22,27 @@ from calibration_routines.display.display_learning import (
     learning_lines,
     photograph_looks,
 )
-from calibration_routines.display.hologram_photograph import Capture, HologramCamera
+from calibration_routines.display.hologram_photograph import (
+    Capture,
+    HologramCamera,
+    display_of_pattern,
+    target_of_pattern,
+)
 from calibration_routines.display.mask_alignment import AlignmentReport, MaskAlignment, alignment_of
 from calibration_routines.display.mask_search import AlignmentSettings
 from calibration_routines.procedure import Listener
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
-from instrument.display.hologram import bench_display, prepare_target, save_alignment
+from instrument.display.hologram import (
+    Alignment,
+    bench_display,
+    colour_shares,
+    prepare_target,
+    save_alignment,
+)
+from instrument.display.hologram_files import CHANNELS
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
-from instrument.files.sample_images import load_sample
+from instrument.files.sample_images import load_sample, portrait_in_colour
 from instrument.runs.writer import free_name
 from recon.base.declare import option
 from recon.holography import Display, HologramModel, HologramOptions, compute_hologram
@@ -45,6 +62,8 @@ driver = "simulated_display"
 [slm]
 driver = "simulated_display"
 shape = [108, 192]
+[led_array]
+driver = "simulated_display"
 [scene]
 control = "simulated"
 [display]
@@ -71,6 +90,8 @@ mask_depth = 0.95
 mask_roughness_rad = 0.05
 """
 """The bench that is simulated, its errors in the open; the programs do not look there."""
+LASERS_NM = (638.0, 520.0, 450.0)
+"""Of its ``[led_array]``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +112,8 @@ class DisplayDemo:
     """The picture, photographed, by the alignment alone."""
     learned: Capture
     """The same by what was learned of the display."""
+    colour: ColourCapture
+    """In three colours, one after the other, by what was learned in the light of the bench's own laser."""
     seconds: dict[str, float]
     lesson: Lesson
     frames: int
@@ -113,6 +136,7 @@ class DisplayDemo:
             *learning_lines(self.lesson, self.frames, simulated=True),
             f"Photographed: {aligned.psnr_db:.2f} dB, SSIM {aligned.ssim:.3f} by the alignment alone; "
             f"{learned.psnr_db:.2f} dB, SSIM {learned.ssim:.3f} by what was learned",
+            f"In three colours, in turn: {self.colour.psnr_db:.2f} dB, SSIM {self.colour.ssim:.3f}",
         ]
 
 
@@ -153,10 +177,13 @@ def run_display_demo(
             listener.step(f"computing and photographing the picture, {words}")
             captures.append(_shown(replace(seen, display=display), nominal, settings))
         seconds["show"] = time.perf_counter() - began - sum(seconds.values())
+        listener.step("computing and photographing it in three colours")
+        colour = _in_colour(bench, learned, settings)
+        seconds["colour"] = time.perf_counter() - began - sum(seconds.values())
         frames = io.frames
     aligned, taught = captures
-    save_figure(_figure(aligned, taught, lesson), folder / "display-demo.png")
-    return DisplayDemo(folder, aligned, taught, seconds, lesson, frames)
+    save_figure(_figure(aligned, taught, colour, lesson), folder / "display-demo.png")
+    return DisplayDemo(folder, aligned, taught, colour, seconds, lesson, frames)
 
 
 def _aligned(io: DisplayBench, nominal: Display, bench: Bench, listener: Listener) -> AlignmentReport:
@@ -175,7 +202,22 @@ def _shown(seen: HologramCamera, nominal: Display, settings: DisplayDemoSettings
     )
 
 
-def _figure(aligned: Capture, learned: Capture, lesson: Lesson) -> Figure:
+def _in_colour(bench: Bench, place: Alignment, settings: DisplayDemoSettings) -> ColourCapture:
+    """Compute a hologram a colour, show one after the other and photograph them."""
+    picture = portrait_in_colour(256)
+    options = HologramOptions(iterations=settings.iterations, srgb=True)
+    size = require_slm(bench).shape, require_slm(bench).pixel_pitch_um
+    lights, patterns = [], []
+    for name, nm, share in zip(CHANNELS, LASERS_NM, colour_shares(LASERS_NM), strict=True):
+        facts = {"wavelength_nm": nm, "colour": name, "field_share": share, "options": {"srgb": True}}
+        display = display_of_pattern(bench.config, size, facts, place)
+        model = HologramModel(display, [target_of_pattern(picture, display, facts)], options)
+        patterns.append(ColourPattern(list(compute_hologram(model).slm), facts))
+        lights.append(DisplayBench(bench, 1, wavelength_nm=nm))
+    return photograph_colours(lights, patterns, picture, place, average=2)
+
+
+def _figure(aligned: Capture, learned: Capture, colour: ColourCapture, lesson: Lesson) -> Figure:
     panels = [Panel("Wanted", aligned.wanted, caption="through the eye's low-pass", white=1.0)]
     for title, capture in (("Photographed: aligned", aligned), ("Photographed: learned", learned)):
         score = capture.scores
@@ -187,6 +229,16 @@ def _figure(aligned: Capture, learned: Capture, lesson: Lesson) -> Figure:
                 white=1.0,
             )
         )
+    shades = np.clip(colour.seen, 0, 1)
+    panels.append(
+        Panel(
+            "Photographed: three colours",
+            shades,
+            caption=f"{colour.psnr_db:.1f} dB, SSIM {colour.ssim:.2f}",
+            white=1.0,
+            gamma=1 / 2.2,
+        )
+    )
     unexplained = [100 * part for part in lesson.rounds]
     rounds = Convergence(
         [float(n + 1) for n in range(len(unexplained))],

@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from drivers.led_array import LedPattern
 from drivers.slm import Slm
 from drivers.stage import Stage
 from instrument.bench.bench import Bench
 from instrument.bench.sequence import Wire, take_sequence
 from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError
-from instrument.files.slm_image import SlmCorrection, phase_levels
+from instrument.files.slm_image import SlmCorrection, field_levels
 from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.writer import dated_name, free_name
 from recon.holography import Display
@@ -51,6 +52,11 @@ class DisplayBench:
         Called before anything is shown or photographed; what it raises ends that, e.g. ``RunControl.check``.
     on_frame : callable, optional
         Called after each frame with how many were taken.
+    wavelength_nm : float, optional
+        Of the light. Unless it is that of ``[display]``, whose laser is the scene's light, the LED array's
+        colour of that wavelength shines, and the SLM's phases are taken for those of the same optical path.
+
+    Raises BenchError when the bench has no light of that wavelength.
     """
 
     def __init__(
@@ -62,20 +68,27 @@ class DisplayBench:
         estimate_background: bool = False,
         check: Callable[[], object] = lambda: None,
         on_frame: Callable[[int], object] = lambda _: None,
+        wavelength_nm: float | None = None,
     ) -> None:
         self.bench = bench
         self.slm = require_slm(bench)
         self.binning = binning
+        own_nm = bench.config.display.wavelength_nm
+        self.wavelength_nm = wavelength_nm or own_nm
+        self._laser = None if self.wavelength_nm == own_nm else laser_of(bench, self.wavelength_nm)
         self.correction = correction or SlmCorrection.ideal()
+        if self._laser is not None:
+            self.correction = self.correction.at(own_nm / self.wavelength_nm)
         self.estimates_background = estimate_background
         self._check, self._on_frame = check, on_frame
         self.frames = 0
         self._dark: tuple[tuple[float, ...], Array | float] | None = None
 
     def show(self, field: Array) -> None:
-        """Show the phase of an SLM field, complex (height, width) in binned pixels."""
+        """Show an SLM field, complex (height, width) in binned pixels: its phase, or what mirrors send."""
         self._check()
-        self.slm.display(self.correction.apply(phase_levels(np.angle(field), self.binning)))
+        levels = field_levels(field, self.binning, mirrors=self.slm.mirrors)
+        self.slm.display(levels if self.slm.mirrors else self.correction.apply(levels))
 
     def show_levels(self, levels: npt.NDArray[np.uint8]) -> None:
         """Show grey levels as they are, uncorrected, (height, width) of the whole SLM."""
@@ -119,11 +132,25 @@ class DisplayBench:
         low, high = camera.exposure_limits_ms
         exposure = camera.set_exposure_ms(float(np.clip(exposure_ms, low, high)))
         if not self.estimates_background and (self._dark is None or self._dark[0] != self._key):
-            self.bench.scene_off()
+            self.light(on=False)
             self._dark = self._key, self._snap()
             self._check()
-        self.bench.scene_on()
+        self.light(on=True)
         return exposure
+
+    def light(self, *, on: bool) -> None:
+        """Switch the laser; another than the bench's own shines alone."""
+        bench = self.bench
+        if self._laser is None:
+            bench.scene_on() if on else bench.scene_off()
+            return
+        assert bench.led_array is not None
+        if bench.can_switch_scene:
+            bench.scene_off()
+        if on:
+            bench.led_array.set_pattern(self._laser)
+        else:
+            bench.led_array.off()
 
     @property
     def _key(self) -> tuple[float, ...]:
@@ -195,15 +222,18 @@ def find_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:
     return found, _inner_mean(frame, found)
 
 
-def random_brightness(io: DisplayBench, display: Display, camera: CameraMap, mean_per_ms: float) -> float:
+def random_brightness(
+    io: DisplayBench, display: Display, camera: CameraMap, mean_per_ms: float | None = None
+) -> float:
     """Return counts a millisecond of the mean intensity of random phases.
 
     A blank SLM adds up with light that is not modulated, so that its picture is brighter or darker than that
-    of any hologram; ``mean_per_ms``, from :func:`find_camera`, only sets the exposure.
+    of any hologram; ``mean_per_ms``, from :func:`find_camera`, only sets the exposure (the camera's own).
     """
     phases = np.random.default_rng(0).uniform(0, 2 * np.pi, display.slm_shape)
     io.show(np.exp(1j * phases))
-    return _inner_mean(io.photograph(io.exposure_ms(mean_per_ms)), camera)
+    own_ms = io.bench.camera.exposure_ms
+    return _inner_mean(io.photograph(own_ms if mean_per_ms is None else io.exposure_ms(mean_per_ms)), camera)
 
 
 def _inner_mean(frame: Array, camera: CameraMap) -> float:
@@ -212,6 +242,31 @@ def _inner_mean(frame: Array, camera: CameraMap) -> float:
     inner = frame[round(rows[0]) : round(rows[1]), round(columns[0]) : round(columns[1])]
     envelope = (np.sinc(np.linspace(-0.3, 0.3, 101)) ** 2).mean() ** 2
     return float(inner.mean() / envelope)
+
+
+def laser_of(bench: Bench, wavelength_nm: float) -> LedPattern:
+    """Return the LED pattern that lights one colour of a display: the point source's LEDs in that colour.
+
+    Raises BenchError when the bench has no LED array, or none of its colours is within 2 % of the wavelength.
+    """
+    leds = bench.led_array
+    if leds is None:
+        raise BenchError(
+            f"The pattern is for {wavelength_nm:g} nm, the laser of {bench.label} has "
+            f"{bench.config.display.wavelength_nm:g} nm. Lasers or LEDs of other colours are an [led_array]; "
+            "this bench has none."
+        )
+    channel = int(np.argmin(np.abs(np.subtract(leds.wavelengths_nm, wavelength_nm))))
+    if abs(leds.wavelengths_nm[channel] / wavelength_nm - 1) > 0.02:
+        colours = ", ".join(f"{nm:g}" for nm in leds.wavelengths_nm)
+        raise BenchError(
+            f"The pattern is for {wavelength_nm:g} nm; {leds.name} has {colours} nm. Compute it for these: "
+            f"diffuserbench hologram --color --wavelengths {' '.join(colours.split(', '))}"
+        )
+    rgb = [0, 0, 0]
+    rgb[channel] = 255
+    lit = tuple((index, (rgb[0], rgb[1], rgb[2])) for index, _ in bench.source_pattern.levels)
+    return LedPattern(f"{wavelength_nm:g} nm", lit)
 
 
 # Files ------------------------------------------------------------------------------------------------

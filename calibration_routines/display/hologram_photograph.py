@@ -6,22 +6,30 @@ With the camera in the loop one hologram is improved by what the camera sees of 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.display_io import DisplayBench, find_camera
+from calibration_routines.display.display_io import DisplayBench
+from calibration_routines.display.spot_photograph import registered_camera
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import Alignment, CaptureOptions, bench_display
-from instrument.files.images import write_image
-from instrument.files.slm_image import phase_levels, write_slm_image
-from recon.holography import Display, HologramModel, Scores, Target, compute_hologram
+from instrument.display.hologram import (
+    Alignment,
+    CaptureOptions,
+    bench_display,
+    prepare_target,
+    within,
+)
+from instrument.display.hologram_files import CHANNELS
+from instrument.files.errors import BenchError
+from instrument.files.images import Pixels, write_image
+from instrument.files.slm_image import field_levels, is_of_mirrors, write_slm_image
+from recon.holography import Display, HologramModel, HologramOptions, Scores, Target, compute_hologram
 from recon.holography.camera_map import CameraMap
 from recon.holography.judge import compare, low_pass
-from recon.holography.options import Envelope
 from recon.holography.target import Band, make_band
 
 Array = npt.NDArray[Any]
@@ -34,8 +42,8 @@ class Capture:
     """A photographed hologram."""
 
     seen: npt.NDArray[np.float64]
-    """(height, width): low-passed picture over the field of view, the axis in the middle, in units
-    of the target's white."""
+    """(height, width): low-passed picture over the field of view (of mirrors, where the target counts), the
+    axis in the middle, in units of the target's white."""
     wanted: npt.NDArray[np.float64]
     """The target on the same grid, low-passed."""
     scores: Scores
@@ -66,11 +74,15 @@ class HologramCamera:
     camera: CameraMap
     mean_per_ms: float
     """Counts a millisecond of the mean intensity, from the registration."""
+    computed: HologramOptions = field(default_factory=HologramOptions)
+    """How its holograms are computed when they are refined."""
 
     @classmethod
-    def registered(cls, io: DisplayBench, display: Display) -> HologramCamera:
-        """Register the camera (:func:`find_camera`)."""
-        return cls(io, display, *find_camera(io, display))
+    def registered(
+        cls, io: DisplayBench, display: Display, computed: HologramOptions | None = None
+    ) -> HologramCamera:
+        """Register the camera (:func:`registered_camera`)."""
+        return cls(io, display, *registered_camera(io, display), computed or HologramOptions())
 
     def capture(self, fields: Sequence[Array], target: Target, *, average: int = 1) -> Capture:
         """Show SLM fields one after the other, add their photographs, and compare with the target.
@@ -81,14 +93,15 @@ class HologramCamera:
         io, display = self.io, self.display
         exposure_ms = io.exposure_ms(self.mean_per_ms)
         total = np.zeros(io.bench.camera.image_shape)
-        for field in fields:
-            io.show(field)
+        for shown in fields:
+            io.show(shown)
             for _ in range(average):
                 total += io.photograph(exposure_ms)
         ceiling = 0.98 * io.full_scale / io.bench.camera.exposure_ms * len(fields) * average
         band = make_band(display.slm_shape, display.factor, "alias-free")
         seen = low_passed_picture(self.camera.lags(total, band), band, display.slm_shape)
         wanted, peak = wanted_picture(target, display)
+        seen, wanted = within(target.window, seen), within(target.window, wanted)
         scaled = seen * (wanted.mean() / seen.mean())
         return Capture(
             scaled / peak, wanted / peak, compare(scaled, wanted, peak), float((total >= ceiling).mean())
@@ -120,11 +133,13 @@ class HologramCamera:
         best_slm = now = np.asarray(slm, np.complex64)
         first = self.capture(list(now), target, average=options.average)
         best, measured, history = first, first, [first.scores.psnr_db]
-        plain = HologramModel(self.display, [target])
+        plain = HologramModel(self.display, [target], self.computed)
         for number in range(1, options.refine + 1):
             shown = plain.seen(now) / plain.peaks[0]
-            aim = np.maximum(shown + _GAIN * (measured.wanted - measured.seen), 0)
-            model = HologramModel(self.display, [replace(target, image=aim, white=1.0)])
+            aim = shown if target.window is None else np.zeros_like(shown)
+            part = (...,) if target.window is None else target.window.part(aim.shape)
+            aim[part] = np.maximum(shown[part] + _GAIN * (measured.wanted - measured.seen), 0)
+            model = HologramModel(self.display, [replace(target, image=aim, white=1.0)], self.computed)
             now = compute_hologram(model, initial=now, iterations=_ITERATIONS, tolerance=0).slm
             measured = self.capture(list(now), target, average=options.average)
             history.append(measured.scores.psnr_db)
@@ -176,14 +191,30 @@ def display_of_pattern(
 
     ``size`` is the SLM's shape and pitch in micrometres. Errors as ``bench_display``.
     """
-    display = bench_display(config, size, expansion=facts.get("expansion"))
+    display = bench_display(
+        config, size, expansion=facts.get("expansion"), wavelength_nm=facts.get("wavelength_nm")
+    )
     return display if alignment is None else alignment.of(display)
 
 
-def envelope_of_pattern(facts: Mapping[str, Any]) -> Envelope:
-    """Return how a pattern's target treated the mask pixels' envelope, by the facts beside the pattern."""
-    envelope: Envelope = facts.get("metrics_computed_for", {}).get("envelope", "shade")
-    return envelope
+def options_of_pattern(facts: Mapping[str, Any]) -> HologramOptions:
+    """Return how a pattern was computed, by the facts beside it: fit, tone, envelope, mirrors' light."""
+    names = ("fit", "srgb", "lift", "envelope", *(("mirrors", "light") if is_of_mirrors(facts) else ()))
+    said = facts.get("options", {})
+    return HologramOptions(**{name: said[name] for name in names if name in said})
+
+
+def target_of_pattern(picture: Pixels, display: Display, facts: Mapping[str, Any]) -> Target:
+    """Return a picture as a pattern shows it: colour, size and :func:`options_of_pattern`.
+
+    Raises BenchError where the pattern is one colour of several and the picture has none.
+    """
+    if (colour := facts.get("colour")) in CHANNELS:
+        if picture.ndim != 3 or picture.shape[2] != len(CHANNELS):
+            raise BenchError(f"The pattern is the {colour} of a picture in colour; the one wanted is grey.")
+        picture = picture[..., CHANNELS.index(colour)]
+    share = facts.get("field_share", 1.0)
+    return prepare_target(picture, display, options_of_pattern(facts), share=share)
 
 
 def photograph_hologram(
@@ -193,8 +224,9 @@ def photograph_hologram(
     target: Target,
     options: CaptureOptions | None = None,
     progress: Callable[[int, float], object] | None = None,
+    computed: HologramOptions | None = None,
 ) -> Photographed:
-    """Register the camera by the mask's speckle, photograph a hologram, and compare it with its target.
+    """Register the camera, photograph a hologram, and compare it with its target.
 
     ``fields``, complex (height, width), are time-multiplexed frames; one where it is to be refined. The
     display has the mask's displacement where it is known; ``progress(round, psnr_db)`` is called when
@@ -203,7 +235,7 @@ def photograph_hologram(
     Raises InputError when the speckle is not recognised; DeviceError when a device fails.
     """
     options = options or CaptureOptions()
-    seen = HologramCamera.registered(io, display)
+    seen = HologramCamera.registered(io, display, computed)
     refined = None
     if options.refine:
         refined = seen.refine(np.asarray(fields[0])[None], target, options, progress)
@@ -220,7 +252,7 @@ def write_refined(pattern: Path, refined: Refinement, facts: Mapping[str, Any], 
     path = pattern.with_name(f"{pattern.stem}-refined.png")
     kept = {name: fact for name, fact in facts.items() if name not in ("format", "levels_per_turn")}
     kept |= {"refined_by_camera": True, "captured_psnr_db": list(refined.psnr_db)}
-    write_slm_image(path, phase_levels(np.angle(refined.slm[0]), binning), kept)
+    write_slm_image(path, field_levels(refined.slm[0], binning, mirrors=is_of_mirrors(facts)), kept)
     return path
 
 

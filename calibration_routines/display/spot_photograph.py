@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.display_io import DisplayBench, find_camera
+from calibration_routines.display.display_io import DisplayBench, find_camera, random_brightness
 from instrument.display.hologram import CaptureOptions
 from instrument.files.images import write_image
 from recon.errors import InputError
@@ -71,10 +71,7 @@ def photograph_spots(
 
     Raises InputError when the camera does not see the spots; DeviceError when a device fails.
     """
-    if len(np.unique(display.mask.levels)) == 1:
-        camera = register_by_spots(io, display)
-    else:
-        camera, _ = find_camera(io, display)
+    camera, _ = registered_camera(io, display)
     seen = _Spots(io, display, spots, camera, options.average)
     frame, relative = seen.measure(slm)
     best = PhotographedSpots(np.asarray(slm, np.complex64), frame, relative, (), camera.residual_px)
@@ -89,6 +86,17 @@ def photograph_spots(
         if deviations[-1] < best.relative.std():
             best = PhotographedSpots(now, frame, relative, (), camera.residual_px)
     return PhotographedSpots(best.slm, best.frame, best.relative, tuple(deviations), best.camera_residual_px)
+
+
+def registered_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:
+    """Find the camera, by the mask's speckle or else by spots, and how bright the mean intensity is.
+
+    Returns that in counts a millisecond. Raises InputError when it does not see them.
+    """
+    if len(np.unique(display.mask.levels)) > 1:
+        return find_camera(io, display)
+    camera = register_by_spots(io, display)
+    return camera, random_brightness(io, display, camera)
 
 
 def register_by_spots(io: DisplayBench, display: Display) -> CameraMap:
@@ -111,6 +119,7 @@ def register_by_spots(io: DisplayBench, display: Display) -> CameraMap:
     shifts, clear = [], []
     for frame, (y, x) in zip(frames, places - 0.5, strict=True):
         alone = np.maximum(frame - rest, 0)
+        alone *= _about(alone.shape, nominal.pixels(y, x), 0.15 * across)  # mirrors have a twin opposite
         row, column = np.unravel_index(int(np.argmax(alone)), alone.shape)
         top, left = max(int(row) - 4, 0), max(int(column) - 4, 0)
         box = alone[top : top + 9, left : left + 9]
@@ -126,6 +135,13 @@ def register_by_spots(io: DisplayBench, display: Display) -> CameraMap:
             "Check that the laser shines, the focal length, the SLM's pitch and how the camera is turned."
         )
     return polynomial_map(nominal, places[good] - 0.5, np.array(shifts)[good])
+
+
+def _about(shape: tuple[int, ...], place: tuple[Array, Array], reach: float) -> npt.NDArray[np.bool_]:
+    """Return which pixels lie within a reach of a place."""
+    rows, columns = np.ogrid[: shape[0], : shape[1]]
+    near: npt.NDArray[np.bool_] = np.hypot(rows - float(place[0]), columns - float(place[1])) < reach
+    return near
 
 
 def _exposed(io: DisplayBench, average: int) -> npt.NDArray[np.float64]:

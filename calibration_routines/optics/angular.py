@@ -89,6 +89,9 @@ class AngularSweep(Checked):
     average: int = option(4, least=1, label="Frames a place", help="Frames a place, averaged.")
     dark_frames: int = option(4, least=1, help="Dark frames, at two exposures each.", group=RARE)
 
+    ends_deg: tuple[float, float] | None = None
+    """Along x and y: the pattern leaves the sensor beyond; None where that is not known."""
+
     def disagreements(self, wrong: Collection[str]) -> list[tuple[str, str]]:
         """As :meth:`Checked.disagreements`."""
         if wrong or self.step_deg <= self.largest_deg <= MOST_STEPS * self.step_deg:
@@ -102,13 +105,16 @@ class AngularSweep(Checked):
         return [("step_deg", words)]
 
     def planned(self, bench: Bench) -> AngularSweep:
-        """Return the sweep with its distance filled in."""
-        return self if self.z_um is not None else replace(self, z_um=farthest_um(bench, self.largest_deg))
+        """Return the sweep with its distance filled in, and where the pattern leaves the sensor."""
+        seen = replace(self, ends_deg=pattern_ends_deg(bench))
+        if self.z_um is not None:
+            return seen
+        return replace(seen, z_um=farthest_um(bench, max(max(seen.angles_deg(along)) for along in (0, 1))))
 
-    @property
-    def angles_deg(self) -> tuple[float, ...]:
-        """Angles above zero."""
-        number = int(np.floor(self.largest_deg / self.step_deg + 1e-9))
+    def angles_deg(self, along: int) -> tuple[float, ...]:
+        """Angles above zero along x (0) or y (1), one at least."""
+        end = self.largest_deg if self.ends_deg is None else min(self.ends_deg[along], self.largest_deg)
+        number = max(1, int(np.floor(end / self.step_deg + 1e-9)))
         return tuple(self.step_deg * (k + 1) for k in range(number))
 
     @property
@@ -127,12 +133,31 @@ class AngularSweep(Checked):
         points = [axis]
         for along in (0, 1):
             for sign in (1.0, -1.0):
-                for angle in self.angles_deg:
+                for angle in self.angles_deg(along):
                     away = round(float(sign * z_um * np.tan(np.deg2rad(angle))), 3)
                     points.append((away, 0.0, z_um) if along == 0 else (0.0, away, z_um))
         return PointSweep(
             points_um=tuple(points), kind="angular", average=self.average, dark_frames=self.dark_frames
         )
+
+
+_SEEN = 0.05  # part of the pattern's side that is still on the sensor at the last place
+
+
+def pattern_ends_deg(bench: Bench) -> tuple[float, float] | None:
+    """Return the angles along x and y at which the pattern of a far source leaves the sensor.
+
+    None where pitch, d or aperture is not known.
+    """
+    geometry, shape = bench.geometry, bench.camera.frame_shape
+    pitch_um, d_mm, aperture_mm = geometry.pixel_pitch_um, geometry.diffuser_distance_mm, geometry.aperture_mm
+    if pitch_um is None or d_mm is None or aperture_mm is None:
+        return None
+    y, x = (
+        float(np.rad2deg(np.arctan((0.5 * pixels * pitch_um * 1e-3 + (0.5 - _SEEN) * side_mm) / d_mm)))
+        for pixels, side_mm in zip(shape[:2], aperture_mm, strict=True)
+    )
+    return x, y
 
 
 def farthest_um(bench: Bench, largest_deg: float) -> float:
@@ -165,11 +190,12 @@ def check_angular(bench: Bench, sweep: AngularSweep, folder: Path | None = None)
             f"The source at z = {z_um / 1e3:.4g} mm is outside the stage's limits {low / 1e3:.4g} to "
             f"{high / 1e3:.4g} mm. Choose a distance between them, or leave --z out."
         )
-    needed = z_um * float(np.tan(np.deg2rad(sweep.angles_deg[-1])))
+    largest_deg = max(*sweep.angles_deg(0), *sweep.angles_deg(1))
+    needed = z_um * float(np.tan(np.deg2rad(largest_deg)))
     if needed > reach:
         reached = np.floor(np.rad2deg(np.arctan(reach / z_um)))
         raise BenchError(
-            f"+-{sweep.angles_deg[-1]:g} degrees from z = {z_um / 1e3:.4g} mm are +-{needed / 1e3:.4g} mm, "
+            f"+-{largest_deg:g} degrees from z = {z_um / 1e3:.4g} mm are +-{needed / 1e3:.4g} mm, "
             f"outside the stage's limits of +-{reach / 1e3:.4g} mm: choose --largest {reached:g} at most, a "
             "nearer --z, or leave --z out for the farthest that spans the angles."
         )
@@ -287,8 +313,10 @@ class AngularProcedure(Procedure):
         plan = check_angular(bench, sweep, folder or bench.config.data_folder)
         reason = (
             f"{len(points.points_um)} places at z = {sweep.distance_um / 1e3:.4g} mm, up to "
-            f"+-{sweep.largest_deg:g} degrees along x and y"
+            f"+-{sweep.angles_deg(0)[-1]:g} degrees along x and +-{sweep.angles_deg(1)[-1]:g} along y"
         )
+        if sweep.ends_deg is not None and min(sweep.ends_deg) < sweep.largest_deg:
+            reason += " (beyond, the pattern leaves the sensor)"
         given = self.sweep.z_um is not None
         farthest = "" if given else ", the farthest from which the stage spans the angles"
         return outlook_of(bench, plan, folder, [reason + farthest])

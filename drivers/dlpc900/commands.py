@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -54,6 +54,12 @@ LED_BITS: Mapping[str, int] = {
 MIN_EXPOSURE_US: Mapping[int, int] = {1: 105, 8: 4046}
 """Shortest exposure by bits a pixel (pattern modes, constant illumination)."""
 MAX_EXPOSURE_US = 2**24 - 1
+IMAGE_BITS = 24
+"""Bits a pixel of an image: so many patterns of one bit are in one."""
+MOST_PATTERNS: Mapping[int, int] = {1: 400, 8: 50}
+"""Patterns by bits a pixel that the controller's memory holds."""
+TRIGGER_OUTPUTS = 2
+"""TRIG_OUT_1 is high while a pattern is exposed, TRIG_OUT_2 pulses as one begins."""
 
 _ERRORS: Mapping[int, str] = {
     1: "batch file checksum error",
@@ -139,28 +145,42 @@ _MAX_RLE_RUN = 255
 _END_OF_LINE = b"\x00\x00"
 
 # Pattern images: header (section 2.4.2) and compression (section 2.4.3). A pattern has up to 8 bits a pixel,
-# an image 24: each pixel's level is written to all three bytes, so that the pattern is the same from
-# whichever of the image's bits it is taken.
+# an image 24: bit 0 is the lowest of a pixel's last byte.
 Levels = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.uint32]
 Numbers = npt.NDArray[np.intp]
 
 
-def encode(levels: Levels, compression: str = "auto") -> bytes:
+def image_of(patterns: Sequence[Levels], bit_depth: int) -> Pixels:
+    """Return the image, (height, width), that holds patterns of 1 or 8 bits one beside the other.
+
+    Patterns are uint8 levels, of which the upper ``bit_depth`` bits count; the first is at bit 0. A single
+    one fills all bits, so that it is the same from whichever it is taken.
+    """
+    if len(patterns) == 1:
+        return np.asarray(patterns[0].astype(np.uint32) * 0x010101, np.uint32)
+    image = np.zeros(patterns[0].shape, np.uint32)
+    for number, levels in enumerate(patterns):
+        image |= (levels >> (8 - bit_depth)).astype(np.uint32) << np.uint32(number * bit_depth)
+    return image
+
+
+def encode(pixels: Pixels, compression: str = "auto") -> bytes:
     """Return an image with its header.
 
     Parameters
     ----------
-    levels : ndarray
-        (height, width) uint8; of a board with two controllers, one of the halves.
+    pixels : ndarray
+        (height, width) uint32, of :func:`image_of`; of a board with two controllers, one of the halves.
     compression : str
         ``"none"``, ``"rle"``, ``"enhanced_rle"``, or ``"auto"``: the shortest of them.
     """
     if compression == "auto":
-        return min((encode(levels, name) for name in ("enhanced_rle", "none")), key=len)
+        return min((encode(pixels, name) for name in ("enhanced_rle", "none")), key=len)
     code, compress = _COMPRESSIONS[compression]
-    data = compress(levels)
+    data = compress(pixels)
     data += bytes(-len(data) % 4)
-    height, width = levels.shape
+    height, width = pixels.shape
     header: bytes = (
         _SIGNATURE
         + width.to_bytes(2, "little")
@@ -174,43 +194,44 @@ def encode(levels: Levels, compression: str = "auto") -> bytes:
     return header + data
 
 
-def _uncompressed(levels: Levels) -> bytes:
-    return np.repeat(levels[..., None], 3, axis=2).tobytes()
+def _uncompressed(pixels: Pixels) -> bytes:
+    """Return three bytes a pixel, the highest first."""
+    return np.stack([pixels >> 16, pixels >> 8, pixels], axis=-1).astype(np.uint8).tobytes()
 
 
-def _rle(levels: Levels) -> bytes:
+def _rle(image: Pixels) -> bytes:
     """Compress by runs of up to 255 pixels; lines begin at multiples of four bytes (section 2.4.3.1)."""
-    width = levels.shape[1]
-    pixels = levels.ravel()
+    width = image.shape[1]
+    pixels = image.ravel()
     out = bytearray()
-    segments = _segments(levels, np.zeros(levels.shape, bool))
+    segments = _segments(image, np.zeros(image.shape, bool))
     for start, n, kind in zip(*(part.tolist() for part in segments), strict=True):
         for at in range(start, start + n, _MAX_RLE_RUN):
             count = min(_MAX_RLE_RUN, start + n - at)
             # A literal of one pixel does not exist: its code ends the image.
             is_run = kind == _RUN or count == 1
             out += bytes([count]) if is_run else bytes([0, count])
-            out += np.repeat(pixels[at : at + (1 if is_run else count)], 3).tobytes()
+            out += _uncompressed(pixels[at : at + (1 if is_run else count)])
         if (start + n) % width == 0:
             out += _END_OF_LINE
             out += bytes(-len(out) % 4)
     return bytes(out) + b"\x00\x01"
 
 
-def _enhanced_rle(levels: Levels) -> bytes:
+def _enhanced_rle(image: Pixels) -> bytes:
     """Compress by runs of any length, and by runs of the line above (section 2.4.3.2).
 
     A copy of n pixels from above is ``00 01 n``, a run ``n pixel``, a literal ``00 n pixels``; n is one byte
     below 128, else two: its low seven bits with a mark, then the rest. All segments are written at once.
     """
-    above = np.zeros(levels.shape, bool)
-    above[1:] = levels[1:] == levels[:-1]
-    start, n, kind = _segments(levels, above)
-    pixels = levels.ravel()
+    above = np.zeros(image.shape, bool)
+    above[1:] = image[1:] == image[:-1]
+    start, n, kind = _segments(image, above)
+    pixels = image.ravel()
     head = np.array([0, 1, 2])[kind]  # bytes before the length, by kind
     long = n >= 128
     n_pixels = np.where(kind == _COPY, 0, np.where(kind == _LITERAL, n, 1))
-    ends_line = (start + n) % levels.shape[1] == 0
+    ends_line = (start + n) % image.shape[1] == 0
     size = head + 1 + long + 3 * n_pixels + len(_END_OF_LINE) * ends_line
     stop = np.cumsum(size)
     out = np.zeros(int(stop[-1]), np.uint8)
@@ -225,11 +246,11 @@ def _enhanced_rle(levels: Levels) -> bytes:
     place = np.repeat(at, n_pixels) + 3 * within
     values = pixels[np.repeat(start, n_pixels) + within]
     for color in range(3):
-        out[place + color] = values
+        out[place + color] = (values >> (16 - 8 * color)).astype(np.uint8)
     return out.tobytes() + b"\x00\x01\x00"
 
 
-_COMPRESSIONS: Mapping[str, tuple[int, Callable[[Levels], bytes]]] = {
+_COMPRESSIONS: Mapping[str, tuple[int, Callable[[Pixels], bytes]]] = {
     "none": (_UNCOMPRESSED, _uncompressed),
     "rle": (_RLE, _rle),
     "enhanced_rle": (_ENHANCED_RLE, _enhanced_rle),
@@ -239,17 +260,17 @@ _COMPRESSIONS: Mapping[str, tuple[int, Callable[[Levels], bytes]]] = {
 _RUN, _LITERAL, _COPY = range(3)
 
 
-def _segments(levels: Levels, copied: npt.NDArray[np.bool_]) -> tuple[Numbers, Numbers, Numbers]:
-    """Cut an image into runs of one level, literals, and copies of what is above, none beyond its line.
+def _segments(image: Pixels, copied: npt.NDArray[np.bool_]) -> tuple[Numbers, Numbers, Numbers]:
+    """Cut an image into runs of one value, literals, and copies of what is above, none beyond its line.
 
     Returns
     -------
     start, n, kind : ndarray
         First pixel, counted along the lines; number of pixels; ``_RUN``, ``_LITERAL`` or ``_COPY``.
     """
-    width = levels.shape[1]
-    pixels, copy = levels.ravel(), copied.ravel()
-    # A border lies before a pixel where a line begins, its level changes, or whether it is copied.
+    width = image.shape[1]
+    pixels, copy = image.ravel(), copied.ravel()
+    # A border lies before a pixel where a line begins, its value changes, or whether it is copied.
     border = np.ones(pixels.size, bool)
     border[1:] = (copy[1:] != copy[:-1]) | (~copy[1:] & (pixels[1:] != pixels[:-1]))
     border[::width] = True

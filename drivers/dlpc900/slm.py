@@ -1,12 +1,13 @@
-"""The DLPC900 as a spatial light modulator that shows one pattern, repeated without end."""
+"""The DLPC900 as a spatial light modulator that shows one pattern without end, or a sequence once."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import ceil
 from typing import Literal, Self
 
 import numpy as np
@@ -18,6 +19,7 @@ from drivers.dlpc900 import commands
 from drivers.dlpc900.commands import Board, Command, encode
 from drivers.dlpc900.link import HidLink, found_controllers
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, LimitError, StoppedError
+from drivers.sequence import SequenceLimits
 from drivers.slm import Slm, read_only
 
 _log = logging.getLogger(__name__)
@@ -59,8 +61,17 @@ class Dlpc900Options(DriverOptions):
         return self
 
 
+@dataclass(frozen=True, slots=True)
+class _Armed:
+    """A sequence."""
+
+    patterns: tuple[npt.NDArray[np.uint8], ...]
+    exposure_us: int
+    output: int
+
+
 class Dlpc900Slm(Slm):
-    """A DMD that shows one pattern in pattern-on-the-fly mode.
+    """A DMD that shows patterns in pattern-on-the-fly mode.
 
     ``display`` stops the sequence, defines the pattern, uploads its image (of a DLP9000 in two halves),
     starts the sequence and returns when the controller says that it runs. An upload takes from a tenth of a
@@ -68,6 +79,7 @@ class Dlpc900Slm(Slm):
     """
 
     Options = Dlpc900Options
+    mirrors = True
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         self.options = options = Dlpc900Options.of(options)
@@ -85,6 +97,9 @@ class Dlpc900Slm(Slm):
         self._displayed: npt.NDArray[np.uint8] | None = None
         self._uploaded: npt.NDArray[np.uint8] | None = None
         """What ``start`` shows again, while it is stopped."""
+        self._armed: _Armed | None = None
+        self._before: npt.NDArray[np.uint8] | None = None
+        """What was shown when the armed sequence was uploaded; None while the controller has another one."""
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
@@ -142,7 +157,7 @@ class Dlpc900Slm(Slm):
                 except DeviceError as error:
                     _log.warning("%s: was not stopped: %s", self.name, error)
                 self._link.close()
-            self._displayed = self._uploaded = None
+            self._displayed = self._uploaded = self._armed = self._before = None
 
     @property
     def is_open(self) -> bool:
@@ -239,6 +254,11 @@ class Dlpc900Slm(Slm):
         255; StoppedError when ``close`` or ``blank`` was called meanwhile; DeviceError when the controller
         refuses or was unplugged; what is shown is then unknown.
         """
+        self._require_levels(levels)
+        self._show(levels.copy())
+        self._closing.wait(self.settle_ms * 1e-3)
+
+    def _require_levels(self, levels: npt.NDArray[np.uint8]) -> None:
         self._check(levels)
         if self.options.bit_depth == 1 and np.any((levels != 0) & (levels != _FULL)):
             raise LimitError(
@@ -246,8 +266,6 @@ class Dlpc900Slm(Slm):
                 "cannot show grey levels with bit_depth = 1.",
                 "Give uint8 levels 0 and 255 only, or set bit_depth = 8.",
             )
-        self._show(levels.copy())
-        self._closing.wait(self.settle_ms * 1e-3)
 
     def blank(self) -> None:
         """Show all zeros, ahead of an upload that is under way: that ends with a StoppedError."""
@@ -270,13 +288,94 @@ class Dlpc900Slm(Slm):
             raise DeviceError(self.name, "what it shows is unknown after a failed upload.", "Display again.")
         return read_only(self._displayed)
 
+    # Sequences -------------------------------------------------------------------------------------
+    @property
+    def sequence_limits(self) -> SequenceLimits:
+        """What the controller's memory holds, and its shortest exposure with the dark time."""
+        depth = self.options.bit_depth
+        shortest_us = commands.MIN_EXPOSURE_US[depth] + self.options.dark_us
+        return SequenceLimits(
+            commands.MOST_PATTERNS[depth], 1e-3 * shortest_us, outputs=commands.TRIGGER_OUTPUTS
+        )
+
+    def arm(self, patterns: Sequence[npt.NDArray[np.uint8]], period_ms: float, output: int = 0) -> float:
+        """Upload a sequence, 24 bits of patterns an image; dark until it is played.
+
+        Output 0 is TRIG_OUT_1, high during each exposure; 1 is TRIG_OUT_2, a pulse as each begins. Errors as
+        ``display`` and as the interface says; then what is shown is unknown, unless nothing was sent.
+        """
+        self._require()
+        self._check_sequence(len(patterns), period_ms, output)
+        for levels in patterns:
+            self._require_levels(levels)
+        exposure_us = min(ceil(1e3 * period_ms - 1e-6) - self.options.dark_us, commands.MAX_EXPOSURE_US)
+        self._armed = _Armed(tuple(levels.copy() for levels in patterns), exposure_us, output)
+        self._upload_sequence(self._armed)
+        return 1e-3 * (exposure_us + self.options.dark_us)
+
+    def play(self) -> None:
+        """Show the armed sequence once, and then what was shown before it was armed.
+
+        That is uploaded again unless it was blank; the sequence then is too, when it is played again.
+
+        Raises DeviceError when nothing is armed, or the controller does not end it; StoppedError when
+        ``blank`` or ``close`` did.
+        """
+        self._require()
+        armed = self._armed
+        if armed is None:
+            raise DeviceError(self.name, "has no sequence to play.", "Arm one first.")
+        if self._before is None:
+            self._upload_sequence(armed)
+        with self._lock:
+            board = self._require()
+            before, began = self._before, self._blanked
+            if before is None:
+                raise StoppedError(self.name, "was blanked before its sequence.")
+            self._link.write(Command.START_STOP, bytes([commands.START]))
+        whole_s = 1e-6 * len(armed.patterns) * (armed.exposure_us + self.options.dark_us)
+        deadline_s = time.monotonic() + 1.5 * whole_s + _START_S
+        self._closing.wait(whole_s)
+        while self._runs(began):
+            if time.monotonic() > deadline_s:
+                raise DeviceTimeoutError(
+                    self.name, f"did not end its sequence of {whole_s:.3g} s.", "Blank it, and play it again."
+                )
+            self._closing.wait(_POLL_S)
+        self._check_hardware(board)
+        if before.any():
+            self._show(before)
+
+    def _runs(self, began: int) -> bool:
+        """Return whether the sequence still runs; StoppedError when ``blank`` or ``close`` ended it."""
+        with self._lock:
+            if self._closing.is_set() or began != self._blanked:
+                raise StoppedError(self.name, "was blanked or closed during its sequence.")
+            self._require()
+            return bool(self._link.read(Command.MAIN_STATUS, 1)[0] & commands.SEQUENCER_RUNS)
+
+    def _upload_sequence(self, armed: _Armed) -> None:
+        """Store a sequence in the controller, which is dark from then on."""
+        board, depth = self._require(), self.options.bit_depth
+        before, began = self.displayed, self._blanked
+        if self._before is not None:
+            before = self._before
+        images, per_image = self._encoded(armed.patterns), commands.IMAGE_BITS // depth
+        definitions = [
+            self._definition(armed.exposure_us, number, per_image, pulses=armed.output == 1)
+            for number in range(len(armed.patterns))
+        ]
+        with self._lock:
+            self._load(images, definitions, len(definitions), began)
+            self._displayed, self._before = np.zeros(board.shape, np.uint8), before
+
     # More than the interface ----------------------------------------------------------------------
     def stop(self) -> None:
         """Stop the sequence: nothing is shown until ``start`` or the next pattern. Waits for an upload."""
         with self._lock:
             board = self._require()
             self._link.write(Command.START_STOP, bytes([commands.STOP]))
-            if self._displayed is not None and self._uploaded is None:
+            if self._displayed is not None and self._uploaded is None and self._before is None:
                 self._uploaded, self._displayed = self._displayed, np.zeros(board.shape, np.uint8)
 
     def start(self) -> None:
@@ -293,41 +392,65 @@ class Dlpc900Slm(Slm):
             self._displayed, self._uploaded = self._uploaded, None
 
     def _show(self, levels: npt.NDArray[np.uint8], *, gives_way: bool = True) -> None:
-        """Section 5.3 of the guide: stop, define, configure, load, start.
-
-        ``gives_way``: end with a StoppedError when ``blank`` is called meanwhile.
-        """
-        board = self._require()
+        """Show one pattern without end; ``gives_way``: StoppedError when ``blank`` is called meanwhile."""
+        self._require()
         began = self._blanked if gives_way else None
-        images = [encode(half, self.options.compression) for half in np.hsplit(levels, board.controllers)]
+        images = self._encoded([levels])
         with self._lock:
-            self._require()
-            self._displayed = self._uploaded = None
-            self._link.write(Command.START_STOP, bytes([commands.STOP]))
-            self._link.write(Command.PATTERN_DEFINITION, self._definition())
-            self._link.write(Command.PATTERN_CONFIGURATION, _configuration(patterns=1, repeats=0))
-            # The other half first: the primary controller then has its image last, and starts.
-            for half in reversed(range(board.controllers)):
-                self._upload(images[half], *_LOAD[half], began)
+            self._load(images, [self._definition(self.options.exposure_us)], 0, began)
             self._link.write(Command.START_STOP, bytes([commands.START]))
             self._wait_until_running()
             self._displayed = levels
 
-    def _definition(self) -> bytes:
-        """Return pattern 0, from bit 0 of image 0 (section 2.4.4.3.5)."""
+    def _encoded(self, patterns: Sequence[npt.NDArray[np.uint8]]) -> list[list[bytes]]:
+        """Return the images that hold patterns, each for every controller."""
+        board, depth = self._require(), self.options.bit_depth
+        per_image = commands.IMAGE_BITS // depth
+        groups = [patterns[first : first + per_image] for first in range(0, len(patterns), per_image)]
+        return [
+            [
+                encode(half, self.options.compression)
+                for half in np.hsplit(commands.image_of(group, depth), board.controllers)
+            ]
+            for group in groups
+        ]
+
+    def _load(
+        self, images: Sequence[Sequence[bytes]], definitions: Sequence[bytes], shown: int, began: int | None
+    ) -> None:
+        """Stop, define, configure, load (section 5.3); ``shown``: patterns until the end, or 0."""
+        self._require()
+        self._displayed = self._uploaded = self._before = None
+        self._link.write(Command.START_STOP, bytes([commands.STOP]))
+        for definition in definitions:
+            self._link.write(Command.PATTERN_DEFINITION, definition)
+        self._link.write(
+            Command.PATTERN_CONFIGURATION, _configuration(patterns=len(definitions), shown=shown)
+        )
+        # The last image first, and the other half: the primary controller then has its first image last.
+        for number in reversed(range(len(images))):
+            for half in reversed(range(len(images[number]))):
+                self._upload(number, images[number][half], half, began)
+
+    def _definition(
+        self, exposure_us: int, number: int = 0, per_image: int = 1, *, pulses: bool = True
+    ) -> bytes:
+        """Return a pattern's definition (section 2.4.4.3.5); ``pulses``: on trigger output 2."""
         o = self.options
         flags = (o.bit_depth - 1) << 1 | commands.LED_BITS[o.led] << 4
+        image, place = divmod(number, per_image)
         return (
-            (0).to_bytes(2, "little")
-            + o.exposure_us.to_bytes(3, "little")
+            number.to_bytes(2, "little")
+            + exposure_us.to_bytes(3, "little")
             + bytes([flags])
             + o.dark_us.to_bytes(3, "little")
-            + bytes([0])  # trigger output 2 stays enabled; no extended bit depth
-            + (0).to_bytes(2, "little")
+            + bytes([0 if pulses else 1])  # no extended bit depth
+            + (image | place * o.bit_depth << 11).to_bytes(2, "little")
         )
 
-    def _upload(self, image: bytes, initialise: Command, load: Command, began: int | None) -> None:
-        self._link.write(initialise, (0).to_bytes(2, "little") + len(image).to_bytes(4, "little"))
+    def _upload(self, number: int, image: bytes, half: int, began: int | None) -> None:
+        initialise, load = _LOAD[half]
+        self._link.write(initialise, number.to_bytes(2, "little") + len(image).to_bytes(4, "little"))
         for start in range(0, len(image), commands.LOAD_BYTES):
             blanked = began is not None and (self._blanking or began != self._blanked)
             if self._closing.is_set() or blanked:
@@ -358,6 +481,6 @@ _LOAD = (
 )
 
 
-def _configuration(*, patterns: int, repeats: int) -> bytes:
+def _configuration(*, patterns: int, shown: int) -> bytes:
     """Return how many patterns there are, and how many are shown; 0: without end (section 2.4.4.3.3)."""
-    return patterns.to_bytes(2, "little") + repeats.to_bytes(4, "little")
+    return patterns.to_bytes(2, "little") + shown.to_bytes(4, "little")

@@ -9,7 +9,7 @@ from pydantic import Field
 from drivers.camera import Roi, TriggerEdge, TriggerMode
 from drivers.common.buffered_camera import BufferedCamera
 from drivers.common.camera_settings import GainScale, GainUnit
-from drivers.device import DriverOptions, Setting
+from drivers.device import DriverOptions, OwnSetting, Setting
 from drivers.errors import DeviceError, LimitError
 from drivers.genicam.features import (
     AUTOMATICS,
@@ -119,6 +119,35 @@ class GenicamCamera(BufferedCamera):
         for name in self.options.features:
             made[f"feature.{name}"] = features.text(name)
         return made
+
+    def own_settings(self) -> Mapping[str, OwnSetting]:
+        """Return the features that ``bench.toml`` names: a camera has hundreds."""
+        self._require()
+        features, found = self._features, {}
+        for name in self.options.features:
+            kind = features.kind(name)
+            if kind == "number":
+                low, high = features.bounds(name)
+                found[name] = OwnSetting(features.text(name), f"{low:g} to {high:g}")
+            elif kind in ("choice", "switch"):
+                choices = features.entries(name) if kind == "choice" else ("true", "false")
+                found[name] = OwnSetting(features.text(name), ", ".join(choices), choices)
+        return found
+
+    def set_own(self, name: str, value: str) -> Setting:
+        """Set a feature that ``bench.toml`` names; errors as ``Features.set_any``."""
+        known = self.own_settings().get(name)
+        if known is None or (self._features.kind(name) == "switch" and value not in known.choices):
+            return super().set_own(name, value)
+        kind = self._features.kind(name)
+        try:
+            number = float(value) if kind == "number" else 0.0
+        except ValueError:
+            raise LimitError(self.name, f"takes no {name} {value!r}.", f"It takes {known.takes}.") from None
+        self._features.set_any(
+            name, number if kind == "number" else value == "true" if kind == "switch" else value
+        )
+        return self._features.text(name)
 
     # Exposure, gain, black level -------------------------------------------------------------------
     @property

@@ -17,7 +17,7 @@ from drivers.common.buffered_camera import BufferedCamera, RawFrame
 from drivers.common.camera_settings import GainScale, GainUnit
 from drivers.common.drops import FrameNumberCounter
 from drivers.common.pixels import Bytes, Pixels
-from drivers.device import DriverOptions, FoundDevice, Setting, SharedPart
+from drivers.device import DriverOptions, FoundDevice, OwnSetting, Setting, SharedPart
 from drivers.errors import DeviceError
 from drivers.micromanager.core import (
     MicroManagerDevice,
@@ -153,6 +153,20 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
         """Read all settings from the camera."""
         self._require()
         return self._common_settings() | self._camera.settings()
+
+    def own_settings(self) -> Mapping[str, OwnSetting]:
+        """Return the adapter's properties that the driver leaves alone."""
+        self._require()
+        told = self.options
+        own = (told.pixel_type_property, told.gain_property, told.black_level_property, "Exposure", "Binning")
+        modes = [name for mode in told.triggers.values() for name in mode]
+        return self._camera.own_settings({*own, *modes})
+
+    def set_own(self, name: str, value: str) -> Setting:
+        """Set a property of the adapter; errors as :meth:`Part.set`, and LimitError for the driver's own."""
+        if name not in self.own_settings():
+            return super().set_own(name, value)
+        return self._camera.set(name, value)
 
     # Exposure, gain, black level -------------------------------------------------------------------
     @property

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from drivers.device import Device, DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart
+from drivers.device import Device, DeviceIdentity, DriverOptions, FoundDevice, OwnSetting, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceNotOpenError, LimitError
 
 DOCS = "docs/how-to/devices/micromanager.md"
@@ -309,6 +309,17 @@ class Part:
     def settings(self) -> dict[str, Setting]:
         """Return every property with its value, as ``property.NAME``."""
         return {f"property.{name}": self.text(name) for name in self.properties}
+
+    def own_settings(self, without: Collection[str] = ()) -> dict[str, OwnSetting]:
+        """Return every property that can be set, but for some."""
+        found = {}
+        for name in self.properties:
+            if name in without or self.call(f"look at {name!r}", "isPropertyReadOnly", name):
+                continue
+            choices, bounds = self.choices(name), self.bounds(name)
+            takes = f"{bounds[0]:g} to {bounds[1]:g}" if bounds else ", ".join(choices) or "any text"
+            found[name] = OwnSetting(self.text(name), takes, choices)
+        return found
 
     def identity(self, kind: str) -> DeviceIdentity:
         """Return who the device is, as far as its adapter says."""

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
 from drivers.led_array import LedArray
 from drivers.remote.device import RemoteDevice, filled_in
+from drivers.remote.wire import LONGEST_ARRAYS
+from drivers.sequence import SequenceLimits
 from drivers.slm import Slm, read_only
 from drivers.stage import Stage
 
@@ -64,6 +69,23 @@ class RemoteSlm(RemoteDevice, Slm):
         """Show grey levels; the server has them confirmed when this returns."""
         self._ask("display", levels)
         self._shown = levels.copy()
+
+    @property
+    def sequence_limits(self) -> SequenceLimits | None:
+        """What sequences the SLM plays, and of these what one request can hold."""
+        limits: SequenceLimits | None = self._ask("sequence_limits")
+        if limits is None:
+            return None
+        fits = int(0.7 * LONGEST_ARRAYS) // int(np.prod(self.shape))  # three bytes are sent as four
+        return replace(limits, most=min(limits.most, fits))
+
+    def arm(self, patterns: Sequence[npt.NDArray[np.uint8]], period_ms: float, output: int = 0) -> float:
+        """Have the server arm a sequence; LimitError when it is too long for one request, too."""
+        self._check_sequence(len(patterns), period_ms, output)
+        for levels in patterns:
+            self._check(levels)
+        made: float = self._ask("arm", patterns, period_ms, output)
+        return made
 
     def blank(self) -> None:
         """Show all zeros."""

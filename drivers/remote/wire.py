@@ -21,6 +21,7 @@ import functools
 import inspect
 import io
 import json
+import math
 import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -56,6 +57,9 @@ NUMBER_HEADER = "Diffuserbench-Number"
 PROTOCOL = "diffuserbench"
 """WebSocket subprotocol; a browser, which can send no header, gives the token as a second one."""
 
+LONGEST_ARRAYS, LONGEST_REQUEST = 256 << 20, 16 << 20
+"""Bytes of the longest request that holds arrays, and of any other."""
+
 _AT_HOME = {"open", "close", "is_open", "name", "stream", "start_sequence", "next_frame", "next_frame_into"}
 _AT_HOME |= {"is_streaming", "frame_dtype", "single"}
 """What the computer that asks answers itself."""
@@ -88,9 +92,23 @@ class Values:
         """
         if not self.is_array:
             return self._adapter.validate_python(value)
-        array = np.load(io.BytesIO(base64.b64decode(value, validate=True)), allow_pickle=False)
+        array = _array(base64.b64decode(value, validate=True))
         array.flags.writeable = False
         return list(array) if self._is_list else array
+
+
+def _array(data: bytes) -> Any:
+    """Return an array from a file of NumPy's; ValueError where it is none, or of another size."""
+    file = io.BytesIO(data)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    version = np.lib.format.read_magic(file)
+    if version not in read:
+        raise ValueError(f"an array's file has version {version}")
+    shape, _, dtype = read[version](file)
+    said, there = math.prod(shape) * dtype.itemsize, len(data) - file.tell()
+    if said != there:
+        raise ValueError(f"an array of {shape} {dtype} has {said} bytes, and {there} came")
+    return np.load(io.BytesIO(data), allow_pickle=False)
 
 
 def plain(value: Any) -> Any:
@@ -124,6 +142,11 @@ class Call:
     takes: Mapping[str, Values]
     gives: Values
     function: FunctionType
+
+    @property
+    def longest_request(self) -> int:
+        """Bytes of the longest request that it takes."""
+        return LONGEST_ARRAYS if any(values.is_array for values in self.takes.values()) else LONGEST_REQUEST
 
     def named(self, device: Device, args: tuple[Any, ...], named: Mapping[str, Any]) -> dict[str, Any]:
         """Return arguments by name, as JSON has them."""

@@ -1,4 +1,4 @@
-"""The simulated holographic display: its world, and the camera, six-axis stage and SLM in it."""
+"""The simulated holographic display: its world, and the camera, six-axis stage, SLM and lasers in it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from pydantic import Field
 
 from drivers.common.stage_axes import AXIS_NAMES
 from drivers.device import DriverOptions, SharedPart
+from drivers.led_array import LedPattern
 from drivers.simulated.camera import SimulatedCamera
+from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
 from drivers.simulated.mechanics import AxisSpec
 from drivers.simulated.slm import SimulatedSlm, SlmOptions
 from drivers.simulated.stage import AxisOptions, CarriageStage, StageOptions, axis_spec
@@ -127,7 +129,8 @@ class DisplayWorld(Surroundings):
         self._slm: DisplaySlm | None = None
         self._stage: Callable[[], Mapping[str, float]] = dict
         self._slm_pitch_um = 8.0
-        self._optics: ScatteringDisplay | None = None
+        self._optics: dict[float, ScatteringDisplay] = {}
+        self._lasers: tuple[tuple[float, float], ...] = ()
         self._flatness: npt.NDArray[np.float32] | None = None
         self._image: tuple[Any, Image] | None = None
 
@@ -139,6 +142,10 @@ class DisplayWorld(Surroundings):
     def mount_mask(self, position: Callable[[], Mapping[str, float]]) -> None:
         """Put the mask on a stage: what tells the carriage's true position by axis name."""
         self._stage = position
+
+    def shine(self, lasers: tuple[tuple[float, float], ...]) -> None:
+        """Let lasers of other colours shine: of each the wavelength (nm) and its share of full light."""
+        self._lasers = lasers
 
     # What there is to see ---
     def pose(self) -> MaskPose:
@@ -154,19 +161,32 @@ class DisplayWorld(Surroundings):
         )
 
     def photons_per_s(self, weights: tuple[float, float, float], binning: int = 1) -> Image | None:
-        """Return electrons a second on every binned camera pixel now, or None when the laser is off."""
-        if not self.scene_lit or self._slm is None:
+        """Return electrons a second on every binned camera pixel now, or None when all lasers are off."""
+        if not self._shining or self._slm is None:
             return None
         with self._lock:
             key = self.light_key()
             if self._image is None or self._image[0] != key:
-                phase, amplitude = self._modulation(self._slm)
-                optics = self._scattering_display(phase.shape)
-                light = optics.irradiance(phase + self._flatness_map(phase.shape), self.pose(), amplitude)
-                light *= np.float32(self.options.light)
+                light = np.zeros(self.sensor.shape, np.float32)
+                for wavelength_nm, share in self._shining:
+                    light += np.float32(self.options.light * share) * self._seen(self._slm, wavelength_nm)
                 self._image = (key, light)
             image = self._image[1]
         return image if binning == 1 else block_sum(image, binning)
+
+    @property
+    def _shining(self) -> tuple[tuple[float, float], ...]:
+        """Wavelength and share of full light of every laser that is on."""
+        own = ((self.options.wavelength_nm, 1.0),) if self.scene_lit else ()
+        return own + self._lasers
+
+    def _seen(self, slm: DisplaySlm, wavelength_nm: float) -> Image:
+        """Return the light of one laser, 1 in the mean of the field without losses."""
+        # The same optical path at every wavelength; glass and liquid crystal without dispersion.
+        turns = self.options.wavelength_nm / wavelength_nm
+        phase, amplitude = self._modulation(slm)
+        optics = self._scattering_display(phase.shape, wavelength_nm)
+        return optics.irradiance((phase + self._flatness_map(phase.shape)) * turns, self.pose(), amplitude)
 
     def _modulation(self, slm: DisplaySlm) -> tuple[Image, Image]:
         """Return the phase that light gains at each pixel, and the part of its amplitude that returns."""
@@ -178,27 +198,30 @@ class DisplayWorld(Surroundings):
 
     def light_key(self) -> tuple[Any, ...]:
         """Return something that changes whenever :meth:`photons_per_s` does."""
-        if not self.scene_lit or self._slm is None:
+        if not self._shining or self._slm is None:
             return (False,)
-        return (True, hash(self._slm.displayed.tobytes()), self.pose())
+        return (*self._shining, hash(self._slm.displayed.tobytes()), self.pose())
 
-    def _scattering_display(self, slm_shape: tuple[int, ...]) -> ScatteringDisplay:
-        if self._optics is None:
+    def _scattering_display(self, slm_shape: tuple[int, ...], wavelength_nm: float) -> ScatteringDisplay:
+        if wavelength_nm not in self._optics:
             options = self.options
             height, width = (round(n * self._slm_pitch_um / options.mask_pitch_um) for n in slm_shape)
             bits = np.random.default_rng(options.mask_seed).integers(0, 2, (height, width), dtype=np.uint8)
+            own = options.model_dump(include={field.name for field in fields(DisplaySpec)})
+            turns = options.wavelength_nm / wavelength_nm
+            own |= {"wavelength_nm": wavelength_nm, "wavefront_rad": options.wavefront_rad * turns}
             spec = DisplaySpec(
                 slm_pitch_um=self._slm_pitch_um,
                 sensor_shape=self.sensor.shape,
                 sensor_pitch_um=self.sensor.pitch_um,
-                **options.model_dump(include={field.name for field in fields(DisplaySpec)}),
+                **own,
             )
             phase = (pi * options.mask_depth * options.masked) * bits
             if options.mask_roughness_rad > 0:
                 rough = np.random.default_rng(options.seed + 4).normal(size=phase.shape)
                 phase += options.mask_roughness_rad * rough
-            self._optics = ScatteringDisplay(spec, phase)
-        return self._optics
+            self._optics[wavelength_nm] = ScatteringDisplay(spec, phase * turns)
+        return self._optics[wavelength_nm]
 
     def _flatness_map(self, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
         """Return a smooth phase error of the SLM: random polynomials up to third order, radians."""
@@ -254,6 +277,7 @@ class DisplaySlm(SimulatedSlm):
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         super().__init__(options, shared)
+        self.mirrors = self.world.options.mirrors
         self.world.mount_slm(self)
 
 
@@ -261,3 +285,39 @@ class DisplayCamera(SimulatedCamera):
     """The camera behind the Fourier lens."""
 
     Shared = DisplayWorld
+
+
+class LaserOptions(LedArrayOptions):
+    """Options of the simulated display's lasers in ``bench.toml``."""
+
+    leds: int = Field(1, ge=1, le=1, description="One place, on the axis.")
+    wavelengths_nm: tuple[float, float, float] = Field(
+        (638.0, 520.0, 450.0), description="Of the red, the green and the blue one."
+    )
+
+
+class DisplayLasers(SimulatedLedArray):
+    """Three lasers on the axis of ``[simulated_display]``'s own, for pictures in colour: an array of one LED.
+
+    Their power is 0 to 255; full power is the light of the own laser.
+    """
+
+    Shared = DisplayWorld
+    Options = LaserOptions
+    model = "red, green and blue laser"
+    world: DisplayWorld  # type: ignore[assignment]  # which Shared makes sure of
+
+    def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
+        super().__init__(options, shared)
+        self._wavelengths_nm = LaserOptions.of(options).wavelengths_nm
+
+    @property
+    def wavelengths_nm(self) -> tuple[float, float, float]:
+        """Wavelengths of red, green and blue."""
+        return self._wavelengths_nm
+
+    def _show(self, pattern: LedPattern) -> None:
+        self._pattern = pattern
+        powers = dict(pattern.levels).get(0, (0, 0, 0))
+        lit = zip(self._wavelengths_nm, powers, strict=True)
+        self.world.shine(tuple((nm, power / 255) for nm, power in lit if power))

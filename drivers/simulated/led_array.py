@@ -42,7 +42,7 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
     kind = "led_array"
     Shared: ClassVar[type[Surroundings]] = SimulatedWorld
     model = "round LED array"
-    Options = LedArrayOptions
+    Options: ClassVar[type[LedArrayOptions]] = LedArrayOptions
     world: SimulatedWorld
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:

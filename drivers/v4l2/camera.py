@@ -16,7 +16,7 @@ from drivers.common.buffered_camera import BufferedCamera, RawFrame
 from drivers.common.camera_settings import GainScale, GainUnit
 from drivers.common.drops import FrameNumberCounter
 from drivers.common.pixels import Bytes, Pixels
-from drivers.device import DriverOptions, FoundDevice, Setting, SharedPart, port_claim
+from drivers.device import DriverOptions, FoundDevice, OwnSetting, Setting, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceLostError, LimitError
 from drivers.registry.buses import lasting_name, video_devices
 from drivers.v4l2 import api
@@ -200,6 +200,32 @@ class V4l2Camera(BufferedCamera):
         if not self._connected:
             self._require()
         return self._controls.set(self._controls.named(name), value)
+
+    def own_settings(self) -> Mapping[str, OwnSetting]:
+        """Return the controls that can be set, but for what the driver looks after."""
+        self._require()
+        own = (self._exposure_control, self._gain_control, self._black_control)
+        taken = {quantity.control.name for quantity in own if quantity}
+        found = {}
+        for control in self._controls.settable():
+            if control.name not in taken:
+                choices = tuple(f"{value} ({text})" for value, text in control.menu.items())
+                found[control.name] = OwnSetting(self._controls.text(control), control.range_text, choices)
+        return found
+
+    def set_own(self, name: str, value: str) -> Setting:
+        """Set a control by its name: a whole number, of a menu with its text or without."""
+        known = self.own_settings().get(name)
+        if known is None:
+            return super().set_own(name, value)
+        try:
+            number = int(value.split()[0], 0)
+        except (IndexError, ValueError):
+            raise LimitError(
+                self.name, f"control {name} does not take {value!r}.", f"It takes {known.takes}."
+            ) from None
+        self.set_control(name, number)
+        return self._controls.text(self._controls.named(name))
 
     # Exposure, gain, black level -------------------------------------------------------------------
     def _read_exposure(self) -> float:

@@ -128,6 +128,17 @@ class Controls:
                 f"It has {', '.join(sorted(self.by_name)) or 'none'}.",
             ) from None
 
+    def settable(self) -> list[Control]:
+        """Return the controls that hold a number to be read and set, but for the automatics."""
+        barred = api.CTRL_FLAG_READ_ONLY | api.CTRL_FLAG_INACTIVE
+        return [
+            control
+            for control in self.by_name.values()
+            if control.readable
+            and not control.flags & barred
+            and control.id not in (*_AUTOMATICS, api.CID_EXPOSURE_AUTO)
+        ]
+
     def switch_automatics_off(self) -> None:
         """Have nothing set by the camera itself; say what it did set until now.
 

@@ -18,6 +18,7 @@ from gui.jobs import JobContext
 from gui.widgets.building import button, fill, in_row, label, scrolled, share_bar
 from instrument.files.errors import BenchError
 from instrument.reconstruction.checkpointing import checkpoint_for, require_kept, settle_checkpoint
+from instrument.reconstruction.forecast import Foretold
 from instrument.reconstruction.job import Job as Prepared
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
 from instrument.reconstruction.request import (
@@ -293,15 +294,25 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
     history: list[IterationRecord] = []
     share, note = 0.0, ""
 
+    expected = ""
+
+    def told(words: str) -> None:
+        nonlocal expected
+        expected = f"; {words}"
+
+    foretold = Foretold(told)
+
     def watch(record: IterationRecord, present: Callable[[], npt.NDArray[np.float32]]) -> None:
         history.append(record)
+        foretold.watch(record, present)
         # Of a picture its only plane.
         context.offer(lambda: SoFar(share, note, prepared, np.array(present().max(axis=0)), tuple(history)))
 
     def stage(done: float, what: str) -> None:
         nonlocal share, note
-        share, note = done, what
-        context.offer(lambda: SoFar(done, what, prepared, None, tuple(history)))
+        foretold.stage(done, what)
+        share, note = done, what + expected
+        context.offer(lambda: SoFar(share, note, prepared, None, tuple(history)))
 
     if isinstance(request, VolumeRequest):
         volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_stage=stage)

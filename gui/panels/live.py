@@ -21,6 +21,7 @@ from gui.widgets.camera_controls import CameraForm, RecordBar
 from gui.widgets.entry import NumberEdit
 from gui.widgets.live_picture import LivePicture
 from instrument.bench.photograph import (
+    PHOTOGRAPHS,
     LightState,
     check_photograph_file,
     led_pattern,
@@ -268,7 +269,7 @@ class LivePanel(Panel):
             self.average.setFocus()
             return
         bench, average = self.session.bench, int(self.average.value or 1)
-        target = self.session.runs_folder / "photographs" / photograph_name()
+        target = self.session.runs_folder / PHOTOGRAPHS / photograph_name()
 
         def work(context: JobContext) -> None:
             target.parent.mkdir(parents=True, exist_ok=True)

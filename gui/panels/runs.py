@@ -1,23 +1,19 @@
-"""Past runs: what became of each, its frames, its calibration's verdict; those that did not end go on."""
+"""Past runs and photographs: what became of each, its frames, its calibration's verdict, the way on."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy.typing as npt
 from PySide6.QtCore import QFileSystemWatcher, QSignalBlocker, Qt, QUrl
 from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import QSlider, QTableWidget, QWidget
 
-from calibration_routines.plan_procedures import ResumeProcedure, can_go_on
+from calibration_routines.plan_procedures import ResumeProcedure
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
 from gui.panel import Panel
 from gui.procedure_run import ProcedureRun, RunBar, script
+from gui.run_looks import Opened, Picture, look_into, read_frame
 from gui.session import BenchSession
 from gui.widgets.building import (
     Hint,
@@ -32,12 +28,12 @@ from gui.widgets.building import (
     table,
     text_view,
 )
-from gui.widgets.image_view import ImageView, usual_levels
+from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import follow_orientation
-from instrument.bench.photograph import Progress
+from instrument.bench.photograph import PHOTOGRAPHS
 from instrument.files.errors import count
-from instrument.runs.inspection import RunSummary, Verification, run_paths, summary, verify
-from instrument.runs.run import Run, RunCondition
+from instrument.runs.inspection import RunSummary, runs_and_photographs, summary
+from instrument.runs.run import RunCondition
 from recon.base.declare import Imports, expression
 
 _COLUMNS = ("run", "became", "frames", "kind", "bench")
@@ -45,36 +41,14 @@ _REST_MS = 500
 """Rest after a change in the folder before it is read."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Opened:
-    """A run that was read."""
-
-    run: Run
-    stored: list[int]
-    about: list[str]
-    can_resume: bool
-    is_usable: bool
-
-
-@dataclass(frozen=True, slots=True)
-class _Picture:
-    """A frame that was read, with its levels and what is said of it."""
-
-    image: npt.NDArray[Any]
-    low: float
-    high: float
-    full_scale: int
-    words: str
-
-
 class RunsPanel(Panel):
-    """A list of runs, the newest first; a click opens one."""
+    """A list of runs and photographs, the newest first; a click opens one."""
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.run = ProcedureRun(session, self)
         self.summaries: list[RunSummary] = []
-        self.opened: Run | None = None
+        self.opened: Opened | None = None
         self._opening: Path | None = None
         self._stored: list[int] = []
         self._can_resume = False
@@ -111,11 +85,12 @@ class RunsPanel(Panel):
     def read_folder(self) -> None:
         """Read the folder of runs again, in a job."""
         folder = self.session.runs_folder
-        if folder.is_dir() and str(folder) not in self._watcher.directories():
-            self._watcher.addPath(str(folder))
+        for watched in (folder, folder / PHOTOGRAPHS):
+            if watched.is_dir() and str(watched) not in self._watcher.directories():
+                self._watcher.addPath(str(watched))
 
         def read() -> list[RunSummary]:  # not to its end where the program ends
-            return [summary(path) for path in reversed(run_paths(folder)) if not self.session.is_closing]
+            return [summary(path) for path in runs_and_photographs(folder) if not self.session.is_closing]
 
         self._lister.ask(read, self._show_list)
 
@@ -123,14 +98,14 @@ class RunsPanel(Panel):
         """Show a run, as soon as it is read."""
         self._close_run(f"Reading {path.name} …")
         self._opening = path
-        self._reader.ask(lambda: _look_into(path), self._show_run)
+        self._reader.ask(lambda: look_into(path), self._show_run)
 
-    def _show_run(self, opened: _Opened | str) -> None:
+    def _show_run(self, opened: Opened | str) -> None:
         self._opening = None
         if isinstance(opened, str):
             self._close_run(opened)
             return
-        self.opened = opened.run
+        self.opened = opened
         middle = len(opened.stored) // 2  # the first ones are dark
         with QSignalBlocker(self.slider):
             self.slider.setEnabled(len(opened.stored) > 1)
@@ -141,10 +116,12 @@ class RunsPanel(Panel):
         self._can_resume = opened.can_resume
         self.bar.set_startable("" if self._can_resume else "There is nothing to go on with.")
         self.folder_button.setEnabled(True)
-        self.verify_button.setEnabled(True)
+        run = opened.run
+        self.verify_button.setEnabled(run is not None)
         self.use_button.setEnabled(opened.is_usable)
-        self.play_button.setEnabled(opened.run.plan is None and bool(opened.stored))
-        self.export_button.setEnabled(bool(opened.stored))
+        self.use_button.setText("Reconstruct with it…" if run is not None else "Reconstruct it…")
+        self.play_button.setEnabled(run is not None and run.plan is None and bool(opened.stored))
+        self.export_button.setEnabled(run is not None and bool(opened.stored))
         self._show_frame(middle)
 
     def as_python(self) -> str:
@@ -152,7 +129,10 @@ class RunsPanel(Panel):
         opened, imports = self.opened, Imports()
         if opened is not None and self._can_resume:
             return script(ResumeProcedure(opened.path), self.session.config.path)
-        if opened is not None:
+        if opened is not None and opened.run is None:
+            imports.names.add(("instrument.bench.photograph", "read_snapshot"))
+            lines = [f"taken = read_snapshot({expression(opened.path, imports)})", "print(taken.metadata)"]
+        elif opened is not None:
             imports.names.add(("instrument.runs.run", "Run"))
             lines = [
                 f"run = Run.open({expression(opened.path, imports)})",
@@ -182,7 +162,7 @@ class RunsPanel(Panel):
 
     # Making --------------------------------------------------------------------------------------
     def _make_list(self) -> None:
-        self.table = table(_COLUMNS, "Click a run to open it", wide=0, row_px=26)
+        self.table = table(_COLUMNS, "Click a run or photograph to open it", wide=0, row_px=26)
         self.table.setSelectionMode(QTableWidget.SelectionMode.SingleSelection)
         # What distinguishes runs of a day stands at the end of their names.
         self.table.setTextElideMode(Qt.TextElideMode.ElideMiddle)
@@ -190,7 +170,7 @@ class RunsPanel(Panel):
         self.table.currentCellChanged.connect(lambda row, *_: self._row_chosen(row))
         self.where = label(role="dim", selectable=True, yields=True)
         self.hint = Hint(
-            "No run yet: each calibration, plan and recording becomes one.",
+            "No run yet: each calibration, plan, recording and photograph is listed here.",
             "Calibrate…",
             lambda: self.session.handed_on.emit("sweeps", ""),
         )
@@ -211,7 +191,7 @@ class RunsPanel(Panel):
         self.bar.start.connect(self.resume)
         tip = "Show the run's files in the file manager"
         self.folder_button = button("Open folder", tip, self._open_folder, enabled=False)
-        tip = "Reconstruct photographs with this run's calibration"
+        tip = "Reconstruct photographs with this run's calibration, or this photograph"
         self.use_button = button("Reconstruct with it…", tip, self._use, enabled=False)
         tip = "Play it as a film, follow regions, reconstruct it as a video"
         self.play_button = button("Play as a film…", tip, self._play, enabled=False)
@@ -225,7 +205,10 @@ class RunsPanel(Panel):
         wanted = self._wanted or self._opening or (self.opened and self.opened.path)
         self.summaries = summaries
         folder = self.session.runs_folder
-        self.where.setText(f"{count(len(summaries), 'run')} in {folder.name} of {folder.parent.name}")
+        photographs = sum(listed.is_photograph for listed in summaries)
+        said = count(len(summaries) - photographs, "run")
+        said += f" and {count(photographs, 'photograph')}" if photographs else ""
+        self.where.setText(f"{said} in {folder.name} of {folder.parent.name}")
         self.where.setToolTip(str(folder))
         self.hint.setVisible(not summaries)
         self.table.setVisible(bool(summaries))
@@ -238,7 +221,7 @@ class RunsPanel(Panel):
                     listed.path.name,
                     listed.became,
                     f"{listed.stored} of {listed.frames}",
-                    "recording" if listed.is_recording else "plan",
+                    listed.kind,
                     "SIMULATED" if listed.is_simulated else "",
                 )
                 for place, text in enumerate(texts):
@@ -274,15 +257,15 @@ class RunsPanel(Panel):
             each.setEnabled(False)
 
     def _show_frame(self, number: int) -> None:
-        run = self.opened
-        if run is None or not self._stored:
+        opened = self.opened
+        if opened is None or not self._stored:
             self.view.clear()
-            self.frame_words.setText("No frames." if run is not None else "")
+            self.frame_words.setText("No frames." if opened is not None else "")
             return
         index = self._stored[min(number, len(self._stored) - 1)]
-        self._reader.ask(lambda: _read_frame(run, index), self._frame_read)
+        self._reader.ask(lambda: read_frame(opened, index), self._frame_read)
 
-    def _frame_read(self, frame: _Picture | str) -> None:
+    def _frame_read(self, frame: Picture | str) -> None:
         if isinstance(frame, str):
             self.frame_words.setText(frame)
         else:
@@ -290,8 +273,9 @@ class RunsPanel(Panel):
             self.frame_words.setText(frame.words)
 
     def _use(self) -> None:
-        if self.opened is not None:
-            self.session.handed_on.emit("reconstructions", SWEEP.kept(self.opened.path))
+        if (opened := self.opened) is not None:
+            what = opened.path if opened.run is None else SWEEP.kept(opened.path)
+            self.session.handed_on.emit("reconstructions", what)
 
     def _play(self) -> None:
         if self.opened is not None:
@@ -313,11 +297,11 @@ class RunsPanel(Panel):
             if self.session.is_closing or self.opened is None or self.opened.path != path:
                 raise InterruptedError
 
-        self._verifier.ask(lambda: _look_into(path, read=True, on_progress=watch), self._show_run)
+        self._verifier.ask(lambda: look_into(path, read=True, on_progress=watch), self._show_run)
 
     def _open_folder(self) -> None:
         if self.opened is not None:
-            QDesktopServices.openUrl(QUrl.fromLocalFile(str(self.opened.path)))
+            QDesktopServices.openUrl(QUrl.fromLocalFile(str(self.opened.folder)))
 
     def _over(self) -> None:
         self.bar.set_running(False)
@@ -325,80 +309,3 @@ class RunsPanel(Panel):
         if self.opened is not None:
             self._wanted = self.opened.path
         self.read_folder()
-
-
-def _look_into(path: Path, *, read: bool = False, on_progress: Progress | None = None) -> _Opened | str:
-    """Read a run, and with ``read`` every frame of it; the reason where it cannot be read."""
-    try:
-        run = Run.open(path)
-        looked = verify(run, on_progress, read=read)
-        about = _about(run, looked)
-        if read:
-            about.insert(2, f"{looked.frames} frames read back: {'sound' if looked.is_sound else 'DAMAGED'}")
-        return _Opened(run, sorted(run.records), about, can_go_on(run, looked), SWEEP.kept(path).is_dir())
-    except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is shown
-        return str(error)
-
-
-def _read_frame(run: Run, index: int) -> _Picture | str:
-    """Read a frame; the reason where it cannot be read."""
-    try:
-        image, metadata = run.frame(index), run.metadata(index)
-    except Exception as error:  # noqa: BLE001 - a damaged file is named, whatever it raises
-        return str(error)
-    low, high = usual_levels(image)
-    words = [
-        f"Frame {index} of {run.n_frames}",
-        f"{metadata.utc.astimezone():%Y-%m-%d %H:%M:%S}",
-        f"{metadata.exposure_ms:.4g} ms",
-        metadata.led_pattern or "",
-    ]
-    place = ", ".join(_axis_words(axis, value) for axis, value in (metadata.stage_position or {}).items())
-    return _Picture(
-        image,
-        low,
-        high,
-        (1 << metadata.significant_bits) - 1,
-        ", ".join(word for word in (*words, place) if word),
-    )
-
-
-def _axis_words(axis: str, value: float) -> str:
-    """Return an axis' name without its unit, and its value with it: ``x 100 µm``."""
-    name, _, unit = axis.rpartition("_")
-    return f"{name} {value:g} {unit.replace('um', 'µm')}" if name else f"{axis} {value:g}"
-
-
-def _about(run: Run, looked: Verification) -> list[str]:
-    """Return what is known of a run, a line each."""
-    lines = [str(run.path), f"{run.condition}: {len(run.records)} of {run.n_frames} frames"]
-    lines[1] += "  SIMULATED" if run.is_simulated else ""
-    if run.error:
-        lines.append(run.error)
-    lines += [f"DAMAGED: {line}" for line in looked.lines()]
-    lines += [looked.remedy().replace("diffuserbench resume", "Resume")] if looked.remedy() else []
-    if run.plan is not None:
-        parts: dict[str, int] = {}
-        for part in run.plan.parts:
-            parts[part.label] = parts.get(part.label, 0) + len(part)
-        lines.append(f"Plan {run.plan.label}: " + ", ".join(f"{n} {label}" for label, n in parts.items()))
-    devices = run.provenance.get("devices")
-    if isinstance(devices, Mapping):
-        lines += [f"{kind}: {identity}" for kind, identity in devices.items()]
-    if SWEEP.is_of(run.path):
-        lines += _calibration_lines(run.path)
-    return lines
-
-
-def _calibration_lines(run: Path) -> list[str]:
-    file = SWEEP.kept(run) / "calibration.json"
-    if not file.is_file():
-        return ["A sweep without its calibration: Resume makes it."]
-    try:
-        quality: dict[str, Any] = json.loads(file.read_text("utf-8"))["quality"]
-        psfs = quality["psfs"]
-        findings = [f"z = {q['z_um'] / 1e3:.4g} mm: {text}" for q in psfs for text in q["findings"]]
-        verdict = "good" if quality["good"] else "with findings"
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        return [f"Calibration {file.parent} cannot be read: {error!r}"]
-    return [f"Calibration {file.parent}: {len(psfs)} PSFs, {verdict}", *findings]

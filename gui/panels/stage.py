@@ -16,9 +16,10 @@ from gui.panel import DevicePanel, on_bench
 from gui.session import BenchSession
 from gui.widgets.building import button, fill, in_column, in_row, label, mark, share_bar
 from gui.widgets.dialogues import Question
-from gui.widgets.entry import NumberEdit, grouped
+from gui.widgets.entry import NumberEdit, grouped, quantity
 from gui.widgets.image_view import step_factor
 from gui.widgets.kept_bar import KeptBar
+from instrument.plan import Plan
 from recon.base.declare import Imports
 
 _STEPS = {"um": 100.0, "mrad": 1.0}
@@ -99,12 +100,25 @@ class StagePanel(DevicePanel):
         self._here: dict[str, float] | None = None
         """Where the stage said that it is."""
         self.places = KeptBar(session, "places", "Places", lambda: self._here, self._go_to, "Go")
+        tip = "Make a plan that takes a frame of the lit scene at every place: look at it, then start it"
+        self.all_button = button("Photograph all places…", tip, self.photograph_all)
+        session.kept_changed.connect(self._places_changed)
+        self._places_changed()
         self._grid = QGridLayout()
         self._grid.setHorizontalSpacing(6)
         self._grid.setColumnStretch(2, 1)
         self._step_row = in_row()
         pad = in_row((self.pad, 1), self.home_button)
-        fill(self.body, self.state, self._grid, self._step_row, self.places, pad, None)
+        fill(
+            self.body,
+            self.state,
+            self._grid,
+            self._step_row,
+            self.places,
+            in_row(None, self.all_button),
+            pad,
+            None,
+        )
         self.watch_device(self.state)
 
     # Panel ---------------------------------------------------------------------------------------
@@ -133,7 +147,7 @@ class StagePanel(DevicePanel):
             position.setToolTip(f"Where the stage says that {letter} is")
             gauge = share_bar(_GAUGE)
             gauge.setFixedHeight(6)
-            limits = f"{axis.lower_limit:g} to {axis.upper_limit:g} {unit}"
+            limits = f"{quantity(axis.lower_limit, unit, 6)} to {quantity(axis.upper_limit, unit, 6)}"
             gauge.setToolTip(f"Place between the soft limits: {limits}")
             target = NumberEdit(
                 unit,
@@ -150,8 +164,8 @@ class StagePanel(DevicePanel):
             )
             minus.setFixedWidth(34)
             plus.setFixedWidth(34)
-            limit = label(f"{grouped(f'{axis.lower_limit:g}')} … {grouped(f'{axis.upper_limit:g}')}", "dim")
-            limit.setToolTip(f"Soft limits, {unit}")
+            limit = label(limits.replace(" to ", " … "), "dim")
+            limit.setToolTip("Soft limits")
             self._grid.addWidget(label(letter, "value"), number, 0)
             self._grid.addLayout(in_column(gauge, limit, spacing=1), number, 2)
             for place, widget in {1: position, 3: minus, 4: target, 5: plus}.items():
@@ -180,7 +194,7 @@ class StagePanel(DevicePanel):
         self._here = position
         for name, row in self.rows.items():
             here = position[name]
-            row.position.setText(f"{grouped(f'{here:.1f}')} {_words(row.axis.unit)}")
+            row.position.setText(_place(here, row.target.shown_unit))
             travel = row.axis.upper_limit - row.axis.lower_limit
             row.gauge.setValue(round(_GAUGE * (here - row.axis.lower_limit) / travel) if travel else 0)
             if row.target.value is None or not row.target.hasFocus():
@@ -207,18 +221,36 @@ class StagePanel(DevicePanel):
             field.setFocus()
             return
         delta = steps * (field.value or 0.0)
-        words = f"Jog {letter} by {delta:g} {_words(row.axis.unit)}"
+        words = f"Jog {letter} by {quantity(delta, row.axis.unit, 6)}"
         self._start(words, {row.axis.name: delta}, relative=True)
 
     def _go_to(self, name: str, place: dict[str, float]) -> None:
         self._start(f"Move to {name}", place, relative=False)
+
+    def _places_changed(self) -> None:
+        self.all_button.setEnabled(bool(self.session.kept.of("places")))
+
+    def photograph_all(self) -> None:
+        """Hand a plan on that takes a frame at every place that is kept."""
+        kept = self.session.kept.of("places")
+        parts = [
+            {
+                "label": name.replace("/", "-"),
+                "positions": {"kind": "stage", "points": [place]},
+                "scene_lit": True,
+            }
+            for name, place in sorted(kept.items())
+        ]
+        plan = self.asked(lambda: Plan.checked({"label": "places", "parts": parts}, "the places"))
+        if plan is not None:
+            self.session.handed_on.emit("sweeps", plan)
 
     def _jog_clicked(self, letter: str, sign: int, _checked: bool = False) -> None:
         self.jog(letter, sign)
 
     def _move_to(self, name: str, value: float) -> None:
         row = self.rows[name]
-        words = f"Move {name.rpartition('_')[0] or name} to {value:g} {_words(row.axis.unit)}"
+        words = f"Move {name.rpartition('_')[0] or name} to {quantity(value, row.axis.unit, 6)}"
         job = self._start(words, {name: value}, relative=False)
         if job is not None:
             job.failed.connect(row.target.refuse)
@@ -258,3 +290,8 @@ class StagePanel(DevicePanel):
 
 def _words(unit: str) -> str:
     return {"um": "µm"}.get(unit, unit)
+
+
+def _place(here: float, unit: str) -> str:
+    """Return where an axis is, to a tenth of a micrometre or milliradian, in the unit of its target."""
+    return f"{here / 1e3:.4f} mm" if unit == "mm" else f"{grouped(f'{here:.1f}')} {unit}"

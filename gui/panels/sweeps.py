@@ -105,6 +105,14 @@ class SweepsPanel(ProcedurePanel):
         self._reader = NewestOnly(self.jobs, "Reading")
         self._plan_file: Path | None = None
 
+    def take(self, what: str | Plan) -> None:
+        """Choose a routine, by its name, or put a plan into the form."""
+        if isinstance(what, str):
+            super().take(what)
+            return
+        super().take(PLAN.name)
+        self.views[PLAN.name].set_values({"text": plan_toml(what)})
+
     def show_outlook(self, outlook: Outlook) -> None:
         """Draw the path besides the words."""
         super().show_outlook(outlook)

@@ -19,7 +19,7 @@ from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
 from gui.widgets.building import button, every, fill, in_row, label
-from gui.widgets.dialogues import TextWindow
+from gui.widgets.device_settings import DeviceSettings
 from gui.widgets.entry import Entry, NumberEdit
 from gui.widgets.kept_bar import KeptBar
 from instrument.bench.camera_settings import CameraOptions, CameraState, read_camera, restore_camera
@@ -32,6 +32,8 @@ from instrument.runs.run import Run
 from recon.base.declare import options_of
 
 _READ_BACK_MS = 3000
+_FIRST_READ_MS = 100
+"""Until the camera has told its settings and limits: nothing can be set before."""
 _WHILE_RUNNING = ("exposure_ms", "gain")
 """What is set while the stream runs; for the others it pauses."""
 _OFFERED = {
@@ -75,13 +77,13 @@ class CameraForm(QWidget):
         self.temperature = label("–")
         self.temperature.setToolTip("Of the sensor or camera, degrees Celsius, where it has a thermometer")
         self._temperature_name = label("Temperature")
-        tip = "Everything that the camera reports of itself"
+        tip = "Everything that the camera reports of itself; its own settings can be changed there"
         self.all_button = button("All settings …", tip, self._show_all)
         self.presets = KeptBar(self._session, "camera", "Presets", self._preset, self._use_preset, "Use")
         last = in_row(self._temperature_name, (self.temperature, 1), self.all_button)
         fill(self, self.form, self.presets, last)
         self._session.device_changed.connect(self._device_changed)
-        every(self, _READ_BACK_MS, self.read_back)
+        self._reads = every(self, _FIRST_READ_MS, self.read_back)
         self._device_changed("camera")
 
     def read_back(self) -> None:
@@ -188,14 +190,17 @@ class CameraForm(QWidget):
 
     def _device_changed(self, kind: str) -> None:
         if kind == "camera":
-            self.setEnabled(self._session.is_open("camera"))
+            self.setEnabled(self._session.is_open("camera") and self.state is not None)
             self.read_back()
 
     def _show(self, state: CameraState | None) -> None:
         """Show what was read back."""
         if state is None:
             return
+        if self.state is None:
+            self._reads.setInterval(_READ_BACK_MS)
         self.state = state
+        self.setEnabled(self._session.is_open("camera"))
         for name, limits in (("exposure_ms", state.exposure_limits_ms), ("gain", state.gain_limits)):
             number = self.form.fields[name]
             assert isinstance(number, NumberField)
@@ -218,7 +223,7 @@ class CameraForm(QWidget):
     def _show_all(self) -> None:
         if self.state is not None:
             lines = "\n".join(f"{name} = {value}" for name, value in sorted(self.state.settings.items()))
-            TextWindow("Settings of the camera, as read back", lines, self).show()
+            DeviceSettings(self._session, "camera", lines, self).show()
 
 
 _DISK_MS = 5000
@@ -257,8 +262,12 @@ class RecordBar(QWidget):
         self.gauge.setFixedWidth(150)
         self.gauge.setRange(0, 1000)
         self.gauge.setFormat("…")
-        self.note = label()
-        fill(self, self.button, self.seconds, self.label, self.gauge, (self.note, 1), across=True)
+        self.note = label(yields=True)
+        self._taken: Path | None = None
+        self.look_button = button("Look at it…", "Show the recording, as far as it came", self._look_at_it)
+        self.look_button.hide()
+        parts = (self.button, self.seconds, self.label, self.gauge, (self.note, 1), self.look_button)
+        fill(self, *parts, across=True)
         every(self, _DISK_MS, self._look_at_disk)
         self._look_at_disk()
 
@@ -284,7 +293,7 @@ class RecordBar(QWidget):
             recorder = prepare_recording(
                 session.bench, session.runs_folder, label=label, seconds=seconds, on_progress=context.report
             )
-            self._recorder = recorder
+            self._recorder, self._taken = recorder, recorder.path
             with session.live.watching(recorder.newest):
                 run = recorder.execute()
             context.check()
@@ -294,10 +303,14 @@ class RecordBar(QWidget):
         job = self._panel.begin(lambda: session.exclusive_job("Recording", work), self.button)
         if job is None:
             return
-        self.job = job
+        self.job, self._taken = job, None
+        self.note.clear()
+        self.look_button.hide()
         self.button.setText("■ End")
         job.progressed.connect(self._show)
         job.succeeded.connect(self._done)
+        job.failed.connect(lambda _: self._ended_early("by a fault"))
+        job.cancelled.connect(lambda _: self._ended_early("before its time"))
         job.ended.connect(self._ended)
 
     def _show(self, status: RecordingStatus) -> None:
@@ -319,9 +332,20 @@ class RecordBar(QWidget):
         self._session.log("info", f"Recorded {len(run.records)} frames: {run.path}")
         self._session.run_finished.emit(run.path)
 
+    def _ended_early(self, how: str) -> None:
+        """Say what is kept of a recording that was broken off."""
+        if self._taken is not None:
+            kept = self.note.text().partition(" · ")[0] or "no frame yet"
+            self.note.setText(f"Ended {how} ({kept}); what was taken is kept in {self._taken.name}")
+            self._session.run_finished.emit(self._taken)
+
+    def _look_at_it(self) -> None:
+        self._session.handed_on.emit("runs", self._taken)
+
     def _ended(self) -> None:
         self.job, self._recorder = None, None
         self.button.setText("● Record")
+        self.look_button.setVisible(self._taken is not None)
         self._look_at_disk()
 
     def _look_at_disk(self) -> None:

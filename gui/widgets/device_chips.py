@@ -11,7 +11,8 @@ from gui.session_news import name_of
 from gui.theme import colours
 from gui.way_on import ReconnectButton
 from gui.widgets.building import fill, label
-from gui.widgets.dialogues import TextWindow
+from gui.widgets.device_settings import DeviceSettings
+from instrument.bench.config import Kind
 
 
 class DeviceChips(QWidget):
@@ -50,6 +51,6 @@ class DeviceChips(QWidget):
         for kind in self.chips:
             self.show_state(kind)
 
-    def _show_all(self, kind: str) -> None:
+    def _show_all(self, kind: Kind) -> None:
         state = self._session.state(kind)
-        TextWindow(name_of(kind), state.text or state.condition, self).show()
+        DeviceSettings(self._session, kind, state.text or state.condition, self).show()

@@ -135,6 +135,9 @@ def existing_path(text: str) -> Path:
 
 _LENGTHS_UM = {"nm": 1e-3, "um": 1.0, "µm": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _TIMES_MS = {"us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
+_MM_UM = 1e3
+_LONG_UM = 1e4
+"""A field whose numbers may reach this far shows millimetres."""
 _LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZµ×%/° "
 
 
@@ -151,6 +154,17 @@ def grouped(digits: str) -> str:
     return f"{int(whole):,}".replace(",", THIN) + point + rest
 
 
+def quantity(value: float, unit: str, digits: int = 4) -> str:
+    """Return a number with its unit as people read it: lengths from 1 mm on in mm, thousands apart."""
+    unit = "µm" if unit == "um" else unit
+    if unit == "µm" and abs(value) >= _MM_UM:
+        value, unit = value / _MM_UM, "mm"
+    written = f"{value:.{digits}g}"
+    if "e+" in written:
+        written = f"{value:.0f}"
+    return f"{grouped(written)} {unit}".strip()
+
+
 def _factor(typed: str, unit: str) -> float | None:
     """Return what a number in a typed unit is multiplied with to be in another; None where that is none."""
     for scale in (_LENGTHS_UM, _TIMES_MS):
@@ -162,7 +176,9 @@ def _factor(typed: str, unit: str) -> float | None:
 class NumberEdit(_Refusing):
     """A field for one number: ``12.5 ms``. Enter or leaving it submits; Up and Down step by a tenth.
 
-    Lengths and times may be typed in another unit than the field's: ``2 s`` where it has milliseconds.
+    Lengths and times may be typed in another unit than the field's: ``2 s`` where it has milliseconds. One
+    for micrometres shows millimetres where its limits are far apart, or where what it shows first is 1 mm or
+    more; a number typed without a unit is in the one that the field shows, which stays while one types.
 
     A value that is none, or outside the limits, is refused where it stands, with the reason as tool tip; what
     was typed stays to be corrected. Nothing is ever clipped.
@@ -202,6 +218,8 @@ class NumberEdit(_Refusing):
     ) -> None:
         super().__init__()
         self.unit = unit
+        self._shown = ""
+        """The unit in the field; empty until there is something to choose it by."""
         self.minimum, self.maximum = minimum, maximum
         self.check: Callable[[float], str] | None = None
         """Further says of a number why it cannot be; empty where it can."""
@@ -219,6 +237,20 @@ class NumberEdit(_Refusing):
         """The last number that was accepted or set."""
         return self._value
 
+    @property
+    def shown_unit(self) -> str:
+        """The unit that stands in the field, and that a number typed without one is in."""
+        return self._shown or self.unit
+
+    def _choose_unit(self) -> None:
+        if self.unit != "µm" or self._shown:
+            return
+        farthest = max(
+            (abs(limit) for limit in (self.minimum, self.maximum) if math.isfinite(limit)), default=0.0
+        )
+        if farthest >= _LONG_UM or self._value is not None:
+            self._shown = "mm" if max(farthest / 10, abs(self._value or 0.0)) >= _MM_UM else "µm"
+
     def typed(self) -> tuple[float | None, str]:
         """Return the number as it stands in the field, submitted or not, and why it is refused if it is.
 
@@ -229,13 +261,14 @@ class NumberEdit(_Refusing):
             return None, "" if self.placeholderText() else "A number is needed."
         digits = text.replace(THIN, "").rstrip(_LETTERS).strip()
         typed = text.replace(THIN, "")[len(digits) :].strip() if digits else ""
-        factor: float | None = 1.0 if typed in ("", self.unit) else _factor(typed, self.unit)
+        typed = typed or self.shown_unit
+        factor: float | None = 1.0 if typed == self.unit else _factor(typed, self.unit)
         try:
             number = float(digits.replace(",", "."))
         except ValueError:
             factor = None
         if factor is None:
-            return None, f"{text!r} is no number{f' of {self.unit}' if self.unit else ''}."
+            return None, f"{text!r} is no number{f' of {self.shown_unit}' if self.unit else ''}."
         # 2 cm are 20 mm, not 20.000000000000004.
         number = float(f"{number * factor:.15g}")
         if not math.isfinite(number):
@@ -243,15 +276,16 @@ class NumberEdit(_Refusing):
         if self._integer and number != int(number):
             return None, f"{number:g} is no whole number."
         if not self.minimum <= number <= self.maximum:
-            unit = f" {self.unit}" if self.unit else ""
             in_force = "" if self._value is None else f" In force: {self._text(self._value)}."
-            return None, f"{number:g}{unit} is outside what is allowed: {self._range()}.{in_force}"
+            return None, f"{self._text(number)} is outside what is allowed: {self._range()}.{in_force}"
         problem = "" if self.check is None else self.check(number)
         return (None, problem) if problem else (number, "")
 
     def set_value(self, value: float | None, *, overwrite: bool = False) -> None:
         """Show a number, e.g. as a device reads back; only ``overwrite`` replaces what is being typed."""
         self._value = value
+        if overwrite:
+            self._shown = ""
         if overwrite or not self.isModified():
             self._show()
 
@@ -310,23 +344,25 @@ class NumberEdit(_Refusing):
         return float(10 ** (math.floor(math.log10(abs(number))) - 1)) if number else 0.1
 
     def _range(self) -> str:
-        unit = f" {self.unit}" if self.unit else ""
         if math.isinf(self.maximum):
-            return f"{self.minimum:g}{unit} or more"
+            return f"{self._text(self.minimum)} or more"
         if math.isinf(self.minimum):
-            return f"{self.maximum:g}{unit} or less"
-        return f"{self.minimum:g} to {self.maximum:g}{unit}"
+            return f"{self._text(self.maximum)} or less"
+        return f"{self._text(self.minimum)} to {self._text(self.maximum)}"
 
     def _tip_now(self) -> str:
         if math.isinf(self.minimum) and math.isinf(self.maximum):
-            return f"{self._tip}\nin {self.unit}".strip() if self.unit else self._tip
+            return f"{self._tip}\nin {self.shown_unit}".strip() if self.unit else self._tip
         return f"{self._tip}\n{self._range()}".strip()
 
     def _text(self, number: float) -> str:
+        if self.shown_unit != self.unit:
+            number = float(f"{number / _MM_UM:.15g}")
         digits = f"{number:.0f}" if self._integer else f"{number:.6g}"
-        return f"{grouped(digits)} {self.unit}".strip()
+        return f"{grouped(digits)} {self.shown_unit}".strip()
 
     def _show(self) -> None:
+        self._choose_unit()
         text = "" if self._value is None else self._text(self._value)
         if text != self.text():
             self.setText(text)

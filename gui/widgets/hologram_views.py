@@ -22,6 +22,7 @@ from gui.widgets.building import choice, fill, narrow, offer, split
 from gui.widgets.image_view import ImageView, StretchedImage
 from gui.widgets.plots import curve_pen, plot_widget
 from gui.widgets.result_views import FactsView, ViewGrid
+from instrument.display.hologram_files import drawn_pattern
 from recon.holography import HologramRecord, Scores, foveal_weights, painted_weights
 
 WeightsMode = Literal["uniform", "fovea", "painted"]
@@ -267,7 +268,7 @@ class HologramViews(QWidget):
             [
                 ("target, and what counts in it", self.target),
                 ("seen by an eye (computed)", self.seen),
-                ("phase on the SLM, 0 to 2π", self.phase),
+                ("on the SLM: phase, 0 to 2π (mirrors: light)", self.phase),
                 ("photographed", self.captured),
             ]
         )
@@ -292,7 +293,7 @@ class HologramViews(QWidget):
             self._show_phase(self.computed)
 
     def _show_phase(self, computed: Computed) -> None:
-        self.phase.show_image(computed.result.hologram.phase_rad[0], 0.0, 2 * np.pi)
+        self.phase.show_image(drawn_pattern(computed.result.hologram.slm[0]), 0.0, 2 * np.pi)
         self._draw_history(computed.result.hologram.history)
 
     def show_progress(self, progress: Progress) -> None:

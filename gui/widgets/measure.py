@@ -11,6 +11,7 @@ from PySide6.QtCore import QObject, QPointF, QRectF, Signal
 from PySide6.QtWidgets import QGraphicsRectItem
 
 from gui.theme import colours
+from gui.widgets.entry import quantity
 from gui.widgets.image_view import ImageView
 
 _BAR_SHARE = 0.25
@@ -45,7 +46,7 @@ def region_words(
     height, width = region.shape
     size = f"{region.words} pixels"
     if pitch_um is not None:
-        size += f" ({length_words(width * pitch_um)} x {length_words(height * pitch_um)})"
+        size += f" ({quantity(width * pitch_um, 'um')} x {quantity(height * pitch_um, 'um')})"
     rows, columns = (
         slice(int(one.start * n / whole), max(int(one.stop * n / whole), int(one.start * n / whole) + 1))
         for one, n, whole in zip((region.rows, region.columns), shown.shape, shape, strict=False)
@@ -61,11 +62,6 @@ def round_length(most: float) -> float:
     """Return the largest of 1, 2 and 5 times powers of ten that is at most a length."""
     power = 10.0 ** math.floor(math.log10(max(most, 1e-9)))
     return max(step * power for step in (1, 2, 5) if step * power <= most * (1 + 1e-9))
-
-
-def length_words(um: float) -> str:
-    """Return a length with its unit: mm from 1 mm on."""
-    return f"{um:.4g} µm" if abs(um) < 1000 else f"{um / 1000:.4g} mm"
 
 
 class LengthBar:
@@ -90,7 +86,7 @@ class LengthBar:
             self.bar.size = length / pitch_um
             self.bar.bar.setBrush(pg.mkBrush(colours().text))
             self.bar.bar.setPen(pg.mkPen(colours().text))
-            self.bar.text.setText(length_words(length), color=colours().text)
+            self.bar.text.setText(quantity(length, "um"), color=colours().text)
             self.bar.updateBar()
 
 

@@ -17,6 +17,7 @@ from PySide6.QtWidgets import QCheckBox, QGridLayout, QTextBrowser, QWidget
 from gui.session import BenchSession
 from gui.theme import colours
 from gui.widgets.building import button, choice, fill, in_row, label
+from gui.widgets.entry import quantity
 from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import OrientationButton, follow_orientation
 from gui.widgets.plots import LevelsBar, curve_pen, legend, plot_widget
@@ -141,11 +142,7 @@ class _ScaledImage(ImageView):
             return words
         height, width = self.image.shape[:2]
         x_um, y_um = ((p - n // 2) * self.pitch_um for p, n in ((column, width), (row, height)))
-        return f"{words}   ({_length(x_um)}, {_length(y_um)} from the middle)"
-
-
-def _length(um: float) -> str:
-    return f"{um:.3g} µm" if abs(um) < 1000 else f"{um / 1000:.3g} mm"
+        return f"{words}   ({quantity(x_um, 'um', 3)}, {quantity(y_um, 'um', 3)} from the middle)"
 
 
 Histories = tuple[tuple[IterationRecord, ...], ...]

@@ -14,8 +14,9 @@ from gui.background import NewestOnly
 from gui.jobs import Job, JobContext, JobRunner
 from gui.theme import colours, spares_hues, table
 from gui.widgets.building import button, every, fill, in_row, label, share_bar
+from gui.widgets.entry import quantity
 from gui.widgets.image_view import ArrowKeys
-from gui.widgets.measure import length_words, round_length
+from gui.widgets.measure import round_length
 from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.rendering import Pose, Renderer, depth_shades
 
@@ -92,7 +93,7 @@ class TurningView(QWidget):
         if planes_um is not None and pitch_um is not None and len(planes_um[0]) > 1:
             step_um = float(abs(planes_um[0][-1] - planes_um[0][0])) / (len(planes_um[0]) - 1)
             step = step_um / pitch_um if np.isfinite(step_um) and step_um > 0 else None
-            self._ends = tuple(length_words(float(planes_um[0][z])) for z in (0, -1))  # type: ignore[assignment]
+            self._ends = tuple(quantity(float(planes_um[0][z]), "um") for z in (0, -1))  # type: ignore[assignment]
         n_z = source.shape[0]
         self.progress.setRange(0, n_z)
         self.progress.setValue(0)
@@ -289,7 +290,7 @@ class TurningCanvas(QWidget):
         y = self.height() - _MARGIN_PX
         painter.setPen(QPen(QColor(colours().text), 3))
         painter.drawLine(QPointF(_MARGIN_PX, y), QPointF(_MARGIN_PX + across, y))
-        words = f"{length:g} voxels" if self.pitch_um is None else length_words(length)
+        words = f"{length:g} voxels" if self.pitch_um is None else quantity(length, "um")
         painter.drawText(QPointF(_MARGIN_PX, y - 8), words)
 
     def _draw_axes(self, painter: QPainter) -> None:

@@ -154,6 +154,10 @@ class Lit:
             bench.scene_on() if self.scene else bench.scene_off()
 
 
+PHOTOGRAPHS = "photographs"
+"""Folder of photographs within that of runs."""
+
+
 def photograph_name() -> str:
     """Return a file name for a photograph taken now."""
     now = datetime.now(UTC)

@@ -59,7 +59,8 @@ def display(settings: DisplayDemoSettings, out: OutFolder = Path("runs")) -> Non
     """Align the mask of a SIMULATED holographic display, learn how it differs, show and photograph a picture.
 
     The picture is computed twice, by the alignment alone and by what was learned of the display; both are
-    photographed and compared with what was wanted. Takes minutes.
+    photographed and compared with what was wanted. Then it is shown in three colours, one after the other.
+    Takes minutes.
     """
     with _Terminal(Console(highlight=False)) as listener:
         result = run_display_demo(out, listener, settings)

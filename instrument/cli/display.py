@@ -23,7 +23,7 @@ from instrument.display.hologram import (
     read_weights,
     slm_size,
 )
-from instrument.display.hologram_files import HologramFiles
+from instrument.display.hologram_files import HologramFiles, light_words
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image, read_stack
 from instrument.tasks.spots import HologramInputs, make_spots, tell_limit
@@ -71,7 +71,7 @@ def hologram(
     if (inputs.spots is None) == (not target):
         raise BenchError("Give a TARGET picture, or --spots.")
     config = load_and_say(bench)
-    size = slm_size(config)
+    size = slm_size(config, phases=options.mirrors is None)
     if inputs.spots is not None:
         given.refuse("--spots", "spots")
         finish(make_spots(Terminal(), inputs, options, (config, size)))
@@ -106,7 +106,11 @@ def hologram(
             for channel, display in enumerate(displays):
                 targets = [
                     prepare_target(
-                        _channel(picture, channel if inputs.color else None), display, options, z_mm=z
+                        _channel(picture, channel if inputs.color else None),
+                        display,
+                        options,
+                        z_mm=z,
+                        share=writer.shares[channel],
                     )
                     for picture, z in zip(planes, depths, strict=True)
                 ]
@@ -168,4 +172,4 @@ def _print(label: str, result: HologramResult, options: HologramOptions) -> None
         f"  (computed on the alias-free grid, envelope {options.envelope}, {options.frames} frame(s), "
         "through the eye's low-pass)"
     )
-    typer.echo(f"  light: {result.efficiency:.1%} of what falls on the SLM reaches the field")
+    typer.echo(f"  light: {light_words(result, options)}")

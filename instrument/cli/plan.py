@@ -25,6 +25,7 @@ from instrument.plan.patterns import (
     shape_from_text,
 )
 from instrument.runs.acquire import abilities_of
+from instrument.runs.pace import pace_of
 from recon.base.declare import option
 
 Point = tuple[float, float]
@@ -112,7 +113,10 @@ def show(
     plan = load_plan(file)
     with open_and_say(bench) as opened:
         abilities = abilities_of(opened, opened.config.data_folder)
+        pace = pace_of(plan, abilities, opened.config.data_folder, opened.config.text)
     _describe(plan, abilities)
+    if pace is not None:
+        typer.echo(pace.words(plan, abilities))
     if steps:
         for step in plan.steps():
             typer.echo(f"  {step}")

@@ -29,6 +29,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 from rich.text import Text
 
 from instrument.cli import kept_times
@@ -57,16 +58,15 @@ class _Left(TimeRemainingColumn):
         return Text(f"about {duration(expected_s - task.elapsed)} left, as last time")
 
 
-class _Compiling(ProgressColumn):
-    """What is being compiled; asked for again and again, so that it hears of numba when that is there."""
+class _Note(ProgressColumn):
+    """The task's note, or what is being compiled; asked often, it hears of numba when that is there."""
 
-    max_refresh = None
+    def __init__(self) -> None:
+        super().__init__(Column(no_wrap=True, overflow="ellipsis"))
 
     def render(self, task: Task) -> Text:
         _listen()
-        if not _compiled:
-            return Text()
-        return Text(f"compiling {_compiled[-1]}, once on this machine")
+        return Text(f"compiling {_compiled[-1]} (once)" if _compiled else task.fields["note"])
 
 
 _compiled: list[str] = []
@@ -103,8 +103,7 @@ def progress_bar() -> Progress:
         _Count(),
         TimeElapsedColumn(),
         _Left(),
-        TextColumn("{task.fields[note]}"),
-        _Compiling(),
+        _Note(),
         console=console,
         transient=True,
         disable=not console.is_terminal,

@@ -17,6 +17,7 @@ from instrument.tasks.task import Given
 from recon.base.declare import option
 
 if TYPE_CHECKING:
+    from calibration_routines.display.colour_photograph import ColourPattern
     from calibration_routines.display.display_io import DisplayBench
     from instrument.display.hologram import Alignment
     from instrument.runs.run import Run
@@ -101,6 +102,7 @@ class ShowOptions(CaptureOptions, _Shown):
         "diffuserbench show slm.png --bench display.toml --capture seen.png --target picture.png",
         "diffuserbench show spots.png --bench display.toml --capture seen.png --refine 4",
         "diffuserbench show slm-frame1.png slm-frame2.png --capture seen.png --target picture.png",
+        "diffuserbench show slm-red.png slm-green.png slm-blue.png --capture seen.png --target colour.png",
     )
 )
 def show(
@@ -108,7 +110,7 @@ def show(
         list[Path],
         typer.Argument(
             metavar="RUN|PATTERN...",
-            help="A run's folder; or an 8-bit phase picture from hologram (several: frames that add).",
+            help="A run's folder; or an 8-bit phase picture from hologram (several: frames, colours).",
         ),
     ],
     options: ShowOptions,
@@ -132,53 +134,109 @@ def show(
 
 def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -> None:
     """Put patterns on the SLM; hold them, or photograph what they show."""
-    import numpy as np
-
+    from calibration_routines.display.colour_photograph import colour_patterns
     from calibration_routines.display.display_io import DisplayBench, bring_mask
     from instrument.display.hologram import load_alignment
-    from instrument.files.images import side_car
-    from instrument.files.slm_image import SLM_PHASE, levels_phase, load_slm_correction, read_slm_image
+    from instrument.files.slm_image import (
+        is_of_mirrors,
+        levels_field,
+        load_slm_correction,
+        mismatch,
+        read_slm_image,
+    )
 
-    beside = side_car(what[0])
-    spots = beside.exists() and "spots" in SLM_PHASE.read(beside)
+    read = [read_slm_image(path) for path in what]
+    spots = "spots" in read[0][1]
     options.check(len(what), spots=spots)
     correction = load_slm_correction(options.slm_calibration) if options.slm_calibration else None
     place = load_alignment(options.alignment) if options.alignment else None
     if place is not None:
         place.require_correction(correction is not None)
-    read = [read_slm_image(path) for path in what]
     with naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
         if opened.slm is None:
             raise BenchError(f"{opened.label} has no [slm].")
-        for path, (levels, _) in zip(what, read, strict=True):
+        for path, (levels, facts) in zip(what, read, strict=True):
             if levels.shape != opened.slm.shape:
                 raise FileError(path, f"is {levels.shape} pixels, the SLM {opened.slm.shape}.")
+            if facts and (words := mismatch(opened.slm, mirrors=is_of_mirrors(facts))):
+                raise FileError(path, f"cannot be shown: {words}")
         bring_mask(opened, place.stage_position if place else {})
-        binning = opened.config.display.slm_binning
-        io = DisplayBench(opened, binning, correction, estimate_background=options.as_is)
-        fields = [np.exp(1j * levels_phase(levels, binning)) for levels, _ in read]
+        binning, own_nm = opened.config.display.slm_binning, opened.config.display.wavelength_nm
+        fields = [levels_field(levels, binning, mirrors=opened.slm.mirrors) for levels, _ in read]
+        colours = colour_patterns(fields, [facts for _, facts in read], own_nm)
+        lights = [
+            DisplayBench(
+                opened,
+                binning,
+                correction,
+                estimate_background=options.as_is,
+                wavelength_nm=colour.wavelength_nm,
+            )
+            for colour in colours
+        ]
         if options.capture is None:
-            _hold(io, fields, options.seconds)
+            _hold(lights, colours, options.seconds)
+        elif len(colours) > 1:
+            _capture_colours(lights, colours, options, place)
         elif spots:
-            _capture_spots(io, fields, read[0][1], what[0], options, place)
+            _capture_spots(lights[0], fields, read[0][1], what[0], options, place)
         else:
-            _capture(io, fields, read[0][1], what[0], options, place)
+            _capture(lights[0], fields, read[0][1], what[0], options, place)
 
 
-def _hold(io: DisplayBench, fields: list[Any], seconds: float | None) -> None:
-    io.show(fields[0])
+def _hold(lights: list[DisplayBench], colours: list[ColourPattern], seconds: float | None) -> None:
+    """Show one pattern, or several in turn, each colour in its own light."""
+    shown = [(io, field) for io, colour in zip(lights, colours, strict=True) for field in colour.fields]
+    io, field = shown[0]
+    io.show(field)
+    in_turn = len(lights) > 1
     typer.echo(f"Shown on {io.slm.name}: {io.bench.label}", err=True)
-    if seconds is None and len(fields) == 1:
+    if seconds is None and len(shown) == 1:
         typer.echo("Press Enter to end.", err=True)
         input()
         return
     end = time.monotonic() + (seconds if seconds is not None else float("inf"))
-    frame = 0
-    while time.monotonic() < end:
-        frame = (frame + 1) % len(fields)
-        if len(fields) > 1:
-            io.show(fields[frame])
-        time.sleep(min(0.02, max(end - time.monotonic(), 0)))
+    number = 0
+    try:
+        while time.monotonic() < end:
+            number = (number + 1) % len(shown)
+            if len(shown) > 1:
+                if in_turn:
+                    io.light(on=False)
+                io, field = shown[number]
+                io.show(field)
+                if in_turn:
+                    io.light(on=True)
+            time.sleep(min(0.02, max(end - time.monotonic(), 0)))
+    finally:
+        if in_turn:
+            io.light(on=False)
+
+
+def _capture_colours(
+    lights: list[DisplayBench], colours: list[ColourPattern], options: ShowOptions, place: Alignment | None
+) -> None:
+    """Photograph one colour after the other, say how good the picture is, write."""
+    from calibration_routines.display.colour_photograph import photograph_colours, write_colours
+    from instrument.files.images import read_image
+
+    assert options.capture is not None
+    assert options.target is not None
+    picture = read_image(options.target).pixels
+    found = photograph_colours(lights, colours, picture, place, average=options.average)
+    write_colours(options.capture, found)
+    mark = " (SIMULATED)" if found.simulated else ""
+    for nm, score in zip(found.wavelengths_nm, found.channels, strict=True):
+        typer.echo(f"  {nm:g} nm: {score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}")
+    typer.echo(f"photographed in colour: {found.psnr_db:.2f} dB, SSIM {found.ssim:.3f}{mark}")
+    typer.echo("  each colour brought to the brightness wanted of it, as the lasers' powers are set")
+    _warn_of_saturation(found.saturated_fraction)
+    typer.echo(f"Wrote {options.capture}")
+
+
+def _warn_of_saturation(fraction: float) -> None:
+    if fraction > 1e-3:
+        typer.echo(f"Warning: {100 * fraction:.1f} % of the camera's pixels are saturated.", err=True)
 
 
 def _capture(
@@ -192,14 +250,13 @@ def _capture(
     """Photograph, say how good it is, write."""
     from calibration_routines.display.hologram_photograph import (
         display_of_pattern,
-        envelope_of_pattern,
+        options_of_pattern,
         photograph_hologram,
+        target_of_pattern,
         write_capture,
         write_refined,
     )
-    from instrument.display.hologram import prepare_target
     from instrument.files.images import read_image
-    from recon.holography import HologramOptions
 
     assert options.capture is not None
     assert options.target is not None
@@ -207,14 +264,15 @@ def _capture(
     assert opened.slm is not None
     slm = opened.slm.shape, opened.slm.pixel_pitch_um
     display = display_of_pattern(opened.config, slm, facts, place)
-    wanted = HologramOptions(envelope=envelope_of_pattern(facts))
+    computed = options_of_pattern(facts)
     found = photograph_hologram(
         io,
         fields,
         display,
-        prepare_target(read_image(options.target).pixels, display, wanted),
+        target_of_pattern(read_image(options.target).pixels, display, facts),
         options,
         progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
+        computed=computed,
     )
     mark = " (SIMULATED)" if found.simulated else ""
     typer.echo(f"camera registered to {found.camera_residual_px:.2f} px{mark}")
@@ -230,9 +288,7 @@ def _capture(
         f"photographed: {score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}; "
         f"middle quarter {score.crop_psnr_db:.2f} dB"
     )
-    if found.capture.saturated_fraction > 1e-3:
-        percent = 100 * found.capture.saturated_fraction
-        typer.echo(f"Warning: {percent:.1f} % of the camera's pixels are saturated.", err=True)
+    _warn_of_saturation(found.capture.saturated_fraction)
     typer.echo(f"Wrote {options.capture}")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from math import isqrt
+from math import ceil, isqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from instrument.bench.config import BenchConfig
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image
 from instrument.files.record import RecordFormat, plain, value_of
+from instrument.files.slm_image import mismatch
 from recon.base.declare import option, record
 from recon.holography import (
     DcTerm,
@@ -36,7 +37,7 @@ from recon.holography.judge import compare
 from recon.holography.learned import Learned
 from recon.holography.options import Fit
 from recon.holography.pose import NODES, Pose
-from recon.holography.target import make_band
+from recon.holography.target import EVERYWHERE, FIRST_ORDER, Window, make_band
 
 if TYPE_CHECKING:
     from drivers.slm import Slm
@@ -75,7 +76,8 @@ class HologramResult:
     scores: tuple[Scores, ...]
     """Alias-free, with the envelope that was asked for and all frames."""
     efficiency: float
-    """Part of the light on the SLM that reaches the field, DC term and envelope included."""
+    """Part of the light on the SLM that reaches the field, DC term and envelope included; of mirrors the part
+    that reaches the picture."""
 
     def facts(self, options: HologramOptions) -> dict[str, Any]:
         """Return metrics and options, JSON-compatible."""
@@ -112,11 +114,21 @@ def compute_and_judge(
     if model.options.grid != "alias-free":
         model = HologramModel(display, targets, options, grid="alias-free")
     planes = range(len(targets))
-    wanted = tuple(np.asarray(model.wanted(p), float) / model.peaks[p] for p in planes)
-    seen = tuple(np.asarray(model.seen(hologram.slm, p), float) / model.peaks[p] for p in planes)
-    raw = tuple(np.asarray(model.intensity(hologram.slm, p), float) / model.peaks[p] for p in planes)
+    wanted = tuple(within(targets[p].window, model.wanted(p)) / model.peaks[p] for p in planes)
+    seen = tuple(within(targets[p].window, model.seen(hologram.slm, p)) / model.peaks[p] for p in planes)
+    whole = [model.intensity(hologram.slm, p) for p in planes]
+    raw = tuple(within(targets[p].window, whole[p]) / model.peaks[p] for p in planes)
     scores = tuple(compare(s, w, 1.0) for s, w in zip(seen, wanted, strict=True))
-    return HologramResult(hologram, wanted, seen, raw, scores, model.efficiency(hologram.slm))
+    efficiency = model.efficiency(hologram.slm)
+    if targets[0].window is not None:
+        efficiency *= float(within(targets[0].window, whole[0]).sum() / whole[0].sum())
+    return HologramResult(hologram, wanted, seen, raw, scores, efficiency)
+
+
+def within(window: Window | None, image: npt.NDArray[Any]) -> Image:
+    """Return what an image over the field, its centre in the middle, has inside a window, float64."""
+    inside = image if window is None else image[window.part(image.shape)]
+    return np.asarray(inside, np.float64)
 
 
 def prepare_target(
@@ -125,6 +137,7 @@ def prepare_target(
     options: HologramOptions | None = None,
     *,
     z_mm: float = 0.0,
+    share: float = 1.0,
 ) -> Target:
     """Turn a picture into a target over the whole field of view, which is square.
 
@@ -134,9 +147,14 @@ def prepare_target(
         Intensity; 0 is black, an integer type's greatest value (float: the maximum) is white.
     options : HologramOptions
         Its ``fit``, ``srgb``, ``lift`` and ``envelope``.
+    share : float
+        Part of the field that the picture fills, along each axis; around it is black.
     """
     options = options or HologramOptions()
     image = options.lift + (1 - options.lift) * field_picture(pixels, fit=options.fit, srgb=options.srgb)
+    window = None if options.mirrors is None else FIRST_ORDER
+    if window is not None:
+        image = _placed(image, window)
     small = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
     if image.shape[0] < small[0] or image.shape[1] < small[1]:
         wide, high = max(small[1], image.shape[1]), max(small[0], image.shape[0])
@@ -144,7 +162,30 @@ def prepare_target(
     if options.envelope == "shade":
         ey, ex = (np.fft.fftshift(e) for e in display.envelope((image.shape[0], image.shape[1])))
         image = image * ey[:, None] * ex
-    return Target(image, z_mm, white=1.0)
+    if share < 1:
+        image = _placed(image, EVERYWHERE.shrunk(share))
+        window = None if window is None else window.shrunk(share)
+    return Target(image, z_mm, white=1.0, window=window)
+
+
+def _placed(image: Image, window: Window) -> Image:
+    """Return a picture in its window of a field that is dark elsewhere."""
+    height, width = image.shape
+    field = np.zeros(
+        (ceil(height / (window.bottom - window.top)), ceil(width / (window.right - window.left)))
+    )
+    rows, columns = window.part(field.shape)
+    size = (columns.stop - columns.start, rows.stop - rows.start)
+    field[rows, columns] = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+    return field
+
+
+def colour_shares(wavelengths_nm: Sequence[float]) -> list[float]:
+    """Return which part of its field each colour's picture fills so that all are of one size.
+
+    The field of view is as wide as the wavelength is long, so that of the shortest is what all have.
+    """
+    return [min(wavelengths_nm) / nm for nm in wavelengths_nm]
 
 
 def field_picture(
@@ -197,10 +238,13 @@ def read_weights(path: Path) -> npt.NDArray[np.float64]:
     return np.asarray(pixels, np.float64)
 
 
-def slm_size(config: BenchConfig) -> tuple[tuple[int, int], float]:
+def slm_size(config: BenchConfig, *, phases: bool = True) -> tuple[tuple[int, int], float]:
     """Ask the bench's SLM for its shape and pixel pitch in micrometres; opens and closes it.
 
-    Raises BenchError when the bench has no SLM; DeviceError when it does not answer.
+    ``phases``: it is to show phases.
+
+    Raises BenchError when the bench has no SLM, or phases are asked of mirrors; DeviceError when it does not
+    answer.
     """
     from instrument.bench.bench import Bench
 
@@ -209,6 +253,8 @@ def slm_size(config: BenchConfig) -> tuple[tuple[int, int], float]:
     bench = Bench(config)
     try:
         slm: Slm = bench.open_device("slm")  # type: ignore[assignment]
+        if phases and (words := mismatch(slm, mirrors=False)):
+            raise BenchError(words)
         return slm.shape, slm.pixel_pitch_um
     finally:
         bench.close()
@@ -333,7 +379,8 @@ class Alignment:
         displacement = self.pose.displacement(self.mask_shape) + self.rest
         if self.learned is None:
             return replace(display, displacement=displacement)
-        return replace(display, displacement=displacement).taught(self.learned)
+        turns = display.mask.design_wavelength_nm / display.wavelength_nm
+        return replace(display, displacement=displacement).taught(self.learned.at(turns))
 
     def require_correction(self, given: bool) -> None:
         """Refuse to show a pattern otherwise than what was learned of the display.

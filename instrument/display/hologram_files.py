@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.display.hologram import HologramResult
+from instrument.display.hologram import HologramResult, colour_shares
 from instrument.files.atomic import require_new, write_text
 from instrument.files.errors import BenchError, FileError
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
 from instrument.files.images import side_car, write_image
-from instrument.files.slm_image import phase_levels, write_slm_image
+from instrument.files.slm_image import field_levels, write_slm_image
 from recon.holography import Display, HologramOptions
 from recon.holography.judge import DISSERTATION, GRIDS, METHODS, Cell, average
 from recon.holography.losses import loss_of
@@ -51,8 +51,8 @@ class HologramFiles:
             )
         expected = ".npy" if self.options.complex_slm else ".png"
         if self.out.suffix.lower() != expected:
-            kind = "a complex" if self.options.complex_slm else "a phase"
-            raise FileError(self.out, f"{kind} pattern is written as {expected}.")
+            kind = "a complex pattern" if self.options.complex_slm else "a pattern"
+            raise FileError(self.out, f"{kind} is written as {expected}.")
         if not self.out.parent.is_dir():
             raise FileError(self.out.parent, "there is no such folder.")
         for file in self.files():
@@ -83,18 +83,24 @@ class HologramFiles:
             if self.options.complex_slm:
                 write_image(path, result.hologram.slm[frame], {"format": "diffuserbench SLM field", **about})
             else:
-                write_slm_image(path, phase_levels(result.hologram.phase_rad[frame], self.binning), about)
+                shown, mirrors = result.hologram.slm[frame], self.options.mirrors is not None
+                write_slm_image(path, field_levels(shown, self.binning, mirrors=mirrors), about)
         lines = [
             ("expansion", f"{display.expansion}x, {display.slm_shape[1]} x {display.slm_shape[0]} pixels"),
             ("loss, method", f"{loss_of(self.options.loss).name}, {self.options.method}"),
             ("judged", f"alias-free grid, envelope {self.options.envelope}, {self.options.frames} frame(s)"),
             ("crop", f"{result.scores[0].crop_psnr_db:.1f} dB in the middle quarter"),
-            ("light", f"{result.efficiency:.2%} of what falls on the SLM reaches the field"),
+            ("light", light_words(result, self.options)),
             ("stopped", str(result.hologram.stop_reason)),
             ("iterations", f"{result.hologram.history[-1].iteration}"),
         ]
         figure = hologram_figure(result, title=f"Hologram {patterns[0].stem}", facts=lines)
         save_figure(figure, self.preview(number, channel))
+
+    @property
+    def shares(self) -> list[float]:
+        """Which part of its field each colour's picture fills."""
+        return colour_shares([display.wavelength_nm for display in self.displays])
 
     def display_facts(self, channel: int) -> dict[str, Any]:
         """Return what a pattern was computed for, JSON-compatible."""
@@ -105,6 +111,8 @@ class HologramFiles:
             "slm_shape": list(display.slm_shape),
             "slm_pitch_um": display.slm_pitch_um,
             "wavelength_nm": display.wavelength_nm,
+            "field_share": round(self.shares[channel], 6),
+            "colour": CHANNELS[channel] if len(self.displays) > 1 else None,
             "dc_power": display.dc.power,
             "mask_fill": display.mask_fill,
         }
@@ -132,6 +140,12 @@ class HologramFiles:
         return self.out.with_name(f"{self._stem(number, channel)}-preview.png")
 
 
+def light_words(result: HologramResult, options: HologramOptions) -> str:
+    """Say how much light a hologram uses."""
+    where = "field" if options.mirrors is None else "picture"
+    return f"{result.efficiency:.1%} of what falls on the SLM reaches the {where}"
+
+
 _DETAIL = "middle sixteenth of the field, raw intensity, half as bright"
 
 
@@ -141,7 +155,11 @@ def hologram_figure(result: HologramResult, *, title: str, facts: list[tuple[str
     The first plane is drawn large; further planes as a strip below.
     """
     score = result.scores[0]
-    phase = np.mod(np.angle(result.hologram.slm[0]), 2 * np.pi)
+    drawn = drawn_pattern(result.hologram.slm[0])
+    height, width = drawn.shape
+    slm = Panel("SLM phase", drawn, caption=f"{width} x {height}, 0 to 2 pi", white=2 * np.pi)
+    if is_of_light(result.hologram.slm[0]):
+        slm = Panel("Mirrors", drawn, caption=f"{width} x {height}, white sends light", white=2 * np.pi)
     panels = (
         Panel("Wanted", result.wanted[0], caption="through the eye's low-pass", white=1.0),
         Panel(
@@ -151,7 +169,7 @@ def hologram_figure(result: HologramResult, *, title: str, facts: list[tuple[str
             white=1.0,
         ),
         Panel("Without the low-pass", _detail(result.unfiltered[0]), caption=_DETAIL, white=2.0),
-        Panel("SLM phase", phase, caption=f"{phase.shape[1]} x {phase.shape[0]}, 0 to 2 pi", white=2 * np.pi),
+        slm,
     )
     strip = tuple(
         Panel(f"plane {number + 2}", np.maximum(seen, 0), caption=f"{other.psnr_db:.1f} dB", white=1.0)
@@ -166,6 +184,18 @@ def hologram_figure(result: HologramResult, *, title: str, facts: list[tuple[str
         "seconds of optimisation",
     )
     return summary_figure(Summary(title, panels, convergence, sweep=strip, lines=facts, simulated=True))
+
+
+def is_of_light(field: npt.NDArray[np.complexfloating]) -> bool:
+    """Return whether an SLM field is what mirrors send: real, and not negative."""
+    return not np.any(field.imag) and bool(np.min(field.real) >= 0)
+
+
+def drawn_pattern(field: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.float32]:
+    """Return an SLM field, (height, width), as it is drawn in 0 to 2 pi: its phase, or what mirrors send."""
+    if is_of_light(field):
+        return np.asarray(2 * np.pi * field.real, np.float32)
+    return np.asarray(np.mod(np.angle(field), 2 * np.pi), np.float32)
 
 
 def _detail(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -10,7 +10,7 @@ import numpy as np
 from instrument.files.figures import ACCENT, INK, mark_simulated, style
 from recon.analysis import Analysis
 from recon.analysis.gram import ConditionCurve
-from recon.analysis.points import PointTrial
+from recon.analysis.points import PointTrial, Reached
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -127,18 +127,24 @@ def facts(analysis: Analysis) -> list[tuple[str, str]]:
             f"{a.lateral_inner.object_um(a.pitch_um, a.distance_um, a.z_um):.3g} µm across; "
             f"{1e6 * a.axial_inner.step_per_um:.3g} /m along",
         ),
-        ("depth of field", f"-{_mm(near)}, +{_mm(far)}"),
+        ("depth of field, optics", f"-{_mm(near)}, +{_mm(far)}"),
         ("hyperfocal distance", _mm(a.axial.hyperfocal_um)),
-        ("field of view", f"±{a.view_x.half_deg:.1f}° x ±{a.view_y.half_deg:.1f}°"),
+        (
+            "usable field (half light)",
+            f"±{a.half_light_deg[1]:.1f}° x ±{a.half_light_deg[0]:.1f}°",
+        ),
+        ("field of view (any light)", f"±{a.view_x.half_deg:.1f}° x ±{a.view_y.half_deg:.1f}°"),
         ("  limited by", a.view_x.limited_by),
     ]
+    if (reached := a.reached) is not None:
+        lines += _reached(a, reached)
     if (tests := a.points) is not None:
         if tests.lateral_px is not None:
             um = tests.lateral_px * a.pitch_um * a.z_um / a.distance_um
-            lines.append(("two points across", f"{tests.lateral_px:.2g} px, {um:.3g} µm"))
+            lines.append(("optics: two points across", f"{tests.lateral_px:.2g} px, {um:.3g} µm"))
         if tests.axial_per_um is not None:
             apart = _mm(tests.axial_per_um * a.z_um**2)
-            lines.append(("two points along", f"{1e6 * tests.axial_per_um:.3g} /m, {apart}"))
+            lines.append(("optics: two points along", f"{1e6 * tests.axial_per_um:.3g} /m, {apart}"))
         if tests.sixteen_factor is not None:
             lines.append(("16 points need", f"{tests.sixteen_factor:.2g} times these separations"))
     holds = "not known" if a.convolution_holds_deg is None else f"to {a.convolution_holds_deg:.3g}°"
@@ -157,6 +163,19 @@ def facts(analysis: Analysis) -> list[tuple[str, str]]:
         lines.append(("calibrate across every", _mm(a.lateral_spacing_um)))
     if a.axial_spacing_per_um is not None:
         lines.append(("calibrate along every", f"{1e6 * a.axial_spacing_per_um:.3g} /m"))
+    return lines
+
+
+def _reached(a: Analysis, reached: Reached) -> list[tuple[str, str]]:
+    """Return what the default reconstruction reaches, in words."""
+    y, x = reached.across_px
+    if x is None or y is None:
+        return [("two points, picture", "told apart at no distance tried")]
+    um = max(x, y) * a.pitch_um * a.z_um / a.distance_um
+    lines = [("two points, picture", f"x {x:.2f}, y {y:.2f} px, {um:.3g} µm ({reached.method})")]
+    if reached.focus_um is not None:
+        near, far = (_mm(v) for v in reached.focus_um)
+        lines.append(("depth of field, picture", f"{near} to {far}, for pairs half as far again apart"))
     return lines
 
 

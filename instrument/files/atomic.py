@@ -1,11 +1,17 @@
-"""Files and folders written whole or not at all: under a temporary name beside the target, synced, moved."""
+"""Files and folders written whole or not at all: under a temporary name beside the target, synced, moved.
+
+While it is written, what has a temporary name is locked: what a killed program left has no lock, and is
+removed when the next program writes into its folder.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import json
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
@@ -16,6 +22,10 @@ from typing import Any
 from instrument.files.errors import FileError
 
 _NEARLY_FULL_BYTES = 1 << 20
+_LEFT = re.compile(r"\..+\.[0-9a-f]{8}\.part(\.[^.]+)?")
+_EXCHANGE, _HERE = 2, -100
+"""``RENAME_EXCHANGE`` and ``AT_FDCWD`` of Linux."""
+_cleared: set[Path] = set()
 _inputs: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
 
 
@@ -86,8 +96,11 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     """
     path = Path(path)
     check_writable(path)
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    temporary = _draft_name(path, path.stem, path.suffix)
+    held = -1
     try:
+        held = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        _hold(held)
         yield temporary
         with temporary.open("rb") as written:
             os.fsync(written.fileno())
@@ -102,6 +115,28 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+        if held >= 0:
+            os.close(held)
+
+
+@contextlib.contextmanager
+def draft_folder(path: Path, *, locked: bool = True) -> Iterator[Path]:
+    """Give a new folder beside ``path``, under a temporary name; it is removed where it still has that name.
+
+    ``locked``: False for a caller that locks it itself, at once.
+
+    Raises OSError when it cannot be made.
+    """
+    draft = _draft_name(path, path.name)
+    draft.mkdir()
+    held = os.open(draft, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        if locked:
+            _hold(held)
+        yield draft
+    finally:
+        os.close(held)
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -113,29 +148,71 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
     Raises OSError when writing fails.
     """
-    mark = secrets.token_hex(4)
-    draft, old = path.with_name(f".{path.name}.{mark}.partial"), path.with_name(f".{path.name}.{mark}.old")
     refuse_input(path)
-    draft.mkdir()
-    try:
+    with draft_folder(path) as draft:
         yield draft
         for place, _, files in os.walk(draft, topdown=False):
             for name in files:
                 with (Path(place) / name).open("rb") as written:
                     os.fsync(written.fileno())
             sync_folder(Path(place))
-        if path.exists():
-            path.rename(old)
-        try:
-            draft.rename(path)
-        except OSError:
-            if old.exists():
-                old.rename(path)
-            raise
+        if not (path.exists() and _exchanged(draft, path)):
+            old = path.with_name(f".{path.name}.{secrets.token_hex(4)}.old")
+            if path.exists():
+                path.rename(old)
+            try:
+                draft.rename(path)
+            except OSError:
+                if old.exists():
+                    old.rename(path)
+                raise
+            shutil.rmtree(old, ignore_errors=True)
         sync_folder(path.parent)
-        shutil.rmtree(old, ignore_errors=True)
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _draft_name(path: Path, stem: str, suffix: str = "") -> Path:
+    """Return a temporary name beside ``path``, in a folder cleared of what was left there."""
+    clear_left(path.parent)
+    return path.with_name(f".{stem}.{secrets.token_hex(4)}.part{suffix}")
+
+
+def _hold(handle: int) -> None:
+    """Lock a draft as long as it is open; disks that have no locks do without."""
+    with contextlib.suppress(OSError):
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _exchanged(one: Path, other: Path) -> bool:
+    """Exchange two names in one step, so that neither is ever missing; whether system and disk can."""
+    import ctypes
+
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except AttributeError:
+        return False
+    return bool(rename(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _EXCHANGE) == 0)
+
+
+def clear_left(folder: Path, *, again: bool = False) -> None:
+    """Remove what a killed program left of what it was writing in a folder, once a process, or ``again``.
+
+    What another program writes now is locked, and stays.
+    """
+    if (place := folder.absolute()) in _cleared and not again:
+        return
+    _cleared.add(place)
+    with contextlib.suppress(OSError):
+        for name in filter(_LEFT.fullmatch, os.listdir(place)):  # noqa: PTH208 # 10^5 names take no Paths
+            with contextlib.suppress(OSError):
+                handle = os.open(place / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    if (place / name).is_dir():
+                        shutil.rmtree(place / name)
+                    else:
+                        (place / name).unlink()
+                finally:
+                    os.close(handle)
 
 
 def require_new(path: Path, *, overwrite: bool | None = None) -> None:

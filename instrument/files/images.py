@@ -88,7 +88,7 @@ def read_image(path: Path | str | ImageFile, *, holes: bool = False) -> ImageFil
     path, array, notes = _decoded(Path(path))
     array, more = _one_image(path, array)
     pixels, converted = _standard_dtype(path, array, holes=holes)
-    return ImageFile(path, pixels, (*notes, *more, *converted), _metadata(path))
+    return ImageFile(path, pixels, (*notes, *more, *converted), image_metadata(path))
 
 
 def read_stack(path: Path | str, *, leave_out: Path | None = None) -> ImageFile:
@@ -166,8 +166,11 @@ def check_suffix(path: Path | str) -> None:
 _CFA_PATTERN, _COLOURS = 33422, "RGB"
 
 
-def _metadata(path: Path) -> dict[str, Any]:
-    """Return the metadata kept with an image; of another program's TIFF its colour mosaic."""
+def image_metadata(path: Path) -> dict[str, Any]:
+    """Return the metadata kept with an image, its pixels unread; of another program's TIFF its colour mosaic.
+
+    Empty where there are none, or the file cannot be read.
+    """
     said: dict[str, Any] = {}
     try:
         if path.suffix.lower() in (".tif", ".tiff"):

@@ -83,6 +83,14 @@ class RecordFormat:
         write_text(path, self.text(fields, indent=indent))
 
     # Reading -------------------------------------------------------------------------------------
+    def is_of(self, path: Path) -> bool:
+        """Return whether a file is a record that names this format; :meth:`read` says what else is wrong."""
+        try:
+            found = parse_json(read_bytes(path, error=self.error))
+        except ValueError:
+            return False
+        return isinstance(found, dict) and found.get("format") == self.name
+
     def read(self, path: Path) -> Fields:
         """Return a record's fields, brought up to date.
 
@@ -221,7 +229,7 @@ def _reader(kind: Any) -> Reader:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         others = [_reader(one) for one in arguments if one is not type(None)]
-        read = others[0] if len(others) == 1 else _converter(lambda data: data)
+        read = others[0] if len(others) == 1 else _as_it_is
         return lambda data, unknown, at: None if data is None else read(data, unknown, at)
     if origin is tuple:
         return _tuple_reader(arguments)
@@ -243,7 +251,11 @@ def _reader(kind: Any) -> Reader:
     if kind is datetime:
         return _converter(datetime.fromisoformat)
     is_made_of_its_value = isinstance(kind, type) and issubclass(kind, Path | enum.Enum)
-    return _converter(kind if is_made_of_its_value else lambda data: data)
+    return _converter(kind) if is_made_of_its_value else _as_it_is
+
+
+def _as_it_is(data: Any, _unknown: Unknown, _at: str) -> Any:
+    return data
 
 
 def _converter(convert: Callable[[Any], Any]) -> Reader:
@@ -270,8 +282,10 @@ def _dataclass_reader(kind: type) -> Reader:
             raise TypeError(f"{at.rstrip('.') or 'it'} should be a table, not {data!r:.40}")
         values = {}
         for name, value in data.items():
-            if name in readers:
-                values[name] = readers[name](value, unknown, f"{at}{name}.")
+            if (reader := readers.get(name)) is _as_it_is:
+                values[name] = value
+            elif reader is not None:
+                values[name] = reader(value, unknown, f"{at}{name}.")
             else:
                 unknown[f"{at}{name}"] = value
         return kind(**values)

@@ -50,6 +50,14 @@ def _portrait() -> Image:
     return image[:512, :].astype(np.float64) / 255
 
 
+def portrait_in_colour(side: int) -> npt.NDArray[np.uint8]:
+    """Return the portrait in colour, coded for a screen, (side, side, 3)."""
+    image = cv2.imread(str(_matplotlib_file("grace_hopper.jpg")))
+    assert image is not None
+    small = cv2.resize(image[:512, :], (side, side), interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(small[..., ::-1])
+
+
 def _relief() -> Image:
     """Elevation, lit from the north-west."""
     with np.load(_matplotlib_file("jacksboro_fault_dem.npz")) as file:

@@ -18,6 +18,7 @@ from drivers.slm import Slm
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, side_car, write_image
 from instrument.files.record import RecordFormat
+from recon.holography.variables import coded
 
 SLM_CALIBRATION = RecordFormat(
     "diffuserbench SLM calibration", "SLM calibration", make="Make one: diffuserbench calibrate slm"
@@ -41,6 +42,15 @@ class SlmCorrection:
     def __post_init__(self) -> None:
         if self.phase_of_level_rad.shape != (256,) or not np.isfinite(self.phase_of_level_rad).all():
             raise ValueError("phase_of_level_rad must be 256 finite numbers.")
+
+    def at(self, turns: float) -> SlmCorrection:
+        """Return the correction at another wavelength, where every phase is ``turns`` times as large.
+
+        The same optical path at every wavelength: a liquid crystal's dispersion is left out, and measured by
+        ``calibrate slm`` at that wavelength.
+        """
+        flat = None if self.flatness_rad is None else self.flatness_rad * turns
+        return SlmCorrection(self.phase_of_level_rad * turns, flat)
 
     def apply(self, levels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
         """Return the levels that show ideal ``levels`` ((height, width), 256 a turn) best on this SLM."""
@@ -98,7 +108,47 @@ def load_slm_correction(path: Path) -> SlmCorrection:
 
 
 SLM_PHASE = RecordFormat("diffuserbench SLM phase", "description of an SLM pattern")
+MIRRORS = RecordFormat("diffuserbench mirror pattern", "description of a pattern of mirrors")
 LEVELS = 256
+
+
+def field_levels(
+    field: npt.NDArray[Any], binning: int = 1, *, mirrors: bool = False
+) -> npt.NDArray[np.uint8]:
+    """Return the ideal levels of an SLM field, complex (height, width): its phase, or what mirrors send.
+
+    A field that mirrors cannot send, not real or negative, is their first order: they show fringes.
+    """
+    if not mirrors:
+        return phase_levels(np.angle(field), binning)
+    if np.any(np.imag(field)) or np.min(np.real(field)) < 0:
+        field = coded(field)
+    sent = np.rint(255 * np.clip(np.real(field), 0, 1)).astype(np.uint8)
+    return np.repeat(np.repeat(sent, binning, axis=-2), binning, axis=-1)
+
+
+def levels_field(levels: npt.NDArray[np.uint8], binning: int, *, mirrors: bool) -> npt.NDArray[Any]:
+    """Return the field that a pattern's levels stand for, complex (height, width)."""
+    if mirrors:
+        return np.asarray(levels[::binning, ::binning] / 255, np.complex64)
+    return np.asarray(np.exp(1j * levels_phase(levels, binning)))
+
+
+def mismatch(slm: Slm, *, mirrors: bool) -> str:
+    """Say why an SLM cannot show a pattern of mirrors, or of phases; empty where it can."""
+    if slm.mirrors and not mirrors:
+        return (
+            f"{slm.name} has mirrors that send light or not, and this pattern is of phases: compute it with "
+            "--mirrors optimised (without a mask also lee or off-axis)."
+        )
+    if mirrors and not slm.mirrors:
+        return f"{slm.name} sets phases, and this pattern is of mirrors: compute it without --mirrors."
+    return ""
+
+
+def is_of_mirrors(facts: Mapping[str, Any]) -> bool:
+    """Return whether a pattern is of mirrors, by the facts beside it."""
+    return facts.get("options", {}).get("mirrors") is not None
 
 
 def phase_levels(phase_rad: npt.NDArray[Any], binning: int = 1) -> npt.NDArray[np.uint8]:
@@ -115,7 +165,10 @@ def levels_phase(levels: npt.NDArray[np.uint8], binning: int = 1) -> npt.NDArray
 
 def write_slm_image(path: Path, levels: npt.NDArray[np.uint8], facts: Mapping[str, Any]) -> None:
     """Write a pattern as PNG, and beside it a JSON file that says how it was made; as ``write_image``."""
-    write_image(path, levels, SLM_PHASE.stamped({"levels_per_turn": LEVELS, **facts}))
+    if is_of_mirrors(facts):
+        write_image(path, levels, MIRRORS.stamped(facts))
+    else:
+        write_image(path, levels, SLM_PHASE.stamped({"levels_per_turn": LEVELS, **facts}))
 
 
 def read_slm_levels(path: Path | str) -> npt.NDArray[np.uint8]:
@@ -137,4 +190,6 @@ def read_slm_image(path: Path | str) -> tuple[npt.NDArray[np.uint8], dict[str, A
     Raises FileError as :func:`read_slm_levels`; or when the JSON file is no description of a pattern.
     """
     levels, beside = read_slm_levels(path), side_car(path)
-    return levels, SLM_PHASE.read(beside) if beside.exists() else {}
+    if not beside.exists():
+        return levels, {}
+    return levels, (MIRRORS if MIRRORS.is_of(beside) else SLM_PHASE).read(beside)

@@ -118,7 +118,7 @@ def hologram(
     alignment = overrides.pop("alignment", None)
     options = with_overrides(options or HologramOptions(), overrides)
     config = bench_config(bench)
-    shape, pitch_um = slm_size(config)
+    shape, pitch_um = slm_size(config, phases=options.mirrors is None)
     display = options.display_of(bench_display(config, (slm or shape, pitch_um), expansion=options.expansion))
     if alignment is not None:
         display = load_alignment(Path(alignment)).of(display)

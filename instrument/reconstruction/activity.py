@@ -32,6 +32,7 @@ from recon.streams.activity import (
     fading,
     floor_of,
     motion,
+    smoothed,
 )
 from recon.streams.regions import Region, Search, find_regions, local_correlation, noise_of
 
@@ -75,6 +76,15 @@ class ActivitySettings:
         unit="px",
         least=1,
         flags=("--radius",),
+        group="Activity",
+    )
+    smooth_px: float = option(
+        0.0,
+        help="Gaussian by which frames are smoothed to look for regions: a small cell's width.",
+        unit="px",
+        least=0,
+        flags=("--smooth",),
+        default_words="not at all",
         group="Activity",
     )
     """As :func:`recon.streams.activity.find_regions`."""
@@ -149,8 +159,13 @@ def find_activity(
     base = baseline(frames, max(window, 3), settings.percentile, fade)
     floor = floor_of(frames)
     dff = change(frames, base, floor)
-    noise = noise_of(frames)
-    excess = np.subtract(frames, base, out=base)
+    looked_at = frames
+    if settings.smooth_px:
+        looked_at = smoothed(frames, settings.smooth_px)
+        base = baseline(looked_at, max(window, 3), settings.percentile, fade)
+    noise = noise_of(looked_at)
+    excess = np.subtract(looked_at, base, out=base)
+    del looked_at
     if still_moving_px:
         search = Search([], {}, local_correlation(excess))
     else:

@@ -1,4 +1,4 @@
-"""What a reconstruction will take, time and memory, told by its own first iterations."""
+"""What a reconstruction will take, time and memory, by its first iterations: tried before, or its own."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from instrument.files.errors import duration
+from recon.reconstruction.course import TOLD_AT
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.reconstruct import reconstruct
@@ -20,6 +21,8 @@ from recon.types import Calibration
 TRIED = 6
 """Iterations that are run to tell what each takes; the first ones are slower and do not count."""
 _UNCOUNTED = 2
+WORTH_BYTES = 2**20
+"""Memory that is told: less was there already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,40 @@ class Forecast:
             "" if self.memory_bytes != self.memory_bytes else f"; {in_words(self.memory_bytes)} of memory"
         )
         return f"at most {duration(self.seconds)}{each} ({TRIED} were tried){memory}"
+
+
+class Foretold:
+    """Tells once, early in a reconstruction, what all of it will take.
+
+    Its ``watch`` and ``stage`` are called with what the reconstruction tells
+    (:func:`recon.reconstruction.reconstruct.reconstruct`); made before it begins.
+
+    Parameters
+    ----------
+    tell : callable
+        ``tell(words)``, once: ``"about 12.0 s in all; 340 MiB of memory so far"``.
+    """
+
+    def __init__(self, tell: Callable[[str], object]) -> None:
+        self._tell, self._iterations, self._told = tell, 0, False
+        self._began, self._meter = time.perf_counter(), MemoryMeter()
+        self.seconds = self.memory_bytes = float("nan")
+
+    def watch(self, _record: IterationRecord, _present: Callable[[], Any]) -> None:
+        """Count an iteration."""
+        self._iterations += 1
+
+    def stage(self, share: float, _what: str) -> None:
+        """Tell, where the share has become that of the time."""
+        if self._told or self._iterations < TOLD_AT:
+            return
+        self._told = True
+        self.seconds = (time.perf_counter() - self._began) / max(share, 1e-3)
+        self.memory_bytes = self._meter.peak_mib() * 2**20
+        memory = (
+            f"; {in_words(self.memory_bytes)} of memory so far" if self.memory_bytes >= WORTH_BYTES else ""
+        )
+        self._tell(f"about {duration(self.seconds)} in all{memory}")
 
 
 def forecast(measurement: Measurement, calibration: Calibration, options: ReconstructionOptions) -> Forecast:

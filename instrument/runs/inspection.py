@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 
-from instrument.bench.photograph import Progress
+from instrument.bench.photograph import PHOTOGRAPHS, Progress
 from instrument.files.errors import ranges
 from instrument.files.figures import save_figure
+from instrument.files.images import image_metadata
 from instrument.runs.repair import file_problems
 from instrument.runs.run import DamagedFrame, FinishReason, Run, RunCondition, is_run
 from instrument.runs.run_files import LOG, FileProblem, RunError
@@ -191,7 +193,7 @@ def _shown(run: Run, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.floa
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """One run of a folder."""
+    """One run of a folder, or a photograph beside them."""
 
     path: Path
     condition: RunCondition | None = None
@@ -201,11 +203,17 @@ class RunSummary:
     frames: int = 0
     """Frames on the disk, and those that belong to it."""
     is_recording: bool = False
+    is_photograph: bool = False
     is_simulated: bool = False
     problem: str = ""
     is_damaged: bool = False
     """Whether a small file is not as it was written, or an image is gone or of another size; only ``verify``
     reads the images."""
+
+    @property
+    def kind(self) -> str:
+        """``"plan"``, ``"recording"`` or ``"photograph"``."""
+        return "photograph" if self.is_photograph else "recording" if self.is_recording else "plan"
 
     @property
     def became(self) -> str:
@@ -222,8 +230,26 @@ def run_paths(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if not p.name.startswith(".") and is_run(p))
 
 
+def runs_and_photographs(folder: Path) -> list[Path]:
+    """Return the folders of the runs in a folder and the photographs beside them, the newest first."""
+
+    def began(path: Path) -> str:  # as the names of runs begin
+        if path.parent == folder:
+            return path.name
+        try:
+            return f"{datetime.fromtimestamp(path.stat().st_mtime):%Y-%m-%d_%H-%M-%S}"
+        except OSError:  # gone meanwhile
+            return ""
+
+    return sorted([*run_paths(folder), *(folder / PHOTOGRAPHS).glob("*.tif")], key=began, reverse=True)
+
+
 def summary(path: Path) -> RunSummary:
-    """Return what became of a run."""
+    """Return what became of a run or, from a file, what a photograph says of itself."""
+    if path.is_file():
+        said = image_metadata(path)
+        simulated = bool(said.get("simulated"))
+        return RunSummary(path, RunCondition.COMPLETED, "", 1, 1, is_photograph=True, is_simulated=simulated)
     try:
         run = Run.open(path)
         return RunSummary(
@@ -233,6 +259,7 @@ def summary(path: Path) -> RunSummary:
             len(run.records),
             run.n_frames,
             run.plan is None,
+            False,
             run.is_simulated,
             run.error,
             not run.is_being_written and not verify(run, read=False).is_sound,

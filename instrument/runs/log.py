@@ -10,7 +10,7 @@ import json
 import os
 import re
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +20,7 @@ from drivers.frame import FrameMetadata
 from instrument.files.atomic import sync_folder
 from instrument.files.reading import parse_json
 from instrument.files.record import plain, value_of
+from instrument.runs.run_files import RunError
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,15 +193,84 @@ def log_line(record: Json) -> bytes:
     return text[:-1] + b'%s%08x"}\n' % (_SUM_BEGINS, zlib.crc32(text))
 
 
-def read_lines(path: Path) -> tuple[list[dict[str, Any]], list[BadLine]]:
+@dataclass(frozen=True, slots=True)
+class FrameLine:
+    """A frame's line as it was written, by its checksum; what it says is read when it is asked for."""
+
+    index: int
+    line: bytes
+
+    def record(self) -> FrameRecord:
+        """Read it; raises LookupError, TypeError or ValueError where it says nothing of a frame."""
+        return FrameRecord.from_json(parse_json(self.line))
+
+
+class FrameRecords(MutableMapping[int, FrameRecord]):
+    """Records by the frames' indices; of a log in ``path``. A hundred thousand are not read for one."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._known: dict[int, FrameRecord | FrameLine] = {}
+
+    def add(self, found: FrameRecord | FrameLine) -> None:
+        """Take what a log says of a frame; the last counts."""
+        self._known[found.index] = found
+
+    def __getitem__(self, index: int) -> FrameRecord:
+        found = self._known[index]
+        if isinstance(found, FrameLine):
+            try:
+                found = found.record()
+            except (LookupError, TypeError, ValueError, AttributeError) as error:
+                raise RunError(self._path, f"is damaged: frame {index}: {error!r}.") from error
+            self._known[index] = found
+        return found
+
+    def __setitem__(self, index: int, record: FrameRecord) -> None:
+        self._known[index] = record
+
+    def __delitem__(self, index: int) -> None:
+        del self._known[index]
+
+    def __contains__(self, index: object) -> bool:
+        return index in self._known
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._known)
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+
+UNREAD = "unread"
+_FRAME = re.compile(rb'\{"kind": "frame", "index": (\d{1,15}), ')
+
+
+def _frame_line(line: bytes) -> FrameLine | None:
+    """Return a frame's line that is as it was written; None for every other."""
+    begins = _FRAME.match(line)
+    if begins is None:
+        return None
+    before, found, digits = line.rpartition(_SUM_BEGINS)
+    if not found or digits != b'%08x"}\n' % zlib.crc32(b"}", zlib.crc32(before)):
+        return None
+    return FrameLine(int(begins[1]), line)
+
+
+def read_lines(path: Path, *, unread: bool = False) -> tuple[list[dict[str, Any]], list[BadLine]]:
     """Return a log's records, and the pieces of it that are none.
 
-    What a bad byte spoils is one record: where it joined two lines, both are told apart again.
+    What a bad byte spoils is one record: where it joined two lines, both are told apart again. ``unread``:
+    frames' lines whose checksums are right are not read; their records hold a :class:`FrameLine` as
+    :data:`UNREAD`.
     """
     records: list[dict[str, Any]] = []
     bad: list[BadLine] = []
     with path.open("rb") as file:
         for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), start=1):
+            if unread and (frame := _frame_line(line)) is not None:
+                records.append({"kind": "frame", UNREAD: frame})
+                continue
             record = _record(line) if line.endswith(b"\n") else None
             if record is not None:
                 records.append(record)

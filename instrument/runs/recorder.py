@@ -163,6 +163,11 @@ class Recorder:
         self._disk_checked_s = 0.0
         self._free_bytes = 0
 
+    @property
+    def path(self) -> Path:
+        """The recording's folder."""
+        return self._writer.path
+
     def stop(self) -> None:
         """End the recording after the frames being written; callable from any thread."""
         self._stopping.set()

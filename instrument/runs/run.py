@@ -23,7 +23,7 @@ from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import value_of
 from instrument.plan import Plan, Step
 from instrument.runs.frame_array import FrameArray, description_of
-from instrument.runs.log import FrameRecord, Gap, Lost, Unlisted, read_lines
+from instrument.runs.log import UNREAD, FrameLine, FrameRecord, FrameRecords, Gap, Lost, Unlisted, read_lines
 from instrument.runs.run_files import (
     BENCH,
     FRAMES,
@@ -90,7 +90,7 @@ class Run:
     Attributes
     ----------
     path : Path
-    records : dict of int to FrameRecord
+    records : FrameRecords
         What the log says is on the disk, by frame index (that of the plan's step, or of the recording's
         frame).
     gaps : tuple of Gap
@@ -119,7 +119,7 @@ class Run:
         self.path = path
         self.log_bytes = log_size(path)
         try:
-            lines, self.bad_lines = read_lines(path / LOG)
+            lines, self.bad_lines = read_lines(path / LOG, unread=True)
         except FileNotFoundError:
             lines, self.bad_lines = [], []
         self.files = RunFiles.of_log(path, lines)
@@ -127,16 +127,15 @@ class Run:
         self.log_is_foreign = self.files.log_is_foreign((stored or {}).get("id"))
         if self.log_is_foreign:
             lines, self.files = [], RunFiles(path)
-        self.records: dict[int, FrameRecord] = {}
+        self.records = FrameRecords(path / LOG)
         self.unlisted: dict[int, Unlisted] = {}
         self.lost: dict[int, Lost] = {}
         gaps: list[Gap] = []
         events: list[Mapping[str, Any]] = []
         for line in lines:
             self._take(line, gaps, events)
-        RUN_STATE.warn_unknown(
-            path / LOG, sorted({name for r in self.records.values() for name in r.unknown})
-        )
+        first = next(iter(self.records.values()), None)  # whoever wrote it wrote the others
+        RUN_STATE.warn_unknown(path / LOG, sorted(first.unknown if first is not None else ()))
         self.gaps = tuple(gaps)
         self.events = tuple(events)
         self.state_problem = state_problem
@@ -146,8 +145,9 @@ class Run:
         """Take what a line of the log says; of several about one frame the last counts."""
         match line.get("kind"):
             case "frame":
-                record = FrameRecord.from_json(line)
-                self.records[record.index] = record
+                found = line.get(UNREAD)
+                record = found if isinstance(found, FrameLine) else FrameRecord.from_json(line)
+                self.records.add(record)
                 self.lost.pop(record.index, None)
                 self.unlisted.pop(record.index, None)
             case "gap":

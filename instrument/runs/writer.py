@@ -8,7 +8,6 @@ import os
 import platform
 import re
 import secrets
-import shutil
 import socket
 import subprocess
 import sys
@@ -24,7 +23,15 @@ import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
 from drivers.registry.claim import lock
-from instrument.files.atomic import json_text, make_folder, sync_folder, write_bytes, write_json
+from instrument.files.atomic import (
+    clear_left,
+    draft_folder,
+    json_text,
+    make_folder,
+    sync_folder,
+    write_bytes,
+    write_json,
+)
 from instrument.files.record import plain
 from instrument.plan import Plan
 from instrument.runs.frame_array import FrameArray
@@ -106,8 +113,6 @@ def _disk(path: Path, what: str) -> Iterator[None]:
 
 _FULL, _FORBIDDEN = (errno.ENOSPC, errno.EDQUOT), (errno.EACCES, errno.EPERM, errno.EROFS)
 _FIRST_CAPACITY = 256
-_TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]+)?")
-"""Names that a file has while it is written whole."""
 """Frames that a recording's array is made for at first; it doubles as needed."""
 
 
@@ -187,9 +192,9 @@ class RunWriter:
         with _disk(parent, "no run can be kept there"):
             parent.mkdir(parents=True, exist_ok=True)
             path = free_name(parent, dated_name(label))
-            draft = parent / f".{path.name}.draft"
-            draft.mkdir()
-            try:
+            with draft_folder(path, locked=False) as draft:
+                write_bytes(draft / LOCK, b"")
+                held = lock_run(draft)
                 facts, identity = plain(bench), {"id": secrets.token_hex(8), "label": label}
                 texts = {
                     BENCH: json_text(facts.pop("config")),
@@ -211,12 +216,7 @@ class RunWriter:
                 }
                 write_json(draft / STATE, RUN_STATE.stamped(state))
                 write_bytes(draft / LOG, b"".join(map(log_line, copies_of(texts))))
-                write_bytes(draft / LOCK, b"")
-                held = lock_run(draft)
                 draft.rename(path)
-            except BaseException:
-                shutil.rmtree(draft, ignore_errors=True)
-                raise
             sync_folder(parent)
         return cls(path, held)
 
@@ -235,9 +235,7 @@ class RunWriter:
             try:
                 if log_bytes not in (None, log_size(path)):
                     raise RunError(path, "was written to while it was looked at.", "Try once more.")
-                for leftover in path.glob(".*"):  # of a write that a crash cut off
-                    if leftover.is_file() and _TEMPORARY.fullmatch(leftover.name):
-                        leftover.unlink()
+                clear_left(path, again=True)
                 mended = mend_files(path)
             except BaseException:
                 held.close()
@@ -410,7 +408,7 @@ def dated_name(label: str) -> str:
 def free_name(parent: Path, name: str, suffix: str = "") -> Path:
     """Return a path for a new run or file, with a number before the suffix when its name is taken."""
     path, number = parent / f"{name}{suffix}", 1
-    while path.exists() or (parent / f".{path.name}.draft").exists():
+    while path.exists() or any(parent.glob(f".{path.name}.*.part")):
         number += 1
         path = parent / f"{name}-{number}{suffix}"
     return path

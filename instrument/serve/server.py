@@ -19,11 +19,12 @@ from typing import Any, Self, TypeVar, cast
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from drivers.camera import Camera
-from drivers.errors import DeviceError, DeviceLostError, DeviceTimeoutError
+from drivers.errors import DeviceError, DeviceLostError, DeviceTimeoutError, LimitError
 from drivers.frame import Frame
 from drivers.remote.device import said_facts
 from drivers.remote.wire import (
     INTERFACES,
+    LONGEST_ARRAYS,
     NUMBER_HEADER,
     OPERATOR_HEADER,
     PORT,
@@ -43,7 +44,6 @@ from instrument.serve.watching import Watcher, picture
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-_LONGEST_REQUEST = 256 << 20
 _FRAME_WAIT_S, _CLOSING_S, _GIVE_WAY_S = 0.2, 1.0, 0.002
 _STATE_S, _PICTURE_S = 1.0, 0.1
 """How often a page hears of the state, and sees a picture, at most."""
@@ -53,6 +53,14 @@ _PAGE_HEADERS = {
     "Referrer-Policy": "no-referrer",
 }
 _dumps = functools.partial(json.dumps, default=plain)
+
+
+def _decoded(data: bytes) -> Any:
+    """Return what JSON says; ValueError where it is none, or lists are in lists in lists without end."""
+    try:
+        return json.loads(data)
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +120,7 @@ class BenchServer:
         return self
 
     async def _begin(self) -> None:
-        app = web.Application(client_max_size=_LONGEST_REQUEST, middlewares=[self._guard])
+        app = web.Application(client_max_size=LONGEST_ARRAYS, middlewares=[self._guard])
         app.add_routes(
             [
                 web.get("/", self._page),
@@ -189,6 +197,9 @@ class BenchServer:
             return _error(401, DeviceError("server", "needs its token.", "See where serve has put it."))
         try:
             return await handler(request)
+        except LimitError as error:
+            too_long = isinstance(error.__cause__, web.HTTPRequestEntityTooLarge)
+            return _error(413 if too_long else 409, error)
         except DeviceError as error:
             return _error(409, error)
         except BenchError as error:
@@ -220,9 +231,7 @@ class BenchServer:
         if call is None or call.verb != request.method:
             problem = f"takes no {request.method} {name}."
             return _error(404, DeviceError(kind, problem, "Both ends need the same version of the program."))
-        arguments = await request.json() if request.can_read_body else {}
-        if not isinstance(arguments, dict):
-            raise ValueError("arguments come by name, in a JSON object")
+        arguments = await self._arguments(request, kind, call.longest_request)
         number = int(request.headers.get(NUMBER_HEADER, "0"))
         pool = self._overtaking if call.verb == "PUT" else self._pool
         key = self._operator(request).key
@@ -235,7 +244,27 @@ class BenchServer:
             self._overtakers -= call.verb == "PUT"
         if isinstance(made, Frame):
             return web.Response(body=await self._in_thread(pack_frame, made))
-        return web.json_response({"value": call.gives.dump(made)}, dumps=_dumps)
+        said = await self._in_thread(lambda: _dumps({"value": call.gives.dump(made)}))
+        return web.json_response(text=said)
+
+    async def _arguments(self, request: web.Request, kind: Kind, longest: int) -> dict[str, Any]:
+        """Return what a request says, decoded in another thread, so that no STOP waits for it.
+
+        Raises ValueError when it is no JSON object; LimitError when it is too long.
+        """
+        try:
+            if (request.content_length or 0) > longest:
+                raise web.HTTPRequestEntityTooLarge(longest, request.content_length or 0)
+            data = await request.read() if request.can_read_body else b"{}"
+        except web.HTTPRequestEntityTooLarge as error:
+            problem = f"takes requests of at most {longest >> 20} MB over the network."
+            raise LimitError(
+                kind, problem, "Send less at a time: shorter sequences, smaller patterns."
+            ) from error
+        arguments = await self._in_thread(_decoded, data)
+        if not isinstance(arguments, dict):
+            raise ValueError("arguments come by name, in a JSON object")
+        return arguments
 
     async def _stop(self, request: web.Request) -> web.StreamResponse:
         who = f"somebody at {request.remote}"

@@ -101,8 +101,8 @@ def activity(
             desk.fact("Left out", f"places whose neighbours go together: {', '.join(told)}")
         if not found.regions:
             desk.warn(
-                "Warning: no region found: nothing is active here, or too weakly. A lower --correlation or "
-                "more light may show it."
+                "Warning: no region found: nothing is active here, or too weakly. Where cells are a few "
+                "pixels wide, --smooth 1.5 shows them; else a lower --correlation or more light may."
             )
         with desk.step("writing"):
             written = write_activity(found, pictures, out, settings)

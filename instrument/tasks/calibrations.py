@@ -92,6 +92,7 @@ def analyze(desk: Desk, files: AnalysisFiles, settings: AnalysisSettings, noise:
     from instrument.files.record import plain
     from instrument.reconstruction.job import find_calibration
     from recon.analysis import analyse
+    from recon.evaluation.two_points import reached
 
     out, record = files.out, files.out.with_suffix(".json")
     if out.suffix.lower() not in _PAGES:
@@ -113,7 +114,12 @@ def analyze(desk: Desk, files: AnalysisFiles, settings: AnalysisSettings, noise:
     simulated = bool(measured.provenance.get("simulated"))
     with saying_what_is_left(out, record):
         with desk.step("analyze") as advance:
-            analysis = analyse(measured, settings, on_progress=lambda _what, share: advance(share * 100, 100))
+            analysis = analyse(
+                measured,
+                settings,
+                reach=reached,
+                on_progress=lambda _what, share: advance(share * 100, 100),
+            )
         title, subtitle = _titles(measured, folder)
         with desk.step("drawing"):
             figure = draw_analysis(analysis, title, subtitle, simulated=simulated)

@@ -5,6 +5,7 @@ Kuo 2020, Eqs. 3.11, 3.12 and 4.6, Figs. 3.4, 5.1 and A.3.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -181,6 +182,44 @@ class FieldOfView:
         """``"the pixels' angular response"`` or ``"the sensor's and the aperture's size"``."""
         by_pixels = self.cutoff_deg is not None and self.cutoff_deg < self.geometric_deg
         return "the pixels' angular response" if by_pixels else "the sensor's and the aperture's size"
+
+
+def half_light_deg(
+    psf: Array,
+    sensor_shape: tuple[int, int],
+    tangent_per_px: float,
+    response: Callable[[Array, Array], Array],
+) -> tuple[float, float]:
+    """Return the angles along y and x at which half of the light of the axis is left.
+
+    Parameters
+    ----------
+    psf : ndarray, (height, width)
+        On the axis, its middle the sensor's.
+    sensor_shape : (int, int)
+        Of the whole sensor, on which the pattern moves.
+    tangent_per_px : float
+        By which the source moves off the axis while its pattern moves by a pixel.
+    response : callable
+        Of the pixels, by the tangents along y and x. The aperture's obliquity, the cube of the cosine for its
+        area and the distance, is added.
+    """
+    angles = []
+    for axis in (0, 1):
+        profile = np.maximum(psf, 0).sum(axis=1 - axis, dtype=np.float64)
+        edge = (sensor_shape[axis] - len(profile)) // 2
+        shifts = np.arange(edge + len(profile))
+        # Towards one end; patterns are cut alike at the other, but for their shape.
+        share = profile / profile.sum()
+        ends = [np.concatenate([np.ones(edge + 1), 1 - np.cumsum(p)]) for p in (share, share[::-1])]
+        seen = np.mean([end[: len(shifts)] for end in ends], axis=0)
+        tangents = shifts * tangent_per_px
+        y, x = (tangents * (axis == n) for n in (0, 1))
+        light = seen * response(y, x) * (1 + tangents**2) ** -1.5
+        below = np.flatnonzero(light < 0.5 * light[0])
+        last = tangents[below[0]] if below.size else tangents[-1]
+        angles.append(float(np.rad2deg(np.arctan(last))))
+    return angles[0], angles[1]
 
 
 def field_of_view(

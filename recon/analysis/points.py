@@ -65,6 +65,32 @@ class Noise:
 
 
 @dataclass(frozen=True, slots=True)
+class TriedPair:
+    """A pair of points in a reconstruction."""
+
+    px: float
+    axis: int
+    """0: along y, 1: along x."""
+    told: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Reached:
+    """What the default reconstruction reaches, with the noise of the tests."""
+
+    across_px: tuple[float | None, float | None]
+    """Distance along y and along x at which nine in ten pairs are told apart; None: at none tried."""
+    focus_um: tuple[float, float] | None
+    """Nearest and farthest depth (possibly infinite) at which pairs half as far again apart are told apart in
+    a picture focused at the depth analysed; None where no distance was found."""
+    pairs: tuple[TriedPair, ...]
+    method: str
+    """Solver and prior."""
+    part: float
+    """Part of the sensor's pixels that was used."""
+
+
+@dataclass(frozen=True, slots=True)
 class PointTrial:
     """One image of points, reconstructed."""
 

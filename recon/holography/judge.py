@@ -80,14 +80,16 @@ def seen_image(slm: Array, display: Display, *, z_mm: float = 0.0, padding: int 
 
 
 def judge(slm: Array, display: Display, target: Target, *, padding: int = 2) -> Scores:
-    """Compare what is seen with the target, which must be given on the mask's grid."""
+    """Compare what is seen with the target, given on the mask's grid, within its window if it has one."""
     if target.image.shape != display.mask.shape:
         raise InputError(
             f"The judge needs the target on the mask's grid {display.mask.shape}, not {target.image.shape}."
         )
     image, peak = target.scaled(display)
     wanted = np.fft.fftshift(low_pass(image, display.slm_shape))
-    return compare(seen_image(slm, display, z_mm=target.z_mm, padding=padding), wanted, peak)
+    seen = seen_image(slm, display, z_mm=target.z_mm, padding=padding)
+    part = (...,) if target.window is None else target.window.part(seen.shape)
+    return compare(seen[part], wanted[part], peak)
 
 
 def compare(seen: Array, wanted: Array, peak: float) -> Scores:

@@ -11,12 +11,13 @@ In the symbols of :mod:`recon.holography.model`, with ``phi`` the phase that a p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, pi
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from numpy.polynomial.legendre import legvander
 
 from recon.errors import InputError
 
@@ -83,6 +84,33 @@ class Learned:
         response[:, 0] = display.dc.modulated
         dc = np.array([light.real, light.imag])
         return cls(response, dc, np.zeros(2), amplitude, phase, np.zeros((2, 4)), 1.0)
+
+    def at(self, turns: float) -> Learned:
+        """Return what this says of the display in light in which phases are ``turns`` times as large.
+
+        Errors are optical paths and amplitudes: those of a pixel belong to its height, those of the light
+        that reaches the camera to its angle. Light that is not modulated keeps its phase; glass and liquid
+        crystal have no dispersion.
+        """
+        if turns == 1:
+            return self
+        count = len(self.response)
+        known = self.response[:, 0] + 1j * self.response[:, 1]
+        turn = np.arange(count) / (count - 1)
+        # What a phase needs of the pixel: less than a turn of before at a shorter wavelength.
+        at = np.mod(turn / turns, 1)
+        error = np.interp(at, turn, np.unwrap(np.angle(known))) * turns
+        response = np.interp(at, turn, np.abs(known)) * np.exp(1j * error)
+        places = np.linspace(-1, 1, 1 + max(_SHADE_ORDERS))
+        here, there = (legvander(x, max(_SHADE_ORDERS))[:, 1:] for x in (places, places / turns))
+        whole = np.column_stack([np.ones_like(places), here])  # what is constant over the field is left out
+        shade = [np.linalg.solve(whole, there @ row)[1:] for row in self.shade]
+        return replace(
+            self,
+            response=np.stack([response.real, response.imag], axis=-1),
+            phase=self.phase * turns,
+            shade=np.array(shade),
+        )
 
     def illumination(self, shape: tuple[int, int]) -> npt.NDArray[np.complex64]:
         """Return ``A`` over the SLM on a grid of any size, mean power 1."""

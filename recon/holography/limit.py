@@ -26,9 +26,10 @@ import numpy.typing as npt
 from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.model import HologramModel
-from recon.holography.optimise import HologramRecord, HologramStop, _Lbfgs, _Point, _Watch
+from recon.holography.optimise import HologramRecord, HologramStop, _Lbfgs, _Watch
 from recon.holography.options import HologramOptions
 from recon.holography.target import ORDER, Target
+from recon.holography.variables import Point
 
 Array = npt.NDArray[Any]
 
@@ -130,12 +131,12 @@ class _Rows:
     def field(self, x: Array) -> Array:
         return self._normed(self._inside(x))[0]
 
-    def evaluate(self, x: Array) -> tuple[_Point, Array]:
+    def evaluate(self, x: Array) -> tuple[Point, Array]:
         slm, length = self._normed(self._inside(x))
         found = self.model.evaluate(slm)
         along = np.sum((np.conj(slm) * found.gradient).real, axis=0) / len(slm)
         gradient = 2 * (found.gradient - slm * along) / length
-        return _Point(found.loss, found.seen_psnr_db), gradient.astype(np.complex64).view(np.float32).ravel()
+        return Point(found.loss, found.seen_psnr_db), gradient.astype(np.complex64).view(np.float32).ravel()
 
     def _inside(self, x: Array) -> Array:
         return x.view(np.complex64).reshape(self.model.frames, *self.model.display.slm_shape)

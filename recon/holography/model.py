@@ -30,10 +30,12 @@ from recon.holography.display import Display
 from recon.holography.learned import Panel
 from recon.holography.losses import loss_of
 from recon.holography.options import HologramOptions
-from recon.holography.target import Target, make_band, weights_on
+from recon.holography.target import BESIDE, Target, Window, make_band, weights_on
 
 ComplexArray = npt.NDArray[Any]
 
+_ELSEWHERE = 0.3
+"""Weight of darkness beside a picture whose amplitude mirrors code: what is there is noise when coded."""
 _BANDS = 8
 """Mask row bands with accumulators of their own in the adjoint of a displaced mask; fixed, so that sums do
 not depend on the number of threads."""
@@ -96,7 +98,15 @@ class HologramModel:
         self.display = display
         self.targets = tuple(targets)
         self.options = options
+        self.window = self._window_of()
         self.loss = loss_of(options.loss)
+        if self.window is not None and not self.loss.takes_weights:
+            if not (self.loss.mean_square and self.loss.low_passed):
+                raise InputError(
+                    f"A picture in a part of the field goes with the losses 'frequency' and 'spatial', not "
+                    f"{self.loss.name!r}."
+                )
+            self.loss = loss_of("spatial")
         self.frames = options.frames
         self.dtype: np.dtype[Any] = np.dtype(dtype)
         self._real: np.dtype[Any] = np.empty(0, self.dtype).real.dtype
@@ -113,6 +123,14 @@ class HologramModel:
             height, width = self.band.seen_shape
             if (weights := options.field_weights()) is not None:
                 self._weights = weights_on(weights, (height, width)).astype(self._real)
+            if self.window is not None:
+                asked = np.zeros((height, width), self._real)
+                if options.mirrors == "lee":
+                    asked[BESIDE.part((height, width))] = _ELSEWHERE
+                asked[self.window.part((height, width))] = 1
+                asked = np.fft.ifftshift(asked)
+                self._inside = np.asarray(asked == 1, self._real)
+                self._weights = asked if self._weights is None else asked * self._weights
             self._small = np.empty((height, width // 2 + 1), self.dtype)
             self._seen = np.empty((height, width), self._real)
             if self.loss.takes_wanted:
@@ -176,8 +194,9 @@ class HologramModel:
             error = self._kernels.filtered_power(
                 self._spectrum, self._wanted[plane], self.band.cutoff, self.band.top, self.band.full
             )
+            plane_loss, error = self._loss(plane, error)
             errors.append(error / self.peaks[plane] ** 2)
-            loss += self._loss(plane, error)
+            loss += plane_loss
             self._kernels.columns(self._spectrum, False, get_threads())
             for frame in range(self.frames):
                 self._backward(frame, plane, gradient[frame])
@@ -262,6 +281,12 @@ class HologramModel:
         self._columns_and_gather(0, plane, out)
         return out if panel is None else panel.collected(out)
 
+    def _window_of(self) -> Window | None:
+        window = self.targets[0].window
+        if any(target.window != window for target in self.targets):
+            raise InputError("The targets of one hologram count in the same part of the field.")
+        return window
+
     # Steps -------------------------------------------------------------------------------------
     def _spectrum_of(self, target: Target) -> tuple[ComplexArray, float]:
         spectrum, peak = target.spectrum(self.display, self.band)
@@ -327,22 +352,28 @@ class HologramModel:
             in_blocks(rows, self.band.shape[0], grain=64)
         self._kernels.columns(self._spectrum, True, get_threads())
 
-    def _loss(self, plane: int, error: float) -> float:
-        """Return the loss and turn the kept lags into those of ``dL/dI`` (Kuo 2020, Eq. A.9)."""
+    def _loss(self, plane: int, error: float) -> tuple[float, float]:
+        """Return loss and mean square error, and turn the kept lags into ``dL/dI``'s (Kuo 2020, Eq. A.9).
+
+        ``error`` is that of the whole field, which is returned where no window is.
+        """
         band, spectrum = self.band, self._spectrum
+        counted = error
         if self._cutoff == 0:
-            error = self._kernels.filtered_power(spectrum, self._wanted[plane], 0.0, band.top, band.full)
+            counted = self._kernels.filtered_power(spectrum, self._wanted[plane], 0.0, band.top, band.full)
         self._kernels.subtract_and_filter(spectrum, self._wanted[plane], self._cutoff, band.top)
-        loss = error / 2
+        loss = counted / 2
         if not self.loss.mean_square:
             self._kernels.copy_kept(spectrum, self._small, *band.kept, band.top)
             irfft(self._small, self._seen.shape[1], out=self._seen)
             self._seen *= self._real.type(self._seen.size)
+            if self.window is not None:
+                error = float(np.vdot(self._seen * self._inside, self._seen) / self._inside.sum())
             loss, gradient = self.loss.evaluate(self._seen, self._wanted_images[plane], self._weights)
             rfft(np.ascontiguousarray(gradient, self._real), out=self._small)
             self._kernels.copy_kept(self._small, spectrum, *band.kept, band.top)
         self._kernels.low_pass(spectrum, band.kept[0], self._cutoff, band.top)
-        return loss
+        return loss, error
 
     def _image(self, spectrum: ComplexArray) -> npt.NDArray[Any]:
         """Return the low-passed image of a half spectrum, the field's centre in the middle."""

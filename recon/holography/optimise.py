@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,10 +21,14 @@ from recon.base.declare import with_overrides
 from recon.errors import InputError
 from recon.holography.model import HologramModel
 from recon.holography.options import HologramOptions
+from recon.holography.variables import FIRST_ORDER, Bounded, Mirrors, Phase, Point, Variable, coded, decoded
 
 Array = npt.NDArray[Any]
 
-_OF_THE_MODEL = ("loss", "centre", "radius", "periphery", "weights", "grid", "frames", "complex_slm", "light")
+_OF_THE_MODEL = (
+    *("loss", "centre", "radius", "periphery", "weights", "grid"),
+    *("frames", "complex_slm", "mirrors", "light"),
+)
 
 
 class HologramStop(enum.StrEnum):
@@ -58,7 +62,7 @@ class Hologram:
     Attributes
     ----------
     slm : ndarray, complex64, (n_frames, height, width)
-        Field at the SLM; of modulus 1 for a phase SLM, at most 1 for a complex one.
+        Field at the SLM; of modulus 1 for a phase SLM, at most 1 for a complex one, 0 or 1 of mirrors.
     history : tuple of HologramRecord
     stop_reason : HologramStop
     seconds : float
@@ -109,6 +113,8 @@ def compute_hologram(
     shape = (model.frames, *model.display.slm_shape)
     if initial is not None and initial.shape != shape:
         raise InputError(f"The start must be {shape}, not {initial.shape}.")
+    if options.mirrors is not None and method != "lbfgs":
+        raise InputError("Mirrors need the method 'lbfgs'.")
     if options.phase_levels is not None and (complex_slm or method != "lbfgs"):
         raise InputError("Phase levels are of a phase SLM and need the method 'lbfgs'.")
     if method == "nesterov" and model.wraps:
@@ -118,16 +124,18 @@ def compute_hologram(
             raise InputError("The one-step method takes no start and has no form for a complex SLM.")
         return one_step(model, seed=options.seed)
     watch = _Watch(options, callback, cancel)
+    if options.mirrors is not None:
+        return _on_mirrors(model, initial, options, watch)
     if options.phase_levels is not None:
-        phase = _Phase(model)
+        phase = Phase(model)
         return _on_levels(phase, phase.pack(_start(initial, model, options)), options.phase_levels, watch)
     search: _Lbfgs | _Nesterov
     if method == "lbfgs":
-        variable = _Bounded(model) if complex_slm else _Phase(model)
+        variable = Bounded(model) if complex_slm else Phase(model)
         search = _Lbfgs(variable, variable.pack(_start(initial, model, options)))
     else:
         search = _Nesterov(model, _start(initial, model, options), complex_slm)
-    if isinstance(search, _Lbfgs) and isinstance(variable, _Phase) and model.wraps:
+    if isinstance(search, _Lbfgs) and isinstance(variable, Phase) and model.wraps:
         return _in_turns(variable, search, watch)
     history, reason = watch.run(search, options.iterations, options.psnr_db)
     return Hologram(search.slm.astype(np.complex64), history, reason, history[-1].seconds)
@@ -176,101 +184,6 @@ def _sample(image: Array, shape: tuple[int, int]) -> Array:
     return sampled
 
 
-class _Point(NamedTuple):
-    """What is kept of an evaluation."""
-
-    loss: float
-    psnr_db: float
-
-
-# Variables: what the quasi-Newton method moves -----------------------------------------------------
-class _Phase:
-    """The SLM's phases as a flat real vector; where ``held`` is true they stay as they are."""
-
-    held: npt.NDArray[np.bool_] | None = None
-
-    def __init__(self, model: HologramModel) -> None:
-        self.model = model
-        self.first_step = 0.5
-        """Root mean square of the first step, radians."""
-
-    def pack(self, slm: Array) -> Array:
-        phases: Array = np.angle(slm).astype(self.model.dtype.type(0).real.dtype)
-        return phases.ravel()
-
-    def field(self, x: Array) -> Array:
-        slm = np.empty((self.model.frames, *self.model.display.slm_shape), self.model.dtype)
-        phases = x.reshape(slm.shape)
-        np.cos(phases, out=slm.real)
-        np.sin(phases, out=slm.imag)
-        return slm
-
-    def evaluate(self, x: Array) -> tuple[_Point, Array]:
-        slm = self.field(x)
-        found = self.model.evaluate(slm)
-        # dL/dphi = 2 Im(gradient conj(s)); formed in place of the gradient's imaginary part.
-        found.gradient.imag *= slm.real
-        found.gradient.real *= slm.imag
-        found.gradient.imag -= found.gradient.real
-        gradient: Array = np.multiply(found.gradient.imag, 2).ravel()
-        if self.held is not None:
-            gradient[self.held] = 0
-        return _Point(found.loss, found.seen_psnr_db), gradient
-
-
-class _Bounded:
-    """The field of a complex SLM, amplitude at most 1, as a flat real vector.
-
-    ``s = z (1 + |z|^4)^(-1/4)`` takes any ``z`` into the disc, nearly unchanged where it is small: without a
-    constraint to watch, L-BFGS walks as on the phases. (With ``(1 + |z|^2)^(-1/2)`` or the mean of two phases
-    0.3 to 2.8 dB less after 100 iterations at 4x, 10 % of the light.)
-    """
-
-    def __init__(self, model: HologramModel) -> None:
-        self.model = model
-        self.first_step = 0.5 * float(np.sqrt(model.options.share))
-
-    def pack(self, slm: Array) -> Array:
-        start = slm.astype(self.model.dtype)
-        start *= np.minimum(1, 0.95 / np.maximum(np.abs(start), 1e-12))  # the disc's edge is infinitely far
-        start *= (1 - np.abs(start) ** 4) ** -0.25
-        return start.view(self._real).ravel()
-
-    def field(self, x: Array) -> Array:
-        z = self._inside(x)
-        return np.asarray(z * (1 + np.abs(z) ** 4) ** -0.25, self.model.dtype)
-
-    def evaluate(self, x: Array) -> tuple[_Point, Array]:
-        z = self._inside(x)
-        power = np.abs(z) ** 2
-        shrink = (1 + power**2) ** -0.25
-        found = self.model.evaluate(z * shrink)
-        gradient = found.gradient
-        # ds = shrink dz - shrink^5 |z|^2 z Re(conj(z) dz)
-        radial = (np.conj(z) * gradient).real
-        gradient = 2 * (shrink * gradient - (shrink**5 * power * radial) * z).astype(self.model.dtype)
-        return _Point(found.loss, found.seen_psnr_db), gradient.view(self._real).ravel()
-
-    @property
-    def _real(self) -> np.dtype[Any]:
-        return np.empty(0, self.model.dtype).real.dtype
-
-    def _inside(self, x: Array) -> Array:
-        z: Array = x.view(self.model.dtype).reshape(self.model.frames, *self.model.display.slm_shape)
-        return z
-
-
-class _Variable(Protocol):
-    """What the quasi-Newton method moves: how a flat real vector becomes SLM fields, and its loss."""
-
-    @property
-    def first_step(self) -> float: ...
-
-    def field(self, x: Array) -> Array: ...
-
-    def evaluate(self, x: Array) -> tuple[_Point, Array]: ...
-
-
 # Searches -----------------------------------------------------------------------------------------
 # Each moves on by a step, and returns what is there, or None when it is stuck.
 class _Lbfgs:
@@ -283,7 +196,7 @@ class _Lbfgs:
 
     MEMORY = 3
 
-    def __init__(self, variable: _Variable, x: Array) -> None:
+    def __init__(self, variable: Variable, x: Array) -> None:
         self.variable = variable
         self.x = x
         self.point, self.gradient = variable.evaluate(self.x)
@@ -293,7 +206,7 @@ class _Lbfgs:
     def slm(self) -> Array:
         return self.variable.field(self.x.copy())  # steps are taken in place
 
-    def step(self) -> _Point | None:
+    def step(self) -> Point | None:
         for _ in range(2):
             moved = self._search(self._direction())
             if moved is not None:
@@ -323,7 +236,7 @@ class _Lbfgs:
             self.pairs.popleft()  # used for the last time: its room is needed while the step is tried
         return direction
 
-    def _search(self, step: Array) -> _Point | None:
+    def _search(self, step: Array) -> Point | None:
         """Shorten ``step`` until the loss falls enough, and take it."""
         slope = float(step @ self.gradient)
         if not slope < 0:
@@ -360,7 +273,7 @@ class _Nesterov:
         self.base = self.ahead = start.astype(model.dtype)
         self.t = 1.0
         found = model.evaluate(self.ahead)
-        self.point, self.gradient = _Point(found.loss, found.seen_psnr_db), found.gradient
+        self.point, self.gradient = Point(found.loss, found.seen_psnr_db), found.gradient
         size = float(np.sqrt(np.mean(np.abs(self.gradient) ** 2)))
         self.size = 2.0 / max(size, 1e-30)
 
@@ -368,7 +281,7 @@ class _Nesterov:
     def slm(self) -> Array:
         return self.ahead
 
-    def step(self) -> _Point | None:
+    def step(self) -> Point | None:
         for _ in range(20):
             base = self.project(self.ahead - self.model.dtype.type(self.size) * self.gradient)
             t = 0.5 * (1 + np.sqrt(1 + 4 * self.t**2))
@@ -376,7 +289,7 @@ class _Nesterov:
             found = self.model.evaluate(ahead)
             if found.loss <= self.point.loss:
                 self.base, self.t, self.ahead, self.gradient = base, t, ahead, found.gradient
-                self.point = _Point(found.loss, found.seen_psnr_db)
+                self.point = Point(found.loss, found.seen_psnr_db)
                 return self.point
             self.size /= 2
             self.t = 1.0
@@ -385,15 +298,19 @@ class _Nesterov:
 
 
 # Phase levels -------------------------------------------------------------------------------------
-HELD = (0.0, 0.5, 0.8, 0.95, 0.99)
-"""Part of the pixels that are rounded in each stage, those closest to a level first."""
-STAGES = (0.6, 0.1, 0.1, 0.1, 0.1)
-"""Part of the iterations in each stage."""
+Stages = tuple[tuple[float, float], ...]
+STAGES: Stages = ((0.0, 0.6), (0.5, 0.1), (0.8, 0.1), (0.95, 0.1), (0.99, 0.1))
+"""Part of the pixels that are rounded in each stage, closest to a level first, and of the iterations."""
+MIRROR_STAGES: Stages = (
+    *((0.0, 0.3), (0.25, 0.1), (0.5, 0.1), (0.7, 0.1)),
+    *((0.85, 0.1), (0.93, 0.1), (0.97, 0.1), (0.99, 0.1)),
+)
+"""Of mirrors, which are between their states at first: 0.6 to 2 dB better than by the stages above."""
 FINE = 32
 """So many levels or more are rounded to at the end only: stages would cost more than they make up for."""
 
 
-def _on_levels(variable: _Phase, x: Array, levels: int, watch: _Watch) -> Hologram:
+def _on_levels(variable: Phase, x: Array, levels: int, watch: _Watch, stages: Stages = STAGES) -> Hologram:
     """Find phases on levels; the last record is theirs, all others are of phases that are partly rounded."""
     step = x.dtype.type(2 * np.pi / levels)
     if variable.model.wraps:
@@ -404,8 +321,9 @@ def _on_levels(variable: _Phase, x: Array, levels: int, watch: _Watch) -> Hologr
         return _rounded(variable, np.minimum(near, levels - 1) * step, found.history, found.stop_reason)
     history: tuple[HologramRecord, ...] = ()
     reason = HologramStop.ITERATIONS
-    stages = zip(HELD, np.cumsum(STAGES), strict=True) if levels < FINE else [(0.0, 1.0)]
-    for held, part in stages:
+    done = 0.0
+    for held, part in stages if levels < FINE else ((0.0, 1.0),):
+        done += part
         if held:
             away = np.abs(x / step - np.rint(x / step))
             if variable.held is not None:
@@ -415,7 +333,7 @@ def _on_levels(variable: _Phase, x: Array, levels: int, watch: _Watch) -> Hologr
         if reason is HologramStop.CANCELLED or reason is HologramStop.TIME:
             continue
         search = _Lbfgs(variable, x)
-        iterations = round(watch.options.iterations * float(part))
+        iterations = round(watch.options.iterations * done)
         history, reason = watch.run(search, iterations, None, history)
         x = search.x
     variable.held = None
@@ -423,7 +341,7 @@ def _on_levels(variable: _Phase, x: Array, levels: int, watch: _Watch) -> Hologr
 
 
 def _rounded(
-    variable: _Phase, x: Array, history: tuple[HologramRecord, ...], reason: HologramStop
+    variable: Phase, x: Array, history: tuple[HologramRecord, ...], reason: HologramStop
 ) -> Hologram:
     last = history[-1]
     record = HologramRecord(last.iteration, last.seconds, *variable.evaluate(x)[0])
@@ -431,12 +349,40 @@ def _rounded(
     return Hologram(slm, (*history[:-1], record), reason, last.seconds)
 
 
+def _on_mirrors(
+    model: HologramModel, initial: Array | None, options: HologramOptions, watch: _Watch
+) -> Hologram:
+    """Find patterns of mirrors that send light or not; the last record is theirs.
+
+    Optimised: as phases on two levels. Else what the first order shall be is found as for a phase or a
+    complex SLM, and then coded.
+    """
+    if options.mirrors == "optimised":
+        whole = Mirrors(model)
+        start = initial if initial is not None else 0.5 + 0.5 * _start(None, model, options).real
+        return _on_levels(whole, whole.pack(start), 2, watch, MIRROR_STAGES)
+    if (model.display.mask.levels != model.display.mask.levels.flat[0]).any():
+        raise InputError(
+            f"A mask scatters what carries the picture and what does not over the whole field alike: "
+            f"{options.mirrors!r} is for a display without one (expansion 1). Through a mask: 'optimised'."
+        )
+    kind = Bounded if options.mirrors == "lee" else Phase
+    variable = kind(model, FIRST_ORDER)
+    start = _start(None, model, options) if initial is None else decoded(initial)
+    search = _Lbfgs(variable, variable.pack(start))
+    history, reason = watch.run(search, options.iterations, options.psnr_db)
+    last, shown = history[-1], coded(search.slm)
+    found = model.evaluate(shown)
+    record = HologramRecord(last.iteration, last.seconds, found.loss, found.seen_psnr_db)
+    return Hologram(shown.astype(np.complex64), (*history[:-1], record), reason, last.seconds)
+
+
 TURNS = ((0.25, False), (0.2, False), (0.15, False), (0.2, True), (0.2, True))
 """Where a display jumps as phases wrap: parts of the iterations in which none does, and whether phases stop
 at the ends of their turn then, so that nothing jumps afterwards."""
 
 
-def _in_turns(variable: _Phase, search: _Lbfgs, watch: _Watch) -> Hologram:
+def _in_turns(variable: Phase, search: _Lbfgs, watch: _Watch) -> Hologram:
     """Search with phases that do not wrap, and wrap them in between; the best wrapped ones count."""
     model = variable.model
     history: tuple[HologramRecord, ...] = (HologramRecord(0, 0.0, *search.point),)

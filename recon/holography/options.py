@@ -17,10 +17,16 @@ from recon.holography.target import Grid, foveal_weights
 Method = Literal["lbfgs", "nesterov", "one-step"]
 Fit = Literal["cover", "contain", "stretch"]
 Envelope = Literal["shade", "correct", "ignore"]
+Mirrored = Literal["optimised", "lee", "off-axis"]
 
 LIGHT = 0.1
 """Of the light on a complex SLM: at 16x a tenth is 2.5 to 7 dB better than a phase SLM, and a hundredth
 0.4 dB more (benchmarks/hologram_limits.py)."""
+
+MOST_MIRRORED = 1 / np.pi**2
+"""Of the light on mirrors, in one first order of fringes half as wide as their period (Lee 1979)."""
+LIGHT_MIRRORED = 0.08
+"""The noise of two states stays the same: 0.01 to 0.03 of the light cost 4 to 10 dB."""
 
 _OF_PICTURES, _LIMITED = ("picture",), ("picture", "limit")
 _PICTURE, _COUNTS, _STOP, _SLM, _RARE = "Picture", "What counts", "When to stop", "Display", "Rarely needed"
@@ -135,11 +141,21 @@ class HologramOptions:
         group=_SLM,
         applies=_OF_PICTURES,
     )
+    mirrors: Mirrored | None = option(
+        None,
+        help="For a device of mirrors that send light or not. The picture is in the upper right of the "
+        "field, its twin opposite. optimised: every mirror for itself; lee, off-axis: a carrier's fringes, "
+        "whose places are the phase and (lee) widths the amplitude; without a mask only.",
+        choices=get_args(Mirrored),
+        default_words="a phase SLM",
+        group=_SLM,
+        applies=_OF_PICTURES,
+    )
     light: float | None = option(
         None,
-        help="Of a complex SLM, how much of the light that falls on it goes into the field: the less, the "
-        "better the picture. A phase SLM always sends all of it.",
-        default_words="0.1 with a complex SLM",
+        help="How much of the light that falls on it goes into the picture. Of a complex SLM: the less, the "
+        "better the picture. Of mirrors: at most 0.1. A phase SLM always sends all of it.",
+        default_words="0.1 with a complex SLM, 0.08 with mirrors",
         above=0,
         most=1,
         metavar="SHARE",
@@ -215,8 +231,10 @@ class HologramOptions:
         require(self)
         if not all(0 <= at <= 1 for at in self.centre):
             raise InputError(f"centre must lie in 0 to 1 of the field, not {self.centre}.")
-        if self.light is not None and not self.complex_slm:
-            raise InputError("light is of a complex SLM: a phase SLM sends all of the light into the field.")
+        if self.light is not None and not self.complex_slm and self.mirrors is None:
+            raise InputError("light is of a complex SLM or mirrors: a phase SLM sends all into the field.")
+        if self.mirrors is not None:
+            self._require_mirrors()
         if self.weights is None:
             return
         if not loss_of(self.loss).takes_weights:
@@ -226,12 +244,24 @@ class HologramOptions:
         if weights.ndim != 2 or not np.isfinite(weights).all() or weights.min() < 0 or weights.max() <= 0:
             raise InputError("Weights must be a (height, width) image, finite, not negative, not all zero.")
 
+    def _require_mirrors(self) -> None:
+        if self.complex_slm or self.phase_levels is not None:
+            raise InputError("Mirrors send light or not: leave --complex and --levels out.")
+        if self.method != "lbfgs":
+            raise InputError("Mirrors need the method 'lbfgs'.")
+        if self.light is not None and self.light > MOST_MIRRORED:
+            raise InputError(
+                f"Mirrors send at most {MOST_MIRRORED:.3f} of the light into a picture, not {self.light:g}."
+            )
+
     @property
     def share(self) -> float:
         """How much of the light on the SLM the target asks for."""
-        if not self.complex_slm:
+        if not self.complex_slm and self.mirrors is None:
             return 1.0
-        return LIGHT if self.light is None else self.light
+        if self.light is not None:
+            return self.light
+        return LIGHT if self.complex_slm else LIGHT_MIRRORED
 
     def field_weights(self) -> npt.NDArray[Any] | None:
         """Return the weights over the field, (height, width); None where the loss takes none."""

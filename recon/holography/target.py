@@ -109,6 +109,40 @@ def make_band(slm_shape: tuple[int, int], factor: int, grid: Grid, *, unfiltered
 
 
 @dataclass(frozen=True, slots=True)
+class Window:
+    """A rectangle of the field, in fractions of it from the top left."""
+
+    top: float
+    left: float
+    bottom: float
+    right: float
+
+    def part(self, shape: tuple[int, ...]) -> tuple[slice, slice]:
+        """Return the rows and columns inside it of an image over the field, the centre in the middle."""
+        height, width = shape[:2]
+        return _between(self.top, self.bottom, height), _between(self.left, self.right, width)
+
+    def shrunk(self, share: float) -> Window:
+        """Return it in a field of which this one is the middle, a ``share`` along each axis."""
+        sides = (self.top, self.left, self.bottom, self.right)
+        return Window(*(0.5 + share * (side - 0.5) for side in sides))
+
+
+def _between(first: float, last: float, n: int) -> slice:
+    return slice(ceil((first - 0.5) * n + n // 2), ceil((last - 0.5) * n + n // 2))
+
+
+EVERYWHERE = Window(0.0, 0.0, 1.0, 1.0)
+
+FIRST_ORDER = Window(0.05, 0.55, 0.45, 0.95)
+"""Where mirrors show a picture: away from the twin (opposite), and from the light that no mirror deflects, in
+the middle and on the axes through it."""
+
+BESIDE = Window(0.0, 0.52, 0.48, 1.0)
+"""What is nearer to it than to these."""
+
+
+@dataclass(frozen=True, slots=True)
 class Target:
     """An intensity image over the whole field of view, in focus at ``z_mm``.
 
@@ -120,11 +154,14 @@ class Target:
         Distance of the plane from the Fourier lens' focal plane.
     white : float or None
         The value that PSNR counts as peak; the image's maximum by default.
+    window : Window or None
+        Where in the field it counts; everywhere by default.
     """
 
     image: npt.NDArray[Any]
     z_mm: float = 0.0
     white: float | None = None
+    window: Window | None = None
 
     def __post_init__(self) -> None:
         if self.image.ndim != 2 or min(self.image.shape) < 8:

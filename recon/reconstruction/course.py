@@ -1,9 +1,12 @@
-"""How far a reconstruction is: one measure of all that it does, which never goes back."""
+"""How far a reconstruction is: the share of its time that is over, which never goes back."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
+
+import numpy as np
 
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Stage
@@ -12,10 +15,16 @@ from recon.reconstruction.uncertainty import REPEATS
 from recon.solvers.base import IterationRecord
 
 Name = Literal["refine", "choose", "solve", "uncertainty", "judge"]
+TOLD_AT = 12
+"""Iterations from which on the share is that of the time: how long one takes, and how fast they settle, shows
+then. Of 8 runs by default options the iterations foretold by these were within 25 % in 5, and within 45 %."""
+_UNCOUNTED = 2
+JUDGING_S = 0.4
+"""Processor time that judging takes besides two iterations, of any size: 0.35 to 0.43 s were measured."""
 
 
 class Course:
-    """Gives every stage its share of the whole, about as long as it takes.
+    """Gives every stage its share of the whole: about as long as it takes, from measured iterations on.
 
     Parameters
     ----------
@@ -27,45 +36,96 @@ class Course:
 
     def __init__(self, options: ReconstructionOptions, on_stage: Stage | None) -> None:
         self._options, self._tell, self._done = options, on_stage, 0.0
-        costs: dict[Name, float] = {  # in units of solving
+        self._began = time.perf_counter(), time.process_time()
+        self._left: dict[Name, float] = {  # in units of solving, what is not begun
             "refine": 1.5 * options.refine_psf,
             "choose": 0.25 * (options.model == "auto"),
             "solve": 1.0,
             "uncertainty": float(REPEATS * options.uncertainty),
             "judge": 0.5 * options.judged,
         }
-        self._of = {name: cost / sum(costs.values()) for name, cost in costs.items()}
-        names = list(costs)
-        self._before = {name: sum(self._of[n] for n in names[:i]) for i, name in enumerate(names)}
 
     def stage(self, name: Name) -> Stage:
-        """Return what a stage tells its own share."""
+        """Return what a stage tells its own share; it gets its part of what is left when it begins."""
+        span: tuple[float, float] | None = None
 
         def tell(share: float, what: str) -> None:
-            self._done = max(self._done, self._before[name] + self._of[name] * min(max(share, 0.0), 1.0))
-            if self._tell is not None:
-                self._tell(self._done, what)
+            nonlocal span
+            if span is None:
+                whole = sum(self._left.values())
+                span = self._done, (1 - self._done) * self._left.pop(name) / whole if whole else 0.0
+            self._say(span[0] + span[1] * min(max(share, 0.0), 1.0), what)
 
         return tell
 
-    def iterations(self, on_progress: Progress | None, runs: int) -> Progress | None:
-        """Return what the solver tells: of each run, one after the other, the nearer of count and time."""
+    def _say(self, done: float, what: str) -> None:
+        self._done = max(self._done, min(done, 1.0))
+        if self._tell is not None:
+            self._tell(self._done, what)
+
+    def iterations(self, on_progress: Progress | None, runs: int, tolerance: float) -> Progress | None:
+        """Return what the solver tells: of each run, one after the other."""
         if self._tell is None:
             return on_progress
-        tell, run, last = self.stage("solve"), -1, 0
+        tell, run, records = self.stage("solve"), -1, list[IterationRecord]()
 
         def watch(record: IterationRecord, present: Callable[[], Any]) -> None:
-            nonlocal run, last
+            nonlocal run
             if on_progress is not None:
                 on_progress(record, present)
-            run, last = run + (run < 0 or record.iteration <= last), record.iteration
-            share = (min(run, runs - 1) + done_share(self._options, record, runs)) / runs
-            tell(share, f"iteration {record.iteration}, change {record.change:.1e}")
+            if run < 0 or record.iteration <= records[-1].iteration:
+                run += 1
+                records.clear()
+            records.append(record)
+            what = f"iteration {record.iteration}, change {record.change:.1e}"
+            if len(records) < TOLD_AT:
+                if not run:
+                    tell(_done_share(self._options, record, runs) / runs, what)
+                return
+            count = expected_iterations(records, self._options, tolerance, runs)
+            each_s = (record.seconds - records[_UNCOUNTED - 1].seconds) / (len(records) - _UNCOUNTED)
+            further = max(runs - 1 - run, 0) * count + max(count - record.iteration, 0)
+            wall_s, processor_s = (
+                now - began
+                for now, began in zip((time.perf_counter(), time.process_time()), self._began, strict=True)
+            )
+            left_s = each_s * (further + self._left.get("uncertainty", 0.0) * runs * count)
+            if "judge" in self._left and self._options.judged:
+                left_s += 2 * each_s + JUDGING_S * max(wall_s / max(processor_s, 1e-9), 0.5)
+            self._say(wall_s / (wall_s + left_s), f"{what}, of about {count}")
 
         return watch
 
 
-def done_share(options: ReconstructionOptions, record: IterationRecord, runs: int = 1) -> float:
+def expected_iterations(
+    records: Sequence[IterationRecord], options: ReconstructionOptions, tolerance: float, runs: int = 1
+) -> int:
+    """Return how many iterations a run will take, by those that it did.
+
+    At most as many as count and time allow; fewer where what they change falls to the tolerance before, as a
+    power of their number and of its exponential alike: the first foretells too many, the second too few.
+    """
+    last = records[-1]
+    limit = ITERATIONS if options.iterations is None and options.time_s is None else options.iterations
+    most = float("inf") if limit is None else float(limit)
+    if options.time_s is not None:
+        most = min(most, last.iteration * options.time_s / runs / max(last.seconds, 1e-9))
+    counted = records[len(records) // 2 - 1 :]
+    number = np.array([r.iteration for r in counted], float)
+    unrest = np.array([r.unrest for r in counted])
+    if tolerance > 0 and len(counted) > 2 and np.isfinite(unrest).all() and (unrest > 0).all():
+        ends = []
+        for bent, back in ((np.log, np.exp), (np.sqrt, np.square)):
+            slope, start = np.polyfit(bent(number), np.log(unrest), 1)
+            with np.errstate(over="ignore"):  # as good as never
+                end = float(back(max((np.log(tolerance) - start) / slope, 0.0))) if slope < 0 else most
+            ends.append(end)
+        settled = np.sqrt(np.prod(np.minimum(ends, max(most, 1.0))))
+        most = min(most, float(settled))
+    return max(round(min(most, 1e9)), last.iteration)
+
+
+def _done_share(options: ReconstructionOptions, record: IterationRecord, runs: int = 1) -> float:
     """Return how much of one run's iterations is done, 0 to 1: the nearer of count and time to its end."""
     limit = ITERATIONS if options.iterations is None and options.time_s is None else options.iterations
     by_count = 0.0 if limit is None else record.iteration / limit

@@ -21,6 +21,7 @@ from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import window_of
 from recon.reconstruction.weights import default_tau, is_weighted, kind_of, penalty_of
 from recon.solvers import memory
+from recon.solvers.splitting import SensorData
 
 BACKGROUND_FREQUENCIES = (5, 5)
 """Lowest DCT frequencies that belong to the background (Kuo 2020, sec. 6.2)."""
@@ -74,6 +75,8 @@ class Part:
         What takes a smooth background out of the data, where one is estimated.
     tau, weight : float or None
         Of the prior: relative to ``max |A^H b|``, and absolute; set by :meth:`weigh`.
+    held : float
+        How many times what noise asks for the weight is, where the table's least decided; else 1.
     """
 
     def __init__(self, problem: Problem, channels: slice) -> None:
@@ -85,7 +88,7 @@ class Part:
         self.storage = memory.Storage()
         self.plan: memory.MemoryPlan | None = None
         self.tau: float | None = None
-        self.weight = 0.0
+        self.weight, self.held = 0.0, 1.0
         self._removed: BackgroundRemoval | None = None
         self._usual: Array = np.zeros((1, 1, 1), self.dtype)
         self.removal = (
@@ -130,7 +133,7 @@ class Part:
 
     def _make_camera(self) -> LinearOperator:
         problem, depths = self.problem, self.problem.levelled[0]
-        if problem.together:
+        if problem.together or (problem.smooth and problem.solver.flat):
             plane = Convolution(
                 self._own(depths.central)[0] / self._energy[:, None, None],
                 problem.sensor_shape,
@@ -242,26 +245,38 @@ class Part:
     @property
     def operator(self) -> LinearOperator:
         """The camera with everything that happens to its data."""
-        return self._with_data(self.camera)
+        seen = self._seen(self.camera)
+        return seen if self.removal is None else self.removal @ seen
 
     @property
     def picture_operator(self) -> LinearOperator:
         """The same of one plane for solvers of pictures, whose objects are (n_channels, height, width)."""
+        camera = self.picture_camera
+        return camera if self.removal is None else self.removal @ camera
+
+    @property
+    def picture_camera(self) -> LinearOperator:
+        """The same without what takes out a background."""
         camera = self.camera
         if isinstance(camera, Reshaped):
-            return self._with_data(camera.own)
+            return self._seen(camera.own)
         channels, _, *shape = camera.domain_shape
-        return self._with_data(Reshaped(camera, (channels, *shape)))
+        return self._seen(Reshaped(camera, (channels, *shape)))
 
-    def _with_data(self, operator: LinearOperator) -> LinearOperator:
-        if not self.valid.all():
-            operator = Erasures(self.valid, self.data.shape, dtype=self.dtype) @ operator
-        return operator if self.removal is None else self.removal @ operator
+    def _seen(self, operator: LinearOperator) -> LinearOperator:
+        if self.valid.all():
+            return operator
+        return Erasures(self.valid, self.data.shape, dtype=self.dtype) @ operator
 
     @property
     def solved_data(self) -> Array:
         """The data that belong to :attr:`operator`."""
         return self.data if self.removal is None else self.removal.forward(self.data)
+
+    @property
+    def sensor_data(self) -> SensorData:
+        """The same for solvers that take a background out themselves."""
+        return SensorData(self.data, self.valid[0], self.removal)
 
     @property
     def prior(self) -> Prior:
@@ -306,7 +321,10 @@ class Part:
         peak = self.peak()
         if tau is None and times_noise is not None and peak > 0:
             tau = times_noise / peak
-        self.tau = default_tau(name, self.problem.camera_class, peak) if tau is None else float(tau)
+        if tau is None:
+            tau, of_noise = default_tau(name, self.problem.camera_class, peak)
+            self.held = tau / of_noise if of_noise > 0 else 1.0
+        self.tau = float(tau)
         self.weight = self.tau * peak
 
     def peak(self) -> float:

@@ -93,7 +93,7 @@ def reconstruct(
     if options.refine_psf:
         problem, refinement = refined(problem, on_stage=course.stage("refine"), cancel=cancel)
     problem = choose(problem, on_stage=course.stage("choose"))
-    watch = course.iterations(on_progress, len(parts_of(problem)))
+    watch = course.iterations(on_progress, len(parts_of(problem)), problem.stop_tolerance)
     result = solve(problem, warm=warm, on_progress=watch, cancel=cancel, keeper=keeper)
     if options.uncertainty:
         result = uncertain(result, problem, on_stage=course.stage("uncertainty"), cancel=cancel)
@@ -164,6 +164,7 @@ def held_out_error(
     offered = SOLVERS.named(result.solver)
     if offered.accepts(seen) is not None:
         offered = SOLVERS.named("admm")
+    seen = replace(seen, options=replace(seen.options, solver=offered.name))
     rules = rules_of(seen, offered)
     if not offered.one_step:
         rules = replace(rules, iterations=max(len(result.history) // SHARE, LEAST))

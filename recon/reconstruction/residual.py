@@ -19,6 +19,8 @@ rises to 1.3 as the prior takes hold, the USAF target's without a background to 
 is where splittings of exact data begin, and all may rise to the usual error of a model."""
 FALLING, EARLIER = 0.98, 10
 """Of so many iterations earlier: a last residual below it had not come to its end."""
+HELD = 3.0
+"""How many times what noise asks for a weight must be to be named among the causes."""
 NEGATIVE = 0.25
 """Share of the data's mean below zero from which on a background is said to be negative."""
 
@@ -54,7 +56,9 @@ def beyond_in_words(problem: Problem, beyond: npt.NDArray[Any], channels: slice 
     ]
 
 
-def residual_in_words(problem: Problem, outcome: Outcome, residual: float, noise: float) -> list[str]:
+def residual_in_words(
+    problem: Problem, outcome: Outcome, residual: float, noise: float, held: tuple[float, float] = (0.0, 1.0)
+) -> list[str]:
     """Return a warning where a run of one part ended far from its data, or went away from them.
 
     Parameters
@@ -66,6 +70,8 @@ def residual_in_words(problem: Problem, outcome: Outcome, residual: float, noise
         Its norm at the end, in units of the noise.
     noise : float
         Its expected norm.
+    held : (float, float)
+        The prior's weight relative to ``max |A^H b|``, and how many times what noise asks for it is.
     """
     times = residual / noise
     norms = [record.data_residual for record in outcome.history]
@@ -83,7 +89,15 @@ def residual_in_words(problem: Problem, outcome: Outcome, residual: float, noise
         after = "1 iteration" if least == 0 else f"{least + 1} iterations"
         said += f", and it rose, from {norms[least] / noise:.1f} times after {after}"
     falling = norms[-1] < FALLING * norms[-1 - min(EARLIER, len(norms) - 1)]
-    return [f"{said}: {_cause(problem, share, outcome.stop_reason if falling else None)}"]
+    cause = _cause(problem, share, outcome.stop_reason if falling else None)
+    tau, over = held
+    if over > HELD and not falling:
+        cause = (
+            f"the weight of the prior keeps some of it, {over:.0f} times what noise asks for: no less by "
+            f"default, for errors of the camera model. Where the PSFs are good, a smaller one explains more "
+            f"(--tau {tau / min(np.sqrt(over), 10):.1g}). Or {cause}"
+        )
+    return [f"{said}: {cause}"]
 
 
 def _cause(problem: Problem, share: float, stopped: StopReason | None) -> str:

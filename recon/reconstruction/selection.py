@@ -135,8 +135,8 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     looked = not picture or len(scale) > 1  # else one PSF is all there is
     given = measurement.background is not None
     unsaid = not given and overrides.background is None
-    lit = unsaid and (looked or all(floor(d[v]) >= FLOOR for d, v in zip(data, valid, strict=True)))
-    coarse = _coarse(data, valid, calibration, problem.options.z_um) if looked or lit else []
+    coarse = _coarse(data, valid, calibration, problem.options.z_um) if looked or unsaid else []
+    lit = unsaid and (looked or all(floor(c.data[0][c.valid[0]]) >= FLOOR for c in coarse))
     costs = {m: camera_cost(coarse[0], m) for m in scale} if len(scale) > 1 else {}
     tell(0.2, "choosing: where light is")
     contrast = None if kind == "l1" or picture else _contrast(data, valid, deviation)

@@ -267,7 +267,7 @@ def _run(
         residual = outcome.history[-1].data_residual
     rows = slice(None) if problem.patterned else part.channels
     doubts = [
-        *residual_in_words(problem, outcome, residual, part.noise_norm),
+        *residual_in_words(problem, outcome, residual, part.noise_norm, (part.tau or 0.0, part.held)),
         *background_in_words(problem, smooth, rows),
     ]
     if problem.n_depths < problem.n_planes:

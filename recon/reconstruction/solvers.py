@@ -44,6 +44,8 @@ class OfferedSolver:
         Whether it has no iterations: limits do not apply to it.
     cost : float
         Rough time that a picture takes, relative to the first solver's.
+    flat : bool
+        Whether it takes pictures through one PSF alone: its camera is of one plane.
     suits : callable
         ``suits(problem)`` tells whether it is to be preferred to those before it where it takes a problem.
     """
@@ -56,6 +58,7 @@ class OfferedSolver:
     prior: str = "tv"
     one_step: bool = False
     cost: float = 1.5
+    flat: bool = False
     suits: Callable[[Problem], bool] = lambda _: False
 
     def accepts(self, problem: Problem) -> str | None:
@@ -122,7 +125,7 @@ def _admm_refuses(problem: Problem) -> str | None:
 def _admm(part: Part, start: Array | None) -> Solver:
     from recon.camera.convolution import Convolution
     from recon.solvers.admm import Admm
-    from recon.solvers.splitting import Room, SensorData, Tuning
+    from recon.solvers.splitting import Room, Tuning
     from recon.solvers.tv_admm_volume import volume_solver
 
     problem, camera = part.problem, part.camera
@@ -130,11 +133,10 @@ def _admm(part: Part, start: Array | None) -> Solver:
         return Admm(part.picture_operator, part.data, part.prior, initial=_of_picture(start))
     if not isinstance(camera, Convolution):
         return _varying_admm(part, camera, start)
-    data = SensorData(part.data, part.valid[0], part.removal)
     prior = part.prior_on(problem.axis_weights, (False, True, True))
     tuning = Tuning(drop_empty=problem.options.drop_empty)
     room = Room(part.namespace, part.storage, keep_state=False)
-    return volume_solver(camera, data, prior, initial=start, tuning=tuning, room=room)
+    return volume_solver(camera, part.sensor_data, prior, initial=start, tuning=tuning, room=room)
 
 
 def _of_picture(start: Array | None) -> Array | None:
@@ -143,17 +145,22 @@ def _of_picture(start: Array | None) -> Array | None:
 
 def _varying_admm(part: Part, camera: LinearOperator, start: Array | None) -> Solver:
     from recon.solvers.operator_admm import OperatorAdmm
-    from recon.solvers.splitting import SensorData
 
-    data = SensorData(part.data, part.valid[0], part.removal)
     prior = part.prior_on(part.mean_axis_weights, (False,) * 3)
-    return OperatorAdmm(camera, part.central, data, prior, initial=start)
+    return OperatorAdmm(camera, part.central, part.sensor_data, prior, initial=start)
 
 
 def _sensor_admm(part: Part, start: Array | None) -> Solver:
     from recon.solvers.sensor_admm import SensorAdmm
 
-    return SensorAdmm(part.picture_operator, part.data, part.prior, initial=_of_picture(start))
+    operator, initial = part.picture_camera, _of_picture(start)
+    return SensorAdmm(operator, part.data, part.prior, initial=initial, background=part.removal)
+
+
+def _sensor_refuses(problem: Problem) -> str | None:
+    if problem.smooth and not problem.valid.all():
+        return "it estimates no background where pixels are erased"
+    return _plain_only(replace(problem, smooth=False)) or _by_name(problem, splitting_priors())
 
 
 def _fista(part: Part, start: Array | None) -> Solver:
@@ -233,9 +240,10 @@ def _offered() -> tuple[OfferedSolver, ...]:
             name="admm-sensor",
             help="Splitting with the data term solved on the sensor, for dense pictures of many pixels.",
             make=_sensor_admm,
-            refuses=lambda problem: _plain_only(problem) or _by_name(problem, splitting_priors()),
+            refuses=_sensor_refuses,
             cost=2.0,
-            suits=lambda problem: problem.data[0].size >= MANY_PIXELS,
+            flat=True,
+            suits=lambda problem: problem.smooth or problem.data[0].size >= MANY_PIXELS,
         ),
         OfferedSolver(
             name="fista",

@@ -65,10 +65,14 @@ def is_weighted(prior: str) -> bool:
     return prior not in PRIORS or PRIORS[prior].weighted
 
 
-def default_tau(prior: str, camera: CameraClass, peak: float) -> float:
-    """Return the default weight relative to ``max |A^H b|``, which is ``peak`` in units of the noise."""
+def default_tau(prior: str, camera: CameraClass, peak: float) -> tuple[float, float]:
+    """Return the default weight relative to ``max |A^H b|`` (``peak``, in units of the noise), and noise's.
+
+    The second is what noise alone asks for, without a least weight.
+    """
     row = DEFAULT_WEIGHTS[kind_of(prior), camera]
-    return max(row.noise / peak if peak > 0 else 0.0, row.least)
+    of_noise = row.noise / peak if peak > 0 else 0.0
+    return max(of_noise, row.least), of_noise
 
 
 def penalty_of(prior: str | Prior, weight: float) -> Prior:

@@ -43,8 +43,13 @@ class CosinePreconditioner:
         rows, columns = (laplacian_eigenvalues(2 * n)[:n] for n in sensor_shape)
         self._laplacian = (rows[:, None] + columns[None]).astype(dtype)
         self._low = _LowModes(power, grid_shape, sensor_shape)
+        self._weights = np.ones(self._low.counts)
         self._gain = np.ones(sensor_shape, dtype)
         self._low_gain = np.eye(self._low.size, dtype=dtype)
+
+    def weigh(self, shape: tuple[int, int], weight: float) -> None:
+        """Have so many of the lowest modes count less from the next penalties on: ``I + W C q C^T W``."""
+        self._weights[: shape[0], : shape[1]] = weight
 
     def set_penalties(self, differences: float, separable: float) -> None:
         """Adapt to ``T = separable + differences |Psi|^2``."""
@@ -55,7 +60,8 @@ class CosinePreconditioner:
         self._gain += dtype.type(separable)
         # 1 / (1 + symbol / T)
         np.divide(self._gain, self._gain + self._symbol, out=self._gain)
-        block = self._low.block(differences, separable)
+        weights = self._weights.ravel()
+        block = self._low.block(differences, separable) * weights * weights[:, None]
         factor, _ = lapack.dpotrf(np.eye(len(block)) + block, lower=1)
         inverse, _ = lapack.dpotri(factor, lower=1)  # its lower half, in 0.4 of a general inverse's time
         self._low_gain = (np.tril(inverse) + np.tril(inverse, -1).T).astype(dtype)

@@ -18,6 +18,10 @@ splitting converges without exact solves in this place.)
 Erased pixels would spoil the preconditioner. They are imputed instead: their data is what the object of the
 iteration before casts there, so that they pull at nothing once converged (a proximal ADMM; the minimiser is
 that of the valid pixels alone).
+
+A smooth background that is estimated as well is a further factor ``W`` before the data
+(:class:`~recon.camera.factors.BackgroundRemoval`), diagonal in the preconditioner's cosine modes, so that
+the system ``(I + W C q C^T W) e = W (b - A T^-1 rhs)`` takes no more steps than the other.
 """
 
 from __future__ import annotations
@@ -31,7 +35,7 @@ from recon.base import fft
 from recon.base.threads import over_rows
 from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import Convolution
-from recon.camera.factors import Erasures
+from recon.camera.factors import BackgroundRemoval, Erasures
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import IterationRecord
@@ -63,6 +67,9 @@ IMPUTATION = 1.5
 LEAST_SHARE = 0.05
 """Share of valid pixels from which a local mean is worth taking."""
 
+NEARLY = 0.01
+"""Change of the share that a background takes from which on the preconditioner follows."""
+
 FIRST_DATA_STEPS = 4
 """Conjugate gradient steps of the first iteration, whose start is nowhere near."""
 
@@ -84,6 +91,8 @@ class SensorAdmm(PictureSplitting):
         Over-relaxation, between 1 and 2.
     data_steps : int
         Conjugate gradient steps an iteration.
+    background : BackgroundRemoval, optional
+        Of a smooth background to be estimated as well, of all pixels.
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
@@ -99,8 +108,14 @@ class SensorAdmm(PictureSplitting):
         initial: Array | None = None,
         relax: float = 1.5,
         data_steps: int = 1,
+        background: BackgroundRemoval | None = None,
     ) -> None:
         super().__init__(operator, prior, initial)
+        self._background = background
+        self._adapted_to: float | None = None
+        if background is not None:
+            rows, columns, _ = background.basis(0)
+            self._cosines = rows.astype(operator.dtype), columns.astype(operator.dtype)
         from recon.solvers import _picture_kernels
 
         self._kernels: Any = _picture_kernels
@@ -108,7 +123,6 @@ class SensorAdmm(PictureSplitting):
         self._erased = not np.all(self._weight)
         # Imputed on erased pixels, so part of the state.
         self._data = np.empty(operator.range_shape, operator.dtype)
-        self.set_data(data)
         self._top, self._left = camera.corner
         self._spectrum = camera.spectrum[:, 0]
         self.relax = relax
@@ -122,6 +136,7 @@ class SensorAdmm(PictureSplitting):
         self._residual, self._direction, self._z = (
             np.empty(camera.sensor_shape, operator.dtype) for _ in range(3)
         )
+        self.set_data(data)
         grid = (start.shape[1], start.shape[2])
         self._laplace_rows, columns = (laplacian_eigenvalues(n).astype(operator.dtype) for n in grid)
         self._laplace_columns = columns[: grid[1] // 2 + 1].copy()
@@ -143,6 +158,16 @@ class SensorAdmm(PictureSplitting):
         Object, dual variables and penalties stay: a warm start of all that an iteration builds on.
         """
         self._data[...] = data
+        if self._background is not None:  # how much it takes may have changed with the data
+            for image, e, E in zip(self._data, self._e, self._E, strict=True):
+                self._weigh(image)
+                self._band[...] = 0
+                seen = self._band[:, self._left : self._left + e.shape[1]]
+                seen[...] = e
+                self._weigh(seen)
+                fft.rfft_strip(self._band[None], self._top, E[None])
+            if self._adapted_to is not None and abs(self._background.taken - self._adapted_to) > NEARLY:
+                self._adapt()
         if self._erased:
             for image, weight in zip(self._data, self._weight, strict=True):
                 fill_smoothly(image, weight)
@@ -213,6 +238,7 @@ class SensorAdmm(PictureSplitting):
         fft.rfft(y, out=Y)
         over_rows(kernels.predict, Y, E, H, *T, P)
         fft.irfft_strip(P[None], self._top, band[None])
+        self._weigh(band[:, columns])
         over_rows(kernels.residual, r, band, self._left, self._data[channel], e)
         rho_before = 1.0
         for step in range(steps):
@@ -229,6 +255,7 @@ class SensorAdmm(PictureSplitting):
                 p[...] = self._z
             band[...] = 0
             band[:, columns] = p
+            self._weigh(band[:, columns])
             fft.rfft_strip(band[None], self._top, P[None])
             # <p, (I + C q C^T) p> by Parseval: the last step needs no transform back.
             over_rows(kernels.curvature, P, H, *T, band.shape[1] % 2 == 0, self._row_sums)
@@ -241,6 +268,7 @@ class SensorAdmm(PictureSplitting):
             if step < steps - 1:
                 over_rows(kernels.weigh, P, H, *T)
                 fft.irfft_strip(P[None], self._top, band[None])
+                self._weigh(band[:, columns])
                 over_rows(kernels.reduce_residual, r, p, band, self._left, length)
             rho_before = rho
         if self._erased:
@@ -248,9 +276,20 @@ class SensorAdmm(PictureSplitting):
         fft.irfft(Y, y.shape[1], out=y)
         return float(np.vdot(e, weight * e if self._erased else e))
 
+    def _weigh(self, image: Array) -> None:
+        """Take out of an image, in place, what a smooth background takes: ``W``."""
+        if self._background is not None:
+            rows, columns = self._cosines
+            taken = image.dtype.type(self._background.taken)
+            image -= rows.T @ (taken * (rows @ image @ columns.T)) @ columns
+
     def _adapt(self) -> None:
         """Tell the preconditioners of new penalties."""
         for channel, preconditioner in enumerate(self._preconditioners):
+            if self._background is not None:
+                rows, columns = self._cosines
+                preconditioner.weigh((len(rows), len(columns)), 1 - self._background.taken)
+                self._adapted_to = self._background.taken
             preconditioner.set_penalties(*self._quadratic(channel))
 
     def _quadratic(self, channel: int) -> Array:
@@ -294,8 +333,12 @@ class SensorAdmm(PictureSplitting):
         if self.iteration in GRADIENT_BALANCING:
             w = self.solution
             misfit = self._camera.forward(w)
+            for image in misfit:
+                self._weigh(image)
             misfit -= self._data
             misfit *= self._weight
+            for image in misfit:
+                self._weigh(image)
             gradient = self._camera.adjoint(misfit)
             for c, pixels in enumerate(w):
                 size, slope = float(np.linalg.norm(pixels)), float(np.linalg.norm(gradient[c]))

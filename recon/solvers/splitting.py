@@ -20,7 +20,7 @@ from recon.camera.factors import BackgroundRemoval
 from recon.solvers.base import Solver
 from recon.solvers.memory import Storage
 
-MOST_STEPS, MOST_STEPS_OF_OPERATOR = 30, 8
+MOST_STEPS = 30
 """Conjugate gradient steps of one iteration at most."""
 
 
@@ -67,21 +67,26 @@ class SensorSystem:
         xp: Namespace = np,
         bend: Callable[[Array], Array] | None = None,
     ) -> None:
-        valid, background = measured.valid, measured.background
+        valid = measured.valid
         self.xp = xp
         self.window = window
         self.tolerance = 1e-4
-        self.max_steps = MOST_STEPS if bend is None else MOST_STEPS_OF_OPERATOR
+        self.max_steps = MOST_STEPS
         self._operator_bend = bend
         self.dtype = np.dtype(dtype)
-        self._basis = None if background is None else [xp.asarray(part) for part in background.basis(0)]
-        self._taken = 1.0 if background is None else background.taken
+        self.set_background(measured.background)
         self._mask = None if valid is None or valid.all() else xp.asarray(valid.astype(self.dtype))
         self._plane = xp.zeros(grid_shape, self.dtype)
         self._spectrum = xp.empty(fft.spectrum_shape(grid_shape), fft.complex_dtype(self.dtype))
         self._q = xp.zeros(fft.spectrum_shape(grid_shape), self.dtype)
         self._preconditioner = xp.ones_like(self._q)
         self.steps = 0
+
+    def set_background(self, background: BackgroundRemoval | None) -> None:
+        """Estimate a smooth background as well, as restrained as it is now."""
+        xp = self.xp
+        self._basis = None if background is None else [xp.asarray(part) for part in background.basis(0)]
+        self._taken = 1.0 if background is None else background.taken
 
     def set_curvature(self, q: Array) -> None:
         """Give ``q``, real, on the half spectrum."""
@@ -296,6 +301,12 @@ class VolumeSplitting(Solver):
             xp=self.xp,
             bend=bend,
         )
+        self.set_data(data)
+
+    def set_data(self, data: SensorData) -> None:
+        """Go on with other data of the same valid pixels from where the solver is: a video's next frame."""
+        operator = self.operator
+        self.system.set_background(data.background)
         image = np.array(data.image, operator.dtype).reshape(operator.sensor_shape)
         self.data = self.system.masked(self.xp.asarray(image))
 

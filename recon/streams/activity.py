@@ -169,6 +169,20 @@ def baseline(
     return result
 
 
+def smoothed(frames: Floats, deviation_px: float) -> Floats:
+    """Return frames (n_frames, height, width) smoothed by a Gaussian, which weighs a cell's light together.
+
+    A cell that a reconstruction shows in one or two pixels hops among them as it sways: neighbours do not
+    brighten together, their sum does.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    result = np.empty_like(frames)
+    for frame, smooth in zip(frames, result, strict=True):
+        gaussian_filter(frame, deviation_px, output=smooth)
+    return result
+
+
 def brightness(image: Floats) -> float:
     """Return the value above which half of an image's light lies; empty space around it changes nothing."""
     values = np.sort(np.maximum(image, 0), axis=None)[::-1]

@@ -280,6 +280,7 @@ class LiveReconstructor:
             done += 1
             spent_ms = (_now() - began).wall_ms
             if self._settled or done == at_most or spent_ms + ahead_ms > self.budget_ms or newer():
+                self._settled &= level.solver.confirm()
                 return done, _now() - first
 
     def _level_for(self, frame: Floats) -> Level:

@@ -28,6 +28,7 @@ from recon.reconstruction.selection import choice_for, with_background
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver
 from recon.solvers.base import Solver, StoppingRules
 from recon.solvers.sensor_admm import SensorAdmm
+from recon.solvers.splitting import VolumeSplitting
 from recon.types import Calibration
 
 COLD_ITERATIONS, WARM_ITERATIONS = 20, 4
@@ -144,9 +145,9 @@ class VideoSolver:
     """Solves frame after frame of one camera; for one thread. Close it, or use it as a context manager.
 
     Whatever camera, background, erasures and depths the problem has, each frame goes on from the one before,
-    with all that an iteration builds on (object, dual variables, penalties). The exact-data ADMM of a picture
-    takes new data in the memory that it has; other solvers are made anew for each frame, which costs what
-    their making costs.
+    with all that an iteration builds on (object, dual variables, penalties). Splittings whose data term is
+    solved exactly take new data in the memory that they have; other solvers are made anew for each frame,
+    which costs what their making costs.
 
     Raises InputError when the solver has no iterations, or no way for the problem.
 
@@ -220,8 +221,11 @@ class VideoSolver:
         """
         count = self.cold_iterations if self._cold else self.warm_iterations
         self.take(frame)
-        for _ in range(count):
-            if self.advance(SETTLED):
+        for _ in range(2):
+            for _ in range(count):
+                if self.advance(SETTLED):
+                    break
+            if self.confirm():
                 break
         return self.picture()
 
@@ -232,6 +236,8 @@ class VideoSolver:
             part.set_data(self.problem)
             if isinstance(solver, SensorAdmm):
                 (solver.restart if self._cold else solver.set_data)(part.data)
+            elif isinstance(solver, VolumeSplitting) and not self._cold:
+                solver.set_data(part.sensor_data)
             else:
                 self.solvers[place] = self._renewed(part, solver)
         self.iterations = 0 if self._cold else self.iterations
@@ -240,14 +246,23 @@ class VideoSolver:
     def advance(self, settled: float) -> bool:
         """Do one iteration of every part; return whether changes stay below ``settled``.
 
-        Solvers that are made anew may not move at all in their first iteration: theirs must be calm for
-        several in a row.
+        Other solvers than a picture's may not move at all in their first iterations: theirs must be calm for
+        several in a row, and what does not move at all has not come to rest.
         """
         change = max(float(solver.advance().change) for solver in self.solvers)
         self.iterations += 1
-        self._calm = self._calm + 1 if change < settled else 0
         kept = all(isinstance(solver, SensorAdmm) for solver in self.solvers)
+        self._calm = self._calm + 1 if change < settled and (kept or change > 0) else 0
         return self._calm >= (1 if kept else StoppingRules().patience)
+
+    def confirm(self) -> bool:
+        """Let depths that were left out as empty take part again where this frame has light there.
+
+        Returns whether there were none.
+        """
+        missing = [s for s in self.solvers if isinstance(s, Solver) and not s.confirm()]
+        self._calm = 0 if missing else self._calm
+        return not missing
 
     def volume(self) -> Floats:
         """Return what there is of the newest frame, (n_z, height, width[, n_channels]), measurement units."""

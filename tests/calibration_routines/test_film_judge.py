@@ -18,7 +18,7 @@ SHAPE, PERIOD_S = (100, 240), 0.1
 
 
 def film(*, shows: bool) -> tuple[Activity, object]:
-    """Return a film of the animal with two regions, one of them on tissue; each light in its own pixels."""
+    """Return a film of the animal, each light in its own pixels; regions at a cell, on tissue, on nothing."""
     animal = draw_animal(2500.0, 1000.0, seed=1)
     times = PERIOD_S * np.arange(120)
     truth = truth_of(animal, times, (50, 120), 10.0, 3800.0)
@@ -37,10 +37,11 @@ def film(*, shows: bool) -> tuple[Activity, object]:
     rng = np.random.default_rng(0)
     frames += rng.normal(0, 1e-3, frames.shape).astype(np.float32)
     cell = truth.cells_px[np.flatnonzero(truth.clear & (truth.change.max(axis=1) > 0.1))[0]]
+    still = truth.tissue_px[np.argmax(np.hypot(*(truth.tissue_px[:, None] - truth.cells_px).T).min(axis=0))]
     far = (2.0, 2.0)
     regions = [
         Region(np.array([int(row)]), np.array([int(column)]), (float(row), float(column)), 1.0)
-        for row, column in (cell, far)
+        for row, column in (cell, still, far)
     ]
     found = Activity(
         indices=tuple(range(len(times))),
@@ -60,7 +61,7 @@ def test_cells_regions_and_blood_are_told_as_they_are(shows: bool, tmp_path: Pat
     found, truth = film(shows=shows)
     judged = judge(found, truth, PERIOD_S, 300)
     assert judged.clear_active >= 5
-    assert (judged.found, judged.on_tissue) == (1, 1)
+    assert (judged.found, judged.cells_found, judged.on_tissue, judged.elsewhere) == (1, 1, 1, 1)
     if shows:
         assert judged.followed_clear == 1
         assert judged.median_um_s == pytest.approx(judged.true_median_um_s, rel=0.05)

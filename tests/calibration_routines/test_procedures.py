@@ -256,6 +256,8 @@ def test_the_angular_procedure_fills_in_the_distance(bench: Bench, tmp_path: Pat
     procedure = AngularProcedure(AngularSweep(largest_deg=20.0, step_deg=10.0))
     outlook = procedure.outlook(bench, tmp_path)
     assert "the farthest from which the stage spans the angles" in outlook.reasons[0]
+    assert "5 places" in outlook.reasons[0]  # at 20 degrees nothing is left of the pattern
+    assert "leaves the sensor" in outlook.reasons[0]
     with pytest.raises(SettingsError):
         AngularSweep(average=0)
     with pytest.raises(CalibrationError):  # four angles an axis, most of which leave the tiny sensor

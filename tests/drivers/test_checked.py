@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -35,7 +36,7 @@ def made(driver: type[Device]) -> Any:
 
 
 # Cameras ---
-@pytest.mark.parametrize("said", [float("nan"), float("inf"), 0.0, -20.0, 30.0, 5000.0])
+@pytest.mark.parametrize("said", [float("nan"), float("inf"), 0.0, -20.0, 17.9, 22.1, 5000.0])
 def test_an_exposure_that_is_none_or_another_is_refused(said: float) -> None:
     class Lying(MockCamera):
         def set_exposure_ms(self, exposure_ms: float) -> float:
@@ -43,6 +44,17 @@ def test_an_exposure_that_is_none_or_another_is_refused(said: float) -> None:
 
     with pytest.raises(DeviceError, match=r"was asked for an exposure \(ms\) of 20 and says "):
         made(Lying).set_exposure_ms(20.0)
+
+
+@pytest.mark.parametrize(("said", "is_refused"), [(9.9, True), (10.0, False), (17.0, False), (17.1, True)])
+def test_a_sequence_is_no_faster_than_asked_nor_far_slower(said: float, *, is_refused: bool) -> None:
+    class Playing(MockLedArray):
+        def arm(self, patterns: Any, period_ms: float, output: int = 0) -> float:
+            return said
+
+    refused = pytest.raises(DeviceError, match="a sequence with a period of 10 ms")
+    with refused if is_refused else nullcontext():
+        assert made(Playing).arm((), 10.0) == said
 
 
 def test_an_exposure_read_back_otherwise_is_refused() -> None:

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from drivers.device import Device
 from drivers.dlpc900 import commands, link
-from drivers.dlpc900.commands import Board, Command, encode
+from drivers.dlpc900.commands import Board, Command, encode, image_of
 from drivers.dlpc900.link import parse_reply, reports
 from drivers.dlpc900.slm import Dlpc900Options, Dlpc900Slm
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
@@ -71,8 +71,11 @@ IMAGES = hnp.arrays(
 
 @given(IMAGES, st.sampled_from(["none", "rle", "enhanced_rle", "auto"]))
 def test_every_image_comes_back_exactly(levels: np.ndarray, compression: str) -> None:
-    decoded = decode_image(encode(levels, compression))
+    decoded = decode_image(encode(image_of([levels], 8), compression))
     np.testing.assert_array_equal(decoded, np.repeat(levels[..., None], 3, axis=2))
+    shifted = image_of([levels, levels[::-1], levels[:, ::-1]], 8)
+    decoded = decode_image(encode(shifted, compression))
+    np.testing.assert_array_equal(decoded, np.stack([levels[:, ::-1], levels[::-1], levels], axis=2))
 
 
 @pytest.mark.parametrize("compression", ["none", "rle", "enhanced_rle"])
@@ -84,12 +87,12 @@ def test_long_runs_and_long_literals_come_back_exactly(compression: str) -> None
     levels[3, 100:2000] = 7
     levels[4] = np.arange(2560) % 255
     levels[5, ::256] = 9
-    np.testing.assert_array_equal(decode_image(encode(levels, compression))[..., 1], levels)
+    np.testing.assert_array_equal(decode_image(encode(image_of([levels], 8), compression))[..., 1], levels)
 
 
 def test_the_guides_examples_of_compressed_data_are_decoded() -> None:
     """Tables 2-111 and 2-113 without their typing errors; holds the emulator to the document."""
-    header = encode(np.zeros((2, 13), np.uint8), "rle")[:48]
+    header = encode(np.zeros((2, 13), np.uint32), "rle")[:48]
     line = "03 040506 05 777777 00 03 040506 070809 0A0B0C 02 789ABC 00 00 000000"
     data = bytes.fromhex(f"{line} 07 1D1E1F 06 212223 00 01")
     assert len(data.split(b"\x00\x00", 1)[0]) == 25 - 2
@@ -101,9 +104,9 @@ def test_the_guides_examples_of_compressed_data_are_decoded() -> None:
 
 
 def test_a_blank_full_size_image_is_small_and_noise_no_larger_than_uncompressed() -> None:
-    assert len(encode(np.zeros((1080, 1920), np.uint8))) < 10_000
+    assert len(encode(np.zeros((1080, 1920), np.uint32))) < 10_000
     noise = np.random.default_rng(0).integers(0, 256, (64, 1920), dtype=np.uint8)
-    assert len(encode(noise)) <= 48 + 3 * noise.size
+    assert len(encode(image_of([noise], 8))) <= 48 + 3 * noise.size
 
 
 @given(st.binary(max_size=80))
@@ -188,6 +191,96 @@ def test_binary_patterns_are_binary(board: Dlpc900Emulator) -> None:
         with pytest.raises(LimitError, match="bit_depth = 8"):
             device.display(pattern())
         np.testing.assert_array_equal(device.displayed, binary)
+
+
+@pytest.mark.parametrize(("depth", "count", "period_ms"), [(1, 51, 0.15), (8, 5, 6.0)])
+@pytest.mark.parametrize("controllers", [1, 2])
+def test_a_sequence_is_played_in_order_and_what_was_shown_comes_back(
+    monkeypatch: pytest.MonkeyPatch, depth: int, count: int, period_ms: float, controllers: int
+) -> None:
+    monkeypatch.setattr(commands, "BOARDS", {controllers: Board("a board", SMALL, 7.56, controllers)})
+    board = Dlpc900Emulator(board=controllers, shape=SMALL)
+    plug_in(monkeypatch, board)
+    rng = np.random.default_rng(0)
+    patterns = [rng.integers(0, 256, SMALL, dtype=np.uint8) for _ in range(count)]
+    if depth == 1:
+        patterns = [np.where(levels > 127, 255, 0).astype(np.uint8) for levels in patterns]
+    with slm(bit_depth=depth, dark_us=20, exposure_us=5000) as device:
+        assert device.arm(patterns, period_ms, output=1) == pytest.approx(period_ms)
+        assert board.shown is None
+        board.commands.clear()
+        device.play()
+        device.play()
+        assert 0x1A2B not in board.commands  # blank before, so nothing is uploaded again
+        np.testing.assert_array_equal(board.played, patterns)
+        assert (board.pattern["exposure_us"], board.pattern["no_trigger_2"]) == (1000 * period_ms - 20, 0)
+        device.display(patterns[0])
+        device.play()
+        np.testing.assert_array_equal(board.played, patterns)
+        np.testing.assert_array_equal(device.displayed, patterns[0])
+        np.testing.assert_array_equal(board.shown, patterns[0])
+        board.faults.never_ends = True
+        device.arm(patterns[:2], period_ms)
+        assert board.pattern["no_trigger_2"] == 1
+        ended: list[bool] = []
+
+        def play() -> None:
+            with contextlib.suppress(StoppedError):
+                device.play()
+                return
+            ended.append(True)
+
+        player = threading.Thread(target=play)
+        player.start()
+        assert until(lambda: board.commands[-1] == 0x1A0C)
+        device.blank()
+        player.join(5)
+        assert ended == [True]
+        assert board.shown is not None
+        assert not board.shown.any()
+
+
+def test_a_sequence_that_does_not_end_is_an_error(
+    board: Dlpc900Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivers.dlpc900.slm._START_S", 0.1)
+    with slm() as device:
+        device.arm([pattern(), pattern(1)], 5.0)
+        board.faults.never_ends = True
+        with pytest.raises(DeviceTimeoutError, match=r"did not end its sequence of 0\.01 s"):
+            device.play()
+        with pytest.raises(LimitError, match="1 to 50"):
+            device.arm([pattern()] * 51, 5.0)
+
+
+def test_the_messages_of_a_sequence_are_those_of_a_published_client(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Pycrafter6500's payloads for 26 patterns of 1 bit, 1000 and 50 us, shown once.
+
+    It has patterns cleared after their exposure (bit 0 of the flags), which this driver leaves.
+    """
+    sent: list[tuple[int, bytes]] = []
+    with slm(bit_depth=1, dark_us=50) as device:
+        write = device._link.write
+        monkeypatch.setattr(device._link, "write", lambda c, d: (sent.append((c, d)), write(c, d)))
+        device.arm([np.zeros(SMALL, np.uint8)] * 26, 1.05)
+    wanted = {
+        0: "0000e8030071320000010000",
+        1: "0100e8030071320000010008",
+        23: "1700e80300713200000100b8",
+        24: "1800e8030071320000010100",
+        25: "1900e8030071320000010108",
+    }
+    defined = [data for command, data in sent if command == Command.PATTERN_DEFINITION]
+    for number, payload in wanted.items():
+        expected = bytearray.fromhex(payload)
+        expected[5] &= 0xFE
+        assert defined[number] == expected
+    rest = [data.hex() for command, data in sent if command == Command.PATTERN_CONFIGURATION]
+    assert rest == ["1a001a000000"]
+    images = [data[:2].hex() for command, data in sent if command == Command.INITIALISE_PRIMARY_IMAGE]
+    assert images == ["0100", "0000"]  # the last image first
 
 
 def test_a_stopped_pattern_starts_again_without_another_upload(board: Dlpc900Emulator) -> None:

@@ -136,6 +136,9 @@ def test_settings_and_information() -> None:
     settings = ControllerSettings({}, info)
     assert settings.is_hal
     assert settings.letters == "XYZAB"
+    assert not any((settings.soft_limits, settings.hard_limits, settings.homing, settings.reports_inches))
+    settings = ControllerSettings({13: 1.0, 20: 1.0, 21: 1.0, 22: 1.0}, info)
+    assert all((settings.soft_limits, settings.hard_limits, settings.homing, settings.reports_inches))
 
 
 @given(

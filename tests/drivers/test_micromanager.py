@@ -351,3 +351,16 @@ def test_one_wheel_cannot_stand_at_two_places(manager: MicroManager) -> None:
         with pytest.raises(LimitError, match="no such colour"):
             light.set_pattern(LedPattern("green", ((0, (0, 255, 0)),)))
         assert light.pattern.description == "red"
+
+
+def test_own_settings_are_the_properties_that_the_driver_leaves_alone(adapters: Path) -> None:
+    with camera_on(manager_of(adapters, "Cam")) as camera:
+        own = camera.own_settings()
+        assert not {"Exposure", "Binning", "PixelType", "Gain"} & set(own)
+        assert own["FastImage"].choices == ("0", "1")
+        assert camera.set_own("FastImage", "1") == "1"
+        assert camera.own_settings()["FastImage"].value == "1"
+        with pytest.raises(LimitError, match="is one of"):
+            camera.set_own("FastImage", "7")
+        with pytest.raises(LimitError, match="Exposure"):
+            camera.set_own("Exposure", "7")

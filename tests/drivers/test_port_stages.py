@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ from pydantic import ValidationError
 
 from drivers.asi.stage import AsiOptions, AsiStage
 from drivers.elliptec.stage import ElliptecOptions, ElliptecStage
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, StoppedError
 from drivers.smc100.stage import Smc100Options, Smc100Stage
 from drivers.testing.stage import StageContract
 from tests.mocks.port_stages import AsiController, ElliptecBus, Smc100Chain
@@ -64,6 +66,24 @@ class TestSmc100(PortStageContract):
 class TestAsi(PortStageContract):
     emulator = AsiController
     stage_of = staticmethod(asi)
+
+
+def test_elliptec_is_not_homed_when_its_homing_was_stopped(tmp_path: Path) -> None:
+    bus = ElliptecBus(tmp_path)
+    with elliptec(bus) as stage:
+        assert [axis.speed_per_s for axis in stage.axes] == pytest.approx([60_000.0, 5_000.0])
+        stage.home()
+        stage.move_to({"x_um": 20_000.0})
+        with ThreadPoolExecutor(1) as other:
+            homing = other.submit(stage.home)
+            deadline_s = time.monotonic() + 10
+            while not stage.is_moving and time.monotonic() < deadline_s:
+                time.sleep(0.002)
+            stage.stop()
+            with pytest.raises(StoppedError):
+                homing.result(10)
+        assert not stage.is_homed
+    bus.port.unplug()
 
 
 def test_elliptec_failures_are_said(tmp_path: Path) -> None:

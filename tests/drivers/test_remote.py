@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
 from drivers.device import Device
+from drivers.errors import LimitError
 from drivers.remote.camera import RemoteCamera
 from drivers.remote.light_and_motion import RemoteLedArray, RemoteSlm, RemoteStage
 from drivers.remote.options import RemoteOptions
@@ -72,3 +74,13 @@ class TestLedArray(Over, LedArrayContract):
 
 class TestSlm(Over, SlmContract):
     driver = RemoteSlm
+
+    def test_a_sequence_that_no_request_holds_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("drivers.remote.light_and_motion.LONGEST_ARRAYS", 3 * 60 * 80)
+        with RemoteSlm(self._options) as slm:
+            images = [np.zeros(slm.shape, np.uint8)] * 3
+            assert slm.sequence_limits is not None
+            assert slm.sequence_limits.most == 2
+            assert slm.arm(images[:2], 50.0) == 50.0
+            with pytest.raises(LimitError, match="1 to 2 patterns, not 3"):
+                slm.arm(images, 50.0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import base64
+import io
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +17,7 @@ pytest.importorskip("aiohttp", reason='pip install "diffuserbench[remote]"')
 
 import aiohttp
 import numpy as np
+import numpy.typing as npt
 
 from drivers.errors import DeviceError, DeviceLostError, StoppedError
 from drivers.led_array import LedPattern
@@ -23,7 +26,7 @@ from drivers.remote import link
 from drivers.remote.camera import RemoteCamera
 from drivers.remote.light_and_motion import RemoteLedArray, RemoteSlm, RemoteStage
 from drivers.remote.options import RemoteOptions
-from drivers.remote.wire import OPERATOR_HEADER
+from drivers.remote.wire import OPERATOR_HEADER, Values
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.files.errors import BenchError
@@ -275,8 +278,17 @@ def test_there_is_one_operator_at_a_time_until_somebody_presses_stop(
     leds.close()
 
 
+def _said_to_be_vast() -> str:
+    """Return an array's file that says to be of terabytes."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        file, {"descr": "|u1", "fortran_order": False, "shape": (1 << 21, 1 << 21)}
+    )
+    return base64.b64encode(file.getvalue() + bytes(8)).decode()
+
+
 def test_without_the_token_nothing_is_answered(
-    server: BenchServer, options: RemoteOptions, tmp_path: Any
+    server: BenchServer, options: RemoteOptions, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def ask(verb: str, path: str, **named: Any) -> tuple[int, str]:
         async with (
@@ -320,6 +332,15 @@ def test_without_the_token_nothing_is_answered(
                 ask("POST", "/api/devices/led_array/set_pattern", headers=headers, data=data)
             )
             assert (status, "does not understand" in text) == (400, True), text
+        monkeypatch.setattr("drivers.remote.wire.LONGEST_REQUEST", 200_000)
+        for path, data, status, words in (
+            ("led_array/set_pattern", b" " * 300_000, 413, "over the network"),
+            ("led_array/set_pattern", b"[" * 100_000, 400, "nested too deep"),
+        ):
+            found = asyncio.run(ask("POST", f"/api/devices/{path}", headers=headers, data=data))
+            assert (found[0], words in found[1]) == (status, True), found
+    with pytest.raises(ValueError, match="bytes, and 8 came"):
+        Values(npt.NDArray[np.uint8]).load(_said_to_be_vast())
     (tmp_path / "token").write_text("another-word-than-its")
     with pytest.raises(DeviceError, match=r"does not take the token in .*token"):
         RemoteLedArray(options).open()

@@ -6,14 +6,17 @@ from drivers.device import Device
 from drivers.simulated.camera_settings import CameraOptions
 from drivers.simulated.display import (
     DisplayCamera,
+    DisplayLasers,
     DisplayOptions,
     DisplaySlm,
     DisplayStage,
     DisplayStageOptions,
     DisplayWorld,
+    LaserOptions,
 )
 from drivers.simulated.slm import SlmOptions
 from drivers.testing.camera import CameraContract
+from drivers.testing.led_array import LedArrayContract
 from drivers.testing.slm import SlmContract
 from drivers.testing.stage import StageContract
 from instrument.bench.bench import Bench
@@ -36,6 +39,11 @@ class TestDisplayStage(StageContract):
 class TestDisplaySlm(SlmContract):
     def make(self) -> Device:
         return DisplaySlm(SlmOptions(shape=(60, 80)), DisplayWorld(DisplayOptions(time_scale=0.0)))
+
+
+class TestDisplayLasers(LedArrayContract):
+    def make(self) -> Device:
+        return DisplayLasers(LaserOptions(), DisplayWorld(DisplayOptions(time_scale=0.0)))
 
 
 def test_the_laser_is_the_scene_and_the_mask_rides_on_the_stage() -> None:

@@ -507,3 +507,15 @@ def test_a_cut_off_jpeg_is_refused(cut: float) -> None:
     out = np.zeros((48, 64), np.uint8)
     assert decode(jpeg, wanted, 0, out)
     assert not decode(jpeg[: int(len(jpeg) * cut)], wanted, 0, out)
+
+
+def test_own_settings_are_the_controls_that_the_driver_leaves_alone() -> None:
+    with camera_on(FakeKernel()) as camera:
+        own = camera.own_settings()
+        assert set(own) == {"brightness", "power_line_frequency"}
+        assert own["power_line_frequency"].choices[2] == "2 (60 Hz)"
+        assert camera.set_own("power_line_frequency", "2 (60 Hz)") == "2 (60 Hz)"
+        assert camera.set_own("brightness", "-5") == -5
+        for name, value in (("brightness", "65"), ("brightness", "much"), ("read_only", "4"), ("gain", "3")):
+            with pytest.raises(LimitError, match=name):
+                camera.set_own(name, value)

@@ -112,7 +112,8 @@ class Operator:
         self.wait(self.panel(name).isVisible)
 
     def types(self, field: Any, text: str) -> None:
-        """Type into a field and press Return."""
+        """Type into a field that takes keys, and press Return."""
+        self.wait(field.isEnabled)
         field.setFocus()
         field.selectAll()
         QTest.keyClicks(field, text)
@@ -366,7 +367,7 @@ def _(o: Operator) -> None:
 @step("beyond its limits it does not go")
 def _(o: Operator) -> None:
     target = o.panel("stage").rows["x_um"].target
-    o.types(target, "9999999")
+    o.types(target, "9999999 um")
     o.wait(lambda: target.property("refused"))
 
 
@@ -558,6 +559,7 @@ def _(o: Operator) -> None:
 def _(o: Operator) -> None:
     slider = o.panel("runs").slider
     o.wait(lambda: slider.maximum() > 0)
+    o.keys(KEY.Key_Home, on=slider)
     o.keys(KEY.Key_Right, on=slider)
     assert slider.value() == 1
 

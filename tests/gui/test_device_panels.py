@@ -16,6 +16,7 @@ from gui.panel import Panel
 from gui.panels.led_array import LedPanel
 from gui.panels.slm import SlmPanel
 from gui.panels.stage import StagePanel
+from gui.panels.sweeps import SweepsPanel
 from gui.widgets.dialogues import Question
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
@@ -103,15 +104,15 @@ def test_a_target_is_typed_and_one_outside_the_limits_refused(
     assert device is not None
     field.setFocus()
     field.selectAll()
-    qtbot.keyClicks(field, "1234")
+    qtbot.keyClicks(field, "1.234")
     qtbot.keyClick(field, Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: abs(device.position()["x_um"] - 1234) < 20, timeout=WAIT_MS)
     _settled(qtbot, window)
     field.selectAll()
-    qtbot.keyClicks(field, "60001")
+    qtbot.keyClicks(field, "60001 um")
     qtbot.keyClick(field, Qt.Key.Key_Return)
     assert field.property("refused")
-    assert "-60000 to 60000" in field.toolTip()
+    assert "-60 mm to 60 mm" in field.toolTip()
     assert abs(device.commanded_position()["x_um"] - 1234) < 1
 
 
@@ -142,7 +143,19 @@ def test_a_place_is_kept_with_the_bench_and_gone_to_again(
     assert stage._here == pytest.approx(at, abs=1.0)
     qtbot.mouseClick(stage.places.use_button, LEFT)
     qtbot.waitUntil(lambda: (stage._here or {}) == pytest.approx(here, abs=1.0), timeout=WAIT_MS)
+    session.keep("places", "off/left", at)
+    qtbot.mouseClick(stage.all_button, LEFT)
+    qtbot.waitUntil(lambda: "sweeps" in window.maker.panels, timeout=WAIT_MS)
+    sweeps = window.maker.panels["sweeps"]
+    assert isinstance(sweeps, SweepsPanel)
+    qtbot.waitUntil(lambda: sweeps.run_bar.start_button.isEnabled(), timeout=WAIT_MS)
+    plan = sweeps.procedure().plan  # type: ignore[union-attr]
+    assert [part.label for part in plan.parts] == ["middle", "off-left"]
+    assert plan.parts[0].positions.points[0] == pytest.approx(here, abs=1.0)  # type: ignore[union-attr]
+    assert all(part.scene_lit for part in plan.parts)
+    session.keep("places", "off/left", None)
     qtbot.mouseClick(stage.places.remove_button, LEFT)
+    assert not stage.all_button.isEnabled()
     assert not stage.places.names.count()
 
 
@@ -284,6 +297,8 @@ def test_the_copied_lines_light_the_same_leds_until_enter(
 ) -> None:
     array = window.session.bench.led_array
     assert array is not None
+    # The live view lights the scene with its first frame, and would take the pattern away again.
+    qtbot.waitUntil(lambda: window.session.bench.scene_lit, timeout=WAIT_MS)
     pattern = array.set_pattern(array.single(5, (0, 9, 0)))
     qtbot.waitUntil(lambda: leds._drawn == pattern, timeout=WAIT_MS)
     assert "input(" in leds.as_python()

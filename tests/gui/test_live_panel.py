@@ -10,10 +10,15 @@ import numpy as np
 import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor
+from PySide6.QtWidgets import QComboBox, QLineEdit
 from pytestqt.qtbot import QtBot
 
+from drivers.device import OwnSetting
+from drivers.errors import LimitError
 from gui.main_window import MainWindow
 from gui.panels.live import LivePanel
+from gui.panels.runs import RunsPanel
+from gui.widgets.device_settings import DeviceSettings
 from gui.widgets.image_view import ImageView
 from instrument.bench.photograph import LightState
 from instrument.files.images import read_image
@@ -298,6 +303,27 @@ def test_leds_that_are_not_the_source_are_not_called_so(qtbot: QtBot, live: Live
     compile(code, "copied", "exec")
 
 
+def test_a_photograph_stands_in_the_runs_and_goes_to_be_reconstructed(
+    qtbot: QtBot, window: MainWindow, live: LivePanel
+) -> None:
+    live.snap()
+    qtbot.waitUntil(lambda: live.photograph is not None, timeout=WAIT_MS)
+    runs = window.show_panel("runs")
+    assert isinstance(runs, RunsPanel)
+    qtbot.waitUntil(lambda: runs.table.rowCount() == 1, timeout=WAIT_MS)
+    assert [runs.table.item(0, place).text() for place in (3, 4)] == ["photograph", "SIMULATED"]
+    assert "1 photograph" in runs.where.text()
+    runs.table.setCurrentCell(0, 0)
+    qtbot.waitUntil(lambda: "Photograph" in runs.frame_words.text(), timeout=WAIT_MS)
+    assert "Light: scene" in runs.about.toPlainText()
+    assert not runs.verify_button.isEnabled()
+    compile(runs.as_python(), "copied", "exec")
+    handed: list[object] = []
+    live.session.handed_on.connect(lambda *what: handed.extend(what))
+    qtbot.mouseClick(runs.use_button, Qt.MouseButton.LeftButton)
+    assert handed == ["reconstructions", live.photograph]
+
+
 def test_stop_during_a_recording_leaves_it_dark(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:
     live.record()
     qtbot.waitUntil(lambda: "frames" in live.record_bar.note.text(), timeout=WAIT_MS)
@@ -307,6 +333,12 @@ def test_stop_during_a_recording_leaves_it_dark(qtbot: QtBot, window: MainWindow
     assert not live.session.bench.scene_lit
     (folder,) = live.session.runs_folder.glob("*recording*")
     assert len(Run.open(folder).records) > 0
+    assert folder.name in live.record_bar.note.text()
+    qtbot.mouseClick(live.record_bar.look_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: "runs" in window.maker.panels, timeout=WAIT_MS)
+    runs = window.maker.panels["runs"]
+    assert isinstance(runs, RunsPanel)
+    qtbot.waitUntil(lambda: runs.opened is not None and runs.opened.path == folder, timeout=WAIT_MS)
 
 
 def test_profile_and_cross_hair_follow_the_frame(qtbot: QtBot, live: LivePanel) -> None:
@@ -375,3 +407,35 @@ def test_saturated_pixels_keep_their_colour_however_small_they_are_shown(
         for x in range(picture.width())
     )
     assert reds > 0
+
+
+def test_a_cameras_own_settings_are_set_where_all_are_shown(
+    qtbot: QtBot, live: LivePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = {"Fan": "Off", "Trim": "3"}
+
+    def set_own(name: str, value: str) -> str:
+        if value == "9":
+            raise LimitError("camera", "takes no Trim '9'.", "It takes 0 to 5.")
+        now[name] = value
+        return value
+
+    own = {"Fan": OwnSetting("Off", "Off, On", ("Off", "On")), "Trim": OwnSetting("3", "0 to 5")}
+    monkeypatch.setattr(live.session.bench.camera, "own_settings", lambda: own)
+    monkeypatch.setattr(live.session.bench.camera, "set_own", set_own)
+    qtbot.waitUntil(live.form.isEnabled, timeout=WAIT_MS)
+    qtbot.mouseClick(live.form.all_button, Qt.MouseButton.LeftButton)
+    (shown,) = live.findChildren(DeviceSettings)
+    assert "exposure" in shown.view.toPlainText()
+    qtbot.waitUntil(lambda: set(shown.fields) == {"Fan", "Trim"}, timeout=WAIT_MS)
+    fan, trim = shown.fields["Fan"], shown.fields["Trim"]
+    assert isinstance(fan, QComboBox)
+    assert isinstance(trim, QLineEdit)
+    qtbot.keyClick(fan, Qt.Key.Key_Down)
+    qtbot.waitUntil(lambda: now["Fan"] == "On" and "On now" in shown.note.text(), timeout=WAIT_MS)
+    trim.setText("9")
+    qtbot.keyClick(trim, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: "0 to 5" in shown.note.text(), timeout=WAIT_MS)
+    assert trim.property("refused")
+    assert now["Trim"] == "3"
+    shown.close()

@@ -6,7 +6,7 @@ import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
-from gui.widgets.entry import NumberEdit, grouped
+from gui.widgets.entry import NumberEdit, grouped, quantity
 
 
 def _field(qtbot: QtBot, unit: str = "ms", value: float | None = 10.0, **limits: float) -> NumberEdit:
@@ -78,7 +78,30 @@ def test_thousands_are_kept_apart_and_read_again(qtbot: QtBot) -> None:
         "-60\u2009000",
         "1e+06",
     ]
-    field = NumberEdit("µm", 100000.0)
+    field = NumberEdit("ms", 100000.0)
     qtbot.addWidget(field)
-    assert field.text() == "100\u2009000 µm"
+    assert field.text() == "100\u2009000 ms"
     assert field.typed() == (100000.0, "")
+
+
+def test_lengths_from_a_millimetre_on_are_millimetres(qtbot: QtBot) -> None:
+    pairs = ((999.4, "um"), (-1000, "µm"), (12345.678, "µm"), (3e5, "ms"), (0, "um"))
+    assert [quantity(*pair) for pair in pairs] == ["999.4 µm", "-1 mm", "12.35 mm", "300\u2009000 ms", "0 µm"]
+    long = NumberEdit("µm", minimum=-60000, maximum=60000, tip="To")
+    short, first = NumberEdit("µm", 100.0), NumberEdit("µm")
+    for field in (long, short, first):
+        qtbot.addWidget(field)
+    first.set_value(2500.0)
+    for field, typed, value, text in (
+        (long, "12.5", 12500.0, "12.5 mm"),
+        (long, "40 um", 40.0, "0.04 mm"),
+        (short, "2000", 2000.0, "2000 µm"),
+        (first, "0.3", 300.0, "0.3 mm"),
+    ):
+        field.selectAll()
+        qtbot.keyClicks(field, typed)
+        assert field.submit()
+        assert (field.value, field.text()) == (value, text)
+    assert "-60 mm to 60 mm" in long.toolTip()
+    first.set_value(80.0, overwrite=True)
+    assert first.text() == "80 µm", "what is filled in anew chooses its unit anew"

@@ -55,10 +55,10 @@ def test_a_target_can_be_entered_again_after_stop(
     assert device is not None
     target = stage.rows["z_um"].target
     for _ in range(2):
-        _type(qtbot, target, "290000")
+        _type(qtbot, target, "290")
         qtbot.keyClick(target, Qt.Key.Key_Return)
         qtbot.waitUntil(lambda: device.is_moving, timeout=WAIT_MS)
-        assert "Move z to 290000 µm" in window.job_label.text()
+        assert "Move z to 290 mm" in window.job_label.text()
         with qtbot.waitSignal(window.session.stopped, timeout=WAIT_MS):
             qtbot.keyClick(target, Qt.Key.Key_Escape)
         here = device.position()["z_um"]
@@ -74,13 +74,13 @@ def test_stop_leaves_the_target_that_is_being_typed(
     device = window.session.bench.stage
     assert device is not None
     target = stage.rows["z_um"].target
-    _type(qtbot, target, "290000")
+    _type(qtbot, target, "290")
     qtbot.keyClick(target, Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: device.is_moving, timeout=WAIT_MS)
-    _type(qtbot, target, "12000")
+    _type(qtbot, target, "12")
     with qtbot.waitSignal(window.session.stopped, timeout=WAIT_MS):
         qtbot.keyClick(target, Qt.Key.Key_Escape)
     qtbot.waitUntil(lambda: stage.state.text() == "At rest, homed", timeout=WAIT_MS)
-    assert target.text() == "12000"
+    assert target.text() == "12"
     qtbot.keyClick(target, Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: device.position()["z_um"] == 12_000, timeout=WAIT_MS)

@@ -155,7 +155,7 @@ def test_a_sweep_with_pause_quality_as_it_arrives_and_its_run_in_the_list(
     assert not runs.bar.start_button.isEnabled()
     runs.slider.setFocus()
     qtbot.keyClick(runs.slider, Qt.Key.Key_End)
-    last = f"Frame {runs.opened.n_frames - 1} of"
+    last = f"Frame {runs.opened.run.n_frames - 1} of"
     qtbot.waitUntil(lambda: last in runs.frame_words.text(), timeout=WAIT_MS)
 
 

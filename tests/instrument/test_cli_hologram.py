@@ -91,9 +91,9 @@ def test_frames_colours_planes_and_video_have_files_of_their_own(capsys):
     assert second > first + 1  # six iterations in all, the second frame started warm
 
 
-def seen_db(slm, display, picture):
+def seen_db(slm, display, picture, share=1.0):
     """PSNR of SLM fields as another run of the model sees them."""
-    target = prepare_target(picture, display)
+    target = prepare_target(picture, display, share=share)
     model = HologramModel(display, [target])
     return compare(model.seen(slm), model.wanted(), model.peaks[0]).psnr_db
 
@@ -125,10 +125,11 @@ def test_each_colour_is_computed_for_its_own_wavelength():
         levels, facts = read_slm_image(f"c-{name}.png")
         slm = np.exp(1j * levels_phase(levels, facts["binning"]))[None]
         own = bench_display(config, ((96, 128), 8.0), wavelength_nm=nm)
-        found = seen_db(slm, own, colour[..., channel])
+        assert facts["field_share"] == pytest.approx(473 / nm, abs=1e-6)  # all of the blue one's size
+        found = seen_db(slm, own, colour[..., channel], 473 / nm)
         assert found == pytest.approx(facts["metrics"][0]["psnr_db"], abs=0.3)
-        other = bench_display(config, ((96, 128), 8.0), wavelength_nm=nm - 80)
-        assert seen_db(slm, other, colour[..., channel]) < found - 3
+        other = bench_display(config, ((96, 128), 8.0), wavelength_nm=nm - 200)
+        assert seen_db(slm, other, colour[..., channel], 473 / nm) < found - 1
 
 
 @pytest.mark.usefixtures("here")

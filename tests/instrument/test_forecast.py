@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from instrument.reconstruction.forecast import TRIED, Forecast, forecast
-from recon import Calibration
+from instrument.reconstruction.forecast import TRIED, Forecast, Foretold, forecast
+from recon import Calibration, reconstruct
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 
@@ -39,3 +39,12 @@ def test_solvers_in_one_step_are_forecast_too(scene: tuple[Measurement, Calibrat
     told = forecast(*scene, ReconstructionOptions(model="convolution", solver="wiener", judged=False))
     assert told.iterations == 0
     assert told.seconds > 0
+
+
+def test_a_reconstruction_says_once_what_it_will_take(scene: tuple[Measurement, Calibration]) -> None:
+    said: list[str] = []
+    foretold = Foretold(said.append)
+    reconstruct(*scene, iterations=40, on_progress=foretold.watch, on_stage=foretold.stage)
+    assert len(said) == 1
+    assert said[0].startswith("about ")
+    assert foretold.seconds > 0

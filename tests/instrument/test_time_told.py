@@ -9,7 +9,7 @@ import pytest
 from rich.progress import Progress
 
 from instrument.cli import kept_times
-from instrument.cli.progress import _Compiling, _Left
+from instrument.cli.progress import _Left, _Note
 
 
 @pytest.fixture(autouse=True)
@@ -57,7 +57,7 @@ def test_a_bar_says_what_is_left_and_what_is_compiled() -> None:
     assert "longer than last time" in str(_Left().render(task))
     bar.update(task.id, total=10, completed=3)
     assert str(_Left().render(task)).startswith("left ")
-    column = _Compiling()
+    column = _Note()
     assert not str(column.render(task))
 
     class Kernel:
@@ -65,5 +65,5 @@ def test_a_bar_says_what_is_left_and_what_is_compiled() -> None:
         def py_func() -> None: ...
 
     with event.trigger_event("numba:compile", data={"dispatcher": Kernel}):
-        assert str(column.render(task)) == "compiling py_func, once on this machine"
+        assert str(column.render(task)) == "compiling py_func (once)"
     assert not str(column.render(task))

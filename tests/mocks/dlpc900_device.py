@@ -105,6 +105,7 @@ class Faults:
     refuse: dict[int, int] = field(default_factory=dict)
     """Error code by command."""
     never_starts: bool = False
+    never_ends: bool = False
     stays_in_mode: bool = False
     hardware_status: int | None = None
     unplugged: bool = False
@@ -128,28 +129,38 @@ class Dlpc900Emulator:
         self._error = 0
         self._partial = b""
         self._wanted = 0
-        self._pattern: dict[str, int] | None = None
+        self._patterns: dict[int, dict[str, int]] = {}
         self._lut = b""
-        self._loading: dict[int, tuple[int, bytearray]] = {}
-        self._images: dict[int, np.ndarray] = {}
+        self._loading: dict[int, tuple[int, int, bytearray]] = {}
+        self._images: dict[tuple[int, int], np.ndarray] = {}
+        self.played: list[np.ndarray] = []
+        """Of the finite sequence that was started last."""
         self._held: list[bytes] = []
 
     @property
     def shown(self) -> np.ndarray | None:
         """The grey levels that the mirrors show; None while nothing runs."""
-        if not self.running or self._pattern is None:
+        if not self.running or not self._patterns or self._finite:
             return None
-        halves = [self._images[half] for half in range(self.board)]
+        return self._levels(0)
+
+    def _levels(self, number: int) -> np.ndarray:
+        pattern = self._patterns[number]
+        halves = [self._images[half, pattern["image"]] for half in range(self.board)]
         blue, green, red = np.moveaxis(np.hstack(halves).astype(np.uint32), 2, 0)
-        depth = self._pattern["bit_depth"]
-        levels = (blue << 16 | green << 8 | red) >> self._pattern["bit_position"] & (2**depth - 1)
+        depth = pattern["bit_depth"]
+        levels = (blue << 16 | green << 8 | red) >> pattern["bit_position"] & (2**depth - 1)
         return (levels * (255 // (2**depth - 1))).astype(np.uint8)
 
     @property
     def pattern(self) -> dict[str, int]:
-        """The pattern that is defined."""
-        assert self._pattern is not None
-        return self._pattern
+        """The first pattern that is defined."""
+        return self._patterns[0]
+
+    @property
+    def _finite(self) -> int:
+        """How many patterns are shown until the sequence ends; 0: without end."""
+        return int.from_bytes(self._lut[2:], "little")
 
     # Reports ---------------------------------------------------------------------------------------
     def receive(self, report: bytes) -> list[bytes]:
@@ -200,6 +211,9 @@ class Dlpc900Emulator:
             return bytes([fine if self.faults.hardware_status is None else self.faults.hardware_status])
         if command == 0x1A0C:
             self._polls += 1
+            if self._finite:
+                self.running = self.running and (self._polls < 4 or self.faults.never_ends)
+                return bytes([0x02 if self.running else 0])
             started = self.running and self._polls > 2 and not self.faults.never_starts
             return bytes([0x02 if started else 0])
         if command == 0x1A1B:
@@ -235,10 +249,13 @@ class Dlpc900Emulator:
 
     def _start_stop(self, data: bytes) -> None:
         if data[0] == 2:
-            if self.mode != 3 or len(self._lut) != 6 or self._pattern is None:
+            if self.mode != 3 or len(self._lut) != 6 or not self._patterns:
                 raise Refusal(5)
-            if set(self._images) != set(range(self.board)):
+            images = {pattern["image"] for pattern in self._patterns.values()}
+            if set(self._images) != {(half, image) for half in range(self.board) for image in images}:
                 raise Refusal(11)
+            if self._finite:
+                self.played = [self._levels(number % len(self._patterns)) for number in range(self._finite)]
         self.running = data[0] == 2
         self._polls = 0
 
@@ -255,19 +272,24 @@ class Dlpc900Emulator:
             "led": data[5] >> 4 & 7,
             "trigger": data[5] >> 7,
             "dark_us": int.from_bytes(data[6:9], "little"),
+            "no_trigger_2": data[9] & 1,
             "image": image & 0x7FF,
             "bit_position": image >> 11,
         }
         shortest = (105, 304, 394, 823, 1215, 1487, 1998, 4046)[pattern["bit_depth"] - 1]
         if pattern["exposure_us"] < shortest:
             raise Refusal(14)
-        self._pattern = pattern
+        if pattern["index"] == 0:
+            self._patterns.clear()
+        if pattern["index"] != len(self._patterns) or pattern["index"] >= 400:
+            raise Refusal(15)
+        self._patterns[pattern["index"]] = pattern
         self._images.clear()  # images must be loaded again after each change
 
     def _configure(self, data: bytes) -> None:
-        if self.running or self._pattern is None:
+        if self.running or not self._patterns:
             raise Refusal(5)
-        if len(data) != 6 or int.from_bytes(data[:2], "little") != 1:
+        if len(data) != 6 or int.from_bytes(data[:2], "little") != len(self._patterns):
             raise Refusal(6)
         self._lut = data
         self._images.clear()
@@ -275,9 +297,10 @@ class Dlpc900Emulator:
     def _initialise(self, half: int, data: bytes) -> None:
         if half >= self.board or self.running:
             raise Refusal(5)
-        if len(data) != 6 or int.from_bytes(data[:2], "little") != 0:
+        number = int.from_bytes(data[:2], "little")
+        if len(data) != 6 or number not in {pattern["image"] for pattern in self._patterns.values()}:
             raise Refusal(6)
-        self._loading[half] = (int.from_bytes(data[2:6], "little"), bytearray())
+        self._loading[half] = (number, int.from_bytes(data[2:6], "little"), bytearray())
 
     def _load(self, half: int, data: bytes) -> None:
         if (
@@ -286,7 +309,7 @@ class Dlpc900Emulator:
             or len(data) > 506
         ):
             raise Refusal(6)
-        wanted, got = self._loading[half]
+        number, wanted, got = self._loading[half]
         got += data[2:]
         if len(got) > wanted:
             raise Refusal(8)
@@ -298,7 +321,7 @@ class Dlpc900Emulator:
                 raise Refusal(9) from None
             if image.shape[:2] != (self.shape[0], self.shape[1] // self.board):
                 raise Refusal(9)
-            self._images[half] = image
+            self._images[half, number] = image
 
 
 class Refusal(Exception):  # noqa: N818 - an answer, not a failure

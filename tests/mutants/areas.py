@@ -2,6 +2,23 @@
 
 from __future__ import annotations
 
+_RUNS = tuple(
+    f"tests/instrument/runs/test_{name}.py"
+    for name in (
+        "acquisition_simulated",
+        "damage",
+        "fault_injection",
+        "frame_metadata",
+        "interrupt",
+        "recorder",
+        "resume",
+        "runner",
+        "store",
+        "store_order",
+        "timed",
+    )
+)
+"""Not test_signals.py: its programs are processes of their own."""
 AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "safety": (
         (
@@ -18,6 +35,8 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/drivers/test_answers.py",
             "tests/drivers/test_checked.py",
             "tests/drivers/test_simulated_faults.py",
+            "tests/instrument/runs/test_acquisition_simulated.py",
+            "tests/instrument/runs/test_timed.py",
         ),
     ),
     "runner": (
@@ -28,7 +47,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "instrument/runs/acquire.py",
             "instrument/runs/timed.py",
         ),
-        ("tests/instrument/runs",),
+        _RUNS,
     ),
     "store": (
         (
@@ -43,7 +62,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "instrument/files/atomic.py",
             "instrument/files/record.py",
         ),
-        ("tests/instrument/runs", "tests/instrument/files/test_record.py"),
+        (*_RUNS, "tests/instrument/files/test_record.py"),
     ),
     "drops": (("drivers/common/drops.py",), ("tests/drivers/test_drops.py",)),
     "streams": (
@@ -86,6 +105,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/drivers/test_stage_axes.py",
             "tests/drivers/test_port_stages.py",
             "tests/drivers/test_pixels.py",
+            "tests/drivers/test_simulated_contracts.py",
             "tests/drivers/test_apt.py",
             "tests/drivers/test_grbl.py",
             "tests/drivers/test_grbl_protocol.py",

@@ -7,7 +7,7 @@ import pytest
 
 from recon import InputError, reconstruct
 from recon.base.metrics import psnr
-from recon.base.noise import estimate_deviation
+from recon.base.noise import NoiseModel, averaged_noise, estimate_deviation
 from recon.camera.factors import PATTERNS, interpolate_bayer, split_bayer
 
 
@@ -95,6 +95,12 @@ def test_photon_noise_grows_with_brightness(shoot, peak):
     truth = np.sqrt(9 * photons.mean() + 4)
     assert truth > 1.5 * np.sqrt(9 * np.median(photons) + 4)
     assert estimate_deviation(frame) == pytest.approx(truth, rel=0.2)
+
+
+def test_noise_of_a_model_is_read_noise_and_light_together():
+    assert NoiseModel(3.0, 2.0).deviation(np.array([-5.0, 16.0])) == pytest.approx(5.0)
+    assert averaged_noise(NoiseModel(3.0, 2.0), 4.0) == NoiseModel(1.5, 0.5)
+    assert averaged_noise(3.0, 9.0) == 1.0
 
 
 def test_noise_of_nothing_is_nothing():

@@ -1,20 +1,25 @@
-"""Spots on a simulated display without a mask: found, measured, made even by what the camera sees."""
+"""Spots without a mask, made even by what the camera sees; pictures by mirrors."""
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from instrument.bench.config_file import template
 from instrument.cli import main
+from instrument.files.images import write_image
+from instrument.files.slm_image import read_slm_image
 
 WITHOUT_MASK = {
     "shape": "[96, 128]",
     "slm_binning": "1",
     "expansion": "1",
-    "mask_pitch_um": "8.0\nmasked = false",
+    "mask_pitch_um": "8.0",
+    "masked": "false",
     "shift_um": "[0.0, 0.0]",
     "z_um": "0.0",
     "roll_mrad": "0.0",
@@ -26,14 +31,48 @@ WITHOUT_MASK = {
 }
 
 
+def write_bench(**changes: str) -> None:
+    """Write the bench of a display without a mask."""
+    text = template("display")
+    text = text.replace("mask_pitch_um", "masked = true\nmask_pitch_um")
+    for key, value in (WITHOUT_MASK | changes).items():
+        text = re.sub(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
+    Path("bench.toml").write_text(text)
+
+
+def test_a_picture_by_mirrors_is_photographed_as_it_was_computed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    masked = {"expansion": "4", "mask_pitch_um": "4.0", "masked": "true", "flatness_rad": "0.0"}
+    write_bench(**masked)
+    write_image("picture.png", np.add.outer(np.arange(80), np.arange(90)).astype(np.uint8))
+    shown = ["--capture", "seen.png", "--target", "picture.png"]
+    assert main(["hologram", "picture.png", "--iterations", "2", "--out", "phases.png"]) == 0
+    assert main(["hologram", "picture.png", "--mirrors", "optimised", "--iterations", "25"]) == 0
+    assert main(["show", "slm.png", *shown]) == 2
+    assert "sets phases" in capsys.readouterr().err
+    write_bench(**masked | {"masked": "true\nmirrors = true"})
+    assert main(["hologram", "picture.png", "--out", "p.png"]) == 2
+    assert "--mirrors optimised" in capsys.readouterr().err
+    assert main(["show", "phases.png", *shown]) == 2
+    assert "this pattern is of phases" in capsys.readouterr().err
+    assert set(np.unique(read_slm_image("slm.png")[0])) == {0, 255}
+    computed = json.loads(Path("slm.json").read_text())
+    assert 0.03 < computed["efficiency"] < 0.1
+    assert main(["show", "slm.png", *shown, "--refine", "1", "--average", "2"]) == 0
+    found = re.search(r"loop: ([\d.]+) dB -> ([\d.]+) dB", capsys.readouterr().out)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(computed["metrics"][0]["psnr_db"], abs=1.5)
+    assert float(found[2]) >= float(found[1]) > 20
+    assert set(np.unique(read_slm_image("slm-refined.png")[0])) == {0, 255}
+
+
 def test_spots_are_found_measured_and_evened_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    text = template("display")
-    for key, value in WITHOUT_MASK.items():
-        text = re.sub(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
-    Path("bench.toml").write_text(text)
+    write_bench()
     assert main(["hologram", "--spots", "4x5", "--out", "spots.png"]) == 0
     capsys.readouterr()
     assert main(["show", "spots.png", "--capture", "seen.png", "--refine", "2", "--average", "2"]) == 0

@@ -69,6 +69,7 @@ def test_frames_show_the_light_and_the_place_of_their_step(tmp_path: Path) -> No
         plan = sweep(bench)
         run = acquire(bench, plan, tmp_path)
         distance_um = world(bench).distance_um
+        assert bench.geometry.diffuser_distance_mm == pytest.approx(distance_um / 1000)
         pitch_um = bench.camera.pixel_pitch_um
     assert verify(run).is_sound
     dark = run.images("dark")[0]

@@ -26,7 +26,7 @@ from instrument.runs.acquire import acquire
 from instrument.runs.log import log_line
 from instrument.runs.recorder import record
 from instrument.runs.run import Run
-from instrument.runs.run_files import LOG, PLAN, PROVENANCE, STATE
+from instrument.runs.run_files import LOG, PLAN, PROVENANCE, STATE, RunError
 
 BENCH = """
 [bench]
@@ -139,6 +139,21 @@ def test_what_a_newer_version_added_is_kept_with_a_word(
     assert run.records[0].unknown["voltages"] == {"core_v": 1.8}
     assert frame.pop("line_crc32")
     assert run.records[0].to_json() == frame
+
+
+def test_a_frames_line_is_read_when_it_is_asked_for(tmp_path: Path, bench: Bench) -> None:
+    run = acquire(bench, Plan(label="few", parts=(Part(label="dark", repeats=3),)), tmp_path)
+    lines = (run.path / LOG).read_bytes().splitlines(keepends=True)
+    _, second, third = (i for i, line in enumerate(lines) if b'"kind": "frame"' in line)
+    lines[second] = log_line({"kind": "frame", "index": 1, "n_bytes": 3})  # as if somebody had made it so
+    lines[third] = lines[third].replace(b'"index": 2', b'"index": 1')  # a changed number: no line of ours
+    (run.path / LOG).write_bytes(b"".join(lines))
+    again = Run.open(run.path)
+    assert sorted(again.records) == [0, 1]
+    assert [bad.number for bad in again.bad_lines] == [third + 1]
+    assert again.records[0] == run.records[0]
+    with pytest.raises(RunError, match="is damaged: frame 1"):
+        again.metadata(1)
 
 
 def test_every_field_of_today_comes_back(tmp_path: Path, bench: Bench) -> None:

@@ -135,7 +135,7 @@ def test_what_a_crash_leaves_behind_is_found_and_done_again(tmp_path: Path) -> N
     log.write_bytes(b"".join(lines[:3]) + lines[3][:50])
     state = path / "state.json"
     state.write_text(state.read_text().replace('"finished"', '"running"'))
-    (path / ".state.12ab34cd.json").write_text("{")
+    (path / ".state.12ab34cd.part.json").write_text("{")
     assert Run.open(path).condition is RunCondition.CRASHED
     with open_mock_bench() as bench:
         findings = look(path)

@@ -14,6 +14,7 @@ from recon.streams.activity import (
     fading,
     floor_of,
     motion,
+    smoothed,
 )
 from recon.streams.regions import (
     FOLLOWS,
@@ -242,3 +243,18 @@ def test_motion_is_found_and_taken_out() -> None:
     truth = ndimage.shift(still[5], np.median(way, axis=0), order=3, mode="nearest")
     before, after = (np.abs(video[5] - truth)[4:-4, 4:-4].mean() for video in (moved, there))
     assert after < 0.3 * before
+
+
+def test_a_cell_of_one_pixel_whose_light_hops_is_found_by_its_width() -> None:
+    rng = np.random.default_rng(3)
+    light = 1 + courses(240)[0]
+    frames = rng.normal(0.02, 0.01, (240, 24, 30)).clip(0).astype(np.float32)
+    frames[:, 4, 4] += 1  # stands, and does not flash
+    share = rng.random(240)
+    frames[:, 12, 14] += light * share
+    frames[:, 12, 15] += light * (1 - share)
+    found = []
+    for seen in (frames, smoothed(frames, 1.5)):
+        above = seen - baseline(seen, 200, 20.0)
+        found.append([r.centre for r in find_regions(above, noise=noise_of(seen)).regions])
+    assert found == [[], [pytest.approx((12, 14.5), abs=1.0)]]

@@ -20,7 +20,7 @@ from recon.holography import (
     judge,
     random_mask,
 )
-from recon.holography.optimise import _Bounded
+from recon.holography.variables import Bounded
 
 SHAPE, K = (48, 64), 2
 
@@ -136,7 +136,7 @@ def test_the_gradient_of_a_bounded_amplitude_is_its_finite_difference():
         light=0.6,
         dtype=np.complex128,
     )
-    variable = _Bounded(model)
+    variable = Bounded(model)
     x, step = np.random.default_rng(2).normal(0, 1.2, (2, 128))
     sides = [variable.evaluate(x + h * step)[0].loss for h in (1e-5, -1e-5)]
     assert (sides[0] - sides[1]) / 2e-5 == pytest.approx(float(variable.evaluate(x)[1] @ step), rel=1e-6)

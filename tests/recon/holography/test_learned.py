@@ -94,6 +94,24 @@ def test_cross_talk_is_a_gaussian_also_over_several_pixels():
     assert np.abs(shown - smooth[2::5, 2::5]).max() < 0.003
 
 
+def test_at_another_wavelength_errors_are_the_same_paths_and_angles():
+    learned, turns = wrong(phase=0.03).learned, 1.5
+    other = learned.at(turns)
+    before, after = (np.angle(f.illumination((9, 9))) for f in (learned, other))
+    assert after == pytest.approx(turns * before, abs=1e-4)
+    places = np.linspace(-0.3, 0.3, 7)
+    seen = zip(
+        learned.shading_at(places, places), other.shading_at(turns * places, turns * places), strict=True
+    )
+    for here, there in seen:
+        assert there / there[3] == pytest.approx(here / here[3], rel=1e-6)
+    # A whole turn there is what two thirds of one were.
+    levels = np.linspace(0, 1, len(learned.response))
+    two_thirds = np.interp(2 / 3, levels, np.hypot(*learned.response.T))
+    assert np.hypot(*other.response[-1]) == pytest.approx(two_thirds)
+    assert learned.at(1.0) is learned
+
+
 def test_spots_see_what_was_learned_as_pictures_do():
     display = wrong()
     slm = np.exp(1j * np.random.default_rng(3).uniform(0, 2 * np.pi, SHAPE)).astype(np.complex64)

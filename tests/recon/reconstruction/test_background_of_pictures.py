@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon import reconstruct
-from recon.evaluation.scene import TestScene, make_scene
+from recon.evaluation.scene import Family, TestScene, make_scene
 from recon.reconstruction import selection
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
@@ -38,8 +38,23 @@ def test_without_room_for_stray_light_nobody_looks(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(selection, "trial_of", never)
     scene = lit(0.0)
-    image = scene.measurement - np.percentile(scene.measurement, 5)
+    image = scene.measurement - np.percentile(scene.measurement, 10)
     assert reconstruct(image, scene.calibration.psfs[0, 0], iterations=5, judged=False).background is None
+
+
+@pytest.mark.parametrize(
+    ("family", "stray", "found"), [("sparse-picture", 0.6, True), ("texture", 0.0, False)]
+)
+def test_moderate_stray_light_is_told_from_a_scene_that_is_lit(
+    family: Family, stray: float, found: bool
+) -> None:
+    scene = make_scene(family, size=40, background=stray, photons=3000.0, seed=4)
+    options = ReconstructionOptions(z_um=float(scene.z_um[0]))
+    problem = Problem.of(Measurement(scene.measurement), scene.calibration, options)
+    choice = selection.choice_for(problem)
+    assert choice.background == found
+    (why,) = (d.why for d in choice.decisions if d.name == "background")
+    assert "dark" in why
 
 
 def test_total_variation_leaves_even_light_to_the_background() -> None:

@@ -129,5 +129,5 @@ def test_the_solver_is_admm_sensor_from_many_pixels_on():
 
     assert solver((140, 150)) == "admm-sensor"
     assert solver((130, 140)) == "admm"
-    assert solver((140, 150), estimate_background=True) == "admm"
+    assert solver((130, 140), estimate_background=True) == "admm-sensor"
     assert solver((140, 150), solver="admm") == "admm"

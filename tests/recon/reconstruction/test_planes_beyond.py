@@ -13,7 +13,7 @@ from recon.camera.registration import rescaled
 from recon.errors import InputError
 from recon.evaluation.measured_sets import data_folder, measured_set
 from recon.evaluation.scene import TestScene, make_scene
-from recon.reconstruction.background import Trial, beyond_of
+from recon.reconstruction.background import VOLUME, Trial, beyond_of
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.planes import BEYOND, with_planes_beyond
 from recon.reconstruction.problem import Problem
@@ -72,7 +72,7 @@ def test_nothing_is_added_where_depths_explain_the_data(beads: TestScene) -> Non
 
 
 def test_who_asks_for_planes_beyond_gets_them() -> None:
-    missed = Trial(without=5.0, lit=1.0, light=0.0, light_gain=0.1)
+    missed = Trial(without=5.0, lit=1.0, light=0.0, dark=0.0, taken=VOLUME)
     told = beyond_of(missed, missed, Overrides(beyond=True), None)
     assert (told.value, told.overruled) == ("planes", True)
     assert beyond_of(missed, missed, Overrides(), None).value == "none"

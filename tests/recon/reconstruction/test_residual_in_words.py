@@ -48,3 +48,13 @@ def test_a_run_that_was_cut_short_is_told_from_a_wrong_model(problem: Problem) -
     assert "More iterations" in said(problem, slow), "slow convergence is no fault of the camera"
     assert "--tolerance" in said(problem, slow, StopReason.CONVERGED)
     assert "another state" in said(problem, [400.0, *[200.0] * 12], StopReason.CONVERGED)
+
+
+def test_a_weight_that_is_held_above_the_noise_is_named_before_the_camera(problem: Problem) -> None:
+    history = tuple(IterationRecord(k + 1, 0.1, data_residual=n) for k, n in enumerate([400.0, *[90.0] * 12]))
+    outcome = Outcome(np.empty(0), history, StopReason.CONVERGED, 1.0)
+    (text,) = residual_in_words(problem, outcome, 90.0, 24.0, (1e-2, 9.0))
+    assert "the weight of the prior keeps some of it, 9 times what noise asks for" in text
+    assert "--tau 0.003" in text
+    (text,) = residual_in_words(problem, outcome, 90.0, 24.0, (1e-2, 2.0))
+    assert "weight" not in text

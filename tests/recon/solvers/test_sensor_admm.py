@@ -12,7 +12,7 @@ from recon.base import fft
 from recon.base.metrics import psnr
 from recon.base.threads import get_threads, set_threads
 from recon.camera.convolution import Convolution
-from recon.camera.factors import Erasures
+from recon.camera.factors import BackgroundRemoval, Erasures
 from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation, Zero
 from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules, StopReason, cosine_preconditioner
 from recon.solvers.cosine_preconditioner import CosinePreconditioner
@@ -77,6 +77,23 @@ def test_reaches_the_same_minimum_as_the_splitting_admm_on_a_larger_sensor(erase
     assert exact.history[-1].objective == pytest.approx(value, rel=1e-4)
     residual = np.linalg.norm(operator.forward(exact.solution) - data)
     assert exact.history[-1].data_residual == pytest.approx(residual, rel=1e-3)
+
+
+@pytest.mark.parametrize("restraint", [0.0, 0.05])
+def test_with_a_background_reaches_the_minimum_of_what_it_leaves(restraint):
+    operator, data = problem(2)
+    data = data + 3 * np.linspace(1, 2, data.shape[2])
+    removal = BackgroundRemoval(data.shape, (3, 3), dtype=np.float64, restraint=0.5)
+    solver = SensorAdmm(operator, 0.3 * data, PRIORS["tv"], background=removal)
+    solver.run(StoppingRules(iterations=5, tolerance=0))
+    removal.restrain(restraint)  # other data may leave more or less to the background
+    solver.set_data(data)
+    fast = solver.run(StoppingRules(iterations=800, tolerance=1e-9))
+    left, seen = removal.forward(data), removal @ operator
+    slow = Fista(seen, left, PRIORS["tv"]).run(StoppingRules(iterations=1000, tolerance=1e-7))
+    value = objective(seen, left, PRIORS["tv"], fast.solution)
+    assert 1 - 1e-3 < value / objective(seen, left, PRIORS["tv"], slow.solution) < 1 + 1e-4
+    assert fast.history[-1].objective == pytest.approx(value, rel=1e-4)
 
 
 @pytest.mark.parametrize("steps", [1, 3])

@@ -67,6 +67,22 @@ def test_several_depths_and_colours(channels: int) -> None:
     assert np.linalg.norm(volume - alone) < 0.1 * np.linalg.norm(alone)
 
 
+def test_a_depth_that_was_empty_for_long_takes_part_again_with_the_first_frame_that_has_light_there() -> None:
+    calibration = make_scene("beads", size=24, depths=3).calibration
+    psfs = calibration.psfs[:, 0]
+    noise = np.random.default_rng(0).normal(0, 1, (24, 24))
+    near, far = (np.float32(1e4 * psfs[z] / psfs[z].sum() + noise) for z in (0, 2))
+    problem = stream_problem(
+        near, calibration, prior="l1", estimate_background=False, noise=1.0, model="convolution"
+    )
+    with VideoSolver(problem, cold_iterations=60, warm_iterations=8) as video:
+        assert video.next(near).sum(axis=(1, 2)).argmax() == 0
+        assert not video.solvers[0].watch.active[1:].any()
+        video.next(far)
+        assert video.solvers[0].watch.active[2]
+        assert [video.next(far) for _ in range(4)][-1].sum(axis=(1, 2)).argmax() == 2
+
+
 def test_what_a_stream_has_no_way_for_is_refused_in_words() -> None:
     scene = make_scene("sparse-picture", size=24, grid=3)
     with pytest.raises(InputError, match="no iterations"):

@@ -1,0 +1,152 @@
+"""What napari shows of this program's files: a reader of its own, which napari finds by ``napari.yaml``.
+
+Runs, calibrations, volumes and videos are OME-Zarr, of which nothing is read that is not looked at; results
+are TIFF with a record beside. What is not this program's is left to other readers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from instrument.files.calibration_file import is_calibration, load_calibration
+from instrument.files.reading import parse_json, read_bytes
+from instrument.files.record import plain
+from instrument.files.volumes import is_zarr_name, stem_of
+from instrument.runs.run import is_run
+from instrument.runs.run_files import FRAMES
+
+Layer = tuple[Any, dict[str, Any], str]
+"""napari's: what is shown, the arguments of its layer, and the layer's kind."""
+
+
+def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[Layer]] | None:
+    """Return what reads a folder or file of this program; None for any other, and for several at once."""
+    if not isinstance(path, str):
+        return None
+    return read if _kind(Path(path)) is not None else None
+
+
+def read(path: str | Sequence[str]) -> list[Layer]:
+    """Return the layers of a run, calibration, volume, video or result.
+
+    Raises FileError when it is damaged, in a sentence.
+    """
+    found = Path(str(path))
+    kind = _kind(found)
+    if kind is None:
+        raise ValueError(f"{found} is none of diffuserbench's.")
+    return kind(found)
+
+
+def _kind(path: Path) -> Callable[[Path], list[Layer]] | None:
+    if is_calibration(path):
+        return _calibration
+    if path.is_dir() and is_run(path):
+        return _run
+    if is_zarr_name(path):
+        return _array if "diffuserbench" in _attributes(path) else None
+    return _result if path.suffix.lower() in (".tif", ".tiff") and _record(path) else None
+
+
+def _attributes(path: Path) -> Mapping[str, Any]:
+    """Return a Zarr group's attributes; none where it has none to be read."""
+    try:
+        found = parse_json(read_bytes(path / "zarr.json"))
+    except (OSError, ValueError):
+        return {}
+    attributes = found.get("attributes") if isinstance(found, dict) else None
+    return attributes if isinstance(attributes, dict) else {}
+
+
+def _record(path: Path) -> Mapping[str, Any]:
+    """Return the record beside a result; nothing where there is none of this program's."""
+    try:
+        found = parse_json(read_bytes(path.with_suffix(".json")))
+    except (OSError, ValueError):
+        return {}
+    ours = isinstance(found, dict) and str(found.get("program", "")).startswith("diffuserbench")
+    return found if ours else {}
+
+
+def _run(path: Path) -> list[Layer]:
+    """Return a run's frames, and the PSFs that were made of them."""
+    layers = _array(path / FRAMES, name=path.name)
+    for made in sorted(path.glob("*/calibration.json")):
+        layers += _calibration(made.parent)
+    return layers
+
+
+def _calibration(path: Path) -> list[Layer]:
+    """Return a calibration's PSFs, one a step of the slider; the metadata say where the sources were."""
+    calibration = load_calibration(path)
+    pitch_um = calibration.geometry.pixel_pitch_um
+    facts = {"source_positions_um": calibration.source_positions_um, "quality": calibration.quality}
+    psfs, axes = calibration.psfs, ["n", "c", "y", "x"]
+    if psfs.shape[1] == 1:
+        psfs, axes = psfs[:, 0], ["n", "y", "x"]
+    name = f"PSFs of {path.parent.name if path.name == 'calibration' else path.name}"
+    return [_image(psfs, axes, {"y": pitch_um, "x": pitch_um}, {}, name, facts)]
+
+
+def _array(path: Path, name: str = "") -> list[Layer]:
+    """Return an OME-Zarr image, all its levels, as its own metadata place it."""
+    import zarr
+
+    attributes = _attributes(path)
+    image = attributes["ome"]["multiscales"][0]
+    axes = [axis["name"] for axis in image["axes"]]
+    known = {axis["name"] for axis in image["axes"] if "unit" in axis}
+    placed = {change["type"]: change for change in image["datasets"][0]["coordinateTransformations"]}
+    scale = dict(zip(axes, placed["scale"]["scale"], strict=True))
+    step = {axis: size if axis in known else None for axis, size in scale.items()}
+    move = placed.get("translation", {"translation": [0.0] * len(axes)})["translation"]
+    origin = dict(zip(axes, move, strict=True))
+    levels = [zarr.open_array(path / level["path"], mode="r") for level in image["datasets"]]
+    data = levels if len(levels) > 1 else levels[0]
+    return [_image(data, axes, step, origin, name or stem_of(path), attributes.get("diffuserbench", {}))]
+
+
+def _result(path: Path) -> list[Layer]:
+    """Return a reconstruction on its grid."""
+    import tifffile
+
+    record = _record(path)
+    with tifffile.TiffFile(path) as file:
+        series = file.series[0]
+        data, axes = series.asarray(), [{"s": "c"}.get(a, a) for a in series.axes.lower()]
+    grid = record.get("grid") or {}
+    pitch = grid.get("object_pitch_um")
+    if isinstance(widths := grid.get("pitch_um"), list) and widths:  # a volume's: its middle plane's
+        pitch = widths[len(widths) // 2]
+    depths = grid.get("z_um")
+    step = {"y": pitch, "x": pitch}
+    if isinstance(depths, list) and len(depths) > 1:
+        middle = len(depths) // 2
+        step["z"] = abs(depths[middle] - depths[middle - 1])
+    return [_image(data, axes, step, {}, path.stem, record)]
+
+
+def _image(
+    data: Any,
+    axes: Sequence[str],
+    step: Mapping[str, float | None],
+    origin: Mapping[str, float],
+    name: str,
+    facts: Mapping[str, Any],
+) -> Layer:
+    """Return napari's layer of an image: channels side by side, steps and places in the axes' units."""
+    arguments: dict[str, Any] = {"name": name, "metadata": {"diffuserbench": plain(facts)}}
+    shown = list(axes)
+    if "c" in shown:
+        at = shown.index("c")
+        shown.remove("c")
+        count = (data[0] if isinstance(data, list) else data).shape[at]
+        colours = ["red", "green", "blue"] if count == 3 else [str(n) for n in range(count)]
+        arguments |= {"channel_axis": at, "name": [f"{name} {colour}" for colour in colours]}
+    arguments["scale"] = [step.get(axis) or 1.0 for axis in shown]
+    arguments["translate"] = [origin.get(axis, 0.0) for axis in shown]
+    arguments["units"] = [("s" if axis == "t" else "um") if step.get(axis) else "pixel" for axis in shown]
+    arguments["axis_labels"] = shown
+    return data, arguments, "image"

@@ -1,0 +1,249 @@
+"""Two points told apart by the default reconstruction: the resolution that a calibration's pictures reach.
+
+The tests of :mod:`recon.analysis.points` solve for points alone, in a window, without a prior. Here pairs of
+points of equal light stand in a picture, each pair at another distance and other places between pixels, far
+from the others, with the noise that one pair alone would have; the whole is reconstructed as pictures are by
+default. A pair is told apart where the picture dips by 20 % between its points. A logistic curve through what
+was told apart gives the stated distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+from recon.analysis.correlation import lit_extent
+from recon.analysis.points import DIP, Noise, Reached, TriedPair, smallest_dip
+from recon.base import fft
+from recon.camera.refocus import refocus
+from recon.reconstruction.reconstruct import reconstruct
+from recon.types import Calibration
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float64]
+
+TOLD = 0.95
+"""Share of pairs, at all places between pixels, that the curve tells apart at the stated distance: nine in
+ten are promised."""
+LARGEST_PX = 100_000
+"""Of larger sensors the middle is taken, with as little noise as makes up for the light beyond."""
+PICTURES, PAIRS = 4, 16
+"""Pictures that are reconstructed, and pairs in each, half of them along each axis.
+
+Where there is no room for so many, up to three times as many pictures.
+"""
+_RANGE = 3.0  # of the first distances, largest over smallest
+_ABOUT = 1.3  # of later distances about what was found, to both sides
+_CELL_PX = 20  # for a pair, at least; more where its points lie farther apart
+_FIELD = 0.25  # of the sensor to both sides of its middle, where pairs stand
+_BESIDE = 2  # rows to both sides of a pair's line that the picture is summed over
+_WIDER = 1.5  # times the stated distance: pairs that tell the depth of field
+_DEPTHS = 8  # tried to each side of the focus, to _FARTHEST times the optics' step
+_FARTHEST = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    px: float
+    axis: int
+    first: Floats
+    """``(row, column)`` of the first point, pixels from the middle ``n // 2``; the second one is ``px``
+    farther along the axis."""
+
+    @property
+    def points(self) -> Floats:
+        """(2, 2): both places."""
+        along: Floats = self.px * np.eye(2)[self.axis]
+        return np.stack([self.first, self.first + along])
+
+    def told_apart(self, picture: Array) -> bool:
+        """Whether a picture (height, width) dips between the points."""
+        seen, place = (picture, self.first) if self.axis == 1 else (picture.T, self.first[::-1])
+        row, column = place + np.array(seen.shape) // 2
+        line = seen[round(row) - _BESIDE : round(row) + _BESIDE + 1].sum(axis=0, dtype=np.float64)[None]
+        return smallest_dip(line, np.array([[[0.0, column], [0.0, column + self.px]]])) >= DIP
+
+
+class _Tests:
+    """Pictures of pairs, as the calibration's camera would take them."""
+
+    def __init__(self, calibration: Calibration, z_um: float, noise: Noise, seed: int) -> None:
+        self.z_um, self.rng = z_um, np.random.default_rng(seed)
+        whole = calibration.psfs.shape[-2:]
+        shape = _within(whole)
+        self.part = float(np.prod(shape) / np.prod(whole))
+        down, right = (slice((n - m) // 2, (n + m) // 2) for n, m in zip(whole, shape, strict=True))
+        small = np.ascontiguousarray(calibration.psfs[..., down, right])
+        self.calibration = replace(calibration, psfs=small, background=None)
+        lost = float(np.square(calibration.psfs, dtype=np.float64).sum() / np.square(small).sum())
+        self.noise = Noise(noise.electrons * lost, noise.read_e * float(np.sqrt(lost)))
+        self.method = ""
+
+    def pairs(self, distances: Sequence[float]) -> list[_Pair]:
+        """Return pairs in cells of their own, along both axes in turn; fewer where there is no room."""
+        cells = self.rng.permutation(_cells(self.psf(self.z_um), max(distances)))
+        return [
+            _Pair(px, n % 2, cell + self.rng.uniform(-0.5, 0.5, 2))
+            for n, (px, cell) in enumerate(zip(distances, cells, strict=False))
+        ]
+
+    def psf(self, z_um: float) -> Array:
+        """Return the PSF at a depth, colours averaged."""
+        psf: Array = refocus(self.calibration, z_um).psf.mean(axis=0)
+        return psf
+
+    def told_apart(self, pairs: Sequence[_Pair], light: Floats) -> list[bool]:
+        """Photograph and reconstruct pairs that make this light, with the noise of one of them."""
+        scale = self.noise.electrons * len(pairs) / float(light.sum()) * self._peak(pairs[0])
+        mean = scale * np.maximum(light, 0.0) / len(pairs)
+        charge = scale * light + self.rng.poisson(mean) - mean
+        charge = charge + self.rng.normal(0.0, self.noise.read_e, light.shape)
+        made = reconstruct(charge / scale, self.calibration, z_um=self.z_um, judged=False)
+        self.method = f"{made.solver}, {made.prior}"
+        picture = made.image.mean(axis=-1) if made.image.ndim == 3 else made.image
+        return [pair.told_apart(picture) for pair in pairs]
+
+    def _peak(self, pair: _Pair) -> float:
+        """Return the light of a pair's photograph over its brightest pixel."""
+        alone = shifted(self.psf(self.z_um), pair.points - pair.first)
+        return float(alone.sum() / alone.max())
+
+
+def reached(
+    calibration: Calibration,
+    z_um: float,
+    start_px: float,
+    step_per_um: float,
+    noise: Noise | None = None,
+    *,
+    seed: int = 0,
+    on_progress: Callable[[float], object] | None = None,
+) -> Reached:
+    """Find the smallest distance at which the default reconstruction tells two points apart.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    z_um : float
+        Depth of points and picture; PSFs are refocused to it.
+    start_px, step_per_um : float
+        What the optics allow across and along, where the search begins.
+    noise : Noise, optional
+        Of one pair alone.
+    on_progress : callable, optional
+        Called with the share done.
+    """
+    tests = _Tests(calibration, z_um, noise or Noise(), seed)
+    psf = tests.psf(z_um)
+    low = max(start_px, 1.2)
+    about, wide = low * np.sqrt(_RANGE), np.sqrt(_RANGE)
+    tried: list[TriedPair] = []
+    for number in range(3 * PICTURES):
+        if len(tried) > (PICTURES - 1) * PAIRS:
+            break
+        share = (tests.rng.permutation(PAIRS // 2).repeat(2) + tests.rng.uniform(0, 1)) / (PAIRS / 2)
+        pairs = tests.pairs([float(v) for v in about * wide ** (2 * share - 1)])
+        light = shifted(psf, np.concatenate([pair.points for pair in pairs]))
+        told = tests.told_apart(pairs, light)
+        tried += [TriedPair(p.px, p.axis, t) for p, t in zip(pairs, told, strict=True)]
+        if (found := [px for px in stated_px(tried) if px is not None]) or not any(told):
+            about, wide = (float(np.mean(found)), _ABOUT) if found else (about * _RANGE / 2, wide)
+        if on_progress is not None:
+            on_progress(max(len(tried) / PAIRS, (number + 1) / 3) / (PICTURES + 1))
+    across = stated_px(tried)
+    known = [px for px in across if px is not None]
+    focus = _focus_um(tests, _WIDER * max(known), step_per_um) if known else None
+    return Reached(across, focus, tuple(tried), tests.method, tests.part)
+
+
+def stated_px(tried: Sequence[TriedPair]) -> tuple[float | None, float | None]:
+    """Return where a logistic curve in the logarithm of the distance reaches :data:`TOLD`, along y and x.
+
+    Both axes share its slope. None where no pair of an axis was told apart, or none beyond.
+    """
+    logs = np.log([one.px for one in tried])
+    axes = np.array([one.axis for one in tried])
+    told = np.array([one.told for one in tried])
+    if not told.any() or told.all():
+        return None, None
+    centre = float(logs.mean())
+
+    def misfit(p: Floats) -> float:
+        z = np.exp(p[0]) * (logs - centre - p[1 + axes])
+        # A slope of ten to forty in log distance is usual; pairs told apart by luck do not flatten it.
+        return float(
+            np.logaddexp(0.0, np.where(told, -z, z)).sum() + 0.5 * ((p[0] - np.log(20.0)) / 0.5) ** 2
+        )
+
+    slope, *middles = minimize(misfit, np.array([np.log(20.0), 0.0, 0.0]), method="Nelder-Mead").x
+    beyond = np.log(TOLD / (1 - TOLD)) / np.exp(slope)
+    stated = [float(np.exp(centre + middle + beyond)) for middle in middles]
+    within = [px <= max(one.px for one in tried) for px in stated]
+    return tuple(px if seen else None for px, seen in zip(stated, within, strict=True))  # type: ignore[return-value]
+
+
+def _focus_um(tests: _Tests, px: float, step_per_um: float) -> tuple[float, float]:
+    """Return the nearest and farthest depth from whose points pairs are told apart in the picture."""
+    focus = 1 / tests.z_um
+    steps = step_per_um * _FARTHEST * np.arange(1, _DEPTHS + 1) / _DEPTHS
+    ends: list[float] = []
+    for sign in (1, -1):
+        inverse = [focus + sign * float(step) for step in steps if sign > 0 or step < focus]
+        if not inverse:
+            ends.append(0.0)
+            continue
+        pairs = tests.pairs([px] * 2 * len(inverse))
+        inverse = inverse[: len(pairs) // 2]
+        light = np.zeros(tests.calibration.psfs.shape[-2:])
+        for n, place in enumerate(inverse):
+            here = np.concatenate([pair.points for pair in pairs[2 * n : 2 * n + 2]])
+            light += shifted(tests.psf(float(1 / place)), here)
+        each = tests.told_apart(pairs, light)
+        told = [each[2 * n] and each[2 * n + 1] for n in range(len(inverse))]
+        count = [*told, False].index(False)
+        ends.append(focus if count == 0 else inverse[count - 1])
+        if sign < 0 and count == len(inverse) < _DEPTHS:
+            ends[-1] = 0.0
+    near, far = ends
+    return 1 / near, (1 / far if far > 0 else float("inf"))
+
+
+def _within(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return a shape of the same middle, no larger than :data:`LARGEST_PX`."""
+    height, width = shape
+    while height * width > LARGEST_PX:
+        height, width = (height - 2, width) if height >= width else (height, width - 2)
+    return height, width
+
+
+def _cells(psf: Array, px: float) -> Floats:
+    """Return the middles of the cells that pairs stand in, (n, 2): where all of the pattern is seen.
+
+    At least within a fifth of the sensor, where its pattern leaves no rim.
+    """
+    cell = max(_CELL_PX, 5 * px)
+    sides = []
+    for size, (first, last) in zip(psf.shape, lit_extent(psf), strict=True):
+        half = max(min(first, size - 1 - last, _FIELD * size), size / 5)
+        steps = int(half // cell)
+        sides.append(cell * np.arange(-steps, steps + 1))
+    return np.array(list(product(*sides)))
+
+
+def shifted(psf: Array, points: Floats) -> Floats:
+    """Return the sum of a PSF (height, width) shifted to points (n, 2) between pixels, by linear phases."""
+    room = 2 * int(np.ceil(np.abs(points).max()) + 2)
+    shape = fft.fast_shape([n + room for n in psf.shape])
+    padded = np.zeros(shape)
+    padded[: psf.shape[0], : psf.shape[1]] = psf
+    down, right = np.fft.fftfreq(shape[0]), np.fft.rfftfreq(shape[1])
+    rows = np.exp(-2j * np.pi * down[:, None] * points[:, 0])
+    columns = np.exp(-2j * np.pi * points[:, 1, None] * right)
+    moved = fft.irfft(np.ascontiguousarray(fft.rfft(padded) * (rows @ columns)), shape[1])
+    return np.asarray(moved[: psf.shape[0], : psf.shape[1]])

@@ -1,0 +1,53 @@
+"""What a killed program left of files and folders it was writing, and names that are never missing."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from instrument.files import atomic
+from instrument.files.atomic import whole_file, whole_folder, write_text
+
+
+def killed_while_it_writes(path: Path) -> None:
+    """Write a file and a folder in another process, which is killed within."""
+    process = os.fork()
+    if process == 0:
+        with whole_file(path) as file, whole_folder(path.with_suffix("")) as folder:
+            file.write_text("half")
+            (folder / "a").write_text("half")
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(process, 0)
+
+
+def test_what_a_killed_program_left_goes_and_what_is_being_written_stays(tmp_path: Path) -> None:
+    write_text(tmp_path / ".mine.0123abcd.txt", "a hidden file of the user's")
+    killed_while_it_writes(tmp_path / "kept.txt")
+    assert len(list(tmp_path.iterdir())) == 3
+    with whole_file(tmp_path / "slow.txt") as slow, whole_folder(tmp_path / "slow") as folder:
+        slow.write_text("so far")
+        atomic._cleared.clear()  # as another program begins
+        write_text(tmp_path / "kept.txt", "whole")
+        assert slow.exists()
+        assert folder.exists()
+        assert len(list(tmp_path.iterdir())) == 4
+    assert {p.name for p in tmp_path.iterdir()} == {".mine.0123abcd.txt", "kept.txt", "slow.txt", "slow"}
+
+
+def test_a_folder_that_is_replaced_is_never_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def write(text: str) -> None:
+        with whole_folder(tmp_path / "c") as draft:
+            (draft / "a").write_text(text)
+
+    write("old")
+    (tmp_path / "d").mkdir()
+    if not atomic._exchanged(tmp_path / "c", tmp_path / "d"):
+        pytest.skip("this system or disk cannot exchange two names")
+    atomic._exchanged(tmp_path / "c", tmp_path / "d")
+    monkeypatch.setattr(Path, "rename", lambda *_: pytest.fail("renamed in two steps"))
+    write("new")
+    assert (tmp_path / "c" / "a").read_text() == "new"
+    assert {p.name for p in tmp_path.iterdir()} == {"c", "d"}

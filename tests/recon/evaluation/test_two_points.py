@@ -1,0 +1,64 @@
+"""Two points as the default reconstruction tells them apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from recon.analysis.correlation import half_light_deg
+from recon.analysis.points import TriedPair
+from recon.evaluation import two_points
+from recon.evaluation.two_points import reached, shifted, stated_px
+from recon.types import Calibration, Geometry
+
+
+def _caustics(shape: tuple[int, int]) -> np.ndarray:
+    rough = np.random.default_rng(3).normal(size=shape)
+    lines = np.maximum(ndimage.gaussian_filter(rough, 1.0), 0.0) ** 2
+    y, x = (np.linspace(-1, 1, n) for n in shape)
+    lines[(np.abs(y) > 0.5), :] = 0
+    lines[:, np.abs(x) > 0.5] = 0
+    return np.asarray(lines / lines.max(), np.float32)
+
+
+def test_the_stated_distance_is_that_of_a_curve_through_the_pairs() -> None:
+    rng = np.random.default_rng(0)
+    tried = [
+        TriedPair(float(px), axis, bool(rng.uniform() < 1 / (1 + np.exp(-20 * np.log(px / middle)))))
+        for axis, middle in enumerate((2.0, 2.6))
+        for px in np.geomspace(1.2, 4.5, 80)
+    ]
+    beyond = np.exp(np.log(19) / 20)  # a curve of this slope has 95 % there
+    for stated, middle in zip(stated_px(tried), (2.0, 2.6), strict=True):
+        assert stated is not None
+        assert stated == pytest.approx(middle * beyond, rel=0.08)
+    assert stated_px([one for one in tried if not one.told]) == (None, None)
+
+
+def test_a_shift_between_pixels_moves_the_centre_of_light_and_keeps_it() -> None:
+    psf = _caustics((48, 64))
+    both = shifted(psf, np.array([[1.25, -3.5], [-1.25, 3.5]]))
+    assert both.sum() == pytest.approx(2 * psf.sum(), rel=1e-4)
+    one = shifted(psf, np.array([[1.25, -3.5]]))
+    apart = np.subtract(ndimage.center_of_mass(one), ndimage.center_of_mass(psf.astype(float)))
+    np.testing.assert_allclose(apart, (1.25, -3.5), atol=0.01)
+
+
+def test_the_default_picture_reaches_a_little_less_than_the_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(two_points, "LARGEST_PX", 140 * 160)
+    monkeypatch.setattr(two_points, "PICTURES", 3)
+    calibration = Calibration(
+        _caustics((160, 180))[None, None], np.array([[0.0, 0.0, 50e3]]), geometry=Geometry(10.0, 5.0)
+    )
+    found = reached(calibration, 50e3, 1.2, 2e-6)
+    assert all(px is not None and 1.5 < px < 3.5 for px in found.across_px)
+    assert found.part < 1
+    assert found.focus_um is not None
+    assert 30e3 < found.focus_um[0] < 50.001e3
+    assert found.focus_um[1] > 49.999e3
+
+
+def test_half_of_the_light_is_left_where_half_of_an_even_pattern_is_on_the_sensor() -> None:
+    found = half_light_deg(np.ones((40, 60)), (100, 60), 0.001, lambda y, _x: np.ones(len(y)))
+    np.testing.assert_allclose(np.tan(np.deg2rad(found)), (0.05, 0.03), atol=0.0015)
