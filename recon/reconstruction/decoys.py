@@ -246,4 +246,4 @@ def _score(problem: Problem, iterations: int) -> Score:
     share = np.zeros(valid.shape)
     np.add.at(share, (rows[:, None], columns), steps)
     tiles = fine + asked * tile_means(share, valid) / max(float(share[valid].mean()), 1e-30)
-    return Score(misfit, mean + asked, mean, tuple(tiles.tolist()))
+    return Score(misfit, mean + asked, tuple(fine.tolist()), tuple(tiles.tolist()))

@@ -94,17 +94,24 @@ class Score(NamedTuple):
     objective: float
     """Mean square of its fine structure and twice the prior, a pixel: slow waves are left by stray light and
     unfinished iterations, which another PSF may explain better."""
-    fine: float
-    """Mean square of the residual less its own local mean."""
+    fine: tuple[float, ...]
+    """Mean square of the residual less its own local mean, tile by tile of the photograph."""
     tiles: tuple[float, ...]
     """The objective tile by tile, the prior where the picture has what it asks for: of faint photographs it
     is the prior that tells."""
 
     def leads(self, other: Score) -> float:
-        """By how many standard errors its objective is less than another's, as tiles differ."""
-        ratio = np.log(np.maximum(other.tiles, LEAST) / np.maximum(self.tiles, LEAST))
-        scatter = float(np.std(ratio, ddof=1)) / len(ratio) ** 0.5 if len(ratio) > 1 else np.inf
-        return float(np.mean(ratio)) / max(scatter, LEAST)
+        """By how many standard errors its fine structure or objective is less, as tiles differ.
+
+        Whichever says more: of few bright things the prior is in few tiles, of faint ones the rest is noise.
+        """
+        return max(_ahead(self.fine, other.fine), _ahead(self.tiles, other.tiles))
+
+
+def _ahead(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+    ratio = np.log(np.maximum(other, LEAST) / np.maximum(one, LEAST))
+    scatter = float(np.std(ratio, ddof=1)) / len(ratio) ** 0.5 if len(ratio) > 1 else np.inf
+    return float(np.mean(ratio)) / max(scatter, LEAST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +223,7 @@ def check_of(scores: Mapping[Transformation, Score], pixels: int, structure: flo
         return CalibrationCheck(Fit.FITS, scores, pixels)
     objectives = [score.objective for score in (given, *decoys.values())]
     speaks = (max(objectives) - min(objectives)) * pixels / 2 > SPEAKS_NATS
-    unlike = given.fine > EXPLAINED and _lead(given, far.values()) < NOT_OWN
+    unlike = float(np.mean(given.fine)) > EXPLAINED and _lead(given, far.values()) < NOT_OWN
     likelier = all(score.objective > (1 + LIKELIER) * given.objective for score in far.values())
     gained = min((score.objective - given.objective for score in far.values()), default=np.inf)
     missing = structure * pixels / 2 > STRUCTURE_NATS and gained < OWN_SHARE * structure

@@ -129,7 +129,8 @@ TILES = 1 + 0.01 * np.random.default_rng(0).normal(size=16)
 
 def score(misfit: float, objective: float, unlike: float = 0.0) -> Score:
     """Return a score in tiles that differ."""
-    return Score(misfit, objective, misfit, tuple(objective * (TILES + unlike * TILES[::-1])))
+    tiles = TILES + unlike * TILES[::-1]
+    return Score(misfit, objective, tuple(misfit * tiles), tuple(objective * tiles))
 
 
 GOOD = {GIVEN: score(1.2, 1.5), BETWEEN: score(1.2, 1.5)} | {how: score(1.6, 2.0, 0.1) for how in NEAR}
