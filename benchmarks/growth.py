@@ -1,6 +1,7 @@
 """Draw time and memory of reconstructions against pixels, planes, PSFs, frames and threads, with slopes.
 
     python benchmarks/growth.py [--most 1.0] [--out growth] [--iterations 30]
+    python benchmarks/growth.py --told            # what reconstructions say early, and what they took
 
 Cases run in processes of their own on points seen through random lenslets (SIMULATED): first the
 forecast that ``reconstruct --explain`` gives, from six iterations, then the whole of it. Written are
@@ -23,9 +24,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from instrument.files.figures import ACCENT, INK, SECOND, save_figure, style
-from instrument.reconstruction.forecast import forecast
+from instrument.reconstruction.forecast import Foretold, forecast
 from recon import Calibration, Geometry, reconstruct
 from recon.base.threads import set_threads
+from recon.evaluation.scene import make_scene
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.solvers.memory import GIB, MemoryMeter, available_bytes
@@ -116,6 +118,24 @@ def measured(case: Case, iterations: int) -> tuple[float, float, float, float]:
     return found[0], found[1], found[2], found[3]
 
 
+def tell_default(size: int) -> None:
+    """Print what reconstructions by default options say they will take, and what they took."""
+    for name in ("dense-picture", "sparse-picture", "beads", "dense-volume"):
+        made = make_scene(name, size=size)
+        reconstruct(made.measurement, made.calibration, iterations=2)  # kernels are compiled
+        foretold, meter, began = Foretold(lambda _: None), MemoryMeter(), time.perf_counter()
+        found = reconstruct(
+            made.measurement, made.calibration, on_progress=foretold.watch, on_stage=foretold.stage
+        )
+        took_s, took_bytes = time.perf_counter() - began, meter.peak_mib() * 2**20
+        print(
+            f"{name:<16}{len(found.history):4} iterations, "
+            f"{took_s:6.2f} s (told {foretold.seconds / took_s - 1:+.0%}), "
+            f"{took_bytes / 2**20:6.1f} MiB (told {foretold.memory_bytes / max(took_bytes, 1) - 1:+.0%})",
+            flush=True,
+        )
+
+
 def slope(sizes: list[int], values: list[float]) -> float:
     """Return the exponent of growth over the two largest sizes."""
     ratio = np.log(sizes[-1] / sizes[-2])
@@ -127,9 +147,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--most", type=float, default=1.0, help="pixels, times those of 1024 x 1024")
     parser.add_argument("--iterations", type=int, default=30)
+    parser.add_argument("--told", action="store_true", help="only: what is told early, by default options")
     parser.add_argument("--only", help="one of pixels, planes, PSFs, frames, threads")
     parser.add_argument("--out", type=Path, default=Path("growth"))
     options = parser.parse_args()
+    if options.told:
+        tell_default(96)
+        return
     options.out.mkdir(parents=True, exist_ok=True)
     wanted = {k: v for k, v in cases(options.most).items() if options.only in (None, k)}
     figure = Figure(figsize=(4.2 * len(wanted), 4.4), layout="constrained")

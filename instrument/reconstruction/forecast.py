@@ -73,7 +73,7 @@ class Foretold:
     Parameters
     ----------
     tell : callable
-        ``tell(words)``, once: ``"about 12.0 s in all; 340 MiB of memory"``.
+        ``tell(words)``, once: ``"about 12.0 s in all; 340 MiB of memory so far"``.
     """
 
     def __init__(self, tell: Callable[[str], object]) -> None:
@@ -92,7 +92,9 @@ class Foretold:
         self._told = True
         self.seconds = (time.perf_counter() - self._began) / max(share, 1e-3)
         self.memory_bytes = self._meter.peak_mib() * 2**20
-        memory = f"; {in_words(self.memory_bytes)} of memory" if self.memory_bytes >= WORTH_BYTES else ""
+        memory = (
+            f"; {in_words(self.memory_bytes)} of memory so far" if self.memory_bytes >= WORTH_BYTES else ""
+        )
         self._tell(f"about {duration(self.seconds)} in all{memory}")
 
 

@@ -32,6 +32,8 @@ SAME_PLACE = 0.02
 """Places of two depths that differ by no more of the field were meant to be the same."""
 LEAST_LIKENESS = 0.5
 """Scaled neighbours less alike than this are not mixed: the mixture would be a double image."""
+_LOSS = 1.5  # power of the distance in 1/z at which a scaled pattern loses its likeness
+_LEAST_LOST = 0.003  # that is not told from noise
 TYPICAL_DEFLECTION_DEG = 0.25
 """Half width of the deflection of the dissertation's 0.5 degree diffuser (A.2), where nothing is known."""
 
@@ -392,11 +394,13 @@ def _expected_similarity(
 ) -> float | None:
     """Predict what a measured PSF would agree to, from calibrated PSFs left out one at a time.
 
-    A plane predicted from planes at a distance ``D`` in 1/z misses ``1 - similarity``, which grows as
+    A plane mixed from planes at a distance ``D`` in 1/z misses ``1 - similarity``, which grows as
     ``D^2`` while it is small; so it is scaled to the distance of the wanted depth.
     """
     if len(depths) < 3:
         return None
+    if len(members) == 1:
+        return _scaled_likeness(depths, psfs, z_um, members[0], distance_um)
     wanted = min(abs(1 / depths[k] - 1 / z_um) for k in members)
     nearest = np.argsort(np.abs(1 / depths - 1 / z_um))[:2]
     missed = []
@@ -410,6 +414,33 @@ def _expected_similarity(
         gap = min(abs(1 / depths[rest][j] - 1 / depths[k]) for j in used)
         missed.append((1 - likeness) * (wanted / gap) ** 2)
     return float(np.clip(1 - np.mean(missed), 0.0, 1.0))
+
+
+def _scaled_likeness(
+    depths: npt.NDArray[np.float64], psfs: Floats, z_um: float, member: int, distance_um: float
+) -> float:
+    """Predict what a measured PSF would agree to with one plane that is only scaled.
+
+    That plane is scaled to a near, a middle and the farthest other plane. Caustics lose their likeness as
+    ``1 / (1 + (D / D0)^1.5 + noise)`` of the distance ``D`` in 1/z: seen on propagated light to 25 times the
+    planes' spacing (docs/decisions/0131).
+    """
+    from scipy.optimize import nnls  # costs a tenth of a second
+
+    gaps = np.abs(1 / depths - 1 / depths[member])
+    others = np.argsort(gaps)[1:]
+    chosen = sorted({int(others[0]), int(others[len(others) // 2]), int(others[-1])})
+    lost = []
+    for k in chosen:
+        predicted = refocus_psf(psfs[member], float(depths[member]), float(depths[k]), distance_um)
+        rows, columns = displacement(psfs[k].mean(axis=0), predicted.mean(axis=0))
+        lost.append(1 / max(_likeness(moved(predicted, rows, columns), psfs[k]), 1e-3) - 1)
+    reach = (gaps[chosen] / gaps[chosen].max()) ** _LOSS
+    weights = 1 / (np.array(lost) + _LEAST_LOST)
+    design = np.stack([reach, np.ones(len(chosen))], axis=1)
+    (grows, noise), _ = nnls(design * weights[:, None], np.array(lost) * weights)
+    wanted = (abs(1 / z_um - 1 / depths[member]) / gaps[chosen].max()) ** _LOSS
+    return float(1 / (1 + grows * wanted + noise))
 
 
 def _distance_um(calibration: Calibration) -> float:

@@ -56,6 +56,9 @@ def test_the_expected_similarity_is_that_of_the_truth() -> None:
         assert made.expected_similarity is not None
         assert 1 - made.expected_similarity == pytest.approx(1 - truth, abs=0.02)
         assert made.expected_similarity > 0.95
+    for z_um in (18e3, 24e3, 400e3):  # beyond the calibrated depths
+        made = refocus(calibration, z_um)
+        assert made.expected_similarity == pytest.approx(similarity(made.psf[0], true_psf(z_um)), abs=0.02)
 
 
 def test_a_line_of_motion_beside_the_axis_blurs_nothing() -> None:
