@@ -267,7 +267,7 @@ class Work:
             judge(runs_in(folder / "runs"), promised, kept, tally)
         else:
             self._same(folder, tally)
-        litter = {name for name in tree(folder) - unharmed if "/kept/" not in name}
+        litter = {name for name in tree(folder) - unharmed if "/kept/" not in f"{name}/"}
         tally.found("litter", len(litter), sorted(litter)[:5])
         shutil.rmtree(folder)
 

@@ -206,7 +206,7 @@ class MainWindow(QMainWindow):
         """Make the menus, devices and STOP: one row that nothing can push STOP out of; the strip below it."""
         self.menus = QMenuBar()
         self.menus.setNativeMenuBar(False)
-        self.menus.setSizePolicy(QSizePolicy.Policy.Maximum, QSizePolicy.Policy.Preferred)
+        self.menus.setSizePolicy(QSizePolicy.Policy.Maximum, QSizePolicy.Policy.Fixed)
         self.simulated = label("SIMULATED")
         self.simulated.setObjectName("simulated")
         self.simulated.setToolTip("Some or all devices of this bench have no hardware behind them")

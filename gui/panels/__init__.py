@@ -50,9 +50,12 @@ class PanelEntry(NamedTuple):
         try:
             yield
             yield from panel.parts()
-            for part in panel.findChildren(QWidget):  # what showing it first would do in one go
+            parts = panel.findChildren(QWidget)
+            for part in parts:  # what showing it first would do in one go
                 part.ensurePolished()
                 yield
+            for part in reversed(parts):  # layouts have measured fields that had not their looks yet
+                part.updateGeometry()
         except BaseException:  # or not wanted any more
             Panel.shutdown(panel)  # its timers: a subclass may lack yet what it would end
             raise

@@ -117,11 +117,11 @@ class LivePanel(Panel):
             light.addWidget(switch)
         tip = "Read the whole sensor again"
         self.whole_button = button("Whole sensor", tip, lambda: self.form.set_region(None))
+        self.form.buttons.insertWidget(0, self.whole_button)
         side = fill(
             QWidget(),
             label("CAMERA", "heading"),
             self.form,
-            self.whole_button,
             6,
             label("HISTOGRAM, RAW DATA", "heading"),
             (self.picture.histogram, 1),
@@ -239,8 +239,9 @@ class LivePanel(Panel):
             f"screen {self.screen_rate:.1f}/s",
             self._camera_words(now),
             f"dropped {now.dropped}",
-            f"saturated {frame.metadata.saturated_fraction:.3%}",
         ]
+        if frame.metadata.saturated_fraction:
+            words.append(f"saturated {frame.metadata.saturated_fraction:.3%}")
         state = self.form.state
         if state is not None and state.temperature_c is not None:
             words.append(f"{state.temperature_c:.1f} °C")

@@ -41,6 +41,8 @@ from instrument.reconstruction.stored_result import (
 from recon.base.declare import Imports, expression
 from recon.reconstruction.choice import Choice
 
+_REFINABLE = "--refine-psf fits"
+"""In the verdict's sentence, where fitting the PSF to the photograph is what helps."""
 Views = dict[Path, npt.NDArray[np.uint8]]
 """Files of an export with the colours that they show, (height, width, 3)."""
 
@@ -55,6 +57,8 @@ class ReconstructionsPanel(Panel):
         self._explaining: Job | None = None
         self._opening: Job | None = None
         self._first_picture = True
+        self._made: Path | None = None
+        """The result that the form as it stands has made."""
 
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
@@ -71,6 +75,9 @@ class ReconstructionsPanel(Panel):
         tip = "Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)"
         self.export_button = button("Export…", tip, self._choose_export, enabled=False)
         yield
+        tip = "The PSF is turned or of another size for this photograph: fit it first, then reconstruct again"
+        self.refine_button = button("Fit the PSF, and again", tip, self.refine)
+        self.refine_button.hide()
         self.form = ReconstructForm()
         self.form.asked.connect(self.reconstruct)
         self.form.questioned.connect(self.explain)
@@ -116,7 +123,11 @@ class ReconstructionsPanel(Panel):
         yield
         below = split(self.facts, self.convergence, sizes=[330, 330])
         yield
-        top = fill(QWidget(), in_row(self.heading, (self.place, 1), self.export_button), (self.viewers, 1))
+        top = fill(
+            QWidget(),
+            in_row(self.heading, (self.place, 1), self.refine_button, self.export_button),
+            (self.viewers, 1),
+        )
         yield
         right = split(top, below, sizes=[520, 170], down=True, stretch=1)
         right.setStretchFactor(0, 3)
@@ -172,6 +183,9 @@ class ReconstructionsPanel(Panel):
         self.facts.show_facts(result.facts(), warnings, simulated=result.simulated)
         self.convergence.show_histories(result.histories, result.noise_norm)
         self.export_button.setEnabled(True)
+        misfit = any(_REFINABLE in warning for warning in result.warnings)
+        tried = self.form.options.value("refine_psf")
+        self.refine_button.setVisible(misfit and result.path == self._made and not tried)
         if result.volume is not None:
             self.viewers.setCurrentWidget(self.volume)
             self.volume.open(result.volume, result.grid)
@@ -184,6 +198,7 @@ class ReconstructionsPanel(Panel):
     def _close_result(self) -> None:
         self.volume.release()
         self.result = None
+        self.refine_button.hide()
         self.export_button.setEnabled(False)
 
     # Export --------------------------------------------------------------------------------------
@@ -291,6 +306,8 @@ class ReconstructionsPanel(Panel):
 
     def _settled(self, name: str) -> None:
         """Follow what was named in the form: the result's name, the depths to choose from."""
+        if name != "out":
+            self.refine_button.hide()  # the form is another by now
         if name in ("image", "kind"):
             self._suggest_out()
         if name in ("calibration", "kind"):
@@ -319,6 +336,12 @@ class ReconstructionsPanel(Panel):
         for ended, words in ((job.failed, "failed"), (job.cancelled, "stopped")):
             ended.connect(lambda _, words=words: self._not_reconstructed(request.image.name, words))
         return job
+
+    def refine(self) -> Job | None:
+        """Reconstruct again with the PSF fitted to the photograph first, as the form then says."""
+        self.form.options.set_values({"refine_psf": True})
+        self.tabs.setCurrentWidget(self.form)
+        return self.reconstruct()
 
     def _show_nothing(self, words: str, *, busy: bool = False) -> None:
         """Take what was shown of another result away."""
@@ -402,7 +425,7 @@ class ReconstructionsPanel(Panel):
         self.convergence.show_histories((so_far.history,), None)
 
     def _reconstructed(self, written: Written) -> None:
-        path = written.path
+        path = self._made = written.path
         self.form.show_progress(1.0, f"Wrote {path.name}")
         for name, text in written.checkpoint.items():
             self.session.log("info", f"{name} {text}")

@@ -208,6 +208,9 @@ class RunsPanel(Panel):
         photographs = sum(listed.is_photograph for listed in summaries)
         said = count(len(summaries) - photographs, "run")
         said += f" and {count(photographs, 'photograph')}" if photographs else ""
+        simulated = bool(summaries) and all(listed.is_simulated for listed in summaries)
+        self.table.setColumnHidden(len(_COLUMNS) - 1, simulated)  # said once
+        said += ", SIMULATED," if simulated else ""
         self.where.setText(f"{said} in {folder.name} of {folder.parent.name}")
         self.where.setToolTip(str(folder))
         self.hint.setVisible(not summaries)
@@ -220,7 +223,9 @@ class RunsPanel(Panel):
                 texts = (
                     listed.path.name,
                     listed.became,
-                    f"{listed.stored} of {listed.frames}",
+                    f"{listed.stored}"
+                    if listed.stored == listed.frames
+                    else f"{listed.stored} of {listed.frames}",
                     listed.kind,
                     "SIMULATED" if listed.is_simulated else "",
                 )

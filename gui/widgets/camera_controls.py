@@ -80,8 +80,8 @@ class CameraForm(QWidget):
         tip = "Everything that the camera reports of itself; its own settings can be changed there"
         self.all_button = button("All settings …", tip, self._show_all)
         self.presets = KeptBar(self._session, "camera", "Presets", self._preset, self._use_preset, "Use")
-        last = in_row(self._temperature_name, (self.temperature, 1), self.all_button)
-        fill(self, self.form, self.presets, last)
+        self.buttons = in_row(self._temperature_name, (self.temperature, 1), self.all_button)
+        fill(self, self.form, self.presets, self.buttons)
         self._session.device_changed.connect(self._device_changed)
         self._reads = every(self, _FIRST_READ_MS, self.read_back)
         self._device_changed("camera")

@@ -125,6 +125,7 @@ class ImageView(QWidget):
         self._caution.hide()
         self._caption = QLabel(parent=self.graphics)
         self._caption.setObjectName("caption")
+        self._caption.setWordWrap(True)
         self._caption.hide()
         scene = self.graphics.scene()
         scene.sigMouseMoved.connect(self._moved)
@@ -224,7 +225,9 @@ class ImageView(QWidget):
         if words != self.caption:
             self._caption.setText(words)
             self._caption.setVisible(bool(words))
-            self._caption.adjustSize()
+        room = max(self.graphics.width() - 2 * _MARGIN_PX, 1)
+        self._caption.setFixedWidth(min(room, self._caption.fontMetrics().horizontalAdvance(words) + 24))
+        self._caption.adjustSize()
         self._caption.move(_MARGIN_PX, self.graphics.height() - self._caption.height() - _MARGIN_PX)
 
     def caution_against(self, words: str, *, old: bool = False) -> None:

@@ -274,7 +274,7 @@ class LivePicture(QWidget):
             fit,
             self.turn_button,
             None,
-            spacing=6,
+            spacing=2,
         )
         fill(self, tools, (self.view, 1), self.profile_plot)
 

@@ -37,7 +37,10 @@ class OrientationButton(QPushButton):
     """
 
     def __init__(self, session: BenchSession, kind: Kind, tip: str) -> None:
-        super().__init__("Turn")
+        super().__init__("⟳")
+        self.setAccessibleName("Turn and mirror")
+        self.setCheckable(True)
+        self.setStyleSheet("QPushButton::menu-indicator { width: 0; }")
         self._session, self._kind = session, kind
         self.orientation = AS_IT_IS
         self._tip = tip
@@ -62,4 +65,4 @@ class OrientationButton(QPushButton):
         self.orientation = orientation
         now = orientation.words or "as it is"
         self.setToolTip(f"{self._tip} Kept with the bench. Now: {now}.")
-        self.setText(f"Turn ({orientation.words})" if orientation.words else "Turn")
+        self.setChecked(orientation != AS_IT_IS)

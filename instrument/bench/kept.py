@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from instrument.files.atomic import make_folder, write_json
+from instrument.files.atomic import write_json
 from instrument.files.errors import FileError
 
 FILE = "kept-with-bench.json"
@@ -73,5 +73,5 @@ class KeptWithBench:
         """
         if self._problem is not None:
             raise self._problem
-        make_folder(self.path.parent)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
         write_json(self.path, self._kept)

@@ -37,6 +37,8 @@ DIMMER = 0.2
 """Relative change of brightness that is worth a word."""
 FRESH = 0.98
 """Inner product after alignment below which the pattern has changed, if the spot has not grown as well."""
+MORE_ALIKE = 0.2
+"""Of what a turned pattern lacks of being alike: a pattern that gains no more than this on it is another."""
 _SAME_PITCH = 1e-3  # relative: pitches of one camera are equal but for how they were written
 
 
@@ -60,6 +62,10 @@ class Change:
     """Spot size of the new camera with the old PSF over that with its own."""
     edge_px: float
     """How far scale and rotation move the pattern's edge."""
+    decoy: float
+    """Inner product of the old PSF with the new one turned by 180 degrees, at the best whole-pixel shift.
+
+    Patterns of different diffusers have as much in common."""
     brightness: float
     """Light of the new PSF over the old, at equal exposure where both calibrations know theirs."""
 
@@ -135,6 +141,7 @@ def compare_psfs(new: Array, old: Array, z_um: float = float("nan"), exposure: f
         aligned=similarity(moved, old),
         spot=correlation.spot_px / autocorrelate(new).spot_px,
         edge_px=abs(factor - 1) * extent,
+        decoy=correlate(old, np.ascontiguousarray(new[::-1, ::-1])).maximum,
         brightness=float(new.sum(dtype=np.float64) / old.sum(dtype=np.float64)) / exposure,
     )
 
@@ -197,8 +204,36 @@ def _exposure_ratio(old: Calibration, new: Calibration) -> float:
     return 1.0
 
 
+def _source_instead(change: Change, distance_um: float) -> str:
+    """Return where the source stood if not the diffuser moved, and which of both the light says."""
+    nearness = change.scale * (1 + distance_um / change.z_um) - 1
+    if nearness <= 0:
+        return ""
+    stood_um = distance_um / nearness
+    expected = (change.z_um / stood_um) ** 2
+    words = (
+        f" If the source did, it stands at {stood_um / 1e3:.4g} instead of {change.z_um / 1e3:.4g} mm, and "
+        f"gives {expected:.2f} times the light"
+    )
+    if abs(expected - 1) < DIMMER / 2:
+        return f"{words}: the light does not tell."
+    if abs(change.brightness / expected - 1) < 0.25 * abs(expected - 1):
+        return f"{words}, as is seen: it was the source, unless the lamp changed."
+    if abs(change.brightness - 1) < 0.25 * abs(expected - 1):
+        return f"{words}, which is not seen: it was the diffuser, unless the lamp changed."
+    return f"{words}; {change.brightness:.2f} is seen, which tells neither."
+
+
 def _verdict(changes: list[Change], distance_um: float | None) -> tuple[bool, tuple[str, ...]]:
     due, reasons = False, []
+    alike = max(max(c.as_is, c.aligned) - c.decoy for c in changes)
+    if alike < MORE_ALIKE * (1 - max(c.decoy for c in changes)):
+        best = max(max(c.as_is, c.aligned) for c in changes)
+        return True, (
+            f"These are different patterns: at best {best:.2f} alike, no more than one turned by 180 degrees "
+            f"({max(c.decoy for c in changes):.2f}). Another diffuser, or another part or side of it; shift, "
+            "size and rotation tell nothing then. Use the new calibration.",
+        )
     spot = max(c.spot for c in changes)
     edge = max(changes, key=lambda c: c.edge_px)
     if spot > WIDER:
@@ -215,6 +250,7 @@ def _verdict(changes: list[Change], distance_um: float | None) -> tuple[bool, tu
                 f" If the diffuser moved, it is {abs(change_um):.3g} um "
                 f"{'farther from' if change_um > 0 else 'nearer to'} the sensor."
             )
+            cause += _source_instead(edge, distance_um)
         reasons.append(
             f"The pattern is {edge.scale - 1:+.2%} in size{turned}, {edge.edge_px:.2g} pixels at its "
             f"edge.{cause}"

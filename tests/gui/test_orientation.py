@@ -76,7 +76,7 @@ def test_it_is_kept_with_the_bench_and_all_views_follow(qtbot: QtBot, session: B
         qtbot.addWidget(picture)
     pictures[0].turn_button.menu().actions()[1].trigger()
     assert [p.view.graphics.orientation for p in pictures] == 2 * [Orientation(3)]
-    assert "turned 270" in pictures[1].turn_button.text()
+    assert "turned 270" in pictures[1].turn_button.toolTip()
     qtbot.waitUntil(lambda: session.kept.path.is_file())
     assert '"quarters": 3' in session.kept.path.read_text()
     pictures[1].turn_button.menu().actions()[-1].trigger()

@@ -25,8 +25,10 @@ from gui.widgets.plots import restyle_all
 from instrument.files.images import read_image, write_image
 from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.request import VolumeRequest
-from instrument.reconstruction.stored_result import open_result
+from instrument.reconstruction.stored_result import StoredResult, open_result
+from recon.camera.transformed import Transformation
 from recon.reconstruction.options import Overrides
+from recon.verdict.calibration_check import GIVEN, CalibrationCheck, Fit, Score
 
 WAIT_MS = 60_000
 SIZE, DEPTHS = 32, 4
@@ -355,6 +357,28 @@ def test_export_writes_values_and_views(qtbot: QtBot, panel: ReconstructionsPane
     with qtbot.waitSignal(job.failed, timeout=WAIT_MS):
         pass
     assert "exists already" in panel._note.toolTip()
+
+
+def test_a_psf_that_does_not_fit_is_fitted_by_a_button(
+    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    turned = Transformation(rotation_deg=2.0)
+    scores = {GIVEN: Score(4.0, 1.0, ()), turned: Score(1.0, 1.0, ())}
+    better = CalibrationCheck(Fit.OFF, scores, 600, turned)
+    monkeypatch.setattr(StoredResult, "warnings", property(lambda _: better.sentences))
+    write_image(tmp_path / "p.tif", np.zeros((20, 30), np.float32))
+    panel.show()
+    panel.open(tmp_path / "p.tif")
+    qtbot.waitUntil(lambda: panel.result is not None, timeout=WAIT_MS)
+    assert panel.refine_button.isHidden(), "made by another form"
+    panel._made = panel.result.path
+    panel.show_result(panel.result)
+    asked: list[bool] = []
+    monkeypatch.setattr(panel, "reconstruct", lambda: asked.append(panel.form.options.value("refine_psf")))
+    qtbot.mouseClick(panel.refine_button, Qt.MouseButton.LeftButton)
+    assert asked == [True]
+    panel.show_result(panel.result)
+    assert panel.refine_button.isHidden(), "it was fitted already"
 
 
 @pytest.mark.parametrize("opened_during", ["the name", "the question"])

@@ -107,8 +107,10 @@ class Trials:
         watched = self._watch(session)
         bad = [name for name, test in watched.items() if not test.passed]
         print(f"{len(watched)} tests watched in {time.monotonic() - began_s:.0f} s; not used: {bad}")
-        self._try_all(session, watched, began_s + self._seconds)
-        shutil.rmtree(self._folder, ignore_errors=True)
+        try:
+            self._try_all(session, watched, began_s + self._seconds)
+        finally:
+            shutil.rmtree(self._folder, ignore_errors=True)
         return True
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:

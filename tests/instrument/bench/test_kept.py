@@ -15,8 +15,9 @@ def test_values_come_back_by_kind_and_name_and_a_damaged_file_is_left(tmp_path: 
     kept.read()
     kept.put("places", "corner", {"x_um": 12.5})
     kept.put("places", "gone", {"x_um": 1.0})
-    kept.put("places", "gone", None)
     kept.write()
+    kept.put("places", "gone", None)
+    kept.write()  # into a folder that is there by now
     again = KeptWithBench(tmp_path / "runs")
     again.read()
     assert again.of("places") == {"corner": {"x_um": 12.5}}
