@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.analysis.resolution import lateral_resolution
 from recon.base.checks import saturated_share
 from recon.camera.camera_model import CAMERAS, ModelName
 from recon.camera.registration import likeness
 from recon.camera.transformed import Transformation, transformed
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.pilot import fine_structure, pilot, tile_means
+from recon.reconstruction.pilot import FINE_PX, fine_structure, pilot, tile_means
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import on_blocks, reduced_calibration
 from recon.types import Calibration
@@ -23,10 +24,13 @@ from recon.verdict.calibration_check import (
     BETWEEN,
     FAR,
     GIVEN,
+    NEARLY,
     CalibrationCheck,
     Fit,
     Score,
+    as_given,
     check_of,
+    is_told,
     near_decoys,
 )
 
@@ -47,6 +51,9 @@ DECOYS, MOST_DECOYS = 8, 12
 degrees or per cent."""
 ALIKE = 0.7
 """Likeness from which a far decoy tells nothing, as of regular lenslets, which are their own mirror image."""
+PART = 0.5
+"""Of a near decoy's step, from which the minimum between it and the given one is tried as well: less is no
+other calibration."""
 VARIED = 0.35
 """Difference of a field's PSFs from the central one, relative to it, beyond which that one explains little
 more than any other pattern: then all of them are tried, or, where one was chosen, nobody is accused."""
@@ -79,12 +86,15 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
     check = compete(few, quick, lit=lit)
     if check.sure:
         return check
-    again = compete(few if lit else _small(problem, more_px), thorough, lit=lit)
+    many = few if lit else _small(problem, more_px)
+    again = compete(many, thorough, lit=lit)
     # A faint photograph's large pixels may tell what small ones do not.
-    check = again if again.fit is not Fit.UNTOLD else check
+    check, small = (again, many) if again.fit is not Fit.UNTOLD else (check, few)
     if check.wrong and not lit:  # by stray light, or by light from beyond the field?
-        again = compete(few, thorough, lit=True)
-        check = again if again.fit is Fit.FITS else check
+        again = compete(small, thorough, lit=True)
+        accuser = again.scores.get(check.better) if check.better is not None else None
+        cleared = accuser is None or is_told(again.scores[GIVEN], accuser, small.pixels)
+        check = again if again.fit is Fit.FITS and cleared else check
     given = _given(problem).depths
     one = given.varies and not problem.depths.varies and given.field_error > VARIED
     return None if one and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
@@ -106,6 +116,15 @@ class _Small:
         erasures = self.photograph.erasures
         return int(np.size(self.photograph.image) - (0 if erasures is None else np.count_nonzero(erasures)))
 
+    def structure(self) -> float:
+        """Return the mean square of the photograph's fine structure beyond noise; 0 if PSFs resolve none."""
+        problem = self._problem(self.calibration, background=False)
+        valid = problem.valid[0]
+        finest = lateral_resolution(problem.depths.central[problem.n_depths // 2, 0]).mean_px
+        if not finest <= FINE_PX:
+            return 0.0
+        return float(np.mean(fine_structure(problem.data[0].astype(np.float64), valid)[valid] ** 2)) - 1
+
     def decoys(self) -> tuple[Transformation, ...]:
         """Return those that differ from the PSFs: near ones unless one of many serves, then far ones."""
         psfs = self.calibration.psfs
@@ -123,11 +142,14 @@ class _Small:
         copies = replace(
             self.calibration, psfs=transformed(self.calibration.psfs, how), source_positions_um=positions
         )
+        problem = self._problem(copies, background=background)
+        return _score(problem, iterations if problem.n_planes == 1 else -(-iterations // 2))
+
+    def _problem(self, calibration: Calibration, *, background: bool) -> Problem:
         options = ReconstructionOptions(
             prior="tv", model=self.model, estimate_background=background, drop_empty=False
         )
-        problem = Problem.of(self.photograph, copies, options)
-        return _score(problem, iterations if problem.n_planes == 1 else -(-iterations // 2))
+        return Problem.of(self.photograph, calibration, options)
 
 
 def _competition(small: _Small, scored: Callable[[Transformation], Score]) -> CalibrationCheck:
@@ -137,13 +159,30 @@ def _competition(small: _Small, scored: Callable[[Transformation], Score]) -> Ca
     check = check_of(scores, small.pixels)
     if check.sure:
         return check
+    structure = small.structure()
     scores[BETWEEN] = scored(BETWEEN)
     near = [how for how in decoys if how not in FAR]
+    for how in _minima(scores, near, small.pixels):
+        scores[how] = scored(how)
     before, best = GIVEN, min((GIVEN, *near), key=lambda how: scores[how].objective)
     while scores[best].objective < scores[before].objective and len(scores) < MOST_DECOYS:
         before, best = best, Transformation(scale=best.scale**2, rotation_deg=2 * best.rotation_deg)
         scores[best] = scored(best)
-    return check_of(scores, small.pixels)
+    return check_of(scores, small.pixels, structure)
+
+
+def _minima(
+    scores: Mapping[Transformation, Score], near: Sequence[Transformation], pixels: int
+) -> Iterator[Transformation]:
+    """Yield where the objective of turns and of sizes is least between given and near ones, by a parabola."""
+    given = as_given(scores).objective
+    for one, other in zip(near[::2], near[1::2], strict=True):
+        up, down = scores[one].objective - given, scores[other].objective - given
+        if up + down <= 0:
+            continue
+        at, gain = (down - up) / (2 * (up + down)), (down - up) ** 2 / (8 * (up + down))
+        if PART <= abs(at) <= 1 - PART / 2 and gain * pixels / 2 > NEARLY.nats:
+            yield Transformation(scale=one.scale**at, rotation_deg=at * one.rotation_deg)
 
 
 def _small(problem: Problem, longest_px: int) -> _Small:
@@ -194,6 +233,17 @@ def _score(problem: Problem, iterations: int) -> Score:
     prior = last.objective - 0.5 * last.data_residual**2
     left = found.left[0].astype(np.float64)
     misfit = float(np.mean(left[valid] ** 2))
-    fine = tile_means(fine_structure(left, valid) ** 2, valid)
-    objective = float(np.mean(fine)) + 2 * prior / np.count_nonzero(valid)
-    return Score(misfit, objective, tuple(fine.tolist()))
+    square = fine_structure(left, valid) ** 2
+    fine = tile_means(square, valid)
+    mean = float(np.mean(fine))
+    asked = 2 * prior / np.count_nonzero(valid)
+    # Total variation is where the picture's steps are; beyond the field they count at its edge.
+    steps = sum(np.abs(np.diff(found.solution[0], axis=a, append=0)).sum(axis=0) for a in (1, 2))
+    rows, columns = (
+        np.clip(np.arange(n) - within.start, 0, within.stop - within.start - 1)
+        for n, within in zip(steps.shape, problem.window, strict=True)
+    )
+    share = np.zeros(valid.shape)
+    np.add.at(share, (rows[:, None], columns), steps)
+    tiles = fine + asked * tile_means(share, valid) / max(float(share[valid].mean()), 1e-30)
+    return Score(misfit, mean + asked, tuple(fine.tolist()), tuple(tiles.tolist()))

@@ -39,19 +39,34 @@ FAR = (
 """Decoys that have as much light at as many places, and nothing to do with the photograph."""
 EDGE_PX = 0.6
 """By how much near decoys move a pattern's edge at least, pixels: less tells nothing."""
-TOLD_NATS = 25.0
-"""Odds from which a decoy is the better one: of right calibrations none had more than 4, of those turned by a
-degree all had 40 and more where the photograph tells anything."""
 TOLD_SHARE = 0.002
-"""The same relative to the score: what errors of the model may make of it."""
-CERTAIN = 2.5
-"""Standard errors by which tiles must say so as well, of a decoy or of the calibration: chance alone makes
-them of sixteen tiles once in eighty times (Student's t)."""
+"""Odds relative to the score, from which they are no errors of the model."""
+
+
+class Certainty(NamedTuple):
+    """What it takes for one PSF to be better than another."""
+
+    nats: float
+    """Odds."""
+    errors: float
+    """Standard errors by which tiles must say so as well."""
+
+
+CERTAIN = Certainty(25.0, 2.5)
+"""That a calibration is the photograph's own, of its far decoys: chance alone makes so much of sixteen tiles
+once in eighty times (Student's t)."""
+NEARLY = Certainty(12.0, 1.75)
+"""That it is off, or not, of its near decoys (once in twenty times): a right one is ahead of them, by 0.8
+standard errors and more, and none of theirs had odds of more than one nat."""
 SPEAKS_NATS = 200.0
 """Odds among all that were tried from which a photograph has its say on foreign ones."""
 NOT_OWN = 1.0
 """Standard errors by which tiles prefer the calibration to each of its far decoys, up to which it is not the
-photograph's own: of 40 foreign ones a few had more; of right ones the least was 1.1."""
+photograph's own."""
+STRUCTURE_NATS, OWN_SHARE = 1000.0, 0.025
+"""Fine structure of a photograph, half its squares beyond the noise, from which a PSF that resolves it has to
+be ahead of its far decoys by that share of it: of 25 right ones the least was 4 %, of 32 foreign ones the
+most 2.7 %."""
 LIKELIER = 0.05
 """Score of all far decoys beyond the calibration's, relative to it, from which it is not called foreign
 either: in small photographs of a few beads tiles tell little."""
@@ -81,12 +96,22 @@ class Score(NamedTuple):
     unfinished iterations, which another PSF may explain better."""
     fine: tuple[float, ...]
     """Mean square of the residual less its own local mean, tile by tile of the photograph."""
+    tiles: tuple[float, ...]
+    """The objective tile by tile, the prior where the picture has what it asks for: of faint photographs it
+    is the prior that tells."""
 
     def leads(self, other: Score) -> float:
-        """By how many standard errors it leaves less fine structure than another, as tiles differ."""
-        ratio = np.log(np.maximum(other.fine, LEAST) / np.maximum(self.fine, LEAST))
-        scatter = float(np.std(ratio, ddof=1)) / len(ratio) ** 0.5 if len(ratio) > 1 else np.inf
-        return float(np.mean(ratio)) / max(scatter, LEAST)
+        """By how many standard errors its fine structure or objective is less, as tiles differ.
+
+        Whichever says more: of few bright things the prior is in few tiles, of faint ones the rest is noise.
+        """
+        return max(_ahead(self.fine, other.fine), _ahead(self.tiles, other.tiles))
+
+
+def _ahead(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+    ratio = np.log(np.maximum(other, LEAST) / np.maximum(one, LEAST))
+    scatter = float(np.std(ratio, ddof=1)) / len(ratio) ** 0.5 if len(ratio) > 1 else np.inf
+    return float(np.mean(ratio)) / max(scatter, LEAST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +139,7 @@ class CalibrationCheck:
         """Whether it fits and is certainly ahead of all its near decoys, too."""
         given = self.scores[GIVEN]
         near = [score for how, score in self.scores.items() if how not in (GIVEN, BETWEEN, *FAR)]
-        return self.fit is Fit.FITS and is_ahead(given, near, self.pixels)
+        return self.fit is Fit.FITS and is_ahead(given, near, self.pixels, NEARLY)
 
     @property
     def wrong(self) -> bool:
@@ -173,7 +198,7 @@ def near_decoys(shape: tuple[int, int], *, sizes: bool) -> tuple[Transformation,
     return (*turned, Transformation(scale=1 + step), Transformation(scale=1 - step)) if sizes else turned
 
 
-def check_of(scores: Mapping[Transformation, Score], pixels: int) -> CalibrationCheck:
+def check_of(scores: Mapping[Transformation, Score], pixels: int, structure: float = 0.0) -> CalibrationCheck:
     """Judge a calibration by its score and its decoys'.
 
     Parameters
@@ -183,15 +208,16 @@ def check_of(scores: Mapping[Transformation, Score], pixels: int) -> Calibration
         ones that do not resemble it: where all do, as of regular lenslets, only the near ones tell.
     pixels : int
         Valid ones.
+    structure : float
+        Mean square of the photograph's own fine structure beyond the noise; 0 where the PSF resolves none.
     """
-    as_given = (scores[how] for how in (GIVEN, BETWEEN) if how in scores)
-    given = min(as_given, key=lambda score: score.objective)
+    given = as_given(scores)
     scores = {**scores, GIVEN: given}
     decoys = {how: score for how, score in scores.items() if how not in (GIVEN, BETWEEN)}
     better = min(decoys, key=lambda how: decoys[how].objective)
     far = {how: decoys[how] for how in FAR if how in decoys}
     others = [score for how, score in far.items() if how != better]
-    if is_ahead(decoys[better], (given, *others), pixels):
+    if is_ahead(decoys[better], (given, *others), pixels, NEARLY):
         return CalibrationCheck(Fit.OFF, scores, pixels, better)
     if is_ahead(given, (far or decoys).values(), pixels):
         return CalibrationCheck(Fit.FITS, scores, pixels)
@@ -199,20 +225,27 @@ def check_of(scores: Mapping[Transformation, Score], pixels: int) -> Calibration
     speaks = (max(objectives) - min(objectives)) * pixels / 2 > SPEAKS_NATS
     unlike = float(np.mean(given.fine)) > EXPLAINED and _lead(given, far.values()) < NOT_OWN
     likelier = all(score.objective > (1 + LIKELIER) * given.objective for score in far.values())
-    foreign = speaks and unlike and not likelier
+    gained = min((score.objective - given.objective for score in far.values()), default=np.inf)
+    missing = structure * pixels / 2 > STRUCTURE_NATS and gained < OWN_SHARE * structure
+    foreign = ((speaks and unlike) or missing) and not likelier
     return CalibrationCheck(Fit.FOREIGN if foreign else Fit.UNTOLD, scores, pixels)
 
 
-def is_ahead(one: Score, others: Iterable[Score], pixels: int) -> bool:
+def as_given(scores: Mapping[Transformation, Score]) -> Score:
+    """Return the better score of the calibration itself and displaced by part of a pixel."""
+    return min((scores[how] for how in (GIVEN, BETWEEN) if how in scores), key=lambda score: score.objective)
+
+
+def is_ahead(one: Score, others: Iterable[Score], pixels: int, by: Certainty = CERTAIN) -> bool:
     """Whether odds and tiles are certain that a PSF explains a photograph better than all others."""
     others = list(others)
-    return all(is_told(one, other, pixels) for other in others) and _lead(one, others) > CERTAIN
+    return all(is_told(one, other, pixels, by) for other in others) and _lead(one, others) > by.errors
 
 
-def is_told(one: Score, other: Score, pixels: int) -> bool:
+def is_told(one: Score, other: Score, pixels: int, by: Certainty = CERTAIN) -> bool:
     """Whether the odds for one and against another are more than chance and errors of the model make."""
     gain = other.objective - one.objective
-    return gain * pixels / 2 > TOLD_NATS and gain > TOLD_SHARE * other.objective
+    return gain * pixels / 2 > by.nats and gain > TOLD_SHARE * other.objective
 
 
 def _lead(one: Score, others: Iterable[Score]) -> float:

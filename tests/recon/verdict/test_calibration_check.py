@@ -128,8 +128,9 @@ TILES = 1 + 0.01 * np.random.default_rng(0).normal(size=16)
 
 
 def score(misfit: float, objective: float, unlike: float = 0.0) -> Score:
-    """Return a score whose fine structure is the misfit, in tiles that differ."""
-    return Score(misfit, objective, tuple(misfit * (TILES + unlike * TILES[::-1])))
+    """Return a score in tiles that differ."""
+    tiles = TILES + unlike * TILES[::-1]
+    return Score(misfit, objective, tuple(misfit * tiles), tuple(objective * tiles))
 
 
 GOOD = {GIVEN: score(1.2, 1.5), BETWEEN: score(1.2, 1.5)} | {how: score(1.6, 2.0, 0.1) for how in NEAR}
