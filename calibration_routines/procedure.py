@@ -31,7 +31,7 @@ from recon.base.option_text import size
 from recon.base.registry import Registry
 
 if TYPE_CHECKING:
-    from calibration_routines.display.display_io import SpotLook
+    from calibration_routines.display.spot_camera import SpotLook
     from calibration_routines.psf.sweep_plan import SweepExposures
     from calibration_routines.psf.sweep_watch import SweepEvent
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from PySide6.QtCore import QObject, Signal
 from PySide6.QtWidgets import QWidget
 
-from calibration_routines.display.display_io import SpotLook
+from calibration_routines.display.spot_camera import SpotLook
 from calibration_routines.plan_procedures import unfinished
 from calibration_routines.procedure import Listener, Outcome, Procedure, RunEndedError, place_of
 from calibration_routines.psf.sweep_plan import SweepExposures

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.display_io import DisplayBench, SpotCamera
+from calibration_routines.display.display_io import DisplayBench
+from calibration_routines.display.spot_camera import SpotCamera
 from calibration_routines.procedure import Checked, Listener, Size
 from calibration_routines.scatter import Scatter, scatter_of
 from instrument.files.errors import BenchError

@@ -9,13 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.display_io import (
-    DisplayBench,
-    SpotCamera,
-    bring_mask,
-    require_slm,
-    writable,
-)
+from calibration_routines.display.display_io import DisplayBench, bring_mask, require_slm, writable
+from calibration_routines.display.spot_camera import SpotCamera
 from calibration_routines.procedure import (
     CalibrationError,
     Checked,

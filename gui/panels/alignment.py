@@ -10,8 +10,8 @@ import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtWidgets import QButtonGroup, QHeaderView, QWidget
 
-from calibration_routines.display.display_io import SpotLook
 from calibration_routines.display.mask_alignment import AlignmentReport
+from calibration_routines.display.spot_camera import SpotLook
 from calibration_routines.procedure import Outcome, routines
 from gui.procedure_panel import ProcedurePanel
 from gui.session import BenchSession
