@@ -65,12 +65,15 @@ FLOOR, FLOOR_PERCENTILE = 0.08, 10
 """Of a picture through one PSF, where nothing else is chosen: a trial is made where this percentile of its
 block means has this share of the mean (the measured hand 0.07, under half as much stray light 0.25 and
 more). A darker tenth leaves no room for stray light that is worth a trial."""
+DARKEST, DARKEST_PERCENTILE = 0.05, 1
+"""There, where this percentile has less of the mean, held-out pixels prove nothing of stray light: of a
+measured photograph whose darkest hundredth has 0.02 the error fell by 31 to 49 %, and 4.2 dB were lost."""
 
 
-def floor(data: npt.NDArray[Any]) -> float:
-    """Return the darkest tenth of some block means relative to their mean."""
+def floor(data: npt.NDArray[Any], percentile: float = FLOOR_PERCENTILE) -> float:
+    """Return the darkest part of some block means relative to their mean."""
     mean = float(data.mean(dtype=np.float64))
-    return float(np.percentile(data, FLOOR_PERCENTILE)) / mean if mean > 0 else 0.0
+    return float(np.percentile(data, percentile)) / mean if mean > 0 else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +89,8 @@ class Trial:
     dark : float
         Share of the picture that is dark where a background is taken out; 0 where that proves nothing.
     taken : Taken
+    dim : bool
+        Whether the darkest pixels leave hardly any room for stray light.
     """
 
     without: float
@@ -93,6 +98,7 @@ class Trial:
     light: float
     dark: float
     taken: Taken
+    dim: bool = False
 
     @property
     def explains(self) -> bool:
@@ -103,7 +109,7 @@ class Trial:
     def helps(self) -> bool:
         """Whether a background explains what nothing else does, is light, or lies over a dark scene."""
         fall = self.without**2 - self.lit**2
-        is_light = self.light >= LIGHT and fall >= self.taken.fall * self.without**2
+        is_light = not self.dim and self.light >= LIGHT and fall >= self.taken.fall * self.without**2
         return self.explains or is_light or (self.dark >= self.taken.dark and self.light >= self.taken.light)
 
 
@@ -194,8 +200,10 @@ def background_of(trial: Trial | None, overrides: Overrides, *, given: bool) -> 
     why = (
         f"on pixels held out a coarse pass misses by {trial.without:.1f} times noise and usual error of the "
         f"model, with a background by {trial.lit:.1f} times, {trial.light:.0%} of the light (the square must "
-        f"fall by {GAIN:g}, or by {trial.taken.fall:.0%} where it is {LIGHT:.0%} of the light"
+        f"fall by {GAIN:g}"
     )
+    if not trial.dim:
+        why += f", or by {trial.taken.fall:.0%} where it is {LIGHT:.0%} of the light"
     if trial.taken.light:
         why += (
             f", or the picture be dark for {trial.taken.dark:.0%}, found {trial.dark:.0%}, where it is "

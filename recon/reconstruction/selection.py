@@ -12,6 +12,8 @@ import numpy.typing as npt
 from recon.camera.camera_model import CAMERAS, Extent, ModelName
 from recon.errors import InputError
 from recon.reconstruction.background import (
+    DARKEST,
+    DARKEST_PERCENTILE,
     FLOOR,
     Trial,
     background_of,
@@ -144,6 +146,9 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     sparse = coarse_passes(coarse) if looked else None
     tell(0.4, "choosing: a background")
     trial = _trial(problem, coarse, model) if lit else None
+    if trial is not None and not looked:
+        dim = min(floor(c.data[0][c.valid[0]], DARKEST_PERCENTILE) for c in coarse) < DARKEST
+        trial = replace(trial, dim=dim)
     again = None
     prevented = no_beyond(problem.prior, model, len(depths.z_um))
     looks = trial is not None and (trial.explains if overrides.beyond is None else overrides.beyond)
