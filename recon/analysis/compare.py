@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.correlation import autocorrelate, correlate, cut_to_light, lit_extent, similarity
-from recon.camera.refocus import central_psfs, refocus
+from recon.camera.refocus import central_psfs, psf_at
 from recon.camera.registration import register
 from recon.camera.transformed import geometric_centre, resampled
 from recon.errors import InputError
@@ -197,7 +197,7 @@ def _at(old: Calibration, z_um: float) -> Array:
     nearest = int(np.argmin(np.abs(1 / depths - 1 / z_um)))
     if abs(depths[nearest] / z_um - 1) < 1e-6:
         return np.asarray(planes[nearest].mean(axis=0))
-    return np.asarray(refocus(old, z_um).psf.mean(axis=0))
+    return psf_at(old, z_um)
 
 
 def _exposure_ratio(old: Calibration, new: Calibration) -> float:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from recon.analysis.gram import WindowProblem
 from recon.base import fft
 from recon.base.declare import option
-from recon.camera.refocus import refocus
+from recon.camera.refocus import psf_at
 from recon.errors import InputError
 from recon.types import Calibration
 
@@ -271,7 +271,7 @@ def point_tests(
             f"At {z_um / 1e3:.3g} mm the axial window would reach beyond infinity: points were tested across "
             "the axis only. Choose a nearer depth for tests along it."
         )
-    planes = np.stack([refocus(calibration, float(1 / v)).psf.mean(axis=0) for v in inverse])
+    planes = np.stack([psf_at(calibration, float(1 / v)) for v in inverse])
     make = image or _Shifted(calibration)
 
     def point(columns: float, s: float) -> Array:
@@ -361,7 +361,7 @@ class _Shifted:
         key = round(z_um, 6)
         if key not in self._spectra:
             padded = np.zeros(self._shape)
-            padded[:height, :width] = refocus(self._calibration, z_um).psf.mean(axis=0)
+            padded[:height, :width] = psf_at(self._calibration, z_um)
             if len(self._spectra) > 2 * PLANES:
                 self._spectra.clear()
             self._spectra[key] = fft.rfft(padded)

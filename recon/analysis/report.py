@@ -40,7 +40,7 @@ from recon.analysis.resolution import (
 )
 from recon.base.declare import option
 from recon.camera.camera_model import choose_model, sort_by_depth
-from recon.camera.refocus import central_psfs, refocus
+from recon.camera.refocus import central_psfs, psf_at
 from recon.errors import InputError
 from recon.optics.fall_off import FallOff
 from recon.types import Calibration
@@ -383,7 +383,7 @@ def _fine_planes(calibration: Calibration, z_um: float, step_per_um: float) -> A
     inverse = 1 / z_um + step_per_um * np.arange(half, -half - 1, -1)
     if not np.isfinite(step_per_um) or inverse[-1] <= 0:
         return None
-    return np.stack([refocus(calibration, float(1 / v)).psf.mean(axis=0) for v in inverse])
+    return np.stack([psf_at(calibration, float(1 / v)) for v in inverse])
 
 
 def _condition(planes: Array, *, with_depth: bool) -> tuple[ConditionCurve, ...]:

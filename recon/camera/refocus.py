@@ -151,6 +151,14 @@ def refocus(
     )
 
 
+def psf_at(calibration: Calibration, z_um: float) -> Floats:
+    """Return the PSF of :func:`refocus` alone, colours averaged, (height, width): a third of the time."""
+    depths, psfs = central_psfs(calibration)
+    mixture = _mixture(depths, psfs, z_um, _distance_um(calibration))
+    averaged: Floats = mixture.of([psfs[k] for k in mixture.members]).mean(axis=0)
+    return averaged
+
+
 def refocus_field(calibration: Calibration, z_um: float) -> Calibration:
     """Return what a calibration would hold of one depth, at one that need not have been calibrated.
 

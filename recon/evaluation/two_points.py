@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 from recon.analysis.correlation import lit_extent
 from recon.analysis.points import DIP, Noise, Reached, TriedPair, smallest_dip
 from recon.base import fft
-from recon.camera.refocus import refocus
+from recon.camera.refocus import psf_at
 from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration
 
@@ -96,8 +96,7 @@ class _Tests:
 
     def psf(self, z_um: float) -> Array:
         """Return the PSF at a depth, colours averaged."""
-        psf: Array = refocus(self.calibration, z_um).psf[0]
-        return psf
+        return psf_at(self.calibration, z_um)
 
     def told_apart(self, pairs: Sequence[_Pair], light: Floats) -> list[bool]:
         """Photograph and reconstruct pairs that make this light, with the noise of one of them."""
