@@ -109,7 +109,8 @@ def made_in(runs: Path) -> Made:
 
 def _newest(folder: Path, *patterns: str) -> Path | None:
     files = [file for pattern in patterns for file in folder.glob(pattern)]
-    found = [(file.stat().st_mtime, file) for file in files if not file.name.startswith(DOUBTFUL)]
+    wanted = [file for file in files if not file.name.startswith((DOUBTFUL, "."))]  # a draft begins with one
+    found = [(file.stat().st_mtime, file) for file in wanted]
     return max(found)[1] if found else None
 
 
@@ -159,7 +160,9 @@ def _way_of(config: BenchConfig) -> str:
         return "files"
     if "slm" in kinds and config.devices["slm"].driver_name.endswith("screen"):
         return "screen"
-    if "slm" in kinds and "led_array" not in kinds:
+    # Of a display the LED array is lasers for pictures in colour: no point source is said, no diffuser.
+    lasers = not (config.source.model_fields_set or config.geometry.model_fields_set)
+    if "slm" in kinds and ("led_array" not in kinds or lasers):
         return "display"
     return "microscope" if "led_array" in kinds and not kinds & {"stage", "slm"} else "camera"
 

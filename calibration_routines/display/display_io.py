@@ -132,6 +132,11 @@ class DisplayBench:
         self.light(on=True)
         return exposure
 
+    @property
+    def own_light(self) -> bool:
+        """Whether it is the bench's own laser, which is the scene's light."""
+        return self._laser is None
+
     def light(self, *, on: bool) -> None:
         """Switch the laser; another than the bench's own shines alone."""
         bench = self.bench

@@ -35,6 +35,7 @@ from recon.holography import (
     HologramStop,
     Target,
 )
+from recon.holography.target import EVERYWHERE, Window
 
 hologram_app = App()
 
@@ -115,7 +116,9 @@ def hologram(
                     for picture, z in zip(planes, depths, strict=True)
                 ]
                 label = writer.label(number, channel)
-                result = _compute(display, targets, options, initial[channel], cancel, label)
+                share = writer.shares[channel]
+                part = EVERYWHERE.shrunk(share) if share < 1 and options.mirrors is None else None
+                result = _compute(display, targets, options, (initial[channel], part), cancel, label)
                 initial[channel] = result.hologram.slm if inputs.video else None
                 writer.write(number, channel, result)
                 _print(label, result, options)
@@ -125,8 +128,15 @@ def hologram(
 
 
 def _compute(
-    display: Display, targets: list[Target], options: HologramOptions, initial: Any, cancel: Any, label: str
+    display: Display,
+    targets: list[Target],
+    options: HologramOptions,
+    start: tuple[Any, Window | None],
+    cancel: Any,
+    label: str,
 ) -> HologramResult:
+    """Compute and judge; ``start`` is a warm start, and where in the field the picture is."""
+    initial, part = start
     with one_task(label, options.iterations) as advance:
 
         def show(record: HologramRecord, _slm: object) -> None:
@@ -135,7 +145,9 @@ def _compute(
                 done = max(done, options.iterations * record.seconds / options.time_s)
             advance(done, note=f"{record.psnr_db:.2f} dB")
 
-        return compute_and_judge(display, targets, options, initial=initial, callback=show, cancel=cancel)
+        return compute_and_judge(
+            display, targets, options, initial=initial, callback=show, cancel=cancel, part=part
+        )
 
 
 def _frames(target: list[Path], *, video: bool) -> list[list[Pixels]]:

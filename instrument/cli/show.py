@@ -174,6 +174,8 @@ def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -
             )
             for colour in colours
         ]
+        if spots and len(colours) > 1:
+            raise BenchError("Spots are shown and photographed in one light; these patterns are for several.")
         if options.capture is None:
             _hold(lights, colours, options.seconds)
         elif len(colours) > 1:
@@ -189,27 +191,29 @@ def _hold(lights: list[DisplayBench], colours: list[ColourPattern], seconds: flo
     shown = [(io, field) for io, colour in zip(lights, colours, strict=True) for field in colour.fields]
     io, field = shown[0]
     io.show(field)
-    in_turn = len(lights) > 1
+    lit = not all(io.own_light for io in lights)
+    if lit:
+        io.light(on=True)
     typer.echo(f"Shown on {io.slm.name}: {io.bench.label}", err=True)
-    if seconds is None and len(shown) == 1:
-        typer.echo("Press Enter to end.", err=True)
-        input()
-        return
     end = time.monotonic() + (seconds if seconds is not None else float("inf"))
     number = 0
     try:
+        if seconds is None and len(shown) == 1:
+            typer.echo("Press Enter to end.", err=True)
+            input()
+            return
         while time.monotonic() < end:
             number = (number + 1) % len(shown)
             if len(shown) > 1:
-                if in_turn:
+                if lit:
                     io.light(on=False)
                 io, field = shown[number]
                 io.show(field)
-                if in_turn:
+                if lit:
                     io.light(on=True)
             time.sleep(min(0.02, max(end - time.monotonic(), 0)))
     finally:
-        if in_turn:
+        if lit:
             io.light(on=False)
 
 

@@ -107,17 +107,22 @@ def compute_and_judge(
     initial: npt.NDArray[Any] | None = None,
     callback: Callable[[HologramRecord, Any], object] | None = None,
     cancel: threading.Event | None = None,
+    part: Window | None = None,
 ) -> HologramResult:
-    """Compute one hologram (of one or more planes) and judge it on the alias-free grid."""
+    """Compute one hologram (of one or more planes) and judge it on the alias-free grid.
+
+    ``part`` is where in the field it is judged; by default where the targets count.
+    """
     model = HologramModel(display, targets, options)
     hologram = compute_hologram(model, initial=initial, callback=callback, cancel=cancel)
     if model.options.grid != "alias-free":
         model = HologramModel(display, targets, options, grid="alias-free")
     planes = range(len(targets))
-    wanted = tuple(within(targets[p].window, model.wanted(p)) / model.peaks[p] for p in planes)
-    seen = tuple(within(targets[p].window, model.seen(hologram.slm, p)) / model.peaks[p] for p in planes)
+    part = part or targets[0].window
+    wanted = tuple(within(part, model.wanted(p)) / model.peaks[p] for p in planes)
+    seen = tuple(within(part, model.seen(hologram.slm, p)) / model.peaks[p] for p in planes)
     whole = [model.intensity(hologram.slm, p) for p in planes]
-    raw = tuple(within(targets[p].window, whole[p]) / model.peaks[p] for p in planes)
+    raw = tuple(within(part, whole[p]) / model.peaks[p] for p in planes)
     scores = tuple(compare(s, w, 1.0) for s, w in zip(seen, wanted, strict=True))
     efficiency = model.efficiency(hologram.slm)
     if targets[0].window is not None:

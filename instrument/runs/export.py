@@ -160,7 +160,8 @@ def _hdf5(run: Run, path: Path, indices: list[int], images: Iterator[Image]) -> 
             "Install it (pip install h5py), or export to .ome.tif or .npy."
         ) from None
     array = run.array
-    with h5py.File(path, "w") as file:
+    # The file is held already while it is written, and HDF5 would wait for itself.
+    with h5py.File(path, "w", locking=False) as file:
         data = file.create_dataset(
             "frames", (len(indices), *array.frame_shape), array.dtype, chunks=(1, *array.frame_shape)
         )

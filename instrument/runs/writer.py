@@ -192,9 +192,8 @@ class RunWriter:
         with _disk(parent, "no run can be kept there"):
             parent.mkdir(parents=True, exist_ok=True)
             path = free_name(parent, dated_name(label))
-            with draft_folder(path, locked=False) as draft:
-                write_bytes(draft / LOCK, b"")
-                held = lock_run(draft)
+            with draft_folder(path, locked=False) as draft, contextlib.ExitStack() as locks:
+                locks.push(lock_run(draft))
                 facts, identity = plain(bench), {"id": secrets.token_hex(8), "label": label}
                 texts = {
                     BENCH: json_text(facts.pop("config")),
@@ -217,6 +216,7 @@ class RunWriter:
                 write_json(draft / STATE, RUN_STATE.stamped(state))
                 write_bytes(draft / LOG, b"".join(map(log_line, copies_of(texts))))
                 draft.rename(path)
+                held = locks.pop_all()
             sync_folder(parent)
         return cls(path, held)
 

@@ -181,7 +181,7 @@ def test_a_simulated_bench_serves_its_panels(qtbot: QtBot, name: str) -> None:
         unserved
         == {
             "default": {"alignment"},
-            "display": {"led_array"},
+            "display": set(),
             "led_microscope": {"alignment", "stage", "slm"},
             "screen": {"alignment"},
         }[name]

@@ -10,6 +10,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from drivers.led_array import LedPattern
+from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
 from instrument.cli import main
@@ -65,7 +66,7 @@ def folder(tmp_path_factory):
     cv2.imwrite(str(folder / "picture.png"), picture[..., ::-1])
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        assert main(["hologram", "picture.png", "--color", "--out", "slm.png", "-n", "40"]) == 0
+        assert main(["hologram", "picture.png", "--color", "--out", "slm.png", "-n", "20"]) == 0
     return folder
 
 
@@ -95,6 +96,16 @@ def test_one_colour_is_compared_with_its_own_channel(folder, monkeypatch, capsys
     monkeypatch.chdir(folder)
     assert main(["show", "slm-green.png", *PHOTOGRAPHED, "g.png"]) == 0
     assert float(capsys.readouterr().out.split("photographed: ")[1].split(" dB")[0]) > 14
+
+
+def test_one_colour_is_held_in_its_own_light(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    lit = []
+    shine = DisplayWorld.shine
+    monkeypatch.setattr(DisplayWorld, "shine", lambda self, lasers: (lit.append(lasers), shine(self, lasers)))
+    assert main(["show", "slm-red.png", "--seconds", "0.05"]) == 0
+    assert ((638.0, 1.0),) in lit
+    assert lit[-1] == ()
 
 
 def test_what_does_not_go_together_is_refused_in_words(folder, monkeypatch, capsys):
