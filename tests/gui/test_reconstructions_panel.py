@@ -363,7 +363,7 @@ def test_a_psf_that_does_not_fit_is_fitted_by_a_button(
     qtbot: QtBot, panel: ReconstructionsPanel, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     turned = Transformation(rotation_deg=2.0)
-    scores = {GIVEN: Score(4.0, 1.0, ()), turned: Score(1.0, 1.0, ())}
+    scores = {GIVEN: Score(4.0, 1.0, (), ()), turned: Score(1.0, 1.0, (), ())}
     better = CalibrationCheck(Fit.OFF, scores, 600, turned)
     monkeypatch.setattr(StoredResult, "warnings", property(lambda _: better.sentences))
     write_image(tmp_path / "p.tif", np.zeros((20, 30), np.float32))
