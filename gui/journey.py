@@ -109,7 +109,8 @@ def made_in(runs: Path) -> Made:
 
 def _newest(folder: Path, *patterns: str) -> Path | None:
     files = [file for pattern in patterns for file in folder.glob(pattern)]
-    found = [(file.stat().st_mtime, file) for file in files if not file.name.startswith(DOUBTFUL)]
+    wanted = [file for file in files if not file.name.startswith((DOUBTFUL, "."))]  # a draft begins with one
+    found = [(file.stat().st_mtime, file) for file in wanted]
     return max(found)[1] if found else None
 
 

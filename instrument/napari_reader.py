@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from instrument.files.calibration_file import is_calibration, load_calibration
+from instrument.files.errors import FileError
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
 from instrument.files.volumes import is_zarr_name, stem_of
@@ -31,7 +32,7 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], lis
 def read(path: str | Sequence[str]) -> list[Layer]:
     """Return the layers of a run, calibration, volume, video or result.
 
-    Raises FileError when it is damaged, in a sentence.
+    Raises FileError when it is damaged or has nothing to show, in a sentence.
     """
     found = Path(str(path))
     kind = _kind(found)
@@ -72,9 +73,12 @@ def _record(path: Path) -> Mapping[str, Any]:
 
 def _run(path: Path) -> list[Layer]:
     """Return a run's frames, and the PSFs that were made of them."""
-    layers = _array(path / FRAMES, name=path.name)
-    for made in sorted(path.glob("*/calibration.json")):
+    frames = path / FRAMES
+    layers = _array(frames, name=path.name) if "ome" in _attributes(frames) else []
+    for made in sorted(path.glob("[!.]*/calibration.json")):
         layers += _calibration(made.parent)
+    if not layers:
+        raise FileError(path, "has no frames: the run ended before its first.")
     return layers
 
 

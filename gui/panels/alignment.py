@@ -18,6 +18,7 @@ from gui.session import BenchSession
 from gui.theme import colours
 from gui.widgets.building import button, cell, fill, in_row, label, split, table, tabs
 from gui.widgets.image_view import ImageView
+from gui.widgets.orientation import follow_orientation
 from gui.widgets.plots import curve_pen, dots, plot_widget
 from recon.holography.pose import NAMES
 
@@ -49,6 +50,7 @@ class AlignmentPanel(ProcedurePanel):
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
         self.spots = ImageView()
+        follow_orientation(self.session, "frames", self.spots.orient)
         self.spot_words = label("No picture yet.", "dim", yields=True)
         self.score: Any = plot_widget("hypothesis", "spot / ideal")
         yield

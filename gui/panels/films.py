@@ -33,6 +33,7 @@ from gui.widgets.building import (
 from gui.widgets.dialogues import choose_path
 from gui.widgets.image_view import ImageView
 from gui.widgets.measure import Measure
+from gui.widgets.orientation import orientation_of
 from gui.widgets.plots import LevelsBar, curve_colour, curve_pen, plot_widget
 from instrument.reconstruction.film import Film, curves, relative, slowed, write_film
 from recon.base.declare import Imports, expression
@@ -75,6 +76,7 @@ class FilmsPanel(Panel):
         self.view = ImageView()
         self.view.setAccessibleName("Picture of the film")
         self.measure = Measure(self.view, several=True)
+        self.session.kept_changed.connect(self._turn)
         self._rest = after_rest(self, _REST_MS, self._read_curves)
         self.measure.chosen.connect(lambda _: self._rest.start())
         yield
@@ -161,7 +163,13 @@ class FilmsPanel(Panel):
         self.plot.setLabel("bottom", "time (s)" if film.period_s else "frame")
         self._set_usable()
         self._place = 0
+        self._turn()
         self._show((0, first))
+
+    def _turn(self) -> None:
+        """Turn the pictures as all of their kind are turned."""
+        if self.film is not None:
+            self.view.orient(orientation_of(self.session, "frames" if self.film.is_recording else "results"))
 
     def go_to(self, place: int) -> None:
         """Show a picture."""

@@ -307,7 +307,8 @@ class ReconstructionsPanel(Panel):
     def _settled(self, name: str) -> None:
         """Follow what was named in the form: the result's name, the depths to choose from."""
         if name != "out":
-            self.refine_button.hide()  # the form is another by now
+            self.refine_button.hide()  # the form is another by now, and remains so
+            self._made = None
         if name in ("image", "kind"):
             self._suggest_out()
         if name in ("calibration", "kind"):

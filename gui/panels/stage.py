@@ -233,13 +233,14 @@ class StagePanel(DevicePanel):
     def photograph_all(self) -> None:
         """Hand a plan on that takes a frame at every place that is kept."""
         kept = self.session.kept.of("places")
+        labels = [name.replace("/", "-") for name in sorted(kept)]
         parts = [
             {
-                "label": name.replace("/", "-"),
-                "positions": {"kind": "stage", "points": [place]},
+                "label": label if labels.count(label) == 1 else f"{label}-{number}",
+                "positions": {"kind": "stage", "points": [kept[name]]},
                 "scene_lit": True,
             }
-            for name, place in sorted(kept.items())
+            for number, (name, label) in enumerate(zip(sorted(kept), labels, strict=True), 1)
         ]
         plan = self.asked(lambda: Plan.checked({"label": "places", "parts": parts}, "the places"))
         if plan is not None:

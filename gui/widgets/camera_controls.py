@@ -88,7 +88,11 @@ class CameraForm(QWidget):
 
     def read_back(self) -> None:
         """Ask the camera for all settings, unless something else uses it."""
-        if not self._session.is_open("camera") or self._session.jobs.is_busy("camera"):
+        is_open = self._session.is_open("camera")
+        if is_open and self._session.jobs.is_busy("camera"):
+            return
+        self._reads.setInterval(_READ_BACK_MS)  # one that answers badly is asked no more often
+        if not is_open:
             return
         job = self._session.jobs.device(
             "Reading the camera", lambda _: read_camera(self._session.bench.camera), {"camera"}, quiet=True
@@ -191,14 +195,13 @@ class CameraForm(QWidget):
     def _device_changed(self, kind: str) -> None:
         if kind == "camera":
             self.setEnabled(self._session.is_open("camera") and self.state is not None)
+            self._reads.setInterval(_FIRST_READ_MS)
             self.read_back()
 
     def _show(self, state: CameraState | None) -> None:
         """Show what was read back."""
         if state is None:
             return
-        if self.state is None:
-            self._reads.setInterval(_READ_BACK_MS)
         self.state = state
         self.setEnabled(self._session.is_open("camera"))
         for name, limits in (("exposure_ms", state.exposure_limits_ms), ("gain", state.gain_limits)):

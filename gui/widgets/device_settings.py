@@ -38,6 +38,10 @@ class DeviceSettings(TextWindow):
         self._session, self._kind = session, kind
         self.fields: dict[str, QComboBox | QLineEdit] = {}
         self.note = label(role="dim", wraps=True)
+        layout = self.layout()
+        assert isinstance(layout, QVBoxLayout)
+        self._layout = layout
+        layout.insertWidget(1, self.note)
         session.device_changed.connect(self._changed)
         if session.is_open(kind):
             device = session.bench.devices[kind]
@@ -69,8 +73,7 @@ class DeviceSettings(TextWindow):
 
     def _fill(self, own: Mapping[str, OwnSetting]) -> None:
         """Make the fields."""
-        layout = self.layout()
-        if not own or not isinstance(layout, QVBoxLayout):
+        if not own:
             return
         form = QFormLayout()
         for name, setting in own.items():
@@ -88,8 +91,7 @@ class DeviceSettings(TextWindow):
             form.addRow(label(name), field)
         page = QWidget()
         page.setLayout(form)
-        layout.insertWidget(1, scrolled(page), 2)
-        layout.insertWidget(2, self.note)
+        self._layout.insertWidget(1, scrolled(page), 2)
         self._say("Return, or another choice, sets it; bench.toml keeps it for the next time.")
 
     def _set(self, name: str, value: str) -> None:

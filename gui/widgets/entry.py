@@ -177,8 +177,8 @@ class NumberEdit(_Refusing):
     """A field for one number: ``12.5 ms``. Enter or leaving it submits; Up and Down step by a tenth.
 
     Lengths and times may be typed in another unit than the field's: ``2 s`` where it has milliseconds. One
-    for micrometres shows millimetres where its limits are far apart, or where what it shows first is 1 mm or
-    more; a number typed without a unit is in the one that the field shows, which stays while one types.
+    for micrometres shows millimetres where its limits are far apart or, without limits, where what it shows
+    first is 1 mm or more; a number typed without a unit is in the one that the field shows, which stays.
 
     A value that is none, or outside the limits, is refused where it stands, with the reason as tool tip; what
     was typed stays to be corrected. Nothing is ever clipped.
@@ -245,11 +245,11 @@ class NumberEdit(_Refusing):
     def _choose_unit(self) -> None:
         if self.unit != "µm" or self._shown:
             return
-        farthest = max(
-            (abs(limit) for limit in (self.minimum, self.maximum) if math.isfinite(limit)), default=0.0
-        )
-        if farthest >= _LONG_UM or self._value is not None:
-            self._shown = "mm" if max(farthest / 10, abs(self._value or 0.0)) >= _MM_UM else "µm"
+        farthest = max(abs(self.minimum), abs(self.maximum))
+        if math.isfinite(farthest):
+            self._shown = "mm" if farthest >= _LONG_UM else "µm"
+        elif self._value is not None:
+            self._shown = "mm" if abs(self._value) >= _MM_UM else "µm"
 
     def typed(self) -> tuple[float | None, str]:
         """Return the number as it stands in the field, submitted or not, and why it is refused if it is.
@@ -312,6 +312,8 @@ class NumberEdit(_Refusing):
         if problem:
             super().refuse(problem)
             return False
+        if self.text().strip()[-1:] not in _LETTERS:  # so was it meant, and so is the next
+            self._shown = self.shown_unit
         changed = number != self._value
         self._value = number
         self._show()

@@ -15,11 +15,16 @@ Kind = Literal["frames", "results"]
 _KEPT = "orientation"
 
 
+def orientation_of(session: BenchSession, kind: Kind) -> Orientation:
+    """Return how pictures of a kind are turned."""
+    return Orientation.of(session.kept.of(_KEPT).get(kind))
+
+
 def follow_orientation(session: BenchSession, kind: Kind, show: Callable[[Orientation], object]) -> None:
     """Have something called with how pictures of a kind are turned, now and whenever that changes."""
 
     def changed() -> None:
-        show(Orientation.of(session.kept.of(_KEPT).get(kind)))
+        show(orientation_of(session, kind))
 
     session.kept_changed.connect(changed)
     changed()

@@ -169,10 +169,15 @@ def facts(analysis: Analysis) -> list[tuple[str, str]]:
 def _reached(a: Analysis, reached: Reached) -> list[tuple[str, str]]:
     """Return what the default reconstruction reaches, in words."""
     y, x = reached.across_px
-    if x is None or y is None:
+    known = [px for px in (x, y) if px is not None]
+    if not known:
         return [("two points, picture", "told apart at no distance tried")]
-    um = max(x, y) * a.pitch_um * a.z_um / a.distance_um
-    lines = [("two points, picture", f"x {x:.2f}, y {y:.2f} px, {um:.3g} µm ({reached.method})")]
+    um = max(known) * a.pitch_um * a.z_um / a.distance_um
+    each = ", ".join(
+        f"{name} {px:.2f} px" if px is not None else f"{name} at no distance tried"
+        for name, px in (("x", x), ("y", y))
+    )
+    lines = [("two points, picture", f"{each}, {um:.3g} µm ({reached.method})")]
     if reached.focus_um is not None:
         near, far = (_mm(v) for v in reached.focus_um)
         lines.append(("depth of field, picture", f"{near} to {far}, for pairs half as far again apart"))

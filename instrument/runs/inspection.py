@@ -241,7 +241,7 @@ def runs_and_photographs(folder: Path) -> list[Path]:
         except OSError:  # gone meanwhile
             return ""
 
-    return sorted([*run_paths(folder), *(folder / PHOTOGRAPHS).glob("*.tif")], key=began, reverse=True)
+    return sorted([*run_paths(folder), *(folder / PHOTOGRAPHS).glob("[!.]*.tif")], key=began, reverse=True)
 
 
 def summary(path: Path) -> RunSummary:

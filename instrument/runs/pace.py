@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
+from drivers.errors import DeviceError
 from instrument.files.errors import BenchError, duration
 from instrument.plan.abilities import BenchAbilities, estimate
 from instrument.plan.model import Plan
@@ -48,7 +49,7 @@ def pace_of(plan: Plan, abilities: BenchAbilities, folder: Path, toml: str) -> P
         try:
             run = Run.open(path)
             found = _measured(run, abilities, toml)
-        except (BenchError, OSError, LookupError, ValueError):
+        except (BenchError, DeviceError, OSError, LookupError, ValueError):
             continue
         if found is not None and run.plan is not None and run.plan.label == plan.label:
             return found

@@ -39,6 +39,9 @@ FRESH = 0.98
 """Inner product after alignment below which the pattern has changed, if the spot has not grown as well."""
 MORE_ALIKE = 0.2
 """Of what a turned pattern lacks of being alike: a pattern that gains no more than this on it is another."""
+ALIKE = 0.7
+"""Inner product from which patterns are one whatever the turned one has: regular lenslets, or a spot, are
+their own half turn. Measured diffusers have 0.5 in common with theirs."""
 _SAME_PITCH = 1e-3  # relative: pitches of one camera are equal but for how they were written
 
 
@@ -227,8 +230,8 @@ def _source_instead(change: Change, distance_um: float) -> str:
 def _verdict(changes: list[Change], distance_um: float | None) -> tuple[bool, tuple[str, ...]]:
     due, reasons = False, []
     alike = max(max(c.as_is, c.aligned) - c.decoy for c in changes)
-    if alike < MORE_ALIKE * (1 - max(c.decoy for c in changes)):
-        best = max(max(c.as_is, c.aligned) for c in changes)
+    best = max(max(c.as_is, c.aligned) for c in changes)
+    if best < ALIKE and alike < MORE_ALIKE * (1 - max(c.decoy for c in changes)):
         return True, (
             f"These are different patterns: at best {best:.2f} alike, no more than one turned by 180 degrees "
             f"({max(c.decoy for c in changes):.2f}). Another diffuser, or another part or side of it; shift, "

@@ -79,10 +79,12 @@ class Reached:
     """What the default reconstruction reaches, with the noise of the tests."""
 
     across_px: tuple[float | None, float | None]
-    """Distance along y and along x at which 95 % of the pairs are told apart; None: at none tried."""
+    """Distance along y and along x at which 95 % of the pairs are told apart, at the least the smallest one
+    tried; None: at none tried."""
     focus_um: tuple[float, float] | None
     """Nearest and farthest depth (possibly infinite) at which pairs half as far again apart are told apart in
-    a picture focused at the depth analysed; None where no distance was found."""
+    a picture focused at the depth analysed; None where no distance was found along an axis, or the sensor
+    has no room for two pairs."""
     pairs: tuple[TriedPair, ...]
     method: str
     """Solver and prior."""

@@ -286,7 +286,8 @@ def analyse(
         resolution_px = tests.lateral_px or resolution_px
         step = tests.axial_per_um or step
     if found is not None:
-        resolution_px = max((px for px in found.across_px if px is not None), default=resolution_px)
+        largest = max(pair.px for pair in found.pairs)
+        resolution_px = max(largest if px is None else px for px in found.across_px)
     model, reason = choose_model(sort_by_depth(small), "auto")
     on_progress("done", 1.0)
     return Analysis(

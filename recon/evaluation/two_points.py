@@ -80,22 +80,23 @@ class _Tests:
         self.part = float(np.prod(shape) / np.prod(whole))
         down, right = (slice((n - m) // 2, (n + m) // 2) for n, m in zip(whole, shape, strict=True))
         small = np.ascontiguousarray(calibration.psfs[..., down, right])
-        self.calibration = replace(calibration, psfs=small, background=None)
+        averaged = small.mean(axis=1, keepdims=True)
+        self.calibration = replace(calibration, psfs=averaged, background=None)
         lost = float(np.square(calibration.psfs, dtype=np.float64).sum() / np.square(small).sum())
         self.noise = Noise(noise.electrons * lost, noise.read_e * float(np.sqrt(lost)))
         self.method = ""
 
-    def pairs(self, distances: Sequence[float]) -> list[_Pair]:
-        """Return pairs in cells of their own, along both axes in turn; fewer where there is no room."""
+    def pairs(self, distances: Sequence[float], before: int = 0) -> list[_Pair]:
+        """Return pairs in cells of their own, after others along each axis in turn; fewer without room."""
         cells = self.rng.permutation(_cells(self.psf(self.z_um), max(distances)))
         return [
-            _Pair(px, n % 2, cell + self.rng.uniform(-0.5, 0.5, 2))
+            _Pair(px, (before + n) % 2, cell + self.rng.uniform(-0.5, 0.5, 2))
             for n, (px, cell) in enumerate(zip(distances, cells, strict=False))
         ]
 
     def psf(self, z_um: float) -> Array:
         """Return the PSF at a depth, colours averaged."""
-        psf: Array = refocus(self.calibration, z_um).psf.mean(axis=0)
+        psf: Array = refocus(self.calibration, z_um).psf[0]
         return psf
 
     def told_apart(self, pairs: Sequence[_Pair], light: Floats) -> list[bool]:
@@ -106,8 +107,7 @@ class _Tests:
         charge = charge + self.rng.normal(0.0, self.noise.read_e, light.shape)
         made = reconstruct(charge / scale, self.calibration, z_um=self.z_um, judged=False)
         self.method = f"{made.solver}, {made.prior}"
-        picture = made.image.mean(axis=-1) if made.image.ndim == 3 else made.image
-        return [pair.told_apart(picture) for pair in pairs]
+        return [pair.told_apart(made.image) for pair in pairs]
 
     def _peak(self, pair: _Pair) -> float:
         """Return the light of a pair's photograph over its brightest pixel."""
@@ -148,7 +148,7 @@ def reached(
         if len(tried) > (PICTURES - 1) * PAIRS:
             break
         share = (tests.rng.permutation(PAIRS // 2).repeat(2) + tests.rng.uniform(0, 1)) / (PAIRS / 2)
-        pairs = tests.pairs([float(v) for v in about * wide ** (2 * share - 1)])
+        pairs = tests.pairs([float(v) for v in about * wide ** (2 * share - 1)], len(tried))
         light = shifted(psf, np.concatenate([pair.points for pair in pairs]))
         told = tests.told_apart(pairs, light)
         tried += [TriedPair(p.px, p.axis, t) for p, t in zip(pairs, told, strict=True)]
@@ -158,19 +158,20 @@ def reached(
             on_progress(max(len(tried) / PAIRS, (number + 1) / 3) / (PICTURES + 1))
     across = stated_px(tried)
     known = [px for px in across if px is not None]
-    focus = _focus_um(tests, _WIDER * max(known), step_per_um) if known else None
+    focus = _focus_um(tests, _WIDER * max(known), step_per_um) if len(known) == 2 else None
     return Reached(across, focus, tuple(tried), tests.method, tests.part)
 
 
 def stated_px(tried: Sequence[TriedPair]) -> tuple[float | None, float | None]:
     """Return where a logistic curve in the logarithm of the distance reaches :data:`TOLD`, along y and x.
 
-    Both axes share its slope. None where no pair of an axis was told apart, or none beyond.
+    Both axes share its slope. Never below the smallest distance tried; None where no pair of an axis was told
+    apart, or none beyond.
     """
     logs = np.log([one.px for one in tried])
     axes = np.array([one.axis for one in tried])
     told = np.array([one.told for one in tried])
-    if not told.any() or told.all():
+    if not told.any():
         return None, None
     centre = float(logs.mean())
 
@@ -184,12 +185,16 @@ def stated_px(tried: Sequence[TriedPair]) -> tuple[float | None, float | None]:
     slope, *middles = minimize(misfit, np.array([np.log(20.0), 0.0, 0.0]), method="Nelder-Mead").x
     beyond = np.log(TOLD / (1 - TOLD)) / np.exp(slope)
     stated = [float(np.exp(centre + middle + beyond)) for middle in middles]
-    within = [px <= max(one.px for one in tried) for px in stated]
-    return tuple(px if seen else None for px, seen in zip(stated, within, strict=True))  # type: ignore[return-value]
+    least, most = min(one.px for one in tried), max(one.px for one in tried)
+    y, x = (max(px, least) if px <= most and axis in axes else None for axis, px in enumerate(stated))
+    return y, x
 
 
-def _focus_um(tests: _Tests, px: float, step_per_um: float) -> tuple[float, float]:
-    """Return the nearest and farthest depth from whose points pairs are told apart in the picture."""
+def _focus_um(tests: _Tests, px: float, step_per_um: float) -> tuple[float, float] | None:
+    """Return the nearest and farthest depth from whose points pairs are told apart in the picture.
+
+    None where there is no room for two pairs.
+    """
     focus = 1 / tests.z_um
     steps = step_per_um * _FARTHEST * np.arange(1, _DEPTHS + 1) / _DEPTHS
     ends: list[float] = []
@@ -198,14 +203,18 @@ def _focus_um(tests: _Tests, px: float, step_per_um: float) -> tuple[float, floa
         if not inverse:
             ends.append(0.0)
             continue
-        pairs = tests.pairs([px] * 2 * len(inverse))
-        inverse = inverse[: len(pairs) // 2]
-        light = np.zeros(tests.calibration.psfs.shape[-2:])
-        for n, place in enumerate(inverse):
-            here = np.concatenate([pair.points for pair in pairs[2 * n : 2 * n + 2]])
-            light += shifted(tests.psf(float(1 / place)), here)
-        each = tests.told_apart(pairs, light)
-        told = [each[2 * n] and each[2 * n + 1] for n in range(len(inverse))]
+        told: list[bool] = []
+        while len(told) < len(inverse) and all(told):
+            pairs = tests.pairs([px] * 2 * (len(inverse) - len(told)))
+            tried = inverse[len(told) :][: len(pairs) // 2]
+            if not tried:
+                return None
+            light = np.zeros(tests.calibration.psfs.shape[-2:])
+            for n, place in enumerate(tried):
+                here = np.concatenate([pair.points for pair in pairs[2 * n : 2 * n + 2]])
+                light += shifted(tests.psf(float(1 / place)), here)
+            each = tests.told_apart(pairs[: 2 * len(tried)], light)
+            told += [each[2 * n] and each[2 * n + 1] for n in range(len(tried))]
         count = [*told, False].index(False)
         ends.append(focus if count == 0 else inverse[count - 1])
         if sign < 0 and count == len(inverse) < _DEPTHS:

@@ -74,6 +74,8 @@ def test_elliptec_is_not_homed_when_its_homing_was_stopped(tmp_path: Path) -> No
         assert [axis.speed_per_s for axis in stage.axes] == pytest.approx([60_000.0, 5_000.0])
         stage.home()
         stage.move_to({"x_um": 20_000.0})
+        bus.axes["0"].set_place(bus.axes["0"].target)
+        bus.axes["0"].speed_per_s = 2000  # homing would take 10 s, however late STOP comes
         with ThreadPoolExecutor(1) as other:
             homing = other.submit(stage.home)
             deadline_s = time.monotonic() + 10

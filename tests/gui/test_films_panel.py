@@ -17,6 +17,7 @@ from gui.panel import whole
 from gui.panels.films import FilmsPanel
 from gui.session import BenchSession
 from instrument.cli import main
+from instrument.files.orientation import Orientation
 from instrument.reconstruction.film import slowed
 from instrument.reconstruction.video_files import VideoPictures, create_output
 from recon.camera.grid import Grid
@@ -51,6 +52,8 @@ def test_a_film_is_played_followed_and_written(
         pass
     assert "29 pictures, 20 a second   SIMULATED" in panel.heading.text()
     assert not panel.reconstruct_button.isEnabled()  # it is reconstructed
+    session.keep("orientation", "results", {"quarters": 1})
+    assert panel.view.graphics.orientation == Orientation(1)
     panel.slider.setValue(20)
     qtbot.waitUntil(lambda: panel.words.text() == "1.050 s, picture 21 of 29", timeout=WAIT_MS)
     panel.speed.setCurrentText("4 x")

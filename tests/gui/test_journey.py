@@ -15,6 +15,7 @@ from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.panels.sweeps import SweepsPanel
 from instrument.bench.config_file import TEMPLATES, no_bench, parse_config, template
+from instrument.runs.inspection import runs_and_photographs
 
 WAIT_MS = 60_000
 GOOD = Facts(light="good")
@@ -72,6 +73,8 @@ def test_what_lies_in_a_folder_is_found(tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("")
     os.utime(tmp_path / "photographs/a.tif", (100, 100))
+    (tmp_path / "photographs/.b.tif.12ab34cd.part.tif").write_text("")
+    assert runs_and_photographs(tmp_path) == [tmp_path / "photographs/a.tif"]
     made = made_in(tmp_path)
     assert made.photograph == tmp_path / "x_photograph/photograph.tif"
     assert made.alignment == tmp_path / "mask_alignment.json"

@@ -88,8 +88,9 @@ def test_lengths_from_a_millimetre_on_are_millimetres(qtbot: QtBot) -> None:
     pairs = ((999.4, "um"), (-1000, "µm"), (12345.678, "µm"), (3e5, "ms"), (0, "um"))
     assert [quantity(*pair) for pair in pairs] == ["999.4 µm", "-1 mm", "12.35 mm", "300\u2009000 ms", "0 µm"]
     long = NumberEdit("µm", minimum=-60000, maximum=60000, tip="To")
-    short, first = NumberEdit("µm", 100.0), NumberEdit("µm")
-    for field in (long, short, first):
+    near = NumberEdit("µm", 1100.0, minimum=0, maximum=5000)
+    short, first, empty = NumberEdit("µm", 100.0), NumberEdit("µm"), NumberEdit("µm")
+    for field in (long, near, short, first, empty):
         qtbot.addWidget(field)
     first.set_value(2500.0)
     for field, typed, value, text in (
@@ -97,6 +98,9 @@ def test_lengths_from_a_millimetre_on_are_millimetres(qtbot: QtBot) -> None:
         (long, "40 um", 40.0, "0.04 mm"),
         (short, "2000", 2000.0, "2000 µm"),
         (first, "0.3", 300.0, "0.3 mm"),
+        (near, "2", 2.0, "2 µm"),
+        (empty, "3000", 3000.0, "3000 µm"),
+        (empty, "3500", 3500.0, "3500 µm"),
     ):
         field.selectAll()
         qtbot.keyClicks(field, typed)

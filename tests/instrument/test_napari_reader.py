@@ -11,6 +11,7 @@ import tifffile
 import instrument
 from instrument.files.atomic import write_json
 from instrument.files.calibration_file import save_calibration
+from instrument.files.errors import FileError
 from instrument.files.volumes import write_volume_zarr
 from instrument.napari_reader import get_reader, read
 from instrument.reconstruction.video_files import VideoPictures, create_output
@@ -56,6 +57,11 @@ def test_each_is_shown_with_its_scale(folder: Path, name: str) -> None:
     assert layer["scale"] == pytest.approx(scale)
     assert tuple(layer["units"]) == units
     assert "diffuserbench" in layer["metadata"]
+
+
+def test_a_run_without_frames_is_refused_in_words(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="no frames"):
+        read(str(write_recording(tmp_path, {})))
 
 
 def test_what_is_not_the_program_s_is_left_to_others(folder: Path) -> None:

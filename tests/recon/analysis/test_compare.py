@@ -83,6 +83,18 @@ def test_another_diffuser_is_another_calibration() -> None:
     assert "different patterns" in found.reasons[0]
 
 
+def test_a_pattern_that_is_its_own_half_turn_is_no_other_one() -> None:
+    psf = np.zeros((160, 180))
+    psf[30:-20:20, 30:-20:20] = 1.0
+    psf = ndimage.gaussian_filter(psf, 1.5)
+    one = replace(
+        calibration(world()), psfs=noisy(psf)[None, None], source_positions_um=np.array([(0, 0, 6e4)])
+    )
+    found = compare(one, replace(one, psfs=noisy(np.roll(psf, 3, axis=0), 1)[None, None]))
+    assert not found.due
+    assert "moved by 3 pixels" in " ".join(found.reasons)
+
+
 def test_a_source_that_stands_nearer_is_told_by_its_light() -> None:
     seen = np.stack([noisy(PSF, 3)] * 2)[:, None]  # at 100 mm, and recorded at 120 mm
     counts = 3000 / PSF.max()

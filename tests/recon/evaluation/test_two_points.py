@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from instrument.evaluation.analysis_figure import facts
+from recon.analysis import analyse
 from recon.analysis.correlation import half_light_deg
-from recon.analysis.points import TriedPair
+from recon.analysis.points import Noise, Reached, TriedPair
 from recon.evaluation import two_points
 from recon.evaluation.two_points import reached, shifted, stated_px
 from recon.types import Calibration, Geometry
@@ -22,6 +24,11 @@ def _caustics(shape: tuple[int, int]) -> np.ndarray:
     return np.asarray(lines / lines.max(), np.float32)
 
 
+def _calibration(shape: tuple[int, int], colours: int = 1) -> Calibration:
+    psfs = np.repeat(_caustics(shape)[None, None], colours, axis=1)
+    return Calibration(psfs, np.array([[0.0, 0.0, 50e3]]), geometry=Geometry(10.0, 5.0))
+
+
 def test_the_stated_distance_is_that_of_a_curve_through_the_pairs() -> None:
     rng = np.random.default_rng(0)
     tried = [
@@ -34,6 +41,11 @@ def test_the_stated_distance_is_that_of_a_curve_through_the_pairs() -> None:
         assert stated is not None
         assert stated == pytest.approx(middle * beyond, rel=0.08)
     assert stated_px([one for one in tried if not one.told]) == (None, None)
+    wide = [one for one in tried if one.px > 4.0]
+    assert stated_px(wide) == (least := min(one.px for one in wide), least)  # all were told apart
+    y, x = stated_px([one for one in tried if one.axis == 1])
+    assert y is None
+    assert x is not None
 
 
 def test_a_shift_between_pixels_moves_the_centre_of_light_and_keeps_it() -> None:
@@ -48,15 +60,43 @@ def test_a_shift_between_pixels_moves_the_centre_of_light_and_keeps_it() -> None
 def test_the_default_picture_reaches_a_little_less_than_the_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(two_points, "LARGEST_PX", 140 * 160)
     monkeypatch.setattr(two_points, "PICTURES", 3)
-    calibration = Calibration(
-        _caustics((160, 180))[None, None], np.array([[0.0, 0.0, 50e3]]), geometry=Geometry(10.0, 5.0)
-    )
-    found = reached(calibration, 50e3, 1.2, 2e-6)
+    found = reached(_calibration((160, 180)), 50e3, 1.2, 2e-6)
     assert all(px is not None and 1.5 < px < 3.5 for px in found.across_px)
     assert found.part < 1
     assert found.focus_um is not None
     assert 30e3 < found.focus_um[0] < 50.001e3
-    assert found.focus_um[1] > 49.999e3
+    assert 49.999e3 < found.focus_um[1] < 200e3
+
+
+def test_a_small_colour_sensor_has_room_for_one_pair_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(two_points, "PICTURES", 2)
+    calibration = _calibration((40, 44), colours=3)
+    assert [pair.axis for pair in reached(calibration, 50e3, 1.2, 2e-6).pairs] == [0, 1] * 3
+    assert two_points._focus_um(two_points._Tests(calibration, 50e3, Noise(), 0), 2.0, 2e-6) is None
+
+
+@pytest.mark.parametrize(("step_per_um", "far_um"), [(2e-6, 50e3 / 0.7), (1e-5, float("inf"))])
+def test_depths_reach_infinity_where_all_before_it_were_told_apart(
+    monkeypatch: pytest.MonkeyPatch, step_per_um: float, far_um: float
+) -> None:
+    """With room for four depths at once, of eight."""
+    monkeypatch.setattr(two_points._Tests, "told_apart", lambda _self, pairs, _light: [True] * len(pairs))
+    tests = two_points._Tests(_calibration((96, 128)), 50e3, Noise(), 0)
+    found = two_points._focus_um(tests, 3.0, step_per_um)
+    assert found == pytest.approx((1 / (1 / 50e3 + 3 * step_per_um), far_um))
+
+
+def test_an_axis_along_which_nothing_is_told_apart_is_named_and_makes_voxels_coarser() -> None:
+    tried = tuple(TriedPair(px, axis, axis == 1) for px in (2.0, 9.0) for axis in (0, 1))
+
+    def analysed(y: float | None) -> tuple[int, str]:
+        found = Reached((y, 2.0), None, tried, "", 1.0)
+        analysis = analyse(_calibration((48, 56)), reach=lambda *_args, **_named: found)
+        return analysis.grid.binning, dict(facts(analysis))["two points, picture"]
+
+    none, words = analysed(None)
+    assert none == analysed(9.0)[0] > analysed(2.0)[0]
+    assert words.startswith("x 2.00 px, y at no distance tried")
 
 
 def test_half_of_the_light_is_left_where_half_of_an_even_pattern_is_on_the_sensor() -> None:
