@@ -230,7 +230,8 @@ class Work:
         said = (folder / "said").read_text() if (folder / "said").is_file() else ""
         lived_s = time.monotonic() - (since_s or began_s)
         code = os.waitstatus_to_exitcode(status)
-        return Attempt(promised, sent and code != 0, code, said, lived_s)
+        killed = sent and code in (-number, 128 + number)  # any other end is a failure
+        return Attempt(promised, killed, code, said, lived_s)
 
     def _begun(self, folder: Path, promised: dict[int, int], before: set[Path]) -> bool:
         if self.kind.begins == "finishing":
@@ -303,6 +304,8 @@ def _work(folder: Path, command: Sequence[str], promises: int) -> None:
         tempfile.tempdir = os.environ["TMPDIR"] = str(folder / "tmp")
         promising(promises)
         code = run_in_window() if command[0] == "window" else main(list(command))
+    except KeyboardInterrupt:  # of the window, or of the second one
+        code = 128 + signal.SIGINT
     except BaseException:  # noqa: BLE001 - shown, and the process ends here whatever it was
         traceback.print_exc()
     finally:

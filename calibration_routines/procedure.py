@@ -245,8 +245,8 @@ class Purpose(Generic[T]):
 
     def kept(self, run: Path) -> Path:
         """Return where the result of a run is: under a doubtful name where that is what there is."""
-        doubtful = self.place(run, doubted=True)
-        return doubtful if doubtful.exists() else self.place(run, doubted=False)
+        good, doubtful = (self.place(run, doubted=doubted) for doubted in (False, True))
+        return doubtful if doubtful.exists() and not good.exists() else good
 
     def lacks_result(self, run: Path) -> bool:
         """Whether they are, and the result is not there yet."""

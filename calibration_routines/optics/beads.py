@@ -12,12 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.optics.photograph import (
-    PHOTOGRAPH_FILE,
-    Photograph,
-    photograph,
-    photograph_findings,
-)
+from calibration_routines.optics.photograph import Photograph, photograph, photograph_findings
 from calibration_routines.procedure import (
     MM,
     CalibrationError,
@@ -48,6 +43,8 @@ Progress = Callable[[str, float], object]
 
 BEADS_FOLDER = "calibration-beads"
 """Where the command line writes the calibration."""
+SLIDE_FILE = "beads.tif"
+"""Of a photograph of a slide, in its run's folder: no scene to reconstruct."""
 MANY_PX = 1_000_000
 """Pixels beyond which solving takes long."""
 BIN_FIRST = (
@@ -237,7 +234,8 @@ def photograph_slides(
                 "spread the beads, and start again."
             )
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "binning": slides.binning}
-        write_image(taken.run.path / PHOTOGRAPH_FILE, taken.measurement, facts | {"dark": "taken off"})
+        file = named_by_worth(taken.run.path / SLIDE_FILE, doubted=bool(taken.findings))
+        write_image(file, taken.measurement, facts | {"dark": "taken off"})
         photographs.append(taken)
     return BeadPhotographs(
         mean_images([one.measurement for one in photographs]),

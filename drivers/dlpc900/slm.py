@@ -334,8 +334,11 @@ class Dlpc900Slm(Slm):
                 raise StoppedError(self.name, "was blanked before its sequence.")
             self._link.write(Command.START_STOP, bytes([commands.START]))
         whole_s = 1e-6 * len(armed.patterns) * (armed.exposure_us + self.options.dark_us)
-        deadline_s = time.monotonic() + 1.5 * whole_s + _START_S
-        self._closing.wait(whole_s)
+        began_s = time.monotonic()
+        deadline_s = began_s + 1.5 * whole_s + _START_S
+        while began == self._blanked and (left_s := began_s + whole_s - time.monotonic()) > 0:
+            if self._closing.wait(min(left_s, _POLL_S)):
+                break
         while self._runs(began):
             if time.monotonic() > deadline_s:
                 raise DeviceTimeoutError(

@@ -14,6 +14,7 @@ from drivers.errors import DeviceError, LimitError
 from drivers.genicam.features import (
     AUTOMATICS,
     BLACK_LEVEL,
+    DRIVERS_OWN,
     EXPOSURE,
     FRAME_RATE,
     FRAME_RATE_ENABLE,
@@ -121,10 +122,12 @@ class GenicamCamera(BufferedCamera):
         return made
 
     def own_settings(self) -> Mapping[str, OwnSetting]:
-        """Return the features that ``bench.toml`` names: a camera has hundreds."""
+        """Return the features that ``bench.toml`` names, of hundreds, but for those that the driver sets."""
         self._require()
         features, found = self._features, {}
         for name in self.options.features:
+            if name in DRIVERS_OWN:
+                continue
             kind = features.kind(name)
             if kind == "number":
                 low, high = features.bounds(name)

@@ -20,6 +20,11 @@ FRAME_RATE_ENABLE = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled"
 FRAME_TRIGGERS = ("FrameStart", "FrameTrigger", "AcquisitionStart")
 FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
 AUTOMATICS = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto")
+DRIVERS_OWN = {*EXPOSURE, *GAIN, *BLACK_LEVEL, *FRAME_RATE, *FRAME_RATE_ENABLE, *AUTOMATICS}
+DRIVERS_OWN |= {"AcquisitionMode", "PixelFormat", "Width", "Height", "OffsetX", "OffsetY"}
+DRIVERS_OWN |= {"BinningHorizontal", "BinningVertical", "TriggerSelector", "TriggerMode", "TriggerSource"}
+DRIVERS_OWN |= {"TriggerActivation"}
+"""What the driver itself sets and remembers."""
 
 
 class Features(ABC):

@@ -24,6 +24,7 @@ import json
 import math
 import struct
 import time
+import tokenize
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -104,7 +105,10 @@ def _array(data: bytes) -> Any:
     version = np.lib.format.read_magic(file)
     if version not in read:
         raise ValueError(f"an array's file has version {version}")
-    shape, _, dtype = read[version](file)
+    try:  # NumPy reads it as Python
+        shape, _, dtype = read[version](file)
+    except (tokenize.TokenError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
+        raise ValueError(f"an array's file does not begin as one: {error}") from error
     said, there = math.prod(shape) * dtype.itemsize, len(data) - file.tell()
     if said != there:
         raise ValueError(f"an array of {shape} {dtype} has {said} bytes, and {there} came")

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
+from zlib import crc32
 
 import typer
 
@@ -135,10 +136,12 @@ def open_and_say(bench: BenchConfig | Path | None, *, as_is: bool = False) -> Be
     from instrument.bench.bench import open_bench
     from instrument.cli.progress import one_task
 
-    with one_task("Opening the bench"):
+    with one_task("Reading the bench's file"):
         config = load_and_say(bench) if bench is None or isinstance(bench, Path) else bench
+    # Whichever command: its devices take the time. A run that goes on has the same text elsewhere.
+    kept_times.about(f"{config.bench.name} {crc32(config.text.encode()):08x}")
+    with one_task("Opening the bench"):
         opened = open_bench(config, ask=_taken_for_done if as_is else operator())
-    kept_times.about(opened.label)  # whichever command: its devices take the time
     typer.echo(f"Bench: {opened.label}", err=True)
     return opened
 

@@ -211,7 +211,7 @@ class TerminalListener(Listener):
 
     def __init__(self, console: Console | None = None) -> None:
         self._console = console or Console()
-        self._open = ExitStack()
+        self._open, self._timed, self._began_s = ExitStack(), ExitStack(), 0.0
         self._bar: tuple[Progress, TaskID] | None = None
         self._words = ""
 
@@ -220,14 +220,17 @@ class TerminalListener(Listener):
 
     def __exit__(self, *error: Any) -> None:
         self._open.__exit__(*error)
+        self._timed.__exit__(*error)
         self._bar = None
 
     def step(self, words: str) -> None:
         """Begin a bar of its own, which goes by what the step took last time until it tells its share."""
         self.pause()
+        self._timed.close()
         if words.startswith("homing"):
             typer.echo("Homing the stage.", err=True)
-        self._open.enter_context(kept_times.kept(words))
+        self._timed.enter_context(kept_times.kept(words))
+        self._began_s = time.monotonic()
         self._begin(words)
 
     def _begin(self, words: str) -> None:
@@ -235,6 +238,7 @@ class TerminalListener(Listener):
         bar = self._open.enter_context(progress_bar())
         said, expected_s = words[:1].upper() + words[1:], kept_times.expected_s(words)
         self._bar = bar, bar.add_task(said, total=None, note="", expected_s=expected_s)
+        bar.tasks[0].start_time = self._began_s
 
     def pause(self) -> None:
         """Take the bar away, for lines to be printed."""

@@ -136,7 +136,7 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
         switch_light(opened, light)
         if options.exposure_ms is None:
             _expose(opened, light)
-        with one_task("Frames") as advance:
+        with one_task("Frames", options.average if options.average > 1 else None) as advance:
             taken = opened.snap(options.average, on_progress=advance)
         write_snapshot(opened, target, taken, light, operator_asked=not options.as_is)
     _report(target, taken, light)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -28,42 +29,39 @@ def place() -> Path:
     return Path(cache).expanduser() / "diffuserbench" / "times.json"
 
 
-def expected_s(what: str, size: float = 1.0) -> float | None:
-    """Return how long a step will take by what it took last time, in proportion to its size.
-
-    None where it was never done, or was quick.
-    """
+def expected_s(what: str) -> float | None:
+    """Return how long a step took last time; None where it was never done, or was quick."""
     try:
-        last_size, last_s = _read()[_key(what)]
-        return float(last_s) * size / float(last_size)
-    except (LookupError, TypeError, ValueError, ZeroDivisionError):
+        return float(_read()[_key(what)])
+    except (LookupError, TypeError, ValueError):
         return None
 
 
 @contextmanager
-def kept(what: str, size: float = 1.0) -> Iterator[None]:
-    """Remember how long the block takes, unless it fails."""
+def kept(what: str) -> Iterator[None]:
+    """Remember how long the block takes, unless it fails or nobody sees it: where stderr is no terminal."""
     began_s = time.monotonic()
     yield
     took_s = time.monotonic() - began_s
-    if took_s < WORTH_S:
+    if took_s < WORTH_S or not sys.stderr.isatty():
         return
+    from instrument.files.atomic import write_json
+    from instrument.files.errors import BenchError
+
     times = _read()
     times.pop(_key(what), None)
-    times[_key(what)] = [size, round(took_s, 2)]
+    times[_key(what)] = round(took_s, 2)
     path = place()
-    with suppress(OSError):  # a home that may not be written to: nothing is foretold
+    with suppress(OSError, BenchError):  # a home that may not be written to: nothing is foretold
         path.parent.mkdir(parents=True, exist_ok=True)
-        new = path.with_name(f"{path.name}.{os.getpid()}")
-        new.write_text(json.dumps(dict(list(times.items())[-MOST:])), encoding="utf-8")
-        new.replace(path)
+        write_json(path, dict(list(times.items())[-MOST:]))
 
 
 def _key(what: str) -> str:
     return f"{_of}: {what}"
 
 
-def _read() -> dict[str, list[float]]:
+def _read() -> dict[str, float]:
     try:
         found = json.loads(place().read_text(encoding="utf-8"))
     except (OSError, ValueError):

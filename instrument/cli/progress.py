@@ -66,7 +66,8 @@ class _Note(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         _listen()
-        return Text(f"compiling {_compiled[-1]} (once)" if _compiled else task.fields["note"])
+        now = _compiled[-1:]  # another thread ends it
+        return Text(f"compiling {now[0]} (once)" if now else task.fields["note"])
 
 
 _compiled: list[str] = []
@@ -129,14 +130,14 @@ def first_interrupt_cancels() -> Iterator[threading.Event]:
 
 @contextmanager
 def one_task(
-    description: str, total: float | None = None, *, done: int = 0, note: str = "", size: float = 1.0
+    description: str, total: float | None = None, *, done: int = 0, note: str = ""
 ) -> Iterator[Advance]:
     """Show the bar of a single task while the block runs; gives what advances it.
 
-    Without a total it takes as long as last time, in proportion to ``size``.
+    Without a total it takes as long as last time.
     """
-    with progress_bar() as bar, kept_times.kept(description, size) if total is None else nullcontext():
-        expected_s = kept_times.expected_s(description, size) if total is None else None
+    with progress_bar() as bar, kept_times.kept(description) if total is None else nullcontext():
+        expected_s = kept_times.expected_s(description) if total is None else None
         task = bar.add_task(description, total=total, completed=done, note=note, expected_s=expected_s)
 
         def advance(done: float, total: float | None = None, *, note: str | None = None) -> None:

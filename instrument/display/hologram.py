@@ -288,7 +288,7 @@ def bench_display(
         raise BenchError(f"An SLM of {height} x {width} pixels cannot be binned by slm_binning = {binning}.")
     shape = (height // binning, width // binning)
     if q == 1 and (table.mask_file is None or table.expansion != 1):
-        mask = no_mask(shape)
+        mask = no_mask(shape, design_wavelength_nm=table.wavelength_nm)
     elif table.mask_file is not None and q == table.expansion:
         base = config.path.parent if config.path else Path()
         mask = _mask_from(base / table.mask_file, (shape[0] * k, shape[1] * k), table.wavelength_nm)

@@ -66,9 +66,9 @@ def random_mask(
     return ScatteringMask(levels, np.array([0.0, np.pi]), design_wavelength_nm)
 
 
-def no_mask(shape: tuple[int, int]) -> ScatteringMask:
+def no_mask(shape: tuple[int, int], *, design_wavelength_nm: float = 660.0) -> ScatteringMask:
     """Return the mask of a display without one: an SLM pixel each, phase 0."""
-    return ScatteringMask(np.zeros(shape, np.uint8), np.zeros(1))
+    return ScatteringMask(np.zeros(shape, np.uint8), np.zeros(1), design_wavelength_nm)
 
 
 @dataclass(frozen=True, slots=True)

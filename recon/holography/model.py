@@ -91,10 +91,8 @@ class HologramModel:
 
         self._kernels = _kernels
         options = with_overrides(options or HologramOptions(), overrides)
-        if display.learned is not None and options.complex_slm:
-            raise InputError(
-                "What was learned of the display is of a phase SLM; leave it out for a complex one."
-            )
+        if display.learned is not None and (options.complex_slm or options.mirrors is not None):
+            raise InputError("What was learned of the display is of a phase SLM; leave it out for others.")
         self.display = display
         self.targets = tuple(targets)
         self.options = options

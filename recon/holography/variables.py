@@ -161,8 +161,8 @@ phase has first orders of ``amplitude / pi``, one conjugate to the other (Lee 19
 def decoded(patterns: Array) -> Array:
     """Return the field that patterns of mirrors code, where no mask is behind them."""
     spectrum = np.fft.fft2(2 * patterns.real - 1)
-    spectrum[:, patterns.shape[1] // 2 :] = 0  # kept: the quarter of the field where the picture is
-    spectrum[:, :, : patterns.shape[2] // 2] = 0
+    spectrum[:, : patterns.shape[1] // 2] = 0  # kept: the quarter of the field where the picture is
+    spectrum[:, :, patterns.shape[2] // 2 :] = 0
     return np.asarray(2 * np.fft.ifft2(spectrum), patterns.dtype)
 
 

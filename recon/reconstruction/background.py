@@ -87,7 +87,7 @@ class Trial:
     light : float
         Mean of the background relative to that of the data.
     dark : float
-        Share of the picture that is dark where a background is taken out; 0 where that proves nothing.
+        Share of the picture that is dark where a background is taken out; ``taken`` says what it proves.
     taken : Taken
     dim : bool
         Whether the darkest pixels leave hardly any room for stray light.

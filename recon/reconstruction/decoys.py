@@ -92,9 +92,13 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
     check, small = (again, many) if again.fit is not Fit.UNTOLD else (check, few)
     if check.wrong and not lit:  # by stray light, or by light from beyond the field?
         again = compete(small, thorough, lit=True)
-        accuser = again.scores.get(check.better) if check.better is not None else None
-        cleared = accuser is None or is_told(again.scores[GIVEN], accuser, small.pixels)
-        check = again if again.fit is Fit.FITS and cleared else check
+        cleared = again.fit is Fit.FITS
+        if cleared and check.better is not None:  # which this competition may not have come to
+            accuser = again.scores.get(check.better) or small.score(
+                check.better, iterations=thorough, background=True
+            )
+            cleared = is_told(again.scores[GIVEN], accuser, small.pixels)
+        check = again if cleared else check
     given = _given(problem).depths
     one = given.varies and not problem.depths.varies and given.field_error > VARIED
     return None if one and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check

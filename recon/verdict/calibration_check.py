@@ -54,15 +54,15 @@ class Certainty(NamedTuple):
 
 CERTAIN = Certainty(25.0, 2.5)
 """That a calibration is the photograph's own, of its far decoys: chance alone makes so much of sixteen tiles
-once in eighty times (Student's t)."""
+once in eighty times (Student's t), of the larger of two tests (:meth:`Score.leads`) at most once in forty."""
 NEARLY = Certainty(12.0, 1.75)
-"""That it is off, or not, of its near decoys (once in twenty times): a right one is ahead of them, by 0.8
+"""That it is off, or not, of its near decoys (at most once in ten times): a right one is ahead of them by 0.8
 standard errors and more, and none of theirs had odds of more than one nat."""
 SPEAKS_NATS = 200.0
 """Odds among all that were tried from which a photograph has its say on foreign ones."""
 NOT_OWN = 1.0
 """Standard errors by which tiles prefer the calibration to each of its far decoys, up to which it is not the
-photograph's own."""
+photograph's own: set for one test, the larger of two lets some foreign ones pass (up to 1.4 were seen)."""
 STRUCTURE_NATS, OWN_SHARE = 1000.0, 0.025
 """Fine structure of a photograph, half its squares beyond the noise, from which a PSF that resolves it has to
 be ahead of its far decoys by that share of it: of 25 right ones the least was 4 %, of 32 foreign ones the

@@ -139,8 +139,9 @@ def test_what_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
         camera_of(pixel_pitch_um=None).open()
     with pytest.raises(LimitError, match="has no feature 'Colour'"):
         camera_of(features={"Colour": 1}).open()
-    with camera_of(features={"ReverseX": True, "DigitalShift": 1}) as camera:
+    with camera_of(features={"ReverseX": True, "DigitalShift": 1, "Width": 64}) as camera:
         assert camera.settings()["feature.ReverseX"] == "1"
+        assert set(camera.own_settings()) == {"ReverseX", "DigitalShift"}  # the driver sets the others
     monkeypatch.setitem(__import__("sys").modules, "pypylon", None)
     with pytest.raises(DeviceError, match=r"pip install .diffuserbench\[basler\]"):
         camera_of().open()

@@ -341,6 +341,10 @@ def test_without_the_token_nothing_is_answered(
             assert (found[0], words in found[1]) == (status, True), found
     with pytest.raises(ValueError, match="bytes, and 8 came"):
         Values(npt.NDArray[np.uint8]).load(_said_to_be_vast())
+    for broken in (b"{(", b"'''", b"{[]: 1}", b"-" * 9000):  # NumPy reads them as Python
+        file = b"\x93NUMPY\x01\x00" + len(broken).to_bytes(2, "little") + broken
+        with pytest.raises(ValueError, match="does not begin as one"):
+            Values(npt.NDArray[np.uint8]).load(base64.b64encode(file))
     (tmp_path / "token").write_text("another-word-than-its")
     with pytest.raises(DeviceError, match=r"does not take the token in .*token"):
         RemoteLedArray(options).open()

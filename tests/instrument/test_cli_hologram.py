@@ -158,6 +158,7 @@ def test_spots_without_a_mask_come_from_an_array_or_a_list(capsys):
     config = parse_config(Path("bench.toml").read_text(), Path("bench.toml"))
     display = bench_display(config, ((96, 128), 8.0), expansion=1)
     assert len(np.unique(display.mask.field())) == 1
+    assert display.mask.design_wavelength_nm == config.display.wavelength_nm
     shown = SpotField(display, spot_array(4, 6)).score(
         np.exp(1j * levels_phase(levels, facts["binning"]))[None]
     )

@@ -57,6 +57,8 @@ def test_a_picture_by_mirrors_is_photographed_as_it_was_computed(
     assert "--mirrors optimised" in capsys.readouterr().err
     assert main(["show", "phases.png", *shown]) == 2
     assert "this pattern is of phases" in capsys.readouterr().err
+    assert main(["calibrate", "display", "--dry-run"]) == 2
+    assert "only phases can be learned" in capsys.readouterr().err
     assert set(np.unique(read_slm_image("slm.png")[0])) == {0, 255}
     computed = json.loads(Path("slm.json").read_text())
     assert 0.03 < computed["efficiency"] < 0.1

@@ -19,6 +19,7 @@ from recon.holography import (
 )
 from recon.holography.display import no_mask
 from recon.holography.judge import seen_image
+from recon.holography.learned import Learned
 from recon.holography.target import FIRST_ORDER, Window
 from recon.holography.variables import Mirrors, coded
 
@@ -64,6 +65,8 @@ def test_mirrors_show_a_picture_in_two_states(display: Display) -> None:
         found = compute_hologram(HologramModel(display, [wanted], options))
         assert set(np.unique(found.slm)) == {0, 1}
         assert 10 < judge(found.slm, display, wanted).psnr_db < optimised - gain
+        warm = compute_hologram(HologramModel(display, [wanted], options), initial=found.slm, iterations=1)
+        assert warm.history[0].loss < 0.2 * found.history[0].loss
 
 
 def test_the_first_order_of_fringes_is_the_field_over_pi() -> None:
@@ -83,6 +86,7 @@ def test_the_first_order_of_fringes_is_the_field_over_pi() -> None:
         ({"mirrors": "optimised", "complex_slm": True}, BARE, "leave --complex"),
         ({"mirrors": "optimised", "method": "one-step"}, BARE, "lbfgs"),
         ({"mirrors": "optimised", "loss": "none"}, BARE, "'frequency' and 'spatial'"),
+        ({"mirrors": "optimised"}, BARE.taught(Learned.nothing(BARE)), "of a phase SLM"),
     ],
 )
 def test_what_mirrors_cannot_do_is_refused(options, display: Display, words: str) -> None:

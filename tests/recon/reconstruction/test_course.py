@@ -55,6 +55,8 @@ def test_iterations_are_foretold_by_how_fast_they_settle():
     assert 60 < expected_iterations(slow, options, 1e-3) <= 100  # a power: 100
     assert 13 <= expected_iterations(fast, options, 1e-3) < 30  # an exponential: 14
     assert expected_iterations(history(lambda k: 1.0 + k), options, 1e-3) == 200
+    late = history(lambda k: k**-1.5, n=199), ReconstructionOptions(iterations=900)
+    assert 350 < expected_iterations(*late, 1e-4) <= 464  # a power: 464
     assert expected_iterations(slow, options, 0.0) == 200
     assert expected_iterations(slow, ReconstructionOptions(iterations=20), 1e-9) == 20
     assert expected_iterations(slow, ReconstructionOptions(time_s=4.0), 0.0) == 40

@@ -17,11 +17,21 @@ from recon.optics.grid import GREEN, PixelGrid
 from recon.optics.render import render
 from recon.optics.scene import bar_target, picture
 from recon.optics.wave import WavePropagator
+from recon.reconstruction import decoys
 from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.options import ReconstructionOptions as Options
 from recon.reconstruction.pilot import pilot
 from recon.reconstruction.problem import Problem
-from recon.verdict.calibration_check import BETWEEN, FAR, GIVEN, Fit, Score, check_of, near_decoys
+from recon.verdict.calibration_check import (
+    BETWEEN,
+    FAR,
+    GIVEN,
+    CalibrationCheck,
+    Fit,
+    Score,
+    check_of,
+    near_decoys,
+)
 from recon.verdict.judge import Region, Verdict
 from tests.golden import inputs
 
@@ -99,6 +109,19 @@ def test_of_a_picture_with_a_background(seen: tuple[Image, Image]) -> None:
     )
     right, wrong = check_calibration(problem), check_calibration(turned)
     assert [right and right.fit, wrong and str(wrong.better)] == [Fit.FITS, "turned by -1 degrees"]
+
+
+@pytest.mark.parametrize(("gain", "found"), [(0.0, Fit.OFF), (0.5, Fit.FITS)])
+def test_an_accused_one_is_cleared_against_its_accuser_wherever_that_was_tried(
+    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, gain: float, found: Fit
+) -> None:
+    on_the_way, right = Transformation(scale=1.04), GOOD[GIVEN]
+    accused = CalibrationCheck(Fit.OFF, GOOD, 9000, on_the_way)
+    told = iter((accused, accused, CalibrationCheck(Fit.FITS, GOOD, 9000)))
+    monkeypatch.setattr(decoys, "_competition", lambda *_: next(told))
+    accuser = right._replace(objective=right.objective + gain)
+    monkeypatch.setattr(decoys._Small, "score", lambda *_, **__: accuser)
+    assert fit(*seen)[0] is found
 
 
 def test_volumes_are_told_by_turns(seen: tuple[Image, Image]) -> None:
