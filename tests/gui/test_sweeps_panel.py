@@ -356,7 +356,7 @@ def test_a_run_is_read_outside_the_windows_thread_and_a_damaged_one_told(
         threads.append(threading.current_thread())
         raise OSError(f"{path} is damaged")
 
-    monkeypatch.setattr("gui.panels.runs.Run.open", damaged)
+    monkeypatch.setattr("gui.run_looks.Run.open", damaged)
     runs = window.show_panel("runs")
     assert isinstance(runs, RunsPanel)
     runs.open_run(tmp_path)
