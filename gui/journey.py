@@ -160,8 +160,9 @@ def _way_of(config: BenchConfig) -> str:
         return "files"
     if "slm" in kinds and config.devices["slm"].driver_name.endswith("screen"):
         return "screen"
-    # Of a display the LED array is lasers for pictures in colour: no point source is said, no diffuser.
-    lasers = not (config.source.model_fields_set or config.geometry.model_fields_set)
+    # The LED array of a display is lasers for pictures in colour: no point source is said, no diffuser.
+    camera = config.source.model_fields_set or config.geometry.model_fields_set
+    lasers = bool(config.display.model_fields_set) and not camera
     if "slm" in kinds and ("led_array" not in kinds or lasers):
         return "display"
     return "microscope" if "led_array" in kinds and not kinds & {"stage", "slm"} else "camera"
