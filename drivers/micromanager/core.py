@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -157,10 +158,14 @@ class MicroManager(SharedPart):
 
 def found_installation() -> Path | None:
     """Return the folder of Micro-Manager that pymmcore-plus finds, None without one."""
+    root = logging.getLogger()
+    level = root.level
     try:
         from pymmcore_plus import find_micromanager
     except ImportError:
         return None
+    finally:
+        root.setLevel(level)  # importing it, everybody's messages are wanted down to the smallest
     logging.getLogger("pymmcore-plus").setLevel(logging.WARNING)  # else it prints what it looks at
     found = find_micromanager()
     return Path(found) if found else None
@@ -171,10 +176,8 @@ def found_by_installation() -> tuple[FoundDevice, ...]:
 
     Raises DeviceError when pymmcore-plus is not installed.
     """
-    try:
-        import pymmcore_plus  # noqa: F401
-    except ImportError as error:
-        raise DeviceError("Micro-Manager", f"cannot be looked for: {error}.", _REMEDY) from error
+    if find_spec("pymmcore_plus") is None:
+        raise DeviceError("Micro-Manager", "cannot be looked for: pymmcore-plus is not installed.", _REMEDY)
     folder = found_installation()
     if folder is None:
         return ()

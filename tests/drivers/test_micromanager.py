@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -364,3 +366,13 @@ def test_own_settings_are_the_properties_that_the_driver_leaves_alone(adapters: 
             camera.set_own("FastImage", "7")
         with pytest.raises(LimitError, match="Exposure"):
             camera.set_own("Exposure", "7")
+
+
+def test_looking_for_an_installation_leaves_the_log_as_quiet_as_it_was() -> None:
+    lines = (
+        "import logging",
+        "from drivers.micromanager.core import found_installation",
+        "found_installation()",
+        "assert logging.getLogger().level == logging.WARNING",
+    )
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True, timeout=60)
