@@ -148,6 +148,8 @@ def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -
     read = [read_slm_image(path) for path in what]
     spots = "spots" in read[0][1]
     options.check(len(what), spots=spots)
+    if spots and len({facts.get("wavelength_nm") for _, facts in read}) > 1:
+        raise BenchError("Spots are shown and photographed in one light; these patterns are for several.")
     correction = load_slm_correction(options.slm_calibration) if options.slm_calibration else None
     place = load_alignment(options.alignment) if options.alignment else None
     if place is not None:
@@ -174,8 +176,6 @@ def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -
             )
             for colour in colours
         ]
-        if spots and len(colours) > 1:
-            raise BenchError("Spots are shown and photographed in one light; these patterns are for several.")
         if options.capture is None:
             _hold(lights, colours, options.seconds)
         elif len(colours) > 1:
