@@ -82,6 +82,7 @@ class V4l2Camera(BufferedCamera):
     """
 
     Options = V4l2Options
+    no_binning = "V4L2 has none: choose a smaller size."
     kernel: ClassVar[api.Kernel] = api.LinuxKernel()
     """What makes the system calls."""
 
@@ -372,23 +373,6 @@ class V4l2Camera(BufferedCamera):
             self._exposure_ms = self._read_exposure()
         self._remember("roi", lambda: self.set_roi(roi))
         return self._roi
-
-    @property
-    def binning(self) -> int:
-        """Always 1: V4L2 has no binning, sizes other than the largest may be binned by the camera."""
-        return 1
-
-    @property
-    def binnings(self) -> tuple[int, ...]:
-        """Only 1."""
-        return (1,)
-
-    def set_binning(self, binning: int) -> int:
-        """Take 1, refuse everything else."""
-        self._require_idle("binning")
-        if binning != 1:
-            raise LimitError(self.name, f"has no binning {binning}.", "V4L2 has none: choose a smaller size.")
-        return 1
 
     # Streaming -------------------------------------------------------------------------------------
     def _begin(self, n_buffers: int) -> FrameNumberCounter | None:
