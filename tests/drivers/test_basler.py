@@ -96,7 +96,7 @@ def test_a_hardware_trigger_sets_line_and_edge(camera: BaslerCamera, monkeypatch
         camera.set_trigger_line("Line7")
     # A camera that takes a word and has another is not believed.
     monkeypatch.setattr(camera._features, "_write_text", lambda name, entry: None)
-    with pytest.raises(DeviceError, match="was told TriggerSelector = .* and has FrameStart"):
+    with pytest.raises(DeviceError, match=r"was told TriggerSelector = .* and has FrameStart"):
         camera.set_trigger_mode("free_run")
     assert camera.trigger_mode == "hardware"
 
