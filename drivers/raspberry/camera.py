@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections import deque
@@ -16,7 +17,7 @@ from drivers.camera import Roi
 from drivers.common.buffered_camera import BufferedCamera, RawFrame
 from drivers.common.drops import FrameNumberCounter
 from drivers.common.pixels import Bytes, Pixels
-from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart
+from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, OwnSetting, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError
 from drivers.raspberry.modes import (
     RawFormat,
@@ -30,6 +31,7 @@ from drivers.raspberry.modes import (
 
 _MANUAL: Mapping[str, Any] = {"AeEnable": False, "AwbEnable": False, "AfMode": 0}
 """What would change pictures by itself, switched off where the camera has it."""
+_LOOKED_AFTER = frozenset((*_MANUAL, "ExposureTime", "AnalogueGain", "FrameDurationLimits"))
 _READ_BACK_MS = 500.0
 """Exposures up to this are read back from a frame; a line more or less is nothing to longer ones."""
 _SAME = 0.02
@@ -78,6 +80,7 @@ class RaspberryCamera(BufferedCamera):
         self._triggers: deque[int] = deque()
         self._scratch: Pixels | None = None
         self._black = 0.0
+        self._own: dict[str, bool | int | float] = dict(self.options.controls)
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
@@ -185,6 +188,37 @@ class RaspberryCamera(BufferedCamera):
             made[f"control.{name}"] = ", ".join(map(str, limits))
         return made
 
+    def own_settings(self) -> Mapping[str, OwnSetting]:
+        """Return libcamera's controls that are one number or switch, but for what the driver looks after."""
+        self._require()
+        found = {}
+        for name, (least, most, default) in sorted(self._camera.camera_controls.items()):
+            if name in _LOOKED_AFTER or not isinstance(least, bool | int | float):
+                continue
+            takes = "0 or 1" if isinstance(least, bool) else f"{least:g} to {most:g}"
+            found[name] = OwnSetting(self._own.get(name, default), takes)
+        return found
+
+    def set_own(self, name: str, value: str) -> Setting:
+        """Set a control by its libcamera name, a number; it holds for the frames from now on.
+
+        Returns the value that was set: libcamera reads back few of them.
+        """
+        known = self.own_settings().get(name)
+        if known is None:
+            return super().set_own(name, value)
+        least, most, _ = self._camera.camera_controls[name]
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not least <= number <= most or (not isinstance(least, float) and number != round(number)):
+            problem = f"control {name} does not take {value!r}."
+            raise LimitError(self.name, problem, f"It takes {known.takes}.")
+        self._own[name] = type(least)(number)
+        self._apply()
+        return self._own[name]
+
     # Exposure and gain -----------------------------------------------------------------------------
     @property
     def exposure_limits_ms(self) -> tuple[float, float]:
@@ -229,7 +263,7 @@ class RaspberryCamera(BufferedCamera):
             "AnalogueGain": self._gain,
             # Up to somewhat more than the exposure: a sensor's frame lasts a few lines longer.
             "FrameDurationLimits": (period_us, max(period_us, exposure_us + exposure_us // 10 + 10_000)),
-            **self.options.controls,
+            **self._own,
         }
         return {name: value for name, value in asked.items() if name in self._camera.camera_controls}
 
