@@ -65,6 +65,7 @@ class RaspberryCamera(BufferedCamera):
     """
 
     Options = RaspberryOptions
+    no_binning = "Give a smaller sensor mode by size."
     trigger_modes = ("free_run", "software")
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
@@ -318,23 +319,6 @@ class RaspberryCamera(BufferedCamera):
         self._roi = wanted
         self._remember("roi", lambda: self.set_roi(roi))
         return wanted
-
-    @property
-    def binning(self) -> int:
-        """Always 1: a sensor that bins has a mode of a smaller ``size`` for it."""
-        return 1
-
-    @property
-    def binnings(self) -> tuple[int, ...]:
-        """Only 1."""
-        return (1,)
-
-    def set_binning(self, binning: int) -> int:
-        """Take 1, refuse everything else."""
-        self._require_idle("binning")
-        if binning != 1:
-            raise LimitError(self.name, f"has no binning {binning}.", "Give a smaller sensor mode by size.")
-        return 1
 
     # Streaming -------------------------------------------------------------------------------------
     @property
