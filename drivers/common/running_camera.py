@@ -1,4 +1,4 @@
-"""A camera without triggers and regions of its own: it runs on, its driver lets frames through and cuts them."""
+"""A camera without triggers and regions of its own: its driver lets its frames through, and cuts them."""
 
 from __future__ import annotations
 
