@@ -24,6 +24,7 @@ from drivers.v4l2.controls import Control, Controls, Quantity
 from drivers.v4l2.device import FilledBuffer, VideoDevice
 from drivers.v4l2.formats import V4l2Format, decode
 from drivers.v4l2.images import Images
+from drivers.v4l2.node import Node
 
 _SEQUENCE_MODULUS = 1 << 32
 _EXPOSURE_COUNT_MS = 0.1
@@ -37,6 +38,13 @@ class V4l2Options(DriverOptions):
         "/dev/video0",
         min_length=1,
         description="Device node; a link in /dev/v4l/by-id stays the same when cameras are plugged anew.",
+    )
+    subdevices: tuple[str, ...] = Field(
+        (),
+        description=(
+            'Nodes with controls of the sensor or the lens, e.g. ["/dev/v4l-subdev0"]: camera modules, whose '
+            "/dev/video* has none (media-ctl -p names them)."
+        ),
     )
     pixel_pitch_um: float = Field(
         gt=0, description="Pitch of the pixels as they are sent, micrometres: no V4L2 driver knows it."
@@ -91,13 +99,17 @@ class V4l2Camera(BufferedCamera):
         self.options = V4l2Options.of(options)
         self.frames_to_skip = self.options.frames_to_skip
         self._device = VideoDevice(self.options.device, self.name, self.kernel, self._note_lost)
+        self._subdevices = [
+            Node(path, self.name, self.kernel, self._note_lost) for path in self.options.subdevices
+        ]
         self._triggers: deque[int] = deque()
         self._scratch: Pixels | None = None
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
-        """Claim the device node, whatever link it is named by."""
-        return (port_claim(V4l2Options.of(options).device),)
+        """Claim the nodes, whatever links they are named by."""
+        given = V4l2Options.of(options)
+        return tuple(port_claim(node) for node in (given.device, *given.subdevices))
 
     @classmethod
     def discover(cls) -> tuple[FoundDevice, ...]:
@@ -134,12 +146,14 @@ class V4l2Camera(BufferedCamera):
     def _connect(self) -> None:
         self._device.open()
         try:
+            for node in self._subdevices:
+                node.open()
             if self.options.input is not None:
                 self._device.call(
                     api.S_INPUT, api.InputNumber(self.options.input), f"take input {self.options.input}"
                 )
             self._identity = self._device.identity()
-            self._controls = Controls(self._device)
+            self._controls = Controls((self._device, *self._subdevices))
             self._find_quantities()
             self._controls.switch_automatics_off()
             self._trigger_mode = "free_run"
@@ -150,11 +164,12 @@ class V4l2Camera(BufferedCamera):
             self._exposure_ms = self._read_exposure()
             self._gain = self._read_gain()
         except BaseException:
-            self._device.close()
+            self._disconnect()
             raise
 
     def _disconnect(self) -> None:
-        self._device.close()
+        for node in (self._device, *self._subdevices):
+            node.close()
 
     def _find_quantities(self) -> None:
         options, controls = self.options, self._controls
