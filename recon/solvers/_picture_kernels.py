@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from recon.camera._kernels import FAST, QUICK_RATIOS
+from recon.camera._kernels import FAST
 
 # Columns of ``sums``
 # (squared norms; CHANGE: of a split variable; MULTIPLIER: of its scaled dual variable)
@@ -194,7 +194,7 @@ def _frequencies(
     return step, state
 
 
-@njit(nogil=True, cache=True, **QUICK_RATIOS)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def solve(
     start: int, stop: int, Y: Any, T: Any, Q: Any, H: Any, P: Any, rows: Any, columns: Any,
     mu_v: Any, relax: Any, nyquist: bool, sums: Any,
@@ -217,7 +217,7 @@ def solve(
         sums[i, STATE] = first_sums[1] + inner_sums[1] + inner_sums[1] + last_sums[1]
 
 
-@njit(nogil=True, cache=True, **QUICK_RATIOS)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def see(
     start: int, stop: int, band: Any, left: int, t: Any, data: Any, weight: Any, mu: Any, relax: Any,
     sums: Any,
@@ -259,7 +259,7 @@ def see(
         out[MULTIPLIER], out[STEP_SEEN], out[STATE_SEEN] = multiplier, step_sum, state_sum
 
 
-@njit(nogil=True, cache=True, **QUICK_RATIOS)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def predict(
     start: int, stop: int, Y: Any, E: Any, H: Any, laplace_rows: Any, laplace_columns: Any,
     mu_u: Any, mu_w: Any, MY: Any,
@@ -277,7 +277,7 @@ def predict(
             MY[i, j] = complex(hr * yr - hi * yi, hr * yi + hi * yr)
 
 
-@njit(nogil=True, cache=True, **QUICK_RATIOS)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def curvature(
     start: int, stop: int, P: Any, H: Any, laplace_rows: Any, laplace_columns: Any, mu_u: Any, mu_w: Any,
     even_width: bool, sums: Any,
@@ -302,7 +302,7 @@ def _weighted_power(p: Any, h: Any, scale: Any) -> Any:
     return (p.real * p.real + p.imag * p.imag) * (h.real * h.real + h.imag * h.imag) / scale
 
 
-@njit(nogil=True, cache=True, **QUICK_RATIOS)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def weigh(
     start: int, stop: int, P: Any, H: Any, laplace_rows: Any, laplace_columns: Any, mu_u: Any, mu_w: Any
 ) -> None:
@@ -314,7 +314,7 @@ def weigh(
             P[i, j] *= (h.real * h.real + h.imag * h.imag) / (row + mu_u * laplace_columns[j])
 
 
-@njit(nogil=True, cache=True, **QUICK_RATIOS)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def advance(
     start: int, stop: int, Y: Any, E: Any, P: Any, H: Any, laplace_rows: Any, laplace_columns: Any,
     mu_u: Any, mu_w: Any, length: Any,

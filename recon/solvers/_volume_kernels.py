@@ -27,7 +27,6 @@ from numba import njit
 
 from recon.camera._kernels import (
     FAST,
-    QUICK_RATIOS,
     add_product,
     conjugate_product,
     from_spectrum,
@@ -67,7 +66,7 @@ def _split_row(s: Any, x: Any, neighbour: Any, v: Any, w: Any, p: Any, st: Any) 
     st[4] += y
 
 
-@njit(nogil=True, cache=True, **QUICK_RATIOS)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def _clip_factor_row(s0: Any, s1: Any, s2: Any, t: Any, k: Any) -> None:
     """Isotropic: ``k`` such that the multiplier is ``k s`` and the split variable ``(1 - k) s``."""
     least = max(t, t - t + TINY)
@@ -251,7 +250,7 @@ def plane_sweep(
         x, x_next = x_next, x
 
 
-@njit(nogil=True, cache=True, **QUICK_RATIOS)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def _pivot_tile(
     ratio: Any, ratio_before: Any, inverse: Any, dx2: Any, row: Any, wx2: Any, wz2: Any, wb2: Any
 ) -> None:
