@@ -27,7 +27,7 @@ from rocket_fft import c2c, c2r, r2c
 
 # NaN must survive (solvers stop on it), so neither nnan nor ninf.
 FAST = {"reassoc", "nsz", "arcp", "contract"}
-# Loops that divide need error_model="numpy" too: asking for Python's error at a zero costs them their vectors.
+# Loops that divide need error_model="numpy" too: Python's error at a division by zero costs the vectors.
 
 FIRST_AXIS = np.array([0])
 SECOND_AXIS = np.array([1])
