@@ -25,6 +25,7 @@ from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import IterationRecord
 from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
+from recon.solvers.moving import move
 from recon.solvers.prior_splits import ProxSplit, split_prior
 from recon.solvers.splitting import SensorData, Tuning
 from recon.solvers.volume_admm import ExactAdmm
@@ -92,6 +93,11 @@ class OperatorAdmm(ExactAdmm):
         """Do one iteration; the first ones solve their data term better."""
         self.system.max_steps = FIRST_STEPS if self.iteration < FIRST_ITERATIONS else STEPS
         return super().step()
+
+    def move(self, rows: float, columns: float) -> None:
+        """Move object and dual variables."""
+        super().move(rows, columns)
+        move(self.x, rows, columns)
 
     def _laplacian(self, weights: Array) -> Array:
         """Eigenvalues of T under cosine transforms."""
