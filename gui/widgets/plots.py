@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,9 @@ def plot_widget(
     pyqtgraph has no type annotations, hence ``Any``.
     """
     plot = pg.PlotWidget(enableMenu=False)
-    restyle(plot)
+    plot.restyle = partial(restyle, plot)
+    plot.restyle()
+    plot.getPlotItem().layout.setContentsMargins(0, 0, 0, 4)  # letters that reach below the line
     plot.setLabel("bottom", _label(x_label, x_unit))
     plot.setLabel("left", _label(y_label, y_unit))
     plot.showGrid(x=grid, y=grid, alpha=0.15)
@@ -46,15 +49,6 @@ def restyle(plot: Any) -> None:
     for axis in ("bottom", "left"):
         plot.getAxis(axis).setPen(now.line)
         plot.getAxis(axis).setTextPen(now.dim)
-
-
-def restyle_all(root: QWidget) -> None:
-    """Give a window's or panel's plots, and what has a ``restyle`` of its own, the colours of the theme."""
-    for widget in root.findChildren(QWidget):
-        if isinstance(widget, pg.PlotWidget):
-            restyle(widget)
-        if hasattr(widget, "restyle"):
-            widget.restyle()
 
 
 _DASHES = (Qt.PenStyle.SolidLine, Qt.PenStyle.DashLine, Qt.PenStyle.DotLine, Qt.PenStyle.DashDotLine)

@@ -18,10 +18,9 @@ from gui.jobs import JobState
 from gui.panel import whole
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
-from gui.theme import apply_theme
+from gui.theme import apply_theme, change_theme
 from gui.widgets.dialogues import Question
 from gui.widgets.entry import NumberEdit
-from gui.widgets.plots import restyle_all
 from instrument.files.images import read_image, write_image
 from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.request import VolumeRequest
@@ -501,9 +500,8 @@ def test_the_red_theme_shows_nothing_but_red(
     np.save(tmp_path / "v.npy", np.random.default_rng(0).random((4, 40, 40), np.float32))
     panel.open(tmp_path / "v.npy")
     qtbot.waitUntil(lambda: panel.volume.projections is not None, timeout=WAIT_MS)
-    apply_theme(qapp, "red")
     try:
-        restyle_all(panel)
+        list(change_theme("red", panel, [panel]))
         shown = panel.volume.coloured.image
         assert shown[..., 0].max() > 0.5
         assert shown[..., 1:].max() == 0

@@ -128,7 +128,9 @@ def test_others_read_a_recording_with_its_frame_period(tmp_path: Path) -> None:
 
 def test_recording_for_a_time_and_stopping_from_outside_both_complete(tmp_path: Path) -> None:
     with bench_with(FreeRunningCamera()) as bench:
+        began_s = time.monotonic()
         run = record(bench, tmp_path, seconds=0.2)
+        assert time.monotonic() - began_s >= 0.2
         assert run.reason is FinishReason.COMPLETED
         assert run.records
 

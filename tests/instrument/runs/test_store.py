@@ -186,12 +186,12 @@ def test_a_frame_of_another_shape_or_place_is_refused(tmp_path: Path) -> None:
 
 
 def test_two_runs_of_one_second_get_two_folders(tmp_path: Path) -> None:
-    paths = set()
+    names = []
     for _ in range(3):
         with new_run(tmp_path) as writer:
-            paths.add(writer.path)
-    assert len(paths) == 3
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in paths)
+            names.append(writer.path.name)
+    assert names[1:] == [f"{names[0]}-2", f"{names[0]}-3"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
 
 
 def test_what_is_no_run_is_refused_in_words(tmp_path: Path) -> None:
