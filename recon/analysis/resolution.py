@@ -12,11 +12,11 @@ import numpy.typing as npt
 from recon.analysis.correlation import (
     INNER_PRODUCT,
     RESOLUTION_LEVEL,
-    Correlation,
-    autocorrelate,
+    autocorrelation_cut,
     centre_of_light,
     correlate,
     critical_scale,
+    half_width,
     similarity,
 )
 from recon.errors import InputError
@@ -52,14 +52,13 @@ def across_depth(depths_um: Floats, planes: Array) -> DepthSimilarity:
         depths_um,
         float(depths_um[middle]),
         np.array([similarity(plane, planes[middle]) for plane in planes]),
-        _cut(autocorrelate(planes[0])),
-        _cut(autocorrelate(planes[-1])),
-        _cut(correlate(planes[0], planes[-1])),
+        _cut(autocorrelation_cut(planes[0], 1)),
+        _cut(autocorrelation_cut(planes[-1], 1)),
+        _cut(correlate(planes[0], planes[-1]).profile(1)),
     )
 
 
-def _cut(correlation: Correlation) -> Floats:
-    cut = correlation.profile(1)
+def _cut(cut: Floats) -> Floats:
     peak = int(np.argmax(cut))
     index = np.arange(peak - CUT_PX, peak + CUT_PX + 1)
     inside = (index >= 0) & (index < len(cut))
@@ -189,8 +188,8 @@ class LateralResolution:
 
 def lateral_resolution(psf: Array, level: float = RESOLUTION_LEVEL) -> LateralResolution:
     """Measure the autocorrelation's half width of a PSF (height, width)."""
-    correlation = autocorrelate(psf)
-    return LateralResolution(level, (correlation.half_width(0, level), correlation.half_width(1, level)))
+    y, x = (half_width(autocorrelation_cut(psf, axis), level) for axis in (0, 1))
+    return LateralResolution(level, (y, x))
 
 
 @dataclass(frozen=True, slots=True)
