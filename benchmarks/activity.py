@@ -31,7 +31,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from recon.base.threads import set_threads
 from recon.errors import InputError
 from recon.evaluation.lenslets import LensletCamera, build_camera
-from recon.streams.activity import aligned, baseline, change, fading, floor_of, motion
+from recon.streams.activity import baseline, change, fading, floor_of
+from recon.streams.motion import aligned, motion
 from recon.streams.regions import find_regions, noise_of
 from recon.streams.video import BLOCK, VideoSolver, stream_problem
 

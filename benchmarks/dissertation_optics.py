@@ -13,6 +13,7 @@ import argparse
 import platform
 import time
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ import numpy as np
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.correlation import field_of_view
-from recon.analysis.points import PLANES, PointTests, point_tests
+from recon.analysis.points import PointTests, point_tests
 from recon.analysis.resolution import (
     axial_resolution,
     axial_spacing_per_um,
@@ -29,7 +30,6 @@ from recon.analysis.resolution import (
     lateral_spacing_um,
 )
 from recon.base.threads import set_threads
-from recon.types import Calibration, Geometry
 
 GREEN = (0.0, 1.0, 0.0)
 FAR_UM = 300e3
@@ -83,14 +83,9 @@ def sixteen_points(binning: int, z_um: float = 20e3) -> tuple[PointTests, Simula
 
     psf = image(0.0, z_um)
     inner = axial_resolution(psf, z_um, world.distance_um, 0.8).step_per_um
-    inverse = 1 / z_um - inner / 2 * (np.arange(PLANES) - PLANES // 2)
-    calibration = Calibration(
-        np.stack([image(0.0, float(1 / v)) for v in inverse])[:, None],
-        np.array([(0.0, 0.0, 1 / v) for v in inverse]),
-        geometry=Geometry(pitch_um, 1e-3 * world.distance_um),
-    )
     lateral_px = lateral_resolution(psf, 0.8).mean_px
-    tests = point_tests(calibration, z_um, lateral_px=lateral_px, step_per_um=inner, image=image)
+    on_axis = partial(image, 0.0)
+    tests = point_tests(on_axis, z_um, lateral_px=lateral_px, step_per_um=inner, image=image)
     return tests, world
 
 

@@ -217,7 +217,8 @@ def soon() -> None:
 
     for module in (stream, bench, safety):
         setattr(module, "STOP_ANSWER_S", SOON_S)  # noqa: B010 # its type is final
-    setattr(photograph, "CALL_MARGIN_S", SOON_S)  # noqa: B010
+    for module in (stream, photograph):
+        setattr(module, "CALL_MARGIN_S", SOON_S)  # noqa: B010
     SimulatedCamera.longest_silence_s = SOON_S
 
 
@@ -246,6 +247,9 @@ def live() -> int:
     except (DeviceError, BenchError) as error:
         sys.stderr.write("\n".join((str(error), *getattr(error, "__notes__", ()))) + "\n")
         return 1
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted.\n")
+        return 130
     return 0
 
 
@@ -255,6 +259,7 @@ def trial(work: str, number: int, fault: str, folder: Path, longer_s: float) -> 
     process = os.fork()
     if process == 0:
         code = 70
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
         try:
             os.chdir(folder)
             for handle, name in ((1, "out"), (2, "err")):

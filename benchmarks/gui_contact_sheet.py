@@ -101,6 +101,7 @@ def _pictures(
             QTest.qWait(shots.SETTLE_MS)
         for theme in themes:
             window.set_theme(theme)
+            shots._wait(lambda: not window.is_restyling, "the theme")
             QTest.qWait(RESTYLED_MS)
             picture = window.grab().toImage()
             picture.setDevicePixelRatio(1.0)  # in the screen's own pixels

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from contextlib import ExitStack
 from functools import partial
 from typing import cast
 
-from PySide6.QtCore import QEvent, QObject, QSettings, QSize, Qt
+from PySide6.QtCore import QEvent, QObject, QSettings, QSize, Qt, QTimer
 from PySide6.QtGui import QAction, QCloseEvent, QGuiApplication, QKeyEvent, QKeySequence, QShortcut, QWindow
 from PySide6.QtWidgets import (
     QApplication,
@@ -23,18 +23,17 @@ from PySide6.QtWidgets import (
 
 from gui.help import help_of
 from gui.jobs import Job
-from gui.making import PanelMaker
+from gui.making import REST_MS, PanelMaker, take_slice
 from gui.panel import Panel
 from gui.panels import PANELS
 from gui.panels.unserved import UnservedPanel
 from gui.session import BenchSession
 from gui.session_news import OperatorRequest, name_of
-from gui.theme import THEMES, apply_theme
+from gui.theme import THEMES, change_theme
 from gui.widgets.building import PanelPlace, button, fill, in_row, label, tabs
 from gui.widgets.device_chips import DeviceChips
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
-from gui.widgets.plots import restyle_all
 from gui.widgets.step_strip import StepStrip
 from instrument.bench.config import BenchConfig, Kind
 
@@ -77,6 +76,7 @@ class MainWindow(QMainWindow):
         self.maker = PanelMaker(session, self._places, self)
         self._panels = self.maker.panels
         self._docks: dict[str, QDockWidget] = {}
+        self._restyling: Generator[None] | None = None
         self._may_close = False
         self.question: Question | None = None
         """The question that was asked last, while it is open."""
@@ -218,9 +218,9 @@ class MainWindow(QMainWindow):
         self.strip = StepStrip(self.session)
         self.strip.wanted.connect(self._take_step)
         first = in_row(self.menus, 12, self.simulated, self.chips, None, self.stop_button, spacing=4)
-        header = fill(QWidget(), first, self.strip, spacing=0)
-        header.setObjectName("header")
-        self.setMenuWidget(header)
+        self._header = fill(QWidget(), first, self.strip, spacing=0)
+        self._header.setObjectName("header")
+        self.setMenuWidget(self._header)
 
     def _make_status_bar(self) -> None:
         self.job_label = label("Ready")
@@ -296,12 +296,28 @@ class MainWindow(QMainWindow):
             getattr(panel, what)()
 
     def set_theme(self, name: str) -> None:
-        """Change the looks of the whole program and remember it."""
-        app = QApplication.instance()
-        assert isinstance(app, QApplication)
-        apply_theme(app, name, self)
+        """Change the looks of the whole program, a slice at a time, and remember it."""
         self._settings.setValue("theme", name)
-        restyle_all(self)  # every panel: one white picture spoils a dark room
+        wholes = [self._header, self.statusBar()]
+        wholes += [place.content for place in self._places.values() if place.content is not None]
+        if self._restyling is not None:
+            self._restyling.close()
+        self._restyling = change_theme(name, self, wholes)
+        self._restyle(self._restyling)
+
+    @property
+    def is_restyling(self) -> bool:
+        """Whether parts of the window still have the looks of the theme before."""
+        return self._restyling is not None
+
+    def _restyle(self, parts: Generator[None]) -> None:
+        if parts is not self._restyling:
+            return  # another theme was chosen meanwhile
+        try:
+            take_slice(parts)
+            QTimer.singleShot(REST_MS, self, partial(self._restyle, parts))
+        except StopIteration:
+            self._restyling = None
 
     # STOP ----------------------------------------------------------------------------------------
     def _make_stop_keys(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from functools import partial
 
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
@@ -12,10 +12,21 @@ from gui.jobs import words_for
 from gui.panel import Panel
 from gui.panels import PANELS
 from gui.session import BenchSession
+from gui.theme import dress
 from gui.widgets.building import PanelPlace, label, text_view
 
 _SLICE_S = 0.015
 """Of the window's thread at once; a part that takes longer is the only one of its slice."""
+REST_MS = 1
+"""Between two slices: what was made is laid out and painted, and clicks are taken, in turns of their own."""
+
+
+def take_slice(parts: Iterator[None]) -> None:
+    """Make parts for as long as a slice may take. Raises StopIteration after the last of them."""
+    end_s = time.thread_time() + _SLICE_S
+    next(parts)
+    while time.thread_time() <= end_s:
+        next(parts)
 
 
 class PanelMaker(QObject):
@@ -94,13 +105,9 @@ class PanelMaker(QObject):
         slices = self._slices.get(name)
         if slices is None or self._session.is_closing:
             return  # made at once meanwhile, or not wanted any more
-        end_s = time.thread_time() + _SLICE_S
         try:
-            while True:
-                next(slices)
-                if time.thread_time() > end_s:
-                    QTimer.singleShot(0, self, partial(self._go_on, name))
-                    return
+            take_slice(slices)
+            QTimer.singleShot(REST_MS, self, partial(self._go_on, name))
         except StopIteration as made:
             self._finish(name, made.value)
         except Exception as error:  # noqa: BLE001 - a panel's failure must not end the window
@@ -109,6 +116,7 @@ class PanelMaker(QObject):
     def _finish(self, name: str, panel: Panel) -> None:
         self._slices.pop(name, None)
         self.panels[name] = panel
+        dress(panel)  # where the theme was changed meanwhile
         self._places[name].hold(panel)
         self.made.emit()
         for then in self._then.pop(name, ()):

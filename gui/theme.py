@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -9,7 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtGui import QColor, QPalette
-from PySide6.QtWidgets import QApplication, QWidget
+from PySide6.QtWidgets import QApplication, QDialog, QWidget
+from shiboken6 import isValid
 
 from instrument.live.frame_view import SATURATED
 
@@ -123,18 +125,85 @@ def colours() -> Colours:
     return _now[0]
 
 
-def apply_theme(app: QApplication, name: str, window: QWidget | None = None) -> None:
-    """Give the whole program the looks of a theme, one of :data:`THEMES`.
+def sheet() -> str:
+    """Return the style sheet of the theme in use."""
+    return _style(colours())
 
-    With a window it, and all that belongs to it, takes over from the program's looks of before: a seventh of
-    the time that the program as a whole takes where there are two thousand widgets.
-    """
-    theme = THEMES[name]
-    _now[0] = theme
+
+def apply_theme(app: QApplication, name: str) -> None:
+    """Give the whole program the looks of a theme, one of :data:`THEMES`, before there is a window."""
+    _now[0] = THEMES[name]
     if not app.styleSheet():  # which hides the style's own name
         app.setStyle("Fusion")
-    palette = QPalette()
-    role = QPalette.ColorRole
+    app.setPalette(_palette())
+    app.setStyleSheet(sheet())
+
+
+def change_theme(name: str, window: QWidget, wholes: Sequence[QWidget]) -> Generator[None]:
+    """Give a window the looks of another theme, one of :data:`THEMES`, with a ``yield`` after each part.
+
+    A sheet at the window, or the program, would go to all of two thousand widgets at once.
+
+    Parameters
+    ----------
+    name : str
+    window : QWidget
+        Is not painted until what is seen of it has the new looks, and then at once.
+    wholes : sequence of QWidget
+        In the window: each takes the sheet for itself and all that is in it. What holds them looks as the
+        palette says; what stands beside them takes the sheet, too.
+    """
+    _now[0] = THEMES[name]
+    app = QApplication.instance()
+    assert isinstance(app, QApplication)
+    parts = [*wholes, *window.findChildren(QDialog)]
+    window.setUpdatesEnabled(False)
+    try:
+        app.setPalette(_palette())
+        holding = {window}
+        for whole in wholes:
+            holder = whole.parentWidget()
+            while holder is not None and holder not in holding:
+                holding.add(holder)
+                holder = holder.parentWidget()
+        for holder in holding:
+            holder.style().polish(holder)
+            children = [child for child in holder.children() if isinstance(child, QWidget)]
+            parts += [child for child in children if child not in holding and child not in parts]
+        yield
+        for part in parts:
+            if isValid(part) and part.isVisible():
+                yield from _restyled(part)
+    finally:
+        if isValid(window):
+            window.setUpdatesEnabled(True)
+    yield
+    for part in parts:
+        yield from _restyled(part)
+
+
+def _restyled(part: QWidget) -> Iterator[None]:
+    """Give a part of a window the sheet, and its plots and pictures the colours of the theme in use, once."""
+    own, app = sheet(), QApplication.instance()
+    assert isinstance(app, QApplication)
+    if not isValid(part) or (part.styleSheet() or app.styleSheet()) == own:
+        return
+    part.setStyleSheet(own)
+    yield
+    for widget in (part, *part.findChildren(QWidget)):
+        if isValid(widget) and hasattr(widget, "restyle"):
+            widget.restyle()
+            yield
+
+
+def dress(part: QWidget) -> None:
+    """Give a new panel or dialogue the theme in use, which may be another than the program began with."""
+    for _ in _restyled(part):
+        pass
+
+
+def _palette() -> QPalette:
+    theme, palette, role = colours(), QPalette(), QPalette.ColorRole
     for what, colour in {
         role.Window: theme.window,
         role.WindowText: theme.text,
@@ -160,8 +229,7 @@ def apply_theme(app: QApplication, name: str, window: QWidget | None = None) -> 
         palette.setColor(what, QColor(colour))
     for what in (role.WindowText, role.Text, role.ButtonText):
         palette.setColor(QPalette.ColorGroup.Disabled, what, QColor(theme.dim).darker(130))
-    app.setPalette(palette)
-    (window or app).setStyleSheet(_style(theme))
+    return palette
 
 
 def contrast(one: str, other: str) -> float:
@@ -201,6 +269,7 @@ QComboBox QAbstractItemView {{ border: 1px solid {c.border}; padding: 0; }}
 QGraphicsView {{ border: 1px solid transparent; }}
 QGraphicsView:focus {{ border: 1px solid {c.accent}; }}
 *[refused="true"] {{ border: 2px solid {c.error}; color: {c.error}; font-weight: 700; }}
+QLineEdit[refused="true"], QComboBox[refused="true"] {{ padding: 2px 4px; }}
 QLabel[warns="warning"] {{ color: {c.warning}; font-weight: 700; }}
 QLabel[warns="error"] {{ color: {c.error}; font-weight: 700; }}
 QLabel#reason {{ color: {c.error}; font-size: {SMALL_PT}pt; }}
@@ -218,10 +287,15 @@ QPushButton:focus, QToolButton:focus, QCommandLinkButton:focus {{
 QPushButton:pressed, QPushButton:checked, QToolButton:checked {{
   background: {c.primary}; color: {c.primary_text}; }}
 QPushButton:disabled, QToolButton:disabled {{ color: {unused}; border-color: {c.line}; }}
+QPushButton::menu-indicator {{ width: 0; }}
 QPushButton:flat, QToolButton[autoRaise="true"] {{ background: transparent; border: 1px solid transparent;
   color: {c.dim}; padding: 2px 6px; }}
 QPushButton:flat:hover, QPushButton:flat:focus, QToolButton[autoRaise="true"]:hover,
 QToolButton[autoRaise="true"]:focus {{ color: {c.accent}; border-color: {c.accent}; }}
+QToolButton#device {{ border: none; padding: 2px 4px; }}
+QToolButton#device[condition="open"] {{ color: {c.ok}; }}
+QToolButton#device[condition="failed"] {{ color: {c.error}; }}
+QToolButton#device[condition="opening"] {{ color: {c.warning}; }}
 QCommandLinkButton {{ border-radius: 6px; padding: 8px; text-align: left; }}
 QCommandLinkButton:focus {{ padding: 7px; }}
 QPushButton#stop {{ background: {c.stop}; color: {c.stop_text}; border: 2px solid {c.stop};
@@ -241,15 +315,16 @@ QFrame#strip {{ background: {c.panel}; border-bottom: 1px solid {c.line}; }}
 QGroupBox {{ border: 1px solid {c.line}; border-radius: 5px; margin-top: 10px; padding-top: 6px; }}
 QGroupBox::title {{ subcontrol-origin: margin; left: 8px; padding: 0 4px; color: {c.dim}; }}
 QTabBar {{ qproperty-drawBase: 0; }}
-QTabWidget::pane {{ border: 1px solid {c.line}; }}
-QTabBar::tab {{ background: {c.panel}; color: {c.dim}; border: 1px solid {c.line}; border-bottom: none;
-  padding: 5px 12px; margin-right: 1px; }}
-QTabBar::tab:selected {{ background: {c.field}; color: {c.text}; border-top: 2px solid {c.accent}; }}
-QTabBar::tab:hover {{ color: {c.text}; }}
-QTabBar::tab:selected:focus {{ color: {c.accent}; border: 2px solid {c.accent}; }}
-QDockWidget {{ color: {c.dim}; }}
-QDockWidget::title {{ background: {c.panel}; padding: 4px 8px; }}
-QMainWindow::separator {{ background: {c.line}; width: 3px; height: 3px; }}
+QTabWidget::pane {{ border: 1px solid palette(midlight); }}
+QTabBar::tab {{ background: palette(alternate-base); color: palette(placeholder-text);
+  border: 1px solid palette(midlight); border-bottom: none; padding: 5px 12px; margin-right: 1px; }}
+QTabBar::tab:selected {{ background: palette(base); color: palette(text);
+  border-top: 2px solid palette(link); }}
+QTabBar::tab:hover {{ color: palette(text); }}
+QTabBar::tab:selected:focus {{ color: palette(link); border: 2px solid palette(link); }}
+QDockWidget {{ color: palette(placeholder-text); }}
+QDockWidget::title {{ background: palette(alternate-base); padding: 4px 8px; }}
+QMainWindow::separator {{ background: palette(midlight); width: 3px; height: 3px; }}
 QSplitter::handle {{ background: {c.line}; }}
 QProgressBar {{ background: {c.field}; color: {c.text}; border: 1px solid {c.line}; border-radius: 4px;
   text-align: center; }}

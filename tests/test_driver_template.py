@@ -1,4 +1,4 @@
-"""The driver to copy works as a package of its own: its tests pass, and the program finds and uses it."""
+"""The drivers to copy work as packages of their own: tests pass, and the program finds and uses them."""
 
 from __future__ import annotations
 
@@ -13,17 +13,24 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tifffile
 
 ROOT = Path(__file__).parents[1]
 PROGRAM = "import sys; from instrument.cli import main; sys.exit(main())"
 
 
 @pytest.fixture
-def package(tmp_path: Path) -> Path:
+def kind(request: pytest.FixtureRequest) -> str:
+    """What is copied: the stage, but where a test asks for another."""
+    return str(getattr(request, "param", "stage"))
+
+
+@pytest.fixture
+def package(tmp_path: Path, kind: str) -> Path:
     """A copy, and beside it what pip would write for its entry points."""
-    folder = tmp_path / "my_stage"
+    folder = tmp_path / f"my_{kind}"
     shutil.copytree(
-        ROOT / "examples" / "driver_template", folder, ignore=shutil.ignore_patterns("__pycache__")
+        ROOT / "examples" / f"{kind}_template", folder, ignore=shutil.ignore_patterns("__pycache__")
     )
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     info = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
@@ -44,30 +51,57 @@ def run(package: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         capture_output=True,
         text=True,
         cwd=package,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join((str(package), str(ROOT)))},
+        env=os.environ
+        | {
+            "PYTHONPATH": os.pathsep.join((str(package), str(ROOT))),
+            "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",  # napari's takes seconds
+        },
         timeout=120,
         check=False,
     )
 
 
+def own_tests(package: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return run(
+        package, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "pytest_timeout", *arguments, "."
+    )
+
+
+@pytest.mark.parametrize("kind", ["stage", "camera"], indirect=True)
 def test_its_own_tests_pass(package: Path) -> None:
-    done = run(package, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", ".")
+    done = own_tests(package)
     assert done.returncode == 0, done.stdout
-    assert "TestMyStage" not in done.stdout  # nothing failed
     assert int(done.stdout.split(" passed")[0].rsplit(maxsplit=1)[-1]) >= 15  # the contract ran
 
 
-def test_a_broken_driver_fails_them(package: Path) -> None:
-    """The contract would not notice nothing: a driver that clips its moves fails."""
-    module = package / "my_stage.py"
+@pytest.mark.parametrize(
+    ("kind", "right", "wrong", "name", "says"),
+    [
+        ("stage", "round(position_um /", "round(0.9 * position_um /", "end_where", "came to rest elsewhere"),
+        ("camera", "round(200 * np", "round(100 * np", "gain", "gain"),
+    ],
+    indirect=["kind"],
+)
+def test_a_broken_driver_fails_them(package: Path, right: str, wrong: str, name: str, says: str) -> None:
+    """The contract notices: a stage that ends short of its place, a camera with half its gain."""
+    module = package / f"{package.name}.py"
     text = module.read_text()
-    module.write_text(text.replace("round(position_um /", "round(0.9 * position_um /"))
-    assert module.read_text() != text
-    done = run(
-        package, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-k", "end_where", "."
-    )
+    assert right in text
+    module.write_text(text.replace(right, wrong))
+    done = own_tests(package, "-k", name)
     assert done.returncode == 1
-    assert "came to rest elsewhere: x_um" in done.stdout
+    assert says in done.stdout
+
+
+@pytest.mark.parametrize("kind", ["camera"], indirect=True)
+def test_the_program_finds_the_camera_and_photographs(package: Path) -> None:
+    found = run(package, "-c", PROGRAM, "devices")
+    lines = '[camera]\ndriver = "my_camera"\nserial_number = "MC100-0042"\n'
+    assert all(line in found.stdout for line in lines.splitlines()), found.stdout + found.stderr
+    (package / "bench.toml").write_text(lines)
+    taken = run(package, "-c", PROGRAM, "snap", "--out", "photo.tif", "--as-is", "--bench", "bench.toml")
+    assert taken.returncode == 0, taken.stdout + taken.stderr
+    assert tifffile.imread(package / "photo.tif").shape == (120, 160)
 
 
 @pytest.fixture

@@ -6,10 +6,11 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from drivers.camera import Camera, Roi, TriggerEdge, TriggerMode
 from drivers.device import DeviceIdentity
+from drivers.errors import LimitError
 
 GainUnit = Literal["dB", "factor", "steps"]
 
@@ -74,6 +75,8 @@ class KeptSettings(Camera):
     _trigger_mode: TriggerMode = "free_run"
     _trigger_line: str = ""
     _trigger_edge: TriggerEdge = "rising"
+    no_binning: ClassVar[str] = "It does not bin."
+    """What an operator of a camera without binning is told."""
 
     def __init__(self) -> None:
         self._remembered: dict[str, Callable[[], object]] = {}
@@ -157,6 +160,23 @@ class KeptSettings(Camera):
         """Region of interest."""
         self._require()
         return self._roi
+
+    @property
+    def binning(self) -> int:
+        """Sensor pixels summed along each axis: 1, but of drivers that say otherwise."""
+        return 1
+
+    @property
+    def binnings(self) -> tuple[int, ...]:
+        """The binning factors that the camera offers: 1 alone, but of drivers that say otherwise."""
+        return (1,)
+
+    def set_binning(self, binning: int) -> int:
+        """Take 1, refuse everything else."""
+        self._require_idle("binning")
+        if binning != 1:
+            raise LimitError(self.name, f"has no binning {binning}.", self.no_binning)
+        return 1
 
     @property
     def trigger_mode(self) -> TriggerMode:

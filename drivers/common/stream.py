@@ -8,12 +8,13 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from drivers.common.answers import STOP_ANSWER_S, within
+from drivers.common.answers import CALL_MARGIN_S, STOP_ANSWER_S, within
 from drivers.common.stream_reader import StreamReader, Subscription
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import Frame
@@ -122,7 +123,10 @@ class FrameStream:
 
     # Starting and ending -------------------------------------------------------------------------
     def start(self) -> Self:
-        """Start the camera's sequence."""
+        """Start the camera's sequence.
+
+        Raises DeviceError when it cannot be started, DeviceTimeoutError when its driver hangs.
+        """
         if self._thread is not None:
             raise DeviceError(self.camera.name, "this stream has been started before.", "Make a new one.")
         shape, dtype = self.camera.frame_shape, self.camera.frame_dtype
@@ -130,7 +134,12 @@ class FrameStream:
         self._pool = BufferPool(self.n_buffers + 2, shape, dtype)
         self._scratch: Pixels = np.empty(shape, dtype)
         self._answer_limit_s = self.camera.longest_wait_s + STOP_ANSWER_S
-        self.camera.start_sequence(self.n_buffers)
+        within(
+            CALL_MARGIN_S,
+            self.camera.name,
+            "starting its sequence",
+            partial(self.camera.start_sequence, self.n_buffers),
+        )
         self._running = True
         self._thread = threading.Thread(
             target=self._produce, name=f"stream of {self.camera.name}", daemon=True

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from drivers.common.stream import FrameStream, Slot
 
 
+_POLL_S = 1.0
+
+
 @dataclass(frozen=True, slots=True)
 class StreamStatus:
     """Where every frame of a stream went, as one reader sees it since it began.
@@ -79,11 +82,18 @@ class StreamReader:
         The frame's ``dropped_before`` counts all frames between it and the one got before: lost by the
         device, or missed by this reader.
 
-        Raises DeviceError when the camera failed; frames that came before are returned first.
+        Raises DeviceError when the camera failed, DeviceTimeoutError when its driver hangs; frames that came
+        before are returned first.
         """
         stream = self._stream
         with stream.changed:
-            stream.changed.wait_for(lambda: not stream.is_running or self._oldest() is not None, timeout_s)
+            while not stream.changed.wait_for(
+                lambda: not stream.is_running or self._oldest() is not None,
+                _POLL_S if timeout_s is None else timeout_s,
+            ):
+                stream.require_answer()
+                if timeout_s is not None:
+                    break
             slot = self._oldest()
             if slot is None:
                 if stream.error is not None:

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager
 from typing import Literal
 
-from drivers.errors import LimitError
+from drivers.errors import DeviceError, LimitError
 
 FeatureValue = str | bool | int | float
 FeatureKind = Literal["number", "choice", "switch", "command", "text"]
@@ -108,7 +108,10 @@ class Features(ABC):
         return self.number(name)
 
     def choose(self, name: str, entry: str) -> str:
-        """Choose the entry of an enumeration; returns what it reads afterwards."""
+        """Choose the entry of an enumeration; returns what it reads afterwards.
+
+        Raises LimitError when it is not on offer; DeviceError when it reads another afterwards.
+        """
         offered = self.entries(name)
         if entry not in offered:
             raise LimitError(
@@ -116,7 +119,9 @@ class Features(ABC):
             )
         with self.words(f"take {entry} for its {name}"):
             self._write_text(name, entry)
-        return self.text(name)
+        if (said := self.text(name)) != entry:
+            raise DeviceError(self.name, f"was told {name} = {entry} and has {said}.", "See its firmware.")
+        return said
 
     def execute(self, name: str) -> None:
         """Execute a command."""

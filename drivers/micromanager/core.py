@@ -274,7 +274,7 @@ class Part:
         """Set a property; returns what the device made of it.
 
         Raises LimitError when there is no such property, or the value is none that it takes; DeviceError when
-        the adapter refuses.
+        the adapter refuses, or has another choice afterwards.
         """
         if not self.has(name):
             raise LimitError(
@@ -296,7 +296,10 @@ class Part:
                 self.name, f"has no {name} {wanted}.", f"{name} is {bounds[0]:g} to {bounds[1]:g}."
             )
         self.call(f"set {name!r} to {wanted!r}", "setProperty", name, wanted)
-        return self.text(name)
+        said = self.text(name)
+        if choices and said != wanted:
+            raise DeviceError(self.name, f"was told {name} = {wanted} and has {said}.", "See its adapter.")
+        return said
 
     def _within(self, wanted: str, bounds: tuple[float, float]) -> bool:
         try:

@@ -104,6 +104,9 @@ Rgb = tuple[float, float, float]
 Image = npt.NDArray[np.float32]
 
 CACHE_BYTES = 256 << 20
+SOURCES_KEPT = 96
+"""Lights of the point source that are kept: 32 places in three bands. A stage comes back to a place within
+its play, not to the nanometre, so that old ones would only fill the memory."""
 BAND_WEIGHTS: tuple[Rgb, Rgb, Rgb] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -230,13 +233,15 @@ class SimulatedWorld(Surroundings):
     def _psf(self, source: Position, weights: Rgb, binning: int) -> Image:
         grid = self.sensor_grid(binning)
         spectrum = mixed_spectrum(weights, self.options.spectral_samples)
-        light = self.propagator.psf(
+        # Not the propagator's psf(), which keeps a second copy.
+        caustic = self.propagator.caustic(
             source,
             grid,
             spectrum,
             diameter_um=self.source_diameter_um,
             emission="isotropic" if self.preset.fluorescent else "lambertian",
         )
+        light = caustic.on(grid)
         light *= response_on(grid, source, self.distance_um, self.fall_off)
         return light
 
@@ -423,6 +428,8 @@ class SimulatedWorld(Surroundings):
             image = make()
             image.flags.writeable = False
             self._cache[key] = image
+            for old in [kept for kept in self._cache if kept[0] == "psf"][:-SOURCES_KEPT]:
+                del self._cache[old]
             while sum(entry.nbytes for entry in self._cache.values()) > CACHE_BYTES and len(self._cache) > 1:
                 self._cache.popitem(last=False)
             return image

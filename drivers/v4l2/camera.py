@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import time
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
-import numpy as np
 from pydantic import Field, PositiveInt
 
 from drivers.camera import Roi
-from drivers.common.buffered_camera import BufferedCamera, RawFrame
+from drivers.common.buffered_camera import RawFrame
 from drivers.common.camera_settings import GainScale, GainUnit
 from drivers.common.drops import FrameNumberCounter
 from drivers.common.pixels import Bytes, Pixels
+from drivers.common.running_camera import RunningCamera
 from drivers.device import DriverOptions, FoundDevice, OwnSetting, Setting, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceLostError, LimitError
 from drivers.registry.buses import lasting_name, video_devices
@@ -24,6 +22,7 @@ from drivers.v4l2.controls import Control, Controls, Quantity
 from drivers.v4l2.device import FilledBuffer, VideoDevice
 from drivers.v4l2.formats import V4l2Format, decode
 from drivers.v4l2.images import Images
+from drivers.v4l2.node import Node
 
 _SEQUENCE_MODULUS = 1 << 32
 _EXPOSURE_COUNT_MS = 0.1
@@ -37,6 +36,13 @@ class V4l2Options(DriverOptions):
         "/dev/video0",
         min_length=1,
         description="Device node; a link in /dev/v4l/by-id stays the same when cameras are plugged anew.",
+    )
+    subdevices: tuple[str, ...] = Field(
+        (),
+        description=(
+            'Nodes with controls of the sensor or the lens, e.g. ["/dev/v4l-subdev0"]: camera modules, whose '
+            "/dev/video* has none (media-ctl -p names them)."
+        ),
     )
     pixel_pitch_um: float = Field(
         gt=0, description="Pitch of the pixels as they are sent, micrometres: no V4L2 driver knows it."
@@ -74,7 +80,7 @@ class V4l2Options(DriverOptions):
     )
 
 
-class V4l2Camera(BufferedCamera):
+class V4l2Camera(RunningCamera):
     """A V4L2 camera; lost frames are counted by the kernel's sequence numbers.
 
     V4L2 knows no trigger line. In mode ``"software"`` the camera runs on, and the driver hands out, for each
@@ -82,6 +88,7 @@ class V4l2Camera(BufferedCamera):
     """
 
     Options = V4l2Options
+    no_binning = "V4L2 has none: choose a smaller size."
     kernel: ClassVar[api.Kernel] = api.LinuxKernel()
     """What makes the system calls."""
 
@@ -90,13 +97,15 @@ class V4l2Camera(BufferedCamera):
         self.options = V4l2Options.of(options)
         self.frames_to_skip = self.options.frames_to_skip
         self._device = VideoDevice(self.options.device, self.name, self.kernel, self._note_lost)
-        self._triggers: deque[int] = deque()
-        self._scratch: Pixels | None = None
+        self._subdevices = [
+            Node(path, self.name, self.kernel, self._note_lost) for path in self.options.subdevices
+        ]
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
-        """Claim the device node, whatever link it is named by."""
-        return (port_claim(V4l2Options.of(options).device),)
+        """Claim the nodes, whatever links they are named by."""
+        given = V4l2Options.of(options)
+        return tuple(port_claim(node) for node in (given.device, *given.subdevices))
 
     @classmethod
     def discover(cls) -> tuple[FoundDevice, ...]:
@@ -133,12 +142,14 @@ class V4l2Camera(BufferedCamera):
     def _connect(self) -> None:
         self._device.open()
         try:
+            for node in self._subdevices:
+                node.open()
             if self.options.input is not None:
                 self._device.call(
                     api.S_INPUT, api.InputNumber(self.options.input), f"take input {self.options.input}"
                 )
             self._identity = self._device.identity()
-            self._controls = Controls(self._device)
+            self._controls = Controls((self._device, *self._subdevices))
             self._find_quantities()
             self._controls.switch_automatics_off()
             self._trigger_mode = "free_run"
@@ -149,11 +160,12 @@ class V4l2Camera(BufferedCamera):
             self._exposure_ms = self._read_exposure()
             self._gain = self._read_gain()
         except BaseException:
-            self._device.close()
+            self._disconnect()
             raise
 
     def _disconnect(self) -> None:
-        self._device.close()
+        for node in (self._device, *self._subdevices):
+            node.close()
 
     def _find_quantities(self) -> None:
         options, controls = self.options, self._controls
@@ -373,31 +385,9 @@ class V4l2Camera(BufferedCamera):
         self._remember("roi", lambda: self.set_roi(roi))
         return self._roi
 
-    @property
-    def binning(self) -> int:
-        """Always 1: V4L2 has no binning, sizes other than the largest may be binned by the camera."""
-        return 1
-
-    @property
-    def binnings(self) -> tuple[int, ...]:
-        """Only 1."""
-        return (1,)
-
-    def set_binning(self, binning: int) -> int:
-        """Take 1, refuse everything else."""
-        self._require_idle("binning")
-        if binning != 1:
-            raise LimitError(self.name, f"has no binning {binning}.", "V4L2 has none: choose a smaller size.")
-        return 1
-
     # Streaming -------------------------------------------------------------------------------------
     def _begin(self, n_buffers: int) -> FrameNumberCounter | None:
-        self._triggers.clear()
-        whole = (self._images.made.height, self._images.made.width)
-        frame = self.frame_shape
-        self._scratch = None
-        if frame[:2] != whole:
-            self._scratch = np.empty((*whole, *frame[2:]), self.frame_dtype)
+        self._make_ready((self._images.made.height, self._images.made.width))
         self._device.start(n_buffers)
         return None if self._trigger_mode == "software" else FrameNumberCounter(_SEQUENCE_MODULUS)
 
@@ -430,27 +420,5 @@ class V4l2Camera(BufferedCamera):
     def _end(self) -> None:
         self._device.stop()
 
-    def _decode(self, data: Bytes, out: Pixels) -> bool:
-        if self._scratch is None:
-            return decode(data, self._images.format, self._images.made.bytesperline, out)
-        if not decode(data, self._images.format, self._images.made.bytesperline, self._scratch):
-            return False
-        roi = self._roi
-        np.copyto(out, self._scratch[roi.top : roi.top + roi.height, roi.left : roi.left + roi.width])
-        return True
-
-    # Triggers by software: the camera runs on, frames are let through ------------------------------
-    def _fire(self) -> None:
-        self._triggers.append(time.monotonic_ns())
-
-    def _asked_for(self, raw: RawFrame) -> bool:
-        if self._trigger_mode != "software":
-            return True
-        if not self._triggers:
-            return False
-        ended_ns = raw.device_time_ns if raw.device_time_ns is not None else time.monotonic_ns()
-        # Without the kernel's clock the arrival stands in for it; the exposure before it is an upper bound.
-        if ended_ns - round(self._exposure_ms * 1e6) < self._triggers[0]:
-            return False
-        self._triggers.popleft()
-        return True
+    def _decode_whole(self, data: Bytes, out: Pixels) -> bool:
+        return decode(data, self._images.format, self._images.made.bytesperline, out)

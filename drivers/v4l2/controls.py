@@ -5,13 +5,13 @@ from __future__ import annotations
 import errno
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from drivers.common.camera_settings import GainScale
 from drivers.errors import DeviceError, LimitError
 from drivers.v4l2 import api
-from drivers.v4l2.device import VideoDevice
+from drivers.v4l2.node import Node
 
 _log = logging.getLogger(__name__)
 _SETTABLE = (
@@ -51,6 +51,8 @@ class Control:
     menu : mapping
         Value to text, for menus.
     flags : int
+    node : Node
+        Where it is read and set.
     """
 
     id: int
@@ -62,6 +64,7 @@ class Control:
     default: int
     menu: Mapping[int, str]
     flags: int
+    node: Node
 
     @property
     def readable(self) -> bool:
@@ -96,20 +99,32 @@ class Control:
 
 
 class Controls:
-    """All controls of an open device that hold a number; read anew at each opening."""
+    """All controls of a camera's open nodes that hold a number; read anew at each opening.
 
-    def __init__(self, device: VideoDevice) -> None:
-        self._device = device
+    Where several nodes have the same control the first of them counts: a driver that hands on those of its
+    sensor shows them itself.
+    """
+
+    def __init__(self, nodes: Sequence[Node]) -> None:
+        self._name = nodes[0].name
         self.by_name: dict[str, Control] = {}
         self.by_id: dict[int, Control] = {}
+        for node in nodes:
+            self._look_at(node)
+
+    def _look_at(self, node: Node) -> None:
         last = 0
         for _ in range(_MOST):
             found = api.QueryControl(id=last | api.CTRL_FLAG_NEXT_CTRL)
-            if device.attempt(api.QUERYCTRL, found) or found.id <= last:
+            if node.attempt(api.QUERYCTRL, found) or found.id <= last:
                 break
             last = found.id
-            if found.type in _SETTABLE and not found.flags & api.CTRL_FLAG_DISABLED:
-                control = self._control(found)
+            if (
+                found.type in _SETTABLE
+                and not found.flags & api.CTRL_FLAG_DISABLED
+                and found.id not in self.by_id
+            ):
+                control = _control(node, found)
                 self.by_id[control.id] = control
                 self.by_name.setdefault(control.name, control)
 
@@ -123,7 +138,7 @@ class Controls:
             return self.by_name[name]
         except KeyError:
             raise LimitError(
-                self._device.name,
+                self._name,
                 f"has no control {name!r}.",
                 f"It has {', '.join(sorted(self.by_name)) or 'none'}.",
             ) from None
@@ -152,7 +167,7 @@ class Controls:
             ]
             if not manual:
                 raise DeviceError(
-                    self._device.name,
+                    self._name,
                     f"its exposure cannot be set by hand: {auto.name} offers {auto.range_text}.",
                     "Use another camera.",
                 )
@@ -167,14 +182,14 @@ class Controls:
             _log.warning(
                 "%s: switched off what it set by itself (%s); what it had set stays until controls in "
                 "bench.toml say otherwise.",
-                self._device.name,
+                self._name,
                 ", ".join(switched),
             )
 
     def get(self, control: Control) -> int:
         """Read a control."""
         value = api.ControlValue(id=control.id)
-        self._device.call(api.G_CTRL, value, f"read its control {control.name}")
+        control.node.call(api.G_CTRL, value, f"read its control {control.name}")
         return value.value & _ALL_BITS if control.type == api.CTRL_TYPE_BITMASK else value.value
 
     def set(self, control: Control, value: int) -> int:
@@ -185,57 +200,37 @@ class Controls:
         """
         if not control.takes(value):
             raise LimitError(
-                self._device.name,
+                self._name,
                 f"control {control.name} does not take {value}.",
                 f"It takes {control.range_text}.",
             )
-        number = self._device.attempt(api.S_CTRL, api.ControlValue(id=control.id, value=value))
+        number = control.node.attempt(api.S_CTRL, api.ControlValue(id=control.id, value=value))
         if number == errno.ERANGE:
             raise LimitError(
-                self._device.name, f"refuses {value} for {control.name}.", f"It takes {control.range_text}."
+                self._name, f"refuses {value} for {control.name}.", f"It takes {control.range_text}."
             )
         if number in (errno.EACCES, errno.EBUSY):
             why = "is read only" if number == errno.EACCES else "cannot be set now"
             raise DeviceError(
-                self._device.name,
+                self._name,
                 f"control {control.name} {why}.",
                 "Is an automatic on, or a sequence running?",
             )
         if number:
-            self._device.call(
+            control.node.call(
                 api.S_CTRL, api.ControlValue(id=control.id, value=value), f"set its control {control.name}"
             )
         if not control.readable:
             return value
         now = self.get(control)
         if now != value:
-            _log.warning("%s: control %s is %d, asked for %d", self._device.name, control.name, now, value)
+            _log.warning("%s: control %s is %d, asked for %d", self._name, control.name, now, value)
         return now
 
     def text(self, control: Control) -> str | int:
         """Return a control's value as settings list it: menus with their text."""
         value = self.get(control)
         return f"{value} ({control.menu[value]})" if value in control.menu else value
-
-    def _control(self, found: api.QueryControl) -> Control:
-        menu: dict[int, str] = {}
-        if found.type in (api.CTRL_TYPE_MENU, api.CTRL_TYPE_INTEGER_MENU):
-            for index in range(max(found.minimum, 0), min(found.maximum, _MOST) + 1):
-                item = api.QueryMenu(id=found.id, index=index)
-                if self._device.attempt(api.QUERYMENU, item) == 0:  # menus may have gaps
-                    number = found.type == api.CTRL_TYPE_INTEGER_MENU
-                    menu[index] = str(item.u.value) if number else item.u.name.decode(errors="replace")
-        return Control(
-            id=found.id,
-            name=re.sub(r"[^a-z0-9]+", "_", found.name.decode(errors="replace").lower()).strip("_"),
-            type=found.type,
-            minimum=found.minimum,
-            maximum=found.maximum & _ALL_BITS if found.type == api.CTRL_TYPE_BITMASK else found.maximum,
-            step=found.step,
-            default=found.default_value,
-            menu=menu,
-            flags=found.flags,
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,3 +255,25 @@ class Quantity:
         """Set it to the nearest of its steps; returns what it is afterwards."""
         self.controls.set(self.control, self.control.on_step(self.scale.number(value)))
         return self.read()
+
+
+def _control(node: Node, found: api.QueryControl) -> Control:
+    menu: dict[int, str] = {}
+    if found.type in (api.CTRL_TYPE_MENU, api.CTRL_TYPE_INTEGER_MENU):
+        for index in range(max(found.minimum, 0), min(found.maximum, _MOST) + 1):
+            item = api.QueryMenu(id=found.id, index=index)
+            if node.attempt(api.QUERYMENU, item) == 0:  # menus may have gaps
+                number = found.type == api.CTRL_TYPE_INTEGER_MENU
+                menu[index] = str(item.u.value) if number else item.u.name.decode(errors="replace")
+    return Control(
+        id=found.id,
+        name=re.sub(r"[^a-z0-9]+", "_", found.name.decode(errors="replace").lower()).strip("_"),
+        type=found.type,
+        minimum=found.minimum,
+        maximum=found.maximum & _ALL_BITS if found.type == api.CTRL_TYPE_BITMASK else found.maximum,
+        step=found.step,
+        default=found.default_value,
+        menu=menu,
+        flags=found.flags,
+        node=node,
+    )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-from collections.abc import Callable, Iterator
-from ctypes import Structure, addressof
+from collections.abc import Callable
+from ctypes import addressof
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,12 @@ import numpy as np
 
 from drivers.common.pixels import Bytes
 from drivers.device import DeviceIdentity
-from drivers.errors import DeviceError, DeviceLostError, DeviceNotOpenError
+from drivers.errors import DeviceError, DeviceLostError
 from drivers.registry.buses import video_devices
-from drivers.registry.claim import DeviceBusyError
 from drivers.v4l2 import api
+from drivers.v4l2.node import Node
 
 _VIRTUAL_DRIVERS = ("vivid", "vimc")
-_GONE = (errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,18 +34,8 @@ class FilledBuffer:
     time_ns: int
 
 
-class VideoDevice:
-    """An open ``/dev/video*``.
-
-    Parameters
-    ----------
-    path : str
-    name : str
-        The device as error messages name it.
-    kernel : Kernel
-    on_lost : callable, optional
-        Called with the error when the device turns out to be gone.
-    """
+class VideoDevice(Node):
+    """An open ``/dev/video*``; parameters as of :class:`~drivers.v4l2.node.Node`."""
 
     def __init__(
         self,
@@ -55,31 +44,19 @@ class VideoDevice:
         kernel: api.Kernel,
         on_lost: Callable[[DeviceLostError], None] | None = None,
     ) -> None:
-        self.path = path
-        self.name = name
-        self._kernel = kernel
-        self._on_lost = on_lost
-        self._fd: int | None = None
+        super().__init__(path, name, kernel, on_lost)
         self._wake_fd = -1
         self._maps: list[Any] = []
         self.buffer_type = api.BUF_TYPE_VIDEO_CAPTURE
         """How the driver is spoken to: with memory planes (of which images here have one), or without."""
         self._requested = False
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the node is open."""
-        return self._fd is not None
-
     def open(self) -> None:
         """Open the node and see that it is a camera that streams.
 
         Raises DeviceError: missing, not permitted, no camera.
         """
-        try:
-            self._fd = self._kernel.open(self.path)
-        except OSError as error:
-            raise self._open_error(error) from error
+        super().open()
         self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         try:
             found = self.capability()
@@ -120,8 +97,7 @@ class VideoDevice:
         if self._fd is None:
             return
         self.stop()
-        fd, self._fd = self._fd, None
-        self._kernel.close(fd)
+        super().close()
         os.close(self._wake_fd)
 
     def capability(self) -> api.Capability:
@@ -131,33 +107,6 @@ class VideoDevice:
         if not found.capabilities & api.CAP_DEVICE_CAPS:
             found.device_caps = found.capabilities
         return found
-
-    # Calls -----------------------------------------------------------------------------------------
-    def call(self, request: int, argument: Structure, doing: str) -> None:
-        """Call the driver; ``doing`` completes "it did not ..." in the error."""
-        number = self.attempt(request, argument)
-        if number:
-            raise self._error(number, doing)
-
-    def attempt(self, request: int, argument: Structure) -> int:
-        """Call the driver; returns 0 or the error's number (a device that is gone raises)."""
-        if self._fd is None:
-            raise DeviceNotOpenError(self.name)
-        try:
-            self._kernel.ioctl(self._fd, request, argument)
-        except OSError as error:
-            if error.errno in _GONE:
-                raise self._gone() from error
-            return error.errno or errno.EIO
-        return 0
-
-    def enumerate(self, request: int, kind: type[Structure], **given: int) -> Iterator[Any]:
-        """Yield what an enumeration gives for index 0, 1, ... until it says that there is no more."""
-        for index in range(1000):
-            item = kind(index=index, **given)
-            if self.attempt(request, item):
-                return
-            yield item
 
     # Buffers ---------------------------------------------------------------------------------------
     def start(self, n_buffers: int) -> int:
@@ -228,47 +177,3 @@ class VideoDevice:
             buffer.plane = api.Plane()
             buffer.m.planes, buffer.length = addressof(buffer.plane), 1
         return buffer
-
-    # Errors ----------------------------------------------------------------------------------------
-    def _gone(self) -> DeviceLostError:
-        error = DeviceLostError(
-            self.name, f"{self.path} is gone: unplugged or switched off.", "Plug it in and open it again."
-        )
-        if self._on_lost is not None:
-            self._on_lost(error)
-        return error
-
-    def _error(self, number: int, doing: str) -> DeviceError:
-        if number == errno.EBUSY:
-            return DeviceBusyError(
-                self.name,
-                f"{self.path} is in use by another program.",
-                f"Close it (fuser -v {self.path} names it).",
-            )
-        if number == errno.EIO:
-            remedy = "The camera or its connection failed: check the cable, another port, and dmesg."
-        elif number == errno.ENOSPC:
-            remedy = "USB has no bandwidth left: try another port, or fewer frames a second."
-        else:
-            remedy = "dmesg may say more."
-        return DeviceError(self.name, f"did not {doing}: {os.strerror(number)}.", remedy)
-
-    def _open_error(self, error: OSError) -> DeviceError:
-        if error.errno in (errno.EACCES, errno.EPERM):
-            return DeviceError(
-                self.name,
-                f"{self.path} may not be opened by this user.",
-                "Add the user to the group 'video': sudo usermod -aG video $USER, then log in again.",
-            )
-        if error.errno == errno.EBUSY:
-            return self._error(errno.EBUSY, "open")
-        if error.errno in (errno.ENOENT, *_GONE):
-            there = sorted(str(node) for node in Path("/dev").glob("video*"))
-            return DeviceError(
-                self.name,
-                f"there is no {self.path}.",
-                f"Video devices here: {', '.join(there) or 'none'}. Is the camera plugged in?",
-            )
-        return DeviceError(
-            self.name, f"{self.path} cannot be opened: {error.strerror}.", "dmesg may say more."
-        )

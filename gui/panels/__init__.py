@@ -11,6 +11,7 @@ from PySide6.QtWidgets import QWidget
 from gui.panel import Panel
 from gui.panels.unserved import UnservedPanel, why_not
 from gui.session import BenchSession
+from gui.theme import dress
 
 Area = Literal["centre", "top right", "right", "bottom"]
 
@@ -47,6 +48,7 @@ class PanelEntry(NamedTuple):
         else:
             panel = self.load()(session)
         panel.title = self.title
+        dress(panel)
         try:
             yield
             yield from panel.parts()

@@ -8,9 +8,8 @@ from PySide6.QtWidgets import QToolButton, QWidget
 
 from gui.session import BenchSession
 from gui.session_news import name_of
-from gui.theme import colours
 from gui.way_on import ReconnectButton
-from gui.widgets.building import fill, label
+from gui.widgets.building import fill, label, mark
 from gui.widgets.device_settings import DeviceSettings
 from instrument.bench.config import Kind
 
@@ -25,6 +24,7 @@ class DeviceChips(QWidget):
         self.reconnect_buttons: dict[str, ReconnectButton] = {}
         for kind in session.kinds:
             chip = QToolButton()
+            chip.setObjectName("device")
             chip.setAutoRaise(True)
             chip.clicked.connect(partial(self._show_all, kind))
             again = ReconnectButton(session, kind, self, "Reconnect")
@@ -38,19 +38,11 @@ class DeviceChips(QWidget):
     def show_state(self, kind: str) -> None:
         """Show how a device is doing now."""
         state = self._session.state(kind)
-        now = colours()
-        colour = {"open": now.ok, "failed": now.error, "opening": now.warning}.get(state.condition, now.dim)
         chip = self.chips[kind]
         word = {"open": "", "opening": " …", "failed": " failed", "closed": " closed"}[state.condition]
         chip.setText(f"● {name_of(kind)}{word}")
-        chip.setStyleSheet(f"color: {colour}; border: none; padding: 2px 4px;")
+        mark(chip, "condition", state.condition)
         chip.setToolTip(state.text or state.condition)
 
-    def restyle(self) -> None:
-        """Take over the colours of the theme in use."""
-        for kind in self.chips:
-            self.show_state(kind)
-
     def _show_all(self, kind: Kind) -> None:
-        state = self._session.state(kind)
-        DeviceSettings(self._session, kind, state.text or state.condition, self).show()
+        DeviceSettings(self._session, kind, self).show()

@@ -19,6 +19,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from gui.theme import dress
 from gui.widgets.building import button, fill, text_view
 
 Browse = Literal["open", "folder", "save"]
@@ -52,6 +53,7 @@ class Question(QMessageBox):
         icon: QMessageBox.Icon = QMessageBox.Icon.Question,
     ) -> None:
         super().__init__(icon, title, text, parent=parent)
+        dress(self)
         self.setOption(QMessageBox.Option.DontUseNativeDialog)
         self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         self.setWindowModality(Qt.WindowModality.NonModal)
@@ -91,6 +93,7 @@ def choose_path(
         present.activateWindow()
         return present
     dialogue = QFileDialog(parent, title)
+    dress(dialogue)
     dialogue.setOption(QFileDialog.Option.DontUseNativeDialog)
     dialogue.setOption(QFileDialog.Option.DontConfirmOverwrite)  # its own question is modal
     dialogue.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
@@ -167,6 +170,7 @@ class TextWindow(QDialog):
 
     def __init__(self, title: str, text: str, parent: QWidget | None = None) -> None:
         super().__init__(parent)
+        dress(self)
         self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         self.setWindowTitle(title)
         self.resize(760, 420)

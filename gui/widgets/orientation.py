@@ -45,7 +45,6 @@ class OrientationButton(QPushButton):
         super().__init__("⟳")
         self.setAccessibleName("Turn and mirror")
         self.setCheckable(True)
-        self.setStyleSheet("QPushButton::menu-indicator { width: 0; }")
         self._session, self._kind = session, kind
         self.orientation = AS_IT_IS
         self._tip = tip

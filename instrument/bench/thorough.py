@@ -20,6 +20,8 @@ from instrument.files.errors import BenchError
 _SNAPS = 10
 _STREAM_S = 2.0
 _PATTERNS = 12
+_BRIGHTER = 5.0
+"""Standard errors of the mean by which light must be more than dark."""
 _SHARE, _STEPS = 0.01, 200
 """Of its range, and in steps, that an axis is moved by at most."""
 
@@ -133,12 +135,18 @@ def _light(bench: Bench) -> str:
     leds = bench.led_array
     assert leds is not None
     leds.off()
-    dark = float(bench.camera.snap().image.mean())
+    before = bench.camera.snap().image.astype(np.float32)
     bench.source_on()
-    lit = float(bench.camera.snap().image.mean())
-    change = "more light" if lit > dark else "NO MORE LIGHT"
+    change = bench.camera.snap().image - before
+    dark, lit = float(before.mean()), float((before + change).mean())
+    if not lit - dark > _BRIGHTER * float(change.std()) / change.size**0.5:
+        raise DeviceError(
+            leds.name,
+            f"gives no more light: mean {dark:.5g} counts dark, {lit:.5g} lit.",
+            "See that it lights and reaches the camera, and [source] of bench.toml.",
+        )
     return (
-        f"{change}: mean {dark:.5g} counts dark, {lit:.5g} lit; "
+        f"more light: mean {dark:.5g} counts dark, {lit:.5g} lit; "
         f"switching takes {_timed(lambda: leds.set_pattern(bench.source_pattern), 5)}, "
         f"off {_timed(leds.off, 5)}"
     )

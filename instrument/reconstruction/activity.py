@@ -23,17 +23,8 @@ from instrument.reconstruction.video_files import (
     levels_of,
 )
 from recon.base.declare import option
-from recon.streams.activity import (
-    LEAST_FRAMES,
-    Motion,
-    aligned,
-    baseline,
-    change,
-    fading,
-    floor_of,
-    motion,
-    smoothed,
-)
+from recon.streams.activity import LEAST_FRAMES, baseline, change, fading, floor_of, smoothed
+from recon.streams.motion import Motion, aligned, motion
 from recon.streams.regions import Region, Search, find_regions, local_correlation, noise_of
 
 Floats = npt.NDArray[np.float32]

@@ -144,11 +144,16 @@ def _ome_facts(run: Run, indices: list[int], noted: list[FrameMetadata], axis: s
     told = ("pixel_format", "black_level", "gain", "binning", "roi", "led_pattern", "slm_image_hash")
     facts["MapAnnotation"] = {
         "Namespace": "diffuserbench",
-        **{name: str(getattr(first, name)) for name in told},
+        **{name: _told([str(getattr(one, name)) for one in noted]) for name in told},
         "simulated": str(run.is_simulated).lower(),
         "frames": ranges(indices),
     }
     return facts
+
+
+def _told(values: list[str]) -> str:
+    """Return the value of all frames; where they differ, each frame's, in their order."""
+    return values[0] if len(set(values)) == 1 else "; ".join(values)
 
 
 def _hdf5(run: Run, path: Path, indices: list[int], images: Iterator[Image]) -> None:

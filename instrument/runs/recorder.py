@@ -210,8 +210,6 @@ class Recorder:
         while not self._is_done():
             frame = reader.next_frame(0.1)
             if frame is None:
-                if self._stream is not None:
-                    self._stream.require_answer()
                 if not reader.is_running:  # STOP, from another thread
                     raise StoppedError(self._bench.camera.name, "its stream was stopped.")
                 continue

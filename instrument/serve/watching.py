@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from typing import Any, cast
@@ -17,6 +18,7 @@ from instrument.files.errors import BenchError
 from instrument.live.frame_view import SATURATED, fill_indices, histogram, index_table, percentiles
 from instrument.serve.operation import WATCHER, Operation
 
+_log = logging.getLogger(__name__)
 _WIDEST = 1024
 """Pixels of the page's picture along its longer side, at most."""
 _DARKEST, _BRIGHTEST = 0.5, 99.8
@@ -66,6 +68,9 @@ class Watcher:
                     self._take_frames(nobody)
                 except (DeviceError, BenchError) as error:
                     self.trouble = "" if self._is_operated() else str(error)
+                except Exception as error:  # noqa: BLE001 - the page says it, and the next try follows
+                    _log.exception("the camera could not be watched")
+                    self.trouble = f"The camera could not be watched: {type(error).__name__}: {error}."
             nobody.wait(_RETRY_S)
 
     def _is_operated(self) -> bool:

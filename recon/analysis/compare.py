@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.analysis.correlation import autocorrelate, correlate, cut_to_light, lit_extent, similarity
+from recon.analysis.correlation import correlate, cut_to_light, lit_extent, similarity, spot_px
 from recon.camera.refocus import central_psfs, psf_at
 from recon.camera.registration import register
 from recon.camera.transformed import geometric_centre, resampled
@@ -142,7 +142,7 @@ def compare_psfs(new: Array, old: Array, z_um: float = float("nan"), exposure: f
         rotation_deg=float(-np.rad2deg(np.angle(factor))) if recognised else None,
         as_is=correlation.maximum,
         aligned=similarity(moved, old),
-        spot=correlation.spot_px / autocorrelate(new).spot_px,
+        spot=correlation.spot_px / spot_px(new),
         edge_px=abs(factor - 1) * extent,
         decoy=correlate(old, np.ascontiguousarray(new[::-1, ::-1])).maximum,
         brightness=float(new.sum(dtype=np.float64) / old.sum(dtype=np.float64)) / exposure,

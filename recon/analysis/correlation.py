@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from recon.base import fft
 from recon.camera.camera_model import members_of_depths
-from recon.camera.registration import register, rescaled
+from recon.camera.registration import register
 from recon.errors import InputError
 from recon.types import Calibration
 
@@ -25,6 +26,8 @@ RESOLUTION_LEVEL = 0.7
 """Autocorrelation at which two directions are told apart by most sensors (Kuo 2020, sec. 3.2)."""
 INNER_PRODUCT = 0.8
 """Inner product below which two points were told apart in the microscope (sec. 6.4)."""
+SAMPLES = 400_000
+"""Pixels that tell how similar a PSF is to itself, enlarged: to a hundredth of the enlargement."""
 HOLDS = 1.1
 """Spot size relative to the axis up to which the convolution model is said to hold: Fig. 5.1e is flat to
 within this up to 15 degrees, where the dissertation draws the line."""
@@ -62,14 +65,8 @@ class Correlation:
         return self.values[:, column] if axis == 0 else self.values[row]
 
     def half_width(self, axis: int, level: float) -> float:
-        """Return how far from the peak a cut (:meth:`profile`) falls to ``level`` of it, pixels.
-
-        Linear between pixels, mean of both sides; infinite where it never falls so low.
-        """
-        cut = self.profile(axis)
-        middle = int(np.argmax(cut))
-        bar = level * float(cut[middle])
-        return float(np.mean([_crossing(side, bar) for side in (cut[middle:], cut[middle::-1])]))
+        """Return :func:`half_width` of a cut (:meth:`profile`)."""
+        return half_width(self.profile(axis), level)
 
     @property
     def spot_px(self) -> float:
@@ -99,32 +96,73 @@ def autocorrelate(psf: Array) -> Correlation:
     return correlate(psf, psf)
 
 
-def critical_scale(psf: Array, level: float) -> float:
-    """Return the enlargement at which a PSF is only ``level`` similar to itself; infinite beyond 2.
+def autocorrelation_cut(psf: Array, axis: int) -> Floats:
+    """Return what ``autocorrelate(psf).profile(axis)`` does, from transforms of single lines."""
+    lines = np.asarray(psf if axis == 1 else psf.T, np.float64)
+    length = lines.shape[1]
+    padded = np.zeros((len(lines), fft.fast_length(2 * length - 1, real=True)))
+    padded[:, :length] = lines
+    spectrum = np.zeros(padded.shape[1] // 2 + 1)
+    for some in np.array_split(padded, max(1, padded.size >> 21)):
+        transformed = fft.rfft(some, axes=1)
+        spectrum += np.einsum("ij,ij->j", transformed, transformed.conj()).real
+    cut = fft.irfft(spectrum.astype(np.complex128), padded.shape[1], axes=1)
+    return np.asarray(cut[np.arange(1 - length, length)] / (cut[0] or 1.0))
+
+
+def half_width(cut: Floats, level: float) -> float:
+    """Return how far from its peak a cut through a correlation falls to ``level`` of it, pixels.
+
+    Linear between pixels, mean of both sides; infinite where it never falls so low.
+    """
+    middle = int(np.argmax(cut))
+    bar = level * float(cut[middle])
+    return float(np.mean([_crossing(side, bar) for side in (cut[middle:], cut[middle::-1])]))
+
+
+def spot_px(psf: Array) -> float:
+    """Return the size of the spot that a PSF (height, width) makes (:attr:`Correlation.spot_px`)."""
+    widths = [half_width(autocorrelation_cut(psf, axis), RESOLUTION_LEVEL) for axis in (0, 1)]
+    return float(np.sqrt(widths[0] * widths[1]))
+
+
+def critical_scales(psf: Array, *levels: float) -> tuple[float, ...]:
+    """Return the enlargements at which a PSF is only so similar to itself; infinite beyond 2.
 
     Doubled from a tenth of a pixel at the PSF's edge until it is less similar, then bisected twice; linear
-    between what is left.
+    between what is left. Of large PSFs :data:`SAMPLES` pixels, taken at random, are compared.
     """
+    from scipy import ndimage
+
     light = cut_to_light(psf)
-    centre = centre_of_light(light)
+    centre = np.array(centre_of_light(light))[:, None]
+    values = light.ravel()
+    places = np.arange(values.size)
+    if values.size > SAMPLES:
+        places = np.sort(np.random.default_rng(0).choice(values.size, SAMPLES, replace=False))
+        values = values[places]
+    off_centre = np.array(np.unravel_index(places, light.shape)) - centre
+    spline = ndimage.spline_filter(light, order=3)
 
+    @cache
     def seen(by: float) -> float:
-        return similarity(light, rescaled(light, 1.0 / (1.0 + by), centre=centre))
+        nearer = centre + off_centre / (1.0 + by)
+        enlarged = ndimage.map_coordinates(spline, nearer, order=3, prefilter=False)
+        return similarity(values, np.maximum(enlarged, min(float(light.min()), 0.0)))
 
-    low, at_low = 0.0, 1.0
-    high = 0.1 / (0.5 * max(light.shape))
-    while (at_high := seen(high)) > level:
-        low, at_low = high, at_high
-        high *= 2
-        if high > 1:
-            return float("inf")
-    for _ in range(2):
-        middle = 0.5 * (low + high)
-        if (at_middle := seen(middle)) > level:
-            low, at_low = middle, at_middle
-        else:
-            high, at_high = middle, at_middle
-    return float(1.0 + low + (high - low) * (at_low - level) / (at_low - at_high))
+    def scale(level: float) -> float:
+        low, high = 0.0, 0.1 / (0.5 * max(light.shape))
+        while seen(high) > level:
+            low, high = high, 2 * high
+            if high > 1:
+                return float("inf")
+        for _ in range(2):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if seen(middle) > level else (low, middle)
+        at_low, at_high = (seen(by) if by else 1.0 for by in (low, high))
+        return float(1.0 + low + (high - low) * (at_low - level) / (at_low - at_high))
+
+    return tuple(scale(level) for level in levels)
 
 
 def cut_to_light(image: Array) -> Array:
@@ -279,15 +317,18 @@ def across_field(calibration: Calibration) -> tuple[FieldPoint, ...]:
     members = max(members_of_depths(positions), key=len)
     centre = calibration.nearest_to_axis(members)
     reference = calibration.psfs[centre].mean(axis=0)
-    width = autocorrelate(reference).spot_px
+    width = spot_px(reference)
     points = []
     for k in members:
-        psf = calibration.psfs[k].mean(axis=0)
-        # Off the axis the sensor's edge cuts the pattern: only pixels that both show are compared.
-        likeness = 1.0 if k == centre else register(psf, reference).similarity
+        likeness = spot = 1.0
+        if k != centre:
+            psf = calibration.psfs[k].mean(axis=0)
+            # Off the axis the sensor's edge cuts the pattern: only pixels that both show are compared.
+            likeness = register(psf, reference).similarity
+            spot = correlate(reference, psf).spot_px / width
         angle_deg = _angle_between_deg(positions[k], positions[centre])
         x, y, z = map(float, positions[k])
-        points.append(FieldPoint(x, y, z, angle_deg, likeness, correlate(reference, psf).spot_px / width))
+        points.append(FieldPoint(x, y, z, angle_deg, likeness, spot))
     return tuple(sorted(points, key=lambda p: p.angle_deg))
 
 

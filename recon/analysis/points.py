@@ -16,9 +16,7 @@ import numpy.typing as npt
 from recon.analysis.gram import WindowProblem
 from recon.base import fft
 from recon.base.declare import option
-from recon.camera.refocus import psf_at
 from recon.errors import InputError
-from recon.types import Calibration
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
@@ -234,8 +232,13 @@ class PointTests:
     notes: tuple[str, ...]
 
 
+def planes_about(z_um: float, step_per_um: float, count: int = PLANES) -> Floats:
+    """Return ``1 / z`` of planes half an axial step apart about a depth, the nearest first."""
+    return np.asarray(1 / z_um - step_per_um / 2 * (np.arange(count) - count // 2), np.float64)
+
+
 def point_tests(
-    calibration: Calibration,
+    psf_at: Callable[[float], Array],
     z_um: float,
     *,
     lateral_px: float,
@@ -248,6 +251,8 @@ def point_tests(
 
     Parameters
     ----------
+    psf_at : callable
+        ``psf_at(z_um)``: the PSF (height, width) of a point on the axis.
     z_um : float
         Depth of the middle of the tests.
     lateral_px, step_per_um : float
@@ -255,14 +260,13 @@ def point_tests(
     noise : Noise, optional
     image : callable, optional
         ``image(columns, z_um)``: one point's image (height, width), ``columns`` pixels off the axis on the
-        sensor, measured or from other optics than the calibration's. Default: the calibrated PSFs,
-        refocused and shifted between pixels.
+        sensor, measured or from other optics. Default: ``psf_at``, shifted between pixels.
     on_progress : callable, optional
         Called with the share done.
     """
     noise = noise or Noise()
     on_progress = on_progress or (lambda _share: None)
-    inverse = 1 / z_um - step_per_um / 2 * (np.arange(PLANES) - PLANES // 2)
+    inverse = planes_about(z_um, step_per_um)
     notes: list[str] = []
     with_depth = bool(np.isfinite(step_per_um) and inverse[-1] > 0)
     if not with_depth:
@@ -271,8 +275,8 @@ def point_tests(
             f"At {z_um / 1e3:.3g} mm the axial window would reach beyond infinity: points were tested across "
             "the axis only. Choose a nearer depth for tests along it."
         )
-    planes = np.stack([psf_at(calibration, float(1 / v)) for v in inverse])
-    make = image or _Shifted(calibration)
+    planes = np.stack([psf_at(float(1 / v)) for v in inverse])
+    make = image or _Shifted(psf_at, planes.shape[1:])
 
     def point(columns: float, s: float) -> Array:
         # Places between planes, evenly in 1/z.
@@ -347,21 +351,20 @@ def _sixteen(
 
 
 class _Shifted:
-    """Images of points from calibrated PSFs: refocused, then shifted between pixels by a linear phase."""
+    """Images (height, width) of points: PSFs shifted between pixels by a linear phase."""
 
-    def __init__(self, calibration: Calibration) -> None:
-        self._calibration = calibration
+    def __init__(self, psf_at: Callable[[float], Array], shape: tuple[int, ...]) -> None:
+        self._psf_at, self._light = psf_at, shape
         self._spectra: dict[float, Array] = {}
-        height, width = calibration.psfs.shape[-2:]
         # Room on both sides for the shift, which otherwise would wrap around.
-        self._shape = fft.fast_shape((height, width + 4 * HALF_WINDOW[1]))
+        self._shape = fft.fast_shape((shape[0], shape[1] + 4 * HALF_WINDOW[1]))
 
     def __call__(self, columns: float, z_um: float) -> Array:
-        height, width = self._calibration.psfs.shape[-2:]
+        height, width = self._light
         key = round(z_um, 6)
         if key not in self._spectra:
             padded = np.zeros(self._shape)
-            padded[:height, :width] = psf_at(self._calibration, z_um)
+            padded[:height, :width] = self._psf_at(z_um)
             if len(self._spectra) > 2 * PLANES:
                 self._spectra.clear()
             self._spectra[key] = fft.rfft(padded)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,31 +17,31 @@ from recon.analysis.correlation import (
     FieldOfView,
     FieldPoint,
     across_field,
-    autocorrelate,
+    autocorrelation_cut,
     convolution_holds_deg,
     field_of_view,
     half_light_deg,
     lit_extent,
 )
 from recon.analysis.gram import ConditionCurve, Direction, condition_curve
-from recon.analysis.points import PLANES, Noise, PointTests, Reached, point_tests
+from recon.analysis.middle import RIM_PX, Middle
+from recon.analysis.points import PLANES, Noise, PointTests, Reached, planes_about, point_tests
 from recon.analysis.resolution import (
     AxialResolution,
     DepthSimilarity,
     LateralResolution,
     VoxelGrid,
     across_depth,
-    axial_resolution,
+    axial_resolutions,
     axial_spacing_per_um,
     gaussian_response,
-    lateral_resolution,
     lateral_spacing_um,
     support_extent_px,
     voxel_grid,
 )
 from recon.base.declare import option
 from recon.camera.camera_model import choose_model, sort_by_depth
-from recon.camera.refocus import central_psfs, psf_at
+from recon.camera.refocus import central_psfs
 from recon.errors import InputError
 from recon.optics.fall_off import FallOff
 from recon.types import Calibration
@@ -58,8 +59,6 @@ CONDITION_PLANES = 13
 """Planes for groups in depth: four sources four planes apart."""
 STEEPEST = math.atan(40.0)
 """Angle at which a response is taken to have ended."""
-MARGIN_PX = 24
-"""Dark rim kept around the light of cropped PSFs, for shifts."""
 
 
 def _cutoff(typed: str) -> tuple[float, float]:
@@ -217,15 +216,20 @@ def analyse(
     depths, stack = central_psfs(small)
     planes = stack.mean(axis=1)
     on_progress("resolution", 0.0)
-    z_um = settings.z_um or _depth_to_analyse(depths, planes, distance_um, notes)
+
+    @cache
+    def axial_at(k: int) -> tuple[AxialResolution, ...]:
+        return axial_resolutions(planes[k], float(depths[k]), distance_um, RESOLUTION_LEVEL, INNER_PRODUCT)
+
+    z_um = settings.z_um or _depth_to_analyse(depths, lambda k: axial_at(k)[1].step_per_um, notes)
     # Resolution is a matter of measured pixels: of the calibrated PSF nearest to the depth, not of a blend.
     nearest = int(np.argmin(np.abs(1 / depths - 1 / z_um)))
     psf = planes[nearest]
-    lateral = lateral_resolution(psf, RESOLUTION_LEVEL)
-    lateral_inner = lateral_resolution(psf, INNER_PRODUCT)
-    axial = axial_resolution(psf, float(depths[nearest]), distance_um, RESOLUTION_LEVEL)
-    axial_inner = axial_resolution(psf, float(depths[nearest]), distance_um, INNER_PRODUCT)
-    correlation = autocorrelate(psf).profile(1)
+    cuts = [autocorrelation_cut(psf, axis) for axis in (0, 1)]
+    lateral, lateral_inner = (
+        LateralResolution.of(cuts, level) for level in (RESOLUTION_LEVEL, INNER_PRODUCT)
+    )
+    axial, axial_inner = axial_at(nearest)
 
     support = support_extent_px(psf)
     cutoff = settings.cutoff_deg or (None, None)
@@ -252,22 +256,28 @@ def analyse(
     on_progress("depths", 0.2)
     similarity = across_depth(depths, planes) if len(depths) > 1 else None
     on_progress("condition numbers", 0.3)
-    grid_step = axial_inner.step_per_um / 2
-    fine = _fine_planes(small, z_um, grid_step)
+    step = axial_inner.step_per_um
+    farthest = planes_about(z_um, step)[-1]
+    middle = Middle.of(small, z_um, step, reach=1 / z_um - farthest if farthest > 0 else 0.0, dark_rim=True)
+    at = cache(middle.psf_at)
+    inverse = planes_about(z_um, step * middle.spread, CONDITION_PLANES)
+    fine = np.stack([at(float(1 / v)) for v in inverse]) if np.isfinite(step) and inverse[-1] > 0 else None
     if fine is None:
         notes.append("The pattern does not change enough along the axis for condition numbers in depth.")
-    condition = _condition(psf[None] if fine is None else fine, with_depth=fine is not None)
+    condition = _condition(at(z_um)[None] if fine is None else fine, with_depth=fine is not None)
     on_progress("point tests", 0.5)
     tests = None
     if settings.points:
         tests = point_tests(
-            small,
+            at,
             z_um,
             lateral_px=lateral_inner.mean_px,
-            step_per_um=axial_inner.step_per_um,
-            noise=settings.noise,
+            step_per_um=step * middle.spread,
+            noise=middle.noise(settings.noise),
             on_progress=lambda share: on_progress("point tests", 0.5 + 0.2 * share),
         )
+        if tests.axial_per_um is not None:
+            tests = replace(tests, axial_per_um=tests.axial_per_um / middle.spread)
         notes.extend(tests.notes)
     found = None
     if settings.points and reach is not None:
@@ -275,13 +285,12 @@ def analyse(
             calibration,
             z_um,
             lateral_inner.mean_px,
-            axial_inner.step_per_um,
+            step,
             settings.noise,
             on_progress=lambda share: on_progress("two points by default", 0.7 + 0.3 * share),
         )
         notes.extend(_conditions(z_um, settings.noise, found))
     resolution_px = lateral.mean_px
-    step = axial_inner.step_per_um
     if tests is not None:
         resolution_px = tests.lateral_px or resolution_px
         step = tests.axial_per_um or step
@@ -296,7 +305,7 @@ def analyse(
         distance_um=distance_um,
         sensor_shape=sensor_shape,
         psf=psf,
-        autocorrelation=correlation[len(correlation) // 2 :],
+        autocorrelation=cuts[1][len(cuts[1]) // 2 :],
         support_px=support,
         lateral=lateral,
         lateral_inner=lateral_inner,
@@ -308,7 +317,7 @@ def analyse(
         convolution_holds_deg=convolution_holds_deg(field_points),
         depth=similarity,
         condition=condition,
-        condition_voxel=(1.0, grid_step),
+        condition_voxel=(1.0, axial_inner.step_per_um / 2),
         points=tests,
         reached=found,
         half_light_deg=half_light_deg(psf, sensor_shape, pitch_um / distance_um, _fall_off(settings)),
@@ -328,19 +337,17 @@ def analyse(
     )
 
 
-def _depth_to_analyse(depths: Floats, planes: Array, distance_um: float, notes: list[str]) -> float:
+def _depth_to_analyse(depths: Floats, step_per_um: Callable[[int], float], notes: list[str]) -> float:
     """Return the middle of the range in 1/z, or the nearest to it about which depth can be tested at all.
 
-    Far away the planes of the tests along the axis, evenly spaced in 1/z, would reach beyond infinity.
+    Far away the planes of the tests along the axis, evenly spaced in 1/z, would reach beyond infinity:
+    ``step_per_um(k)`` apart at the ``k``-th depth.
     """
     middle = float(2 / (1 / depths[0] + 1 / depths[-1]))
     reach = max(CONDITION_PLANES, PLANES) // 2
     for z_um in (middle, *sorted((float(z) for z in depths if z < middle), reverse=True)):
         nearest = int(np.argmin(np.abs(1 / depths - 1 / z_um)))
-        step = axial_resolution(
-            planes[nearest], float(depths[nearest]), distance_um, INNER_PRODUCT
-        ).step_per_um
-        if 1 / z_um > reach * step / 2:
+        if 1 / z_um > reach * step_per_um(nearest) / 2:
             if z_um != middle:
                 notes.append(
                     f"Analysed at {z_um / 1e3:.3g} mm, not in the middle of the range "
@@ -371,19 +378,10 @@ def _cut_to_light(calibration: Calibration) -> tuple[Calibration, tuple[int, int
         (height, width), lit_extent(calibration.psfs.max(axis=(0, 1))), strict=True
     ):
         # From both ends alike, so that the axis stays where it is.
-        trim = max(min(first, size - 1 - last) - MARGIN_PX, 0)
+        trim = max(min(first, size - 1 - last) - RIM_PX, 0)
         cuts.append(slice(trim, size - trim))
     psfs = np.ascontiguousarray(calibration.psfs[..., cuts[0], cuts[1]])
     return replace(calibration, psfs=psfs, background=None), (height, width)
-
-
-def _fine_planes(calibration: Calibration, z_um: float, step_per_um: float) -> Array | None:
-    """PSFs at planes of the recommended spacing about a depth, refocused where they were not calibrated."""
-    half = CONDITION_PLANES // 2
-    inverse = 1 / z_um + step_per_um * np.arange(half, -half - 1, -1)
-    if not np.isfinite(step_per_um) or inverse[-1] <= 0:
-        return None
-    return np.stack([psf_at(calibration, float(1 / v)) for v in inverse])
 
 
 def _condition(planes: Array, *, with_depth: bool) -> tuple[ConditionCurve, ...]:

@@ -174,10 +174,17 @@ def _details(image: npt.NDArray[np.float32]) -> tuple[float, float]:
 
 
 def saturated_share(image: npt.NDArray[Any]) -> float:
-    """Return the share of pixels at exactly the maximum when it is suspicious, else 0."""
-    at_top = int(np.count_nonzero(image == image.max()))
+    """Return the share of pixels at exactly the maximum when it is suspicious, else 0.
+
+    Clipped pixels are more than those just below; counts of a few photons become fewer towards the brightest.
+    """
+    top = image.max()
+    at_top = int(np.count_nonzero(image == top))
     share = at_top / image.size
-    return share if at_top >= 4 and share > SATURATED_SHARE else 0.0
+    if at_top < 4 or share <= SATURATED_SHARE:
+        return 0.0
+    below = image[image < top]
+    return share if not below.size or at_top > np.count_nonzero(below == below.max()) else 0.0
 
 
 def select_psf(calibration: Calibration, z_um: float | None) -> tuple[npt.NDArray[np.float32], float | None]:

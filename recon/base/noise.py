@@ -46,6 +46,8 @@ _PAIR: Stencil = ((0, 0, 1.0), (0, 1, -1.0))
 ENOUGH = 256
 """Stencils from which a median is trusted as it is: with fewer, the one that says least, errors included, as
 structure only ever adds."""
+FEW = 16
+"""Stencils below which nothing is said."""
 
 TILE = 16
 """Side of the tiles within which noise is taken for even, pixels."""
@@ -78,10 +80,12 @@ def estimate_deviation(measurement: npt.NDArray[Any], valid: npt.NDArray[np.bool
     m = np.asarray(measurement, np.float64)
     v = np.ones(m.shape, bool) if valid is None else valid
     best, least, enough = None, np.inf, min(ENOUGH, m.size // 4)
+    few = max(1, min(FEW, enough))
     for stencil, stride in ((s, n) for s in (_PLANE, _ROW, _PAIR) for n in (1, 2)):
         samples = np.abs(_apply(stencil, stride, m, v))
         found = int(np.count_nonzero(~np.isnan(samples)))
-        bound = float(np.nanmedian(samples)) * (1 + 2 / np.sqrt(found)) if found else np.inf
+        # The median of a few may be next to nothing by chance.
+        bound = float(np.nanmedian(samples)) * (1 + 2 / np.sqrt(found)) if found >= few else np.inf
         if bound < least:
             best, least = samples, bound
         if found >= enough:

@@ -10,7 +10,7 @@ was told apart gives the stated distance.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -19,9 +19,9 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 
 from recon.analysis.correlation import lit_extent
+from recon.analysis.middle import Middle
 from recon.analysis.points import DIP, Noise, Reached, TriedPair, smallest_dip
 from recon.base import fft
-from recon.camera.refocus import psf_at
 from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration
 
@@ -31,8 +31,6 @@ Floats = npt.NDArray[np.float64]
 TOLD = 0.95
 """Share of pairs, at all places between pixels, that the curve tells apart at the stated distance: nine in
 ten are promised."""
-LARGEST_PX = 100_000
-"""Of larger sensors the middle is taken, with as little noise as makes up for the light beyond."""
 PICTURES, PAIRS = 4, 16
 """Pictures that are reconstructed, and pairs in each, half of them along each axis.
 
@@ -73,18 +71,14 @@ class _Pair:
 class _Tests:
     """Pictures of pairs, as the calibration's camera would take them."""
 
-    def __init__(self, calibration: Calibration, z_um: float, noise: Noise, seed: int) -> None:
+    def __init__(self, middle: Middle, z_um: float, noise: Noise, seed: int) -> None:
         self.z_um, self.rng = z_um, np.random.default_rng(seed)
-        whole = calibration.psfs.shape[-2:]
-        shape = _within(whole)
-        self.part = float(np.prod(shape) / np.prod(whole))
-        down, right = (slice((n - m) // 2, (n + m) // 2) for n, m in zip(whole, shape, strict=True))
-        small = np.ascontiguousarray(calibration.psfs[..., down, right])
-        averaged = small.mean(axis=1, keepdims=True)
-        self.calibration = replace(calibration, psfs=averaged, background=None)
-        lost = float(np.square(calibration.psfs, dtype=np.float64).sum() / np.square(small).sum())
-        self.noise = Noise(noise.electrons * lost, noise.read_e * float(np.sqrt(lost)))
+        self.calibration = middle.calibration
+        self.psf = middle.psf_at
+        self.noise = middle.noise(noise)
         self.method = ""
+        # The default looks for stray light where no part of the sensor is dark, as the middle may be.
+        self.background = False if middle.part < 1 else None
 
     def pairs(self, distances: Sequence[float], before: int = 0) -> list[_Pair]:
         """Return pairs in cells of their own, after others along each axis in turn; fewer without room."""
@@ -94,18 +88,21 @@ class _Tests:
             for n, (px, cell) in enumerate(zip(distances, cells, strict=False))
         ]
 
-    def psf(self, z_um: float) -> Array:
-        """Return the PSF at a depth, colours averaged."""
-        return psf_at(self.calibration, z_um)
-
     def told_apart(self, pairs: Sequence[_Pair], light: Floats) -> list[bool]:
         """Photograph and reconstruct pairs that make this light, with the noise of one of them."""
         scale = self.noise.electrons * len(pairs) / float(light.sum()) * self._peak(pairs[0])
         mean = scale * np.maximum(light, 0.0) / len(pairs)
         charge = scale * light + self.rng.poisson(mean) - mean
         charge = charge + self.rng.normal(0.0, self.noise.read_e, light.shape)
-        made = reconstruct(charge / scale, self.calibration, z_um=self.z_um, judged=False)
-        self.method = f"{made.solver}, {made.prior}"
+        # What is chosen for the first picture holds for the others: a third of the time.
+        made = reconstruct(
+            charge / scale,
+            self.calibration,
+            z_um=self.z_um,
+            estimate_background=self.background,
+            judged=False,
+        )
+        self.method, self.background = f"{made.solver}, {made.prior}", made.background is not None
         return [pair.told_apart(made.image) for pair in pairs]
 
     def _peak(self, pair: _Pair) -> float:
@@ -138,7 +135,8 @@ def reached(
     on_progress : callable, optional
         Called with the share done.
     """
-    tests = _Tests(calibration, z_um, noise or Noise(), seed)
+    middle = Middle.of(calibration, z_um, step_per_um)
+    tests = _Tests(middle, z_um, noise or Noise(), seed)
     psf = tests.psf(z_um)
     low = max(start_px, 1.2)
     about, wide = low * np.sqrt(_RANGE), np.sqrt(_RANGE)
@@ -157,8 +155,8 @@ def reached(
             on_progress(max(len(tried) / PAIRS, (number + 1) / 3) / (PICTURES + 1))
     across = stated_px(tried)
     known = [px for px in across if px is not None]
-    focus = _focus_um(tests, _WIDER * max(known), step_per_um) if len(known) == 2 else None
-    return Reached(across, focus, tuple(tried), tests.method, tests.part)
+    focus = _focus_um(tests, _WIDER * max(known), step_per_um, middle.spread) if len(known) == 2 else None
+    return Reached(across, focus, tuple(tried), tests.method, middle.part)
 
 
 def stated_px(tried: Sequence[TriedPair]) -> tuple[float | None, float | None]:
@@ -189,16 +187,19 @@ def stated_px(tried: Sequence[TriedPair]) -> tuple[float | None, float | None]:
     return y, x
 
 
-def _focus_um(tests: _Tests, px: float, step_per_um: float) -> tuple[float, float] | None:
+def _focus_um(
+    tests: _Tests, px: float, step_per_um: float, spread: float = 1.0
+) -> tuple[float, float] | None:
     """Return the nearest and farthest depth from whose points pairs are told apart in the picture.
 
-    None where there is no room for two pairs.
+    Where a part of the sensor stands for the whole, depths are ``spread`` times as far off; what they would
+    be beyond infinity is not told apart. None where there is no room for two pairs.
     """
     focus = 1 / tests.z_um
     steps = step_per_um * _FARTHEST * np.arange(1, _DEPTHS + 1) / _DEPTHS
     ends: list[float] = []
     for sign in (1, -1):
-        inverse = [focus + sign * float(step) for step in steps if sign > 0 or step < focus]
+        inverse = [focus + sign * float(step) for step in steps if sign > 0 or spread * step < focus]
         if not inverse:
             ends.append(0.0)
             continue
@@ -211,23 +212,15 @@ def _focus_um(tests: _Tests, px: float, step_per_um: float) -> tuple[float, floa
             light = np.zeros(tests.calibration.psfs.shape[-2:])
             for n, place in enumerate(tried):
                 here = np.concatenate([pair.points for pair in pairs[2 * n : 2 * n + 2]])
-                light += shifted(tests.psf(float(1 / place)), here)
+                light += shifted(tests.psf(float(1 / (focus + spread * (place - focus)))), here)
             each = tests.told_apart(pairs[: 2 * len(tried)], light)
             told += [each[2 * n] and each[2 * n + 1] for n in range(len(tried))]
         count = [*told, False].index(False)
         ends.append(focus if count == 0 else inverse[count - 1])
-        if sign < 0 and count == len(inverse) < _DEPTHS:
+        if sign < 0 and count == len(inverse) == int((steps < focus).sum()) < _DEPTHS:
             ends[-1] = 0.0
     near, far = ends
     return 1 / near, (1 / far if far > 0 else float("inf"))
-
-
-def _within(shape: tuple[int, ...]) -> tuple[int, int]:
-    """Return a shape of the same middle, no larger than :data:`LARGEST_PX`."""
-    height, width = shape
-    while height * width > LARGEST_PX:
-        height, width = (height - 2, width) if height >= width else (height, width - 2)
-    return height, width
 
 
 def _cells(psf: Array, px: float) -> Floats:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.resolution import lateral_resolution
+from recon.base.blocks import block_mean
 from recon.base.checks import saturated_share
 from recon.camera.camera_model import CAMERAS, ModelName
 from recon.camera.registration import likeness
@@ -39,9 +40,14 @@ Floats = npt.NDArray[np.float32]
 QUICK, THOROUGH = (100, 10), (160, 20)
 """Longest side, about, pixels, and iterations (half as many of volumes). Most right ones are far ahead of
 all decoys in the quick way already: only the others are looked at again."""
-MOST_ERASED, MOST_CLIPPED = 0.75, 0.5
-"""Shares of the blocks of pixels: with more of them erased blocks are smaller; with more of them clipped
-these are not erased, as a few pixels of a dim photograph share its largest count as well."""
+MOST_ERASED, ALL_ERASED = 0.75, 0.95
+"""Shares of the blocks of pixels: with more of them erased blocks are smaller; beyond, clipped ones are not
+erased as well."""
+CLIPPED_BLOCK, MOST_CLIPPED = 0.1, 0.5
+"""Shares of pixels at full scale: of a block's, from which it is erased, and of all used, from which nobody
+is called foreign: what is left is what was dark."""
+CONTRADICTIONS = ((Fit.OFF, Fit.FITS), (Fit.FITS, Fit.FOREIGN))
+"""What the quick and the thorough way may say: then the photograph does not tell."""
 MOST_PLANES = 6
 """Depths that take part, evenly spaced."""
 WEIGHT = 1.0
@@ -88,6 +94,8 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
         return check
     many = few if lit else _small(problem, more_px)
     again = compete(many, thorough, lit=lit)
+    if (check.fit, again.fit) in CONTRADICTIONS:
+        return replace(again, fit=Fit.UNTOLD, better=None)
     # A faint photograph's large pixels may tell what small ones do not.
     check, small = (again, many) if again.fit is not Fit.UNTOLD else (check, few)
     if check.wrong and not lit:  # by stray light, or by light from beyond the field?
@@ -99,6 +107,8 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
             )
             cleared = is_told(again.scores[GIVEN], accuser, small.pixels)
         check = again if cleared else check
+    if check.fit is Fit.FOREIGN and small.clipped > MOST_CLIPPED:
+        return replace(check, fit=Fit.UNTOLD)
     given = _given(problem).depths
     one = given.varies and not problem.depths.varies and given.field_error > VARIED
     return None if one and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
@@ -113,6 +123,8 @@ class _Small:
     varies: bool
     """Whether there are other PSFs over the field; near decoys of one of them then tell nothing."""
     model: ModelName
+    clipped: float
+    """Share of the photograph's pixels that were at full scale."""
 
     @property
     def pixels(self) -> int:
@@ -195,14 +207,18 @@ def _small(problem: Problem, longest_px: int) -> _Small:
     own = slice(channel, channel + 1)
     factor = max(1, round(max(problem.sensor_shape) / longest_px))
     counts, valid = problem.measurement.channels()[own], problem.valid[own]
-    if 0 < saturated_share(counts[valid]) * factor**2 < MOST_CLIPPED:
-        valid = valid & (counts < counts[valid].max())  # a clipped pattern is no pattern's own
     while True:
         photograph = on_blocks(problem.data[own], valid, 1.0, factor, flat=True)
         erased = photograph.erasures
         if factor == 1 or erased is None or np.asarray(erased).mean() < MOST_ERASED:
             break
         factor //= 2
+    if clipped := saturated_share(counts[valid]):  # a clipped pattern is no pattern's own
+        top = (counts == counts[valid].max()).astype(np.float32)
+        over = block_mean(top, factor, about_axis=True)[0] > CLIPPED_BLOCK
+        over = over if erased is None else over | np.asarray(erased)
+        if over.mean() < ALL_ERASED:
+            photograph = replace(photograph, erasures=over)
     depths = problem.depths
     planes = np.unique(np.linspace(0, problem.n_depths - 1, MOST_PLANES).round().astype(int))
     if local := depths.varies and depths.field_error > VARIED:
@@ -214,7 +230,7 @@ def _small(problem: Problem, longest_px: int) -> _Small:
     calibration = replace(calibration, psfs=_on_sensor(psfs, problem.sensor_shape), background=None)
     calibration = reduced_calibration(calibration, factor, None)
     varies = _given(problem).depths.varies
-    return _Small(photograph, calibration, varies, "local" if local else "convolution")
+    return _Small(photograph, calibration, varies, "local" if local else "convolution", clipped)
 
 
 def _given(problem: Problem) -> Problem:

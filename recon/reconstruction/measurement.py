@@ -160,9 +160,19 @@ def channel_noise(data: Floats, valid: npt.NDArray[np.bool_], noise: Noise) -> f
     elif noise is not None:
         deviation = float(noise)
     else:
-        deviation = estimate_deviation(data, valid)
+        deviation = estimate_deviation(data, valid & ~_clipped(data, valid))
     size = float(np.sqrt(np.mean(data[valid].astype(np.float64) ** 2)))
     return max(deviation, LEAST_NOISE * size) or 1.0
+
+
+def _clipped(data: Floats, valid: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Return which pixels are at full scale, as are all around them: such have no noise."""
+    from scipy.ndimage import minimum_filter
+
+    if not 0 < saturated_share(data[valid]) < 1:
+        return np.zeros(data.shape, bool)
+    top = data[valid].max()
+    return np.asarray(minimum_filter(np.where(valid, data, top), 3) == top)
 
 
 def require_same_pixels(psfs: Array, data: Array) -> None:

@@ -355,3 +355,27 @@ def impute(start: int, stop: int, data: Any, weight: Any, e: Any, relax: Any) ->
     for i in range(start, stop):
         for j in range(data.shape[1]):
             data[i, j] -= (1 - weight[i, j]) * relax * e[i, j]
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def move_rows(
+    start: int, stop: int, out: Any, image: Any, down: int, right: int, along: Any, across: Any
+) -> None:
+    """``out <- image`` moved by ``down - f`` and ``right - g``, of whose fractions the four weights are."""
+    height, width = image.shape
+    row = np.empty(width + 3, image.dtype)
+    turn = right % width
+    for i in range(start, stop):
+        a, b = image[(i - down - 1) % height], image[(i - down) % height]
+        c, d = image[(i - down + 1) % height], image[(i - down + 2) % height]
+        for j in range(width):
+            row[j + 1] = along[0] * a[j] + along[1] * b[j] + along[2] * c[j] + along[3] * d[j]
+        row[0], row[width + 1], row[width + 2] = row[width], row[1], row[2]
+        for first, last, to in ((0, width - turn, turn), (width - turn, width, turn - width)):
+            for j in range(first, last):
+                out[i, j + to] = (
+                    across[0] * row[j]
+                    + across[1] * row[j + 1]
+                    + across[2] * row[j + 2]
+                    + across[3] * row[j + 3]
+                )

@@ -270,6 +270,9 @@ class Solver(ABC):
             reason, solution = StopReason.NOT_FINITE, np.zeros_like(solution) if start is None else start
         return Outcome(solution, tuple(history), reason, seconds)
 
+    def move(self, rows: float, columns: float) -> None:  # noqa: B027 (without a way, it stays where it is)
+        """Go on as if the object had moved by so many pixels, to be given data of it where it is now."""
+
     def confirm(self) -> bool:
         """Tell whether the solver, too, takes itself to be converged, now that a rule says so.
 

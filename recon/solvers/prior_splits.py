@@ -21,6 +21,7 @@ from recon.errors import StructureError
 from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import Solver
+from recon.solvers.moving import move
 
 STRIPS = 16
 """Strips a channel is cut into: enough to share among many cores, few enough to cost nothing."""
@@ -98,6 +99,11 @@ class ProxSplit:
         if mu != self.mu:
             self.state = self.split + self.state.dtype.type(self.mu / mu) * (self.state - self.split)
         self.mu = mu
+
+    def move(self, rows: float, columns: float) -> None:
+        """Move with the object."""
+        move(self.state, rows, columns)
+        move(self.split, rows, columns)
 
     def restart(self) -> None:
         """Begin anew from zero."""
@@ -273,6 +279,13 @@ class PriorSplits:
         self.mu[...] = mu
         for other in self.others:
             other.set_penalty(other.balanced(float(np.mean(mu[1]))))
+
+    def move(self, rows: float, columns: float) -> None:
+        """Move with the object, the next right-hand side as well."""
+        for part in (self.y, self.tx, self.ty, self.t_w):
+            move(part, rows, columns)
+        for other in self.others:
+            other.move(rows, columns)
 
     def restart(self) -> None:
         """Begin anew from zero; penalties are to be set again."""

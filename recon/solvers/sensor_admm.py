@@ -172,6 +172,10 @@ class SensorAdmm(PictureSplitting):
             for image, weight in zip(self._data, self._weight, strict=True):
                 fill_smoothly(image, weight)
 
+    def move(self, rows: float, columns: float) -> None:
+        """Move object and dual variables; what is left of the data is noise, which does not move."""
+        self._splits.move(rows, columns)
+
     def restart(self, data: Array) -> None:
         """Begin anew from zero with other data, in the memory that the solver has."""
         self.iteration = 0
@@ -357,7 +361,9 @@ def _compile(dtype: np.dtype[Any]) -> None:
     tiny = Convolution(np.ones((1, 2, 2)), (2, 2), dtype=dtype)
     valid = np.arange(4).reshape(1, 2, 2) > 0
     masked = Erasures(valid, (1, 2, 2), dtype) @ tiny
-    SensorAdmm(masked, np.ones((1, 2, 2), dtype), TotalVariation(1.0), data_steps=2).step()
+    solver = SensorAdmm(masked, np.ones((1, 2, 2), dtype), TotalVariation(1.0), data_steps=2)
+    solver.move(0.5, 0.5)
+    solver.step()
 
 
 def fill_smoothly(image: Array, weight: Array) -> None:

@@ -1,8 +1,7 @@
-"""Fluorescence over time (Kuo 2020, Sec. 6.4): motion, fading, the baseline and the change relative to it."""
+"""Fluorescence over time (Kuo 2020, Sec. 6.4): fading, the baseline and the change relative to it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,68 +25,6 @@ MOST_COMPARED = 500
 """Frames whose light is compared, each with each, to find how it fades; of longer videos every so many."""
 
 _ANCHORS_A_WINDOW = 4
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """How far each frame lies off the mean of all, less the median frame."""
-
-    shifts: npt.NDArray[np.float64]
-    """(n_frames, 2): rows and columns, pixels."""
-    largest_px: float
-    """Of the frames' distances from their median place."""
-
-    @property
-    def is_still(self) -> bool:
-        """Whether dF/F of a pixel means the same place throughout: no frame is off by half a pixel."""
-        return self.largest_px < 0.5
-
-
-def motion(frames: Floats) -> Motion:
-    """Register each frame to the mean of all, by cross-correlation refined to a fraction of a pixel.
-
-    Means are taken off and edges faded out (Hann window); spectra are not whitened, so that what is bright
-    counts most: a cell that is much brighter than all the rest tells the motion by itself.
-
-    Parameters
-    ----------
-    frames : ndarray, (n_frames, height, width)
-    """
-    reference = np.mean(frames, axis=0)
-    window = np.outer(np.hanning(frames.shape[1]), np.hanning(frames.shape[2]))
-    spectrum = np.fft.rfft2((reference - reference.mean()) * window)
-    shifts = np.array([_shift(frame, window, spectrum) for frame in frames])
-    shifts -= np.median(shifts, axis=0)
-    return Motion(shifts, float(np.hypot(*shifts.T).max(initial=0.0)))
-
-
-def aligned(frames: Floats, found: Motion) -> Floats:
-    """Return the frames moved back to their median place, cubic splines, float32."""
-    from scipy import ndimage
-
-    moved = np.empty(frames.shape, np.float32)
-    for frame, shift, place in zip(frames, found.shifts, moved, strict=True):
-        ndimage.shift(frame, -shift, output=place, order=3, mode="nearest")
-    return moved
-
-
-def _shift(frame: Floats, window: Array, reference: Array) -> tuple[float, float]:
-    """Return rows and columns by which a frame lies off the reference, from the correlation's peak."""
-    spectrum = np.fft.rfft2((frame - frame.mean()) * window)
-    correlation = np.fft.irfft2(spectrum * np.conj(reference), s=window.shape)
-    peak = np.unravel_index(int(np.argmax(correlation)), correlation.shape)
-    place = []
-    for axis, n in enumerate(correlation.shape):
-        index = list(peak)
-        values = []
-        for step in (-1, 0, 1):
-            index[axis] = (peak[axis] + step) % n
-            values.append(float(correlation[tuple(index)]))
-        bend = values[0] - 2 * values[1] + values[2]
-        offset = 0.5 * (values[0] - values[2]) / bend if bend < 0 else 0.0
-        whole = int(peak[axis])
-        place.append((whole - n if whole > n // 2 else whole) + float(np.clip(offset, -0.5, 0.5)))
-    return place[0], place[1]
 
 
 def fading(frames: Floats) -> npt.NDArray[np.float64]:

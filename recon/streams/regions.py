@@ -24,7 +24,8 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.errors import InputError
-from recon.streams.activity import Motion, brightness
+from recon.streams.activity import brightness
+from recon.streams.motion import Motion
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]

@@ -29,6 +29,7 @@ from recon.reconstruction.solvers import SOLVERS, OfferedSolver
 from recon.solvers.base import Solver, StoppingRules
 from recon.solvers.sensor_admm import SensorAdmm
 from recon.solvers.splitting import VolumeSplitting
+from recon.streams.motion import Panning
 from recon.types import Calibration
 
 COLD_ITERATIONS, WARM_ITERATIONS = 20, 4
@@ -146,8 +147,8 @@ class VideoSolver:
 
     Whatever camera, background, erasures and depths the problem has, each frame goes on from the one before,
     with all that an iteration builds on (object, dual variables, penalties). Splittings whose data term is
-    solved exactly take new data in the memory that they have; other solvers are made anew for each frame,
-    which costs what their making costs.
+    solved exactly take new data in the memory that they have, and move what they have with a scene that moves
+    as a whole; other solvers are made anew for each frame, which costs what their making costs.
 
     Raises InputError when the solver has no iterations, or no way for the problem.
 
@@ -188,6 +189,7 @@ class VideoSolver:
         self.solvers: list[Any] = [None for _ in self.parts]
         self.iterations = self._calm = 0
         self._cold = True
+        self._panning = Panning()
 
     def close(self) -> None:
         """Remove what the solvers kept on disk; nothing can be solved afterwards."""
@@ -232,8 +234,13 @@ class VideoSolver:
     def take(self, frame: Floats) -> None:
         """Take a frame as of :meth:`next`, to be iterated by :meth:`advance`."""
         self.problem = self._first.with_data(frame)
+        if self._cold:
+            self._panning.forget()
+        by = self._panning.next(self.problem.data, self.problem.valid)
         for place, (part, solver) in enumerate(zip(self.parts, self.solvers, strict=True)):
             part.set_data(self.problem)
+            if any(by) and isinstance(solver, Solver):
+                solver.move(*by)
             if isinstance(solver, SensorAdmm):
                 (solver.restart if self._cold else solver.set_data)(part.data)
             elif isinstance(solver, VolumeSplitting) and not self._cold:

@@ -64,9 +64,9 @@ NOT_OWN = 1.0
 """Standard errors by which tiles prefer the calibration to each of its far decoys, up to which it is not the
 photograph's own: set for one test, the larger of two lets some foreign ones pass (up to 1.4 were seen)."""
 STRUCTURE_NATS, OWN_SHARE = 1000.0, 0.025
-"""Fine structure of a photograph, half its squares beyond the noise, from which a PSF that resolves it has to
-be ahead of its far decoys by that share of it: of 25 right ones the least was 4 %, of 32 foreign ones the
-most 2.7 %."""
+"""Fine structure of a photograph that any of the PSFs explains, half its squares (noise that is thought to be
+less than it is is explained by none), from which one that resolves it has to be ahead of its far decoys by
+that share of all: of 25 right ones the least was 4 %, of 32 foreign ones the most 2.7 %."""
 LIKELIER = 0.05
 """Score of all far decoys beyond the calibration's, relative to it, from which it is not called foreign
 either: in small photographs of a few beads tiles tell little."""
@@ -226,7 +226,8 @@ def check_of(scores: Mapping[Transformation, Score], pixels: int, structure: flo
     unlike = float(np.mean(given.fine)) > EXPLAINED and _lead(given, far.values()) < NOT_OWN
     likelier = all(score.objective > (1 + LIKELIER) * given.objective for score in far.values())
     gained = min((score.objective - given.objective for score in far.values()), default=np.inf)
-    missing = structure * pixels / 2 > STRUCTURE_NATS and gained < OWN_SHARE * structure
+    explained = structure + 1 - min(float(np.mean(score.fine)) for score in scores.values())
+    missing = explained * pixels / 2 > STRUCTURE_NATS and gained < OWN_SHARE * structure
     foreign = ((speaks and unlike) or missing) and not likelier
     return CalibrationCheck(Fit.FOREIGN if foreign else Fit.UNTOLD, scores, pixels)
 

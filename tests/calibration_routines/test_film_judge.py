@@ -11,7 +11,7 @@ from calibration_routines.film_figure import write_film_figure
 from calibration_routines.film_judge import judge, truth_of
 from instrument.reconstruction.activity import Activity
 from recon.optics.animal import draw_animal
-from recon.streams.activity import Motion
+from recon.streams.motion import Motion
 from recon.streams.regions import Region, Search
 
 SHAPE, PERIOD_S = (100, 240), 0.1

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from drivers.common.answers import within
@@ -13,11 +15,14 @@ from drivers.common.stream import FrameStream
 from drivers.errors import DeviceError, DeviceTimeoutError
 from drivers.frame import FrameMetadata
 from instrument.bench.bench import Bench
+from instrument.live.live import LiveView
 from instrument.plan import Part, Plan
 from instrument.runs.acquire import acquire
 from instrument.runs.inspection import run_paths
 from instrument.runs.recorder import record
 from instrument.runs.run import Run, RunCondition
+from recon.streams.live import LiveReconstructor
+from recon.types import Calibration
 from tests.instrument.conftest import mock_drivers
 from tests.instrument.runs.test_recorder import bench_with
 from tests.mocks.free_running import FreeRunningCamera
@@ -30,7 +35,8 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let what takes ten seconds take a quarter of one."""
     for place in ("drivers.common.stream", "instrument.bench.safety", "instrument.bench.bench"):
         monkeypatch.setattr(f"{place}.STOP_ANSWER_S", 0.25)
-    monkeypatch.setattr("instrument.bench.photograph.CALL_MARGIN_S", 0.25)
+    for place in ("drivers.common.stream", "instrument.bench.photograph"):
+        monkeypatch.setattr(f"{place}.CALL_MARGIN_S", 0.25)
     monkeypatch.setattr(FreeRunningCamera, "longest_silence_s", 0.1)
 
 
@@ -68,6 +74,20 @@ def light_is_off(bench: Bench) -> bool:
     return bench.led_array is not None and bench.led_array.pattern.description == "off"
 
 
+@pytest.mark.usefixtures("mock_drivers")
+def test_a_device_that_takes_a_while_to_close_is_not_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = bench_with(FreeRunningCamera())
+    closed = threading.Event()
+
+    def close() -> None:
+        time.sleep(0.3)
+        closed.set()
+
+    monkeypatch.setattr(bench.camera, "close", close)
+    bench.close()
+    assert closed.is_set()
+
+
 @pytest.mark.usefixtures("mock_drivers", "soon")
 def test_a_camera_that_hangs_ends_a_recording_with_what_came_before(tmp_path: Path) -> None:
     camera = HangingCamera()
@@ -80,6 +100,29 @@ def test_a_camera_that_hangs_ends_a_recording_with_what_came_before(tmp_path: Pa
     assert run.records
     assert light_is_off(bench)
     camera.let_go.set()
+
+
+@pytest.mark.usefixtures("soon")
+def test_a_camera_that_hangs_ends_a_live_view_and_every_reader_that_waits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    camera = HangingCamera()
+    psf = np.zeros((1, 1, *camera.frame_shape), np.float32)
+    psf[..., 12, 16] = 1
+    stream = FrameStream(camera).start()
+    view = LiveView(stream, LiveReconstructor(Calibration(psf, np.array([[0.0, 0.0, 1e5]]))))
+    with pytest.raises(DeviceTimeoutError, match="hangs: its driver has not come back"):
+        for _ in view:
+            pass
+    with pytest.raises(DeviceTimeoutError, match="hangs: its driver has not come back"):
+        stream.reader().next_frame()
+    camera.let_go.set()
+    stream.close()
+    let_go = threading.Event()
+    monkeypatch.setattr(camera, "start_sequence", lambda _: let_go.wait(30))
+    with pytest.raises(DeviceTimeoutError, match="hangs: starting its sequence"):
+        FrameStream(camera).start()
+    let_go.set()
 
 
 @pytest.mark.usefixtures("mock_drivers", "soon")

@@ -81,7 +81,7 @@ def test_a_picture_from_its_file_arrives_whole(camera: BaslerCamera) -> None:
     assert np.unique(image).size > 100
 
 
-def test_a_hardware_trigger_sets_line_and_edge(camera: BaslerCamera) -> None:
+def test_a_hardware_trigger_sets_line_and_edge(camera: BaslerCamera, monkeypatch: pytest.MonkeyPatch) -> None:
     assert camera.set_trigger_mode("hardware") == "hardware"
     assert camera._features.text("TriggerMode") == "On"
     assert camera._features.text("TriggerSource") == "Line1"
@@ -94,6 +94,11 @@ def test_a_hardware_trigger_sets_line_and_edge(camera: BaslerCamera) -> None:
     assert camera._features.text("TriggerActivation") == "FallingEdge"
     with pytest.raises(LimitError, match=r"no trigger line 'Line7'\. It offers .*Line3"):
         camera.set_trigger_line("Line7")
+    # A camera that takes a word and has another is not believed.
+    monkeypatch.setattr(camera._features, "_write_text", lambda name, entry: None)
+    with pytest.raises(DeviceError, match=r"was told TriggerSelector = .* and has FrameStart"):
+        camera.set_trigger_mode("free_run")
+    assert camera.trigger_mode == "hardware"
 
 
 def test_a_camera_that_is_unplugged_is_lost_and_comes_back(

@@ -1,4 +1,4 @@
-"""Elliptec, SMC100 and ASI stages keep the contract over their emulators, and say what fails."""
+"""Elliptec, SMC100, ESP and ASI stages keep the contract over their emulators, and say what fails."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from pydantic import ValidationError
 from drivers.asi.stage import AsiOptions, AsiStage
 from drivers.elliptec.stage import ElliptecOptions, ElliptecStage
 from drivers.errors import DeviceError, StoppedError
+from drivers.esp301.stage import Esp301Options, Esp301Stage
 from drivers.smc100.stage import Smc100Options, Smc100Stage
 from drivers.testing.stage import StageContract
-from tests.mocks.port_stages import AsiController, ElliptecBus, Smc100Chain
+from tests.mocks.port_stages import AsiController, ElliptecBus, EspController, Smc100Chain
 
 
 def elliptec(bus: ElliptecBus) -> ElliptecStage:
@@ -27,6 +28,11 @@ def elliptec(bus: ElliptecBus) -> ElliptecStage:
 def smc100(chain: Smc100Chain) -> Smc100Stage:
     axes = {"x_um": {"number": 1}, "z_um": {"number": 2, "reverse": True, "lower_limit": -8000.0}}
     return Smc100Stage(Smc100Options.model_validate({"port": str(chain.link), "axes": axes}))
+
+
+def esp301(controller: EspController) -> Esp301Stage:
+    axes = {"x_um": {"number": 1}, "roll_mrad": {"number": 2, "reverse": True}}
+    return Esp301Stage(Esp301Options.model_validate({"port": str(controller.link), "axes": axes}))
 
 
 def asi(controller: AsiController) -> AsiStage:
@@ -61,6 +67,11 @@ class TestElliptecMuteWhenBusy(PortStageContract):
 class TestSmc100(PortStageContract):
     emulator = Smc100Chain
     stage_of = staticmethod(smc100)
+
+
+class TestEsp301(PortStageContract):
+    emulator = EspController
+    stage_of = staticmethod(esp301)
 
 
 class TestAsi(PortStageContract):
@@ -120,6 +131,39 @@ def test_smc100_failures_are_said_and_a_disabled_axis_is_enabled(tmp_path: Path)
         with pytest.raises(DeviceError, match=r"x_um \(controller 1\): following error"):
             stage.move_to({"x_um": 50.0})
     chain.port.unplug()
+
+
+def test_esp301_failures_are_said_and_its_units_are_kept(tmp_path: Path) -> None:
+    controller = EspController(tmp_path)
+    found = Esp301Stage.probe(str(controller.link))
+    assert found is not None
+    assert "ESP301, firmware 3.0.1" in str(found)
+    with esp301(controller) as stage:
+        x, roll = stage.axes
+        assert (x.lower_limit, x.upper_limit, x.resolution) == pytest.approx((-1000.0, 25_000.0, 0.1))
+        assert (roll.lower_limit, roll.upper_limit) == pytest.approx((-157.08, 0.17453), rel=1e-4)
+        assert not stage.is_homed
+        stage.home()
+        assert stage.move_to({"x_um": 123.4})["x_um"] == pytest.approx(123.4)
+        controller.powered[1] = False  # by the emergency button: it is switched on again for the next move
+        assert stage.move_to({"x_um": 200.0})["x_um"] == pytest.approx(200.0)
+        stage.move_to({"x_um": 20_000.0}, wait=False)
+        controller.axes[1].halt()
+        controller.errors.append((104, "POSITIVE HARDWARE LIMIT DETECTED"))
+        with pytest.raises(
+            DeviceError, match=r"x_um \(axis 1\): positive hardware limit detected \(error 104\)"
+        ):
+            stage.wait(5.0)
+        with pytest.raises(
+            DeviceError, match=r"axis 1 refuses 'PA999': maximum value exceeded \(error 105\)"
+        ):
+            stage._tell("x_um", "PA999")
+    controller.units = {1: 0, 2: 2}
+    for number, words in ((1, "axis 1 counts in steps: it cannot be x_um"), (2, "axis 2 moves along a line")):
+        controller.units[1] = 0 if number == 1 else 3
+        with pytest.raises(DeviceError, match=words):
+            esp301(controller).open()
+    controller.port.unplug()
 
 
 def test_asi_says_its_refusals_and_reads_what_is_configured_at_home(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
+import tracemalloc
 from collections.abc import Callable
 
 import numpy as np
@@ -119,6 +120,22 @@ def test_a_frame_sees_the_world_after_it_was_asked_for() -> None:
     bench.camera.stop_sequence()
     bench.leds.off()
     assert bench.camera.snap().image.max() < 200
+
+
+def test_places_that_the_source_has_left_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.simulated.world.SOURCES_KEPT", 4)
+    world = Bench().world
+    sweep = [(0.0, 0.0, Z_UM + 1000 * n) for n in range(12)]
+    first = world.psf(sweep[0], (0.0, 1.0, 0.0))
+    tracemalloc.start()
+    try:
+        for place in sweep[1:]:
+            world.psf(place, (0.0, 1.0, 0.0))
+        kept_bytes, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept_bytes < 5 * first.nbytes
+    assert np.array_equal(world.psf(sweep[0], (0.0, 1.0, 0.0)), first)
 
 
 def test_without_a_stage_the_source_rests_on_the_axis() -> None:

@@ -314,6 +314,34 @@ def test_gain_is_a_factor_by_the_configured_unit() -> None:
         assert camera.set_gain(2.0) == pytest.approx(10 ** (30 * 0.2 / 20))
 
 
+def test_controls_of_the_sensors_own_node_are_the_cameras() -> None:
+    kernel = FakeKernel()
+    del kernel.controls[fake.EXPOSURE], kernel.controls[fake.GAIN]
+    kernel.of_subdevice = {
+        0x980911: fake.FakeControl("Exposure", 1, 4, 2000, 1, 500, 500),
+        0x9E0903: fake.FakeControl("Analogue Gain", 1, 0, 100, 1, 0, 7),
+        fake.BLACK: fake.FakeControl("Black Level", 1, 0, 4095, 1, 64, 64),
+    }
+    given = {"subdevices": ["/dev/v4l-subdev0"], "exposure_line_us": 20.0, "controls": {"exposure": 50}}
+    with camera_on(kernel, **given) as camera:
+        assert camera.exposure_limits_ms == (0.08, 40.0)
+        assert camera.exposure_ms == 1.0
+        assert camera.set_exposure_ms(10.0) == pytest.approx(10.0)
+        assert kernel.of_subdevice[0x980911].value == 500
+        assert camera.set_gain(3.0) == 3.0
+        assert kernel.of_subdevice[0x9E0903].value == 2
+        assert camera.black_level == 16  # of the node that comes first
+        kernel.unplugged = True
+        with pytest.raises(DeviceLostError, match="v4l-subdev0 is gone"):
+            camera.set_gain(2.0)
+        assert not camera.is_open
+    assert kernel.opened == 0
+    with pytest.raises(DeviceError, match=r"no /dev/v4l-subdev3.*Nodes of its kind"):
+        camera_on(FakeKernel(), subdevices=["/dev/v4l-subdev3"]).open()
+    claims = V4l2Camera.claims(V4l2Camera.Options(pixel_pitch_um=1.0, **given))
+    assert len(claims) == 2
+
+
 def test_a_camera_without_exposure_control_says_so() -> None:
     kernel = FakeKernel()
     del kernel.controls[fake.EXPOSURE]

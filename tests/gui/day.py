@@ -595,7 +595,7 @@ def _(o: Operator) -> None:
 def _(o: Operator) -> None:
     for key in (KEY.Key_3, KEY.Key_2, KEY.Key_1):
         QTest.keyClick(o.window, key, CONTROL | Qt.KeyboardModifier.ShiftModifier)
-        QTest.qWait(50)
+        o.wait(lambda: not o.window.is_restyling)
 
 
 @step("the log, only what warns")

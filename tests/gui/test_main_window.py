@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from PySide6.QtCore import QSettings, Qt
+from PySide6.QtGui import QColor
 from PySide6.QtWidgets import QApplication, QMessageBox
 from pytestqt.qtbot import QtBot
 
@@ -20,7 +21,7 @@ from gui.procedure_panel import ProcedurePanel
 from gui.session import BenchSession
 from gui.theme import THEMES
 from gui.widgets.building import every
-from gui.widgets.dialogues import TextWindow, choose_path
+from gui.widgets.dialogues import Question, TextWindow, choose_path
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import LightState
 from tests.gui.looks import faults
@@ -221,9 +222,22 @@ def test_the_log_filters_by_level_and_words(window: MainWindow) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(THEMES))
-def test_a_theme_can_be_chosen(window: MainWindow, settings: QSettings, name: str) -> None:
-    window.set_theme(name)
+def test_a_theme_can_be_chosen_and_another_before_it_is_there(
+    qtbot: QtBot, window: MainWindow, settings: QSettings, name: str
+) -> None:
+    window.panel("reconstructions")
+    for chosen in ("light", name):
+        window.set_theme(chosen)
+    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
+    assert window.updatesEnabled()
     assert settings.value("theme") == name
+    late = window.panel("tasks")  # made under the theme that is not the program's first
+    question = Question(window, "Title", "Text", ("Yes", "No"), lambda _: None)
+    assert window.statusBar().palette().window().color() == QColor(THEMES[name].panel)
+    for part in (window, window.tabs, late, question):
+        assert part.palette().window().color() == QColor(THEMES[name].window)
+    assert late.copy_button.palette().buttonText().color() == QColor(THEMES[name].text)  # by the sheet
+    question.close()
     window.set_theme("dark")
 
 

@@ -18,16 +18,17 @@ from gui.jobs import JobState
 from gui.panel import whole
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
-from gui.theme import apply_theme
+from gui.theme import apply_theme, change_theme
 from gui.widgets.dialogues import Question
 from gui.widgets.entry import NumberEdit
-from gui.widgets.plots import restyle_all
+from instrument.files.calibration_file import load_calibration, newest_calibration, save_calibration
 from instrument.files.images import read_image, write_image
 from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.stored_result import StoredResult, open_result
 from recon.camera.transformed import Transformation
 from recon.reconstruction.options import Overrides
+from recon.types import Calibration
 from recon.verdict.calibration_check import GIVEN, CalibrationCheck, Fit, Score
 
 WAIT_MS = 60_000
@@ -381,6 +382,35 @@ def test_a_psf_that_does_not_fit_is_fitted_by_a_button(
     assert panel.refine_button.isHidden(), "it was fitted already"
 
 
+def test_a_fitted_psf_is_kept_and_used_from_then_on(
+    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path
+) -> None:
+    spot = np.zeros((1, 1, 40, 60), np.float32)
+    spot[0, 0, 20, 45] = 1.0
+    saved = save_calibration(Calibration(spot, np.array([[500.0, 0.0, 2e4]])), tmp_path / "cal")
+    write_image(tmp_path / "p.tif", np.zeros((20, 30), np.float32))
+    fitted = {"psf_refinement": {"scale": 1.2, "rotation_deg": 0.0, "used": True}}
+    record = {"inputs": {"calibration": str(saved)}, "provenance": fitted}
+    given: list[tuple[str, object]] = []
+    panel.session.handed_on.connect(lambda name, what: given.append((name, what)))
+    panel.show()
+    for used in (False, True):
+        fitted["psf_refinement"]["used"] = used
+        panel.show_result(StoredResult(tmp_path / "p.tif", np.zeros((20, 30), np.float32), None, record))
+        assert panel.keep_button.isHidden() is not used
+    qtbot.mouseClick(panel.keep_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: bool(given), timeout=WAIT_MS)
+    ((name, folder),) = given
+    assert name == "live_reconstruction"
+    assert panel.form.options.value("calibration") == folder == newest_calibration(panel.session.runs_folder)
+    made = load_calibration(folder)
+    assert np.unravel_index(made.psfs[0, 0].argmax(), (40, 60)) == (
+        20,
+        48,
+    )  # 15 pixels from the middle, 18 now
+    assert made.source_positions_um[0] == pytest.approx([600.0, 0.0, 2e4])
+
+
 @pytest.mark.parametrize("opened_during", ["the name", "the question"])
 def test_another_result_is_not_exported_under_the_name_of_the_first(
     qtbot: QtBot, panel: ReconstructionsPanel, tmp_path, opened_during: str
@@ -501,9 +531,8 @@ def test_the_red_theme_shows_nothing_but_red(
     np.save(tmp_path / "v.npy", np.random.default_rng(0).random((4, 40, 40), np.float32))
     panel.open(tmp_path / "v.npy")
     qtbot.waitUntil(lambda: panel.volume.projections is not None, timeout=WAIT_MS)
-    apply_theme(qapp, "red")
     try:
-        restyle_all(panel)
+        list(change_theme("red", panel, [panel]))
         shown = panel.volume.coloured.image
         assert shown[..., 0].max() > 0.5
         assert shown[..., 1:].max() == 0

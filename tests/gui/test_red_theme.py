@@ -43,6 +43,7 @@ def red_window(qtbot: QtBot, window: MainWindow) -> Iterator[MainWindow]:
         window, Qt.Key.Key_2, Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier
     )
     assert colours() is RED
+    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
     yield window
     window.set_theme("dark")
 
@@ -82,13 +83,14 @@ def test_a_coloured_picture_is_shown_by_its_brightness_in_the_red_map(qtbot: QtB
     assert view.item.image.shape == (40, 60, 3)
 
 
-def test_a_line_of_the_log_keeps_what_its_colour_says(window: MainWindow) -> None:
+def test_a_line_of_the_log_keeps_what_its_colour_says(qtbot: QtBot, window: MainWindow) -> None:
     window.panel("live")
     log = window.panel("log")
     assert isinstance(log, LogPanel)
     window.session.log("info", "a line of before")
     window.session.log("error", "a mistake of before")
     window.set_theme("red")
+    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
 
     def colour(text: str) -> QColor:
         block = log.view.document().begin()
@@ -102,5 +104,6 @@ def test_a_line_of_the_log_keeps_what_its_colour_says(window: MainWindow) -> Non
     assert colour("a line of before") == QColor(RED.text)
     assert colour("a mistake of before") == QColor(RED.error)
     window.set_theme("dark")
+    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
     assert colour("a line of before") == QColor(DARK.text)
     assert {view.colour_map for view in window.findChildren(ImageView)} == {"grey"}

@@ -1,4 +1,4 @@
-"""Elliptec modules, SMC100 and ASI controllers on a pseudo-terminal, written as their drivers expect them."""
+"""Elliptec modules, SMC100, ESP and ASI controllers on a pseudo-terminal, as their drivers expect them."""
 
 from __future__ import annotations
 
@@ -128,6 +128,58 @@ class Smc100Chain:
                     self.refusal[number] = "G"
             case _:
                 self.refusal[number] = "H" if state == 0x0A else "J" if state == 0x3C else "D"
+        return None
+
+
+class EspController:
+    """An ESP301: axis 1 in millimetres, axis 2 in degrees; counts are 0.0001 of them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.axes = {1: MovingAxis(-10_000, 250_000, 400_000, 700), 2: MovingAxis(-100, 90_000, 400_000, 500)}
+        self.units = {1: 2, 2: 7}
+        self.powered = dict.fromkeys(self.axes, False)
+        self.errors: list[tuple[int, str]] = []
+        self.port = PtyDevice(folder, self.answer, lambda got: ((w := got.split(b"\r"))[:-1], w[-1]))
+        self.link = self.port.link
+
+    def answer(self, line: bytes) -> list[Answer]:
+        found = re.fullmatch(r"(\d*)([A-Z]{2})(\?|[-+.\d]*)", line.decode().strip())
+        if found is None:
+            self.errors.append((6, "COMMAND DOES NOT EXIST"))
+            return []
+        said = self.say(int(found[1] or 0), found[2], found[3])
+        return [] if said is None else [f"{said}\r\n".encode()]
+
+    def say(self, number: int, words: str, value: str) -> str | None:
+        if words == "VE":
+            return "ESP301 Version 3.0.1 6/1/99"
+        if words == "TB":
+            code, text = self.errors.pop(0) if self.errors else (0, "NO ERROR DETECTED")
+            return f"{code}, 451322, {text}"
+        axis = self.axes.get(number)
+        if axis is None:
+            self.errors.append((9, "AXIS NUMBER OUT OF RANGE"))
+            return None
+        asked = {
+            **{"SN": self.units[number], "SL": axis.lowest / 1e4, "SR": axis.highest / 1e4, "VA": 40},
+            **{"SU": 0.0001, "TP": f"{axis.place / 1e4:.6f}", "MD": int(not axis.moving)},
+            **{"MO": int(self.powered[number])},
+        }
+        if value == "?" or words == "TP":
+            return str(asked[words])
+        match words:
+            case "ST":
+                axis.stop()
+            case "MO":
+                self.powered[number] = True
+            case _ if not self.powered[number]:
+                self.errors.append((100 * number + 8, "MOTOR NOT ENABLED"))
+            case "OR":
+                axis.home(0)
+            case "PA" if axis.lowest <= round(1e4 * float(value)) <= axis.highest:
+                axis.go(round(1e4 * float(value)))
+            case _:
+                self.errors.append((100 * number + 5, "MAXIMUM VALUE EXCEEDED"))
         return None
 
 

@@ -1,4 +1,4 @@
-"""A kernel with one video device, which answers ioctls byte by byte as <linux/videodev2.h> lays them out.
+"""A kernel with one video device and its sensor's node; it answers byte by byte as <linux/videodev2.h> says.
 
 Offsets and request numbers are written out from the 64-bit header, not taken from the driver.
 Frames are exposed on the clock, whether or not buffers are queued; what finds none is lost.
@@ -77,6 +77,8 @@ class FakeKernel:
         self.shape = shape
         self.formats = formats
         self.controls = _controls()
+        self.of_subdevice: dict[int, FakeControl] = {}
+        """Controls of ``/dev/v4l-subdev0``, which is there when it has some."""
         self.frames_per_s = 200.0
         self.line_padding = 0
         self.shapes: dict[str, tuple[int, int]] = {}
@@ -116,6 +118,9 @@ class FakeKernel:
 
     # The calls -------------------------------------------------------------------------------------
     def open(self, path: str) -> int:
+        if path == "/dev/v4l-subdev0" and self.of_subdevice and not self.unplugged:
+            self.opened += 1
+            return 98
         if path != "/dev/video0" or self.unplugged:
             raise OSError(errno.ENOENT, os.strerror(errno.ENOENT))
         if 0 in self.refuse:
@@ -126,9 +131,9 @@ class FakeKernel:
         return 99
 
     def close(self, fd: int) -> None:
-        assert fd == 99
+        assert fd in (98, 99)
         self.opened -= 1
-        self.streaming = False
+        self.streaming = self.streaming and fd == 98
 
     def map(self, fd: int, length: int, offset: int) -> Mapped:
         assert length == len(self.memory[offset >> 12])
@@ -148,7 +153,8 @@ class FakeKernel:
                 return False
 
     def ioctl(self, fd: int, request: int, argument: Structure) -> None:
-        assert fd == 99
+        assert fd == 99 or (fd == 98 and request in (QUERYCTRL, QUERYMENU, G_CTRL, S_CTRL))
+        self._asked = self.controls if fd == 99 else self.of_subdevice
         self.calls.append(request)
         data = (c_char * sizeof(argument)).from_address(addressof(argument))
         assert request >> 16 & 0x3FFF == len(data), "the structure is not what the request number says"
@@ -252,31 +258,31 @@ class FakeKernel:
     # Controls --------------------------------------------------------------------------------------
     def _queryctrl(self, d: object) -> int:
         (asked,) = struct.unpack_from("I", d, 0)
-        following = [number for number in sorted(self.controls) if number > asked & 0x7FFFFFFF]
+        following = [number for number in sorted(self._asked) if number > asked & 0x7FFFFFFF]
         if not asked >> 31 or not following:
             return errno.EINVAL
-        c = self.controls[following[0]]
+        c = self._asked[following[0]]
         row = (following[0], c.type, c.name.encode(), c.minimum, c.maximum, c.step, c.default, c.flags)
         struct.pack_into("II32siiiiI", d, 0, *row)
         return 0
 
     def _querymenu(self, d: object) -> int:
         number, index = struct.unpack_from("II", d, 0)
-        if index not in self.controls[number].menu:
+        if index not in self._asked[number].menu:
             return errno.EINVAL
-        struct.pack_into("32s", d, 8, self.controls[number].menu[index].encode())
+        struct.pack_into("32s", d, 8, self._asked[number].menu[index].encode())
         return 0
 
     def _g_ctrl(self, d: object) -> int:
         (number,) = struct.unpack_from("I", d, 0)
-        if number not in self.controls or self.controls[number].type == 4:
-            return errno.EINVAL if number not in self.controls else errno.EACCES
-        struct.pack_into("i", d, 4, self.controls[number].value)
+        if number not in self._asked or self._asked[number].type == 4:
+            return errno.EINVAL if number not in self._asked else errno.EACCES
+        struct.pack_into("i", d, 4, self._asked[number].value)
         return 0
 
     def _s_ctrl(self, d: object) -> int:
         number, value = struct.unpack_from("Ii", d, 0)
-        control = self.controls.get(number)
+        control = self._asked.get(number)
         if control is None:
             return errno.EINVAL
         if control.flags & 0x4:

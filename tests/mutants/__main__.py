@@ -6,11 +6,11 @@
 
 A mutant is one small mistake in one function: ``<`` for ``<=``, ``+`` for ``-``, a call or a ``raise`` left
 out, a number changed, a condition negated. First each test runs once and is watched: which lines it comes
-to. Then each mutant is put into a process of its own in which everything is loaded already, and the quickest
-tests that come to its line run until one fails (*noticed*), or all pass (*lived*). What hangs is noticed.
-Compiled kernels, module constants and words are not changed; a test that runs the program in a process of
-its own does not see a mutant. Some processes have no mutant in them: tests that fail there are failing by
-themselves, and the figures are worth less.
+to. Then each mutant is put into a process of its own in which everything is loaded already, and tests that
+come to its line, the quickest of each file first, run until one fails (*noticed*), or all pass (*lived*).
+What hangs is noticed. Compiled kernels, module constants and words are not changed; a test that runs the
+program in a process of its own does not see a mutant. Some processes have no mutant in them: tests that fail
+there are failing by themselves, and the figures are worth less.
 
 Those that cannot be noticed, since they are equal to what was there, stand in tests/mutants/equal.toml with
 the reason. Exit status 1 when less than 95 % of the others were noticed.
@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 import os
 import random
+import signal
 import sys
 import tomllib
 from collections import Counter
@@ -95,6 +96,7 @@ def main() -> int:
     tests = sorted({test for area in areas for test in AREAS[area][1]})
     modules = sorted({path for area in areas for path in AREAS[area][0]})
     trials = Trials(ROOT, modules, chosen, options.jobs, 60 * options.minutes, NO_MUTANT_EVERY)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     os.environ["CI"] = "1"  # property tests try the same examples every time
     os.chdir(ROOT)
     failed = pytest.main(["-q", "-s", "-m", "not slow", "-p", "no:cacheprovider", *tests], plugins=[trials])

@@ -47,7 +47,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "instrument/runs/acquire.py",
             "instrument/runs/timed.py",
         ),
-        _RUNS,
+        (*_RUNS, "tests/drivers/test_answers.py"),
     ),
     "store": (
         (
@@ -62,7 +62,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "instrument/files/atomic.py",
             "instrument/files/record.py",
         ),
-        (*_RUNS, "tests/instrument/files/test_record.py"),
+        (*_RUNS, "tests/instrument/files/test_atomic.py", "tests/instrument/files/test_record.py"),
     ),
     "drops": (("drivers/common/drops.py",), ("tests/drivers/test_drops.py",)),
     "streams": (
@@ -130,7 +130,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "recon/priors/base.py",
             "recon/priors/total_variation.py",
         ),
-        ("tests/recon/solvers", "tests/recon/priors"),
+        ("tests/recon/solvers", "tests/recon/priors", "tests/golden/test_golden.py"),
     ),
     "operators": (
         (
@@ -144,7 +144,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "recon/camera/two_part.py",
             "recon/camera/varying_psfs.py",
         ),
-        ("tests/recon/camera",),
+        ("tests/recon/camera", "tests/golden/test_golden.py"),
     ),
 }
 """Of each area its modules, and its tests; a test may notice a change in any area."""

@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -27,9 +27,9 @@ import pytest
 
 from tests.mutants.mutations import Mutant
 
-MOST_TESTS_S = 8.0
+MOST_TESTS_S = 60.0
 """Of the tests of one mutant together, as they took when they were watched."""
-MOST_WATCHED_S = 8.0
+MOST_WATCHED_S = 30.0
 """A test that took longer is not asked."""
 _WATCH_LIMIT_S = 900.0
 _KEPT = Path("build/mutants.pickle")
@@ -178,7 +178,9 @@ class Trials:
     def _try_all(self, session: pytest.Session, watched: dict[str, Watched], until_s: float) -> None:
         items = {item.nodeid: item for item in session.items}
         usable = sorted(
-            ((test.seconds, name) for name, test in watched.items() if name in items and test.passed)
+            (test.seconds, name)
+            for name, test in watched.items()
+            if name in items and test.passed and test.seconds < MOST_WATCHED_S
         )
         children: list[tuple[_Child, str, Mutant | None]] = []
         for number, (area, mutant) in enumerate(self._mutants):
@@ -186,12 +188,13 @@ class Trials:
                 break
             chosen, total_s = [], 0.0
             reached = {(str(self._root / mutant.path), line) for line in range(*_span(mutant.lines))}
-            for seconds, name in usable:
-                if seconds < MOST_WATCHED_S and reached & watched[name].lines:
-                    if chosen and total_s + seconds > MOST_TESTS_S:
-                        break
-                    chosen.append(items[name])
-                    total_s += seconds
+            for seconds, name in _each_file_in_turn(
+                [test for test in usable if reached & watched[test[1]].lines]
+            ):
+                if chosen and total_s + seconds > MOST_TESTS_S:
+                    continue
+                chosen.append(items[name])
+                total_s += seconds
             if not chosen:
                 self.fates.append((area, mutant, "no test"))
                 continue
@@ -281,6 +284,17 @@ class Trials:
     def pytest_configure(self, config: pytest.Config) -> None:
         """Keep what knows the temporary folders."""
         self._config = config
+
+
+def _each_file_in_turn(tests: Sequence[tuple[float, str]]) -> list[tuple[float, str]]:
+    """Return tests so that the quickest of every file come first: a file is about one thing."""
+    turns: Counter[str] = Counter()
+    placed = []
+    for seconds, name in sorted(tests):
+        file = name.partition("::")[0]
+        placed.append((turns[file], seconds, name))
+        turns[file] += 1
+    return [(seconds, name) for _, seconds, name in sorted(placed)]
 
 
 def _span(lines: tuple[int, int]) -> tuple[int, int]:

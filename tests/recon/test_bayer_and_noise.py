@@ -75,7 +75,9 @@ def test_noise_between_erased_pixels_is_not_the_pictures_own_structure(erased):
     rng = np.random.default_rng(0)
     rows, columns = np.indices((56, 56))
     frame = 100 * np.sin(rows / 2.5) * np.sin(columns / 2.5) + rng.normal(0, 3.0, (56, 56))
-    assert estimate_deviation(frame, rng.random(frame.shape) > erased) < 2 * estimate_deviation(frame)
+    told = [estimate_deviation(frame, rng.random(frame.shape) > erased) for _ in range(10)]
+    assert max(told) < 2 * estimate_deviation(frame)
+    assert min(told) > estimate_deviation(frame) / 2  # of a few stencils all may be nothing by chance
 
 
 @pytest.mark.parametrize("mean", [0.02, 0.3, 5.0, 1000.0])

@@ -272,6 +272,8 @@ def test_saturated_images_are_warned_of(shot):
     assert "The PSF looks saturated: 1.0" in text
     assert "The measurement's channel 0 looks saturated: 5.0" in text
     assert reconstruct(shot.measurement, shot.psf, iterations=1).warnings == ()
+    photons = np.random.default_rng(0).poisson(2 * shot.measurement / shot.measurement.max())
+    assert reconstruct(photons, shot.psf, iterations=1).warnings == ()  # the brightest count of few is shared
 
 
 def test_tiny_measurements_work():

@@ -35,6 +35,15 @@ def test_a_report_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert main(["check", "--bench", str(bench), "--move"]) == 2
 
 
+def test_light_that_does_not_reach_the_camera_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Bench(parse_config(MICROSCOPE, None)) as bench:
+        bench.open()
+        monkeypatch.setattr(bench, "source_on", lambda: None)
+        light = next(found for found in thorough(bench) if found.device == "led_array")
+    assert light.failed
+    assert "gives no more light" in light.words
+
+
 @pytest.mark.usefixtures("mock_drivers")
 def test_axes_move_only_where_it_is_allowed_and_failures_are_findings() -> None:
     text = '[camera]\ndriver = "mock"\nfail = ["snap"]\n[stage]\ndriver = "mock"\n'

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -51,3 +53,22 @@ def test_a_folder_that_is_replaced_is_never_missing(tmp_path: Path, monkeypatch:
     write("new")
     assert (tmp_path / "c" / "a").read_text() == "new"
     assert {p.name for p in tmp_path.iterdir()} == {"c", "d"}
+
+
+def test_a_writer_that_notices_too_little_written_is_told_of_the_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for free, why, number in ((0, "half", errno.ENOSPC), (10**9, "half", None), (0, errno.EIO, errno.EIO)):
+        usage = shutil.disk_usage(tmp_path)._replace(free=free)
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, usage=usage: usage)
+        with pytest.raises(OSError, match="tif") as caught, whole_file(tmp_path / "a.tif"):
+            raise OSError(why, "said") if isinstance(why, int) else OSError(why)
+        assert caught.value.errno == number
+        assert caught.value.filename == str(tmp_path / "a.tif")
+        assert not list(tmp_path.iterdir())
+
+
+def test_a_name_that_cannot_be_made_closes_nothing_of_others(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="too long"), whole_file(tmp_path / ("a" * 250)):
+        raise AssertionError("never begun")
+    os.fstat(1)

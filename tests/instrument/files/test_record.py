@@ -155,6 +155,20 @@ def test_values_come_back_by_their_declaration() -> None:
     assert replace(back, **same) == replace(value, **same)
 
 
+def test_a_union_is_read_as_its_only_type_and_pairs_by_place() -> None:
+    @dataclass(frozen=True)
+    class Local:  # readers are kept: a type of before would not show a mistake
+        one: Path | None
+        either: Path | str | None
+        pair: tuple[Path, str]
+
+    data = {"one": "a", "either": "b", "pair": ["c", "d"]}
+    assert value_of(Local, data) == Local(Path("a"), "b", (Path("c"), "d"))
+    assert value_of(Local, data | {"one": None, "either": None}) == Local(None, None, (Path("c"), "d"))
+    with pytest.raises(ValueError, match="shorter"):
+        value_of(Local, data | {"pair": ["c"]})
+
+
 def test_unknown_fields_of_values_are_handed_over() -> None:
     unknown: dict[str, Any] = {}
     assert value_of(Inner, {"x": 1, "y": 2}, unknown) == Inner(1.0)

@@ -97,6 +97,7 @@ def test_ome_tiff_tells_when_and_where_each_frame_was_taken(tmp_path: Path) -> N
         for i in range(3):
             place = {"x_um": 5.0, "y_um": -2.0, "z_um": 1000.0 + 250 * i}
             stamp = replace(METADATA, host_time_ns=i * 10**9, black_level=64.0, stage_position=place)
+            stamp = replace(stamp, led_pattern=f"level {i}")
             writer.write([FrameToStore(i, image(i, False), stamp)])
         run = writer.finish(FinishReason.COMPLETED)
     export(run, tmp_path / "a.ome.tif")
@@ -110,6 +111,7 @@ def test_ome_tiff_tells_when_and_where_each_frame_was_taken(tmp_path: Path) -> N
     assert picture.images[0].acquisition_date == datetime(2026, 1, 1)
     told = dict(picture.structured_annotations[0].value)
     assert (told["black_level"], told["pixel_format"], told["simulated"]) == ("64.0", "Mono12", "true")
+    assert told["led_pattern"] == "level 0; level 1; level 2"
     np.testing.assert_array_equal(
         tifffile.imread(tmp_path / "a.ome.tif"), [image(i, False) for i in range(3)]
     )

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from drivers.errors import DeviceError, LimitError
-from drivers.led_array import LedPattern
+from drivers.led_array import LedArray, LedPattern
+from drivers.sequence import SequenceLimits
 from drivers.simulated.wire import Wires
+from drivers.slm import Slm
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.bench.sequence import Wire, _placed, take_sequence
-from instrument.files.errors import ConfigError
+from instrument.files.errors import BenchError, ConfigError
 from instrument.plan import Light, Part, Plan, PlanError
 from instrument.runs.acquire import acquire
 from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_control import RunControl
-from instrument.runs.timed import TimedSteps
+from instrument.runs.timed import TimedSteps, left_to
 
 LEVELS = (40, 80, 120, 160, 200, 240)
 
@@ -174,6 +177,39 @@ def test_what_a_sequence_needs_is_asked_for_beforehand(tmp_path: Path) -> None:
         pytest.raises(PlanError, match="trigger_line 'Line9', but the camera's are Line1"),
     ):
         acquire(bench, steps_of_light(trigger_line="Line9"), tmp_path)
+
+
+@pytest.mark.parametrize("kind", [LedArray, Slm])
+def test_what_goes_into_one_sequence(kind: type[Any]) -> None:
+    slm, most = kind is Slm, 6
+    limits = SequenceLimits(most if slm else most + 2, 1.0, 1)  # two dark patterns go before light
+    own = dict.fromkeys(kind.__abstractmethods__) | {"__init__": lambda _: None, "sequence_limits": limits}
+    camera = SimpleNamespace(frame_shape=(8, 8), frame_dtype=np.dtype(np.uint16))
+    wired: Any = SimpleNamespace(trigger_source=type("Plays", (kind,), own)(), camera=camera)
+    one: dict[str, Any] = {"slm_image": "a.png"} if slm else {}
+
+    def groups(*parts: dict[str, Any]) -> list[tuple[bool, int]]:
+        plan = Plan(label="p", parts=tuple(Part.model_validate({"label": "a"} | part) for part in parts))
+        made = TimedSteps(wired, plan).groups(plan.steps())
+        return [(wire is not None, len(steps)) for wire, steps in made]
+
+    assert Wire(wired).most == most
+    assert left_to(Wire(wired)) == ("slm_image" if slm else "light")
+    exposures = [one | {"exposure_ms": exposure_ms, "repeats": 8} for exposure_ms in (1.0, 2.0)]
+    assert groups(*exposures) == [(True, 6), (True, 2)] * 2
+    assert groups(one) == [(False, 1)]
+    assert groups(one | {"timing": "hardware"}) == [(True, 1)]
+    assert groups(one | {"average": most}) == [(True, 1)]
+    assert groups(one | {"average": most + 1}) == [(False, 1)]
+    assert groups(one | {"average": 4}, one | {"average": 2}) == [(True, 2)]
+    assert groups(one | {"average": 4}, one | {"average": 3}) == [(True, 1), (True, 1)]
+    assert groups(one | {"timing": "stepped", "repeats": 2}) == [(False, 1)] * 2
+    with pytest.raises(BenchError, match=r"more frames than one sequence \(6\)"):
+        groups(one | {"average": most + 1, "timing": "hardware"})
+    if slm:
+        assert groups({"repeats": 2}) == [(False, 1)] * 2
+        with pytest.raises(BenchError, match="has no SLM image"):
+            groups({"timing": "hardware"})
 
 
 def test_a_falling_edge_and_another_line(tmp_path: Path) -> None:

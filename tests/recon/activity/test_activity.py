@@ -7,15 +7,8 @@ import pytest
 from scipy import ndimage
 
 from recon import InputError
-from recon.streams.activity import (
-    aligned,
-    baseline,
-    change,
-    fading,
-    floor_of,
-    motion,
-    smoothed,
-)
+from recon.streams.activity import baseline, change, fading, floor_of, smoothed
+from recon.streams.motion import aligned, motion
 from recon.streams.regions import (
     FOLLOWS,
     PASSES,

@@ -7,9 +7,11 @@ import pytest
 from scipy import ndimage
 
 from instrument.evaluation.analysis_figure import facts
-from recon.analysis import analyse
+from recon.analysis import analyse, middle
 from recon.analysis.correlation import half_light_deg
+from recon.analysis.middle import Middle
 from recon.analysis.points import Noise, Reached, TriedPair
+from recon.analysis.resolution import axial_resolution
 from recon.evaluation import two_points
 from recon.evaluation.two_points import reached, shifted, stated_px
 from recon.types import Calibration, Geometry
@@ -37,9 +39,9 @@ def test_the_stated_distance_is_that_of_a_curve_through_the_pairs() -> None:
         for px in np.geomspace(1.2, 4.5, 80)
     ]
     beyond = np.exp(np.log(19) / 20)  # a curve of this slope has 95 % there
-    for stated, middle in zip(stated_px(tried), (2.0, 2.6), strict=True):
+    for stated, centre in zip(stated_px(tried), (2.0, 2.6), strict=True):
         assert stated is not None
-        assert stated == pytest.approx(middle * beyond, rel=0.08)
+        assert stated == pytest.approx(centre * beyond, rel=0.08)
     assert stated_px([one for one in tried if not one.told]) == (None, None)
     wide = [one for one in tried if one.px > 4.0]
     assert stated_px(wide) == (least := min(one.px for one in wide), least)  # all were told apart
@@ -58,7 +60,7 @@ def test_a_shift_between_pixels_moves_the_centre_of_light_and_keeps_it() -> None
 
 
 def test_the_default_picture_reaches_a_little_less_than_the_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(two_points, "LARGEST_PX", 140 * 160)
+    monkeypatch.setattr(middle, "LARGEST_PX", 140 * 160)
     monkeypatch.setattr(two_points, "PICTURES", 3)
     found = reached(_calibration((160, 180)), 50e3, 1.2, 2e-6)
     assert all(px is not None and 1.5 < px < 3.5 for px in found.across_px)
@@ -68,11 +70,35 @@ def test_the_default_picture_reaches_a_little_less_than_the_pixels(monkeypatch: 
     assert 49.999e3 < found.focus_um[1] < 200e3
 
 
+def test_depths_of_the_middle_are_spread_as_its_extent_is_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = _calibration((160, 180))
+    step = axial_resolution(whole.psfs[0, 0], 50e3, 5e3).step_per_um
+    assert Middle.of(whole, 50e3, step).spread == 1
+    monkeypatch.setattr(middle, "LARGEST_PX", 60 * 60)
+    part = Middle.of(whole, 50e3, step)
+    np.testing.assert_array_equal(part.psf_at(50e3), whole.psfs[0, 0, 50:110, 60:120])
+    # Mean distance from the middle, of 80 x 90 lit pixels and of 60 x 60.
+    assert part.spread == pytest.approx(np.hypot(40, 45) / np.hypot(30, 30), rel=0.2)
+    lost = np.square(whole.psfs).sum() / np.square(part.psf_at(50e3)).sum()
+    dimmer = part.psf_at(50e3).max() / whole.psfs.max()
+    assert part.noise(Noise(100.0, 2.0)).electrons == pytest.approx(100 * lost * dimmer, rel=1e-4)
+    dark = Middle.of(whole, 50e3, step, dark_rim=True)
+    assert not dark.psf_at(50e3)[:24].any()
+    assert dark.spread > part.spread
+    farther = Middle.of(whole, 50e3, step, reach=0.9 / 50e3)
+    assert farther.part > part.part
+
+
 def test_a_small_colour_sensor_has_room_for_one_pair_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(two_points, "PICTURES", 2)
     calibration = _calibration((40, 44), colours=3)
     assert [pair.axis for pair in reached(calibration, 50e3, 1.2, 2e-6).pairs] == [0, 1] * 3
-    assert two_points._focus_um(two_points._Tests(calibration, 50e3, Noise(), 0), 2.0, 2e-6) is None
+    assert (
+        two_points._focus_um(
+            two_points._Tests(Middle.of(calibration, 50e3, 2e-6), 50e3, Noise(), 0), 2.0, 2e-6
+        )
+        is None
+    )
 
 
 @pytest.mark.parametrize(("step_per_um", "far_um"), [(2e-6, 50e3 / 0.7), (1e-5, float("inf"))])
@@ -81,7 +107,8 @@ def test_depths_reach_infinity_where_all_before_it_were_told_apart(
 ) -> None:
     """With room for four depths at once, of eight."""
     monkeypatch.setattr(two_points._Tests, "told_apart", lambda _self, pairs, _light: [True] * len(pairs))
-    tests = two_points._Tests(_calibration((96, 128)), 50e3, Noise(), 0)
+    whole = Middle.of(_calibration((96, 128)), 50e3, step_per_um)
+    tests = two_points._Tests(whole, 50e3, Noise(), 0)
     found = two_points._focus_um(tests, 3.0, step_per_um)
     assert found == pytest.approx((1 / (1 / 50e3 + 3 * step_per_um), far_um))
 

@@ -10,6 +10,7 @@ from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.priors import L1, Box, Differences, HaarTotalVariation, NonNegativity, TotalVariation, Zero
 from recon.solvers import Admm, Fista, Penalties, StoppingRules, StopReason
+from recon.solvers.admm import _energy
 from recon.solvers.prior_splits import split_prior
 from tests.recon.solvers.literal_admm import LiteralAdmm, circular
 
@@ -124,6 +125,13 @@ def test_penalties_and_relaxation_change_the_way_not_the_goal():
     ]
     values = [objective(operator, data, prior, e.solution) for e in ends]
     assert values[0] == pytest.approx(values[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("width", [6, 7, 9])
+def test_the_energy_of_half_a_spectrum_is_that_of_its_image(width):
+    image = np.random.default_rng(0).standard_normal((5, width))
+    whole = np.sum(np.abs(np.fft.fft2(image)) ** 2)
+    assert _energy(np.fft.rfft2(image), width) == pytest.approx(whole)
 
 
 def test_float32_follows_float64():

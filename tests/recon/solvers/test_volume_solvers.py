@@ -9,7 +9,7 @@ from recon.base import threads
 from recon.camera.convolution import Convolution
 from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import Fista, StoppingRules, StopReason
-from recon.solvers.douglas_rachford import SparseDouglasRachford
+from recon.solvers.douglas_rachford import DouglasRachford, SparseDouglasRachford
 from recon.solvers.splitting import Room, SensorData, Tuning
 from recon.solvers.tv_admm_volume import LeanTotalVariation
 from tests.recon.solvers.literal_volume import LiteralAdmm
@@ -172,6 +172,23 @@ def test_threads_do_not_change_a_bit(kind):
         threads.set_threads(before)
     np.testing.assert_array_equal(results[0], results[1])
     np.testing.assert_array_equal(results[0], results[2])
+
+
+@pytest.mark.parametrize("kind", [DouglasRachford, SparseDouglasRachford, LeanTotalVariation])
+def test_numbers_do_not_depend_on_units(kind):
+    operator, data = problem()
+    weight = tau(operator, data, 0.02)
+    plain, small = (
+        kind(operator, unit * data, (tv if kind is LeanTotalVariation else l1)(unit * weight)).run(
+            StoppingRules(iterations=12, tolerance=0)
+        )
+        for unit in (1.0, 1e-6)
+    )
+    np.testing.assert_allclose(1e6 * small.solution, plain.solution, atol=1e-6 * plain.solution.max())
+    for one, other in zip(plain.history, small.history, strict=True):
+        assert other.primal_residual == pytest.approx(one.primal_residual, rel=1e-5)
+        assert other.change == pytest.approx(one.change, rel=1e-5)
+        assert 1e12 * other.objective == pytest.approx(one.objective, rel=1e-5)
 
 
 @KINDS

@@ -98,6 +98,32 @@ def test_where_nothing_is_lit_nothing_is_told(seen: tuple[Image, Image]) -> None
     assert fit(noise, seen[1])[0] is Fit.UNTOLD
 
 
+def test_a_photograph_mostly_at_full_scale_has_its_noise_and_makes_nobody_foreign(
+    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clipped = np.minimum(seen[0], np.percentile(seen[0], 40))
+    assert Problem.of(clipped, seen[1]).noise[0] > 0.3 * Problem.of(*seen).noise[0]
+    foreign = CalibrationCheck(Fit.FOREIGN, GOOD, 9000)
+    monkeypatch.setattr(decoys, "_competition", lambda *_: foreign)
+    assert [fit(image, seen[1])[0] for image in (seen[0], clipped)] == [Fit.FOREIGN, Fit.UNTOLD]
+
+
+@pytest.mark.parametrize("said", [(Fit.OFF, Fit.FITS), (Fit.FITS, Fit.FOREIGN)])
+def test_what_contradicts_itself_is_not_told(
+    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, said: tuple[Fit, Fit]
+) -> None:
+    unsure = GOOD | dict.fromkeys(NEAR, GOOD[GIVEN])  # else the first would do
+    told = iter([CalibrationCheck(fit, unsure, 9000, NEAR[0]) for fit in said])
+    monkeypatch.setattr(decoys, "_competition", lambda *_: next(told))
+    assert fit(*seen) == (Fit.UNTOLD, "None")
+
+
+def test_noise_thought_to_be_less_than_it_is_makes_nobody_foreign() -> None:
+    noisy = {how: score(1.22, 1.33, 0.001) for how in (GIVEN, *NEAR, *FAR)}
+    assert check_of(noisy, 9000, structure=0.35).fit is Fit.UNTOLD  # of which any PSF explains 0.13
+    assert check_of(noisy, 9000, structure=0.5).fit is Fit.FOREIGN
+
+
 def test_of_a_picture_with_a_background(seen: tuple[Image, Image]) -> None:
     stray = np.random.default_rng(4).poisson(2 * seen[0].mean() * np.linspace(0.7, 1.3, 96), (96, 96))
     problem = Problem.of(seen[0] + stray.astype(np.float32), seen[1], Options(estimate_background=True))

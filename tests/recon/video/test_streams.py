@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter, shift
+from scipy.signal import fftconvolve
 
 from recon import InputError, Measurement, solve
 from recon.evaluation.scene import make_scene
@@ -16,7 +18,9 @@ from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.selection import choose
 from recon.solvers import memory
+from recon.solvers.moving import move, move_spectra
 from recon.streams.joint import solve_together
+from recon.streams.motion import Panning
 from recon.streams.video import VideoSolver, stream_problem
 
 CASES: dict[str, dict[str, Any]] = {
@@ -137,3 +141,64 @@ def test_a_video_has_the_background_that_a_photograph_would_have() -> None:
         ).smooth
         told.append(problem.smooth)
     assert told == [False, True]
+
+
+@pytest.mark.parametrize("camera", ["one PSF", "erased"])
+def test_what_a_solver_knows_moves_with_a_scene_that_moves_as_a_whole(camera: str) -> None:
+    rng = np.random.default_rng(0)
+    psf = np.zeros((48, 64), np.float32)
+    psf[rng.integers(16, 32, 30), rng.integers(20, 44, 30)] = 1
+    scene = gaussian_filter(rng.random((96, 160)), 2)
+    scene = (scene - scene.min()) ** 3
+    light = fftconvolve(scene, psf, "same")
+    frames = [
+        rng.poisson(1e4 * shift(light, (0, -2 * n))[24:72, 48:112] / light.max()).astype(np.float32)
+        for n in range(6)
+    ]
+    gone = rng.random(frames[0].shape) < 0.05 if camera == "erased" else None
+    problem = stream_problem(Measurement(frames[0], erasures=gone), psf, estimate_background=False)
+    moves = Panning()
+    seen = [moves.next(problem.with_data(frame).data, problem.valid) for frame in frames]
+    np.testing.assert_allclose(seen[1:], [(0, -2)] * 5, atol=0.3)
+    still = problem.with_data(rng.poisson(np.maximum(frames[5], 0))).data
+    assert moves.next(still, problem.valid) == (0, 0)
+    apart = []
+    for forgets in (False, True):
+        video = VideoSolver(problem, cold_iterations=60, warm_iterations=2)
+        for frame in frames:
+            if forgets:
+                video._panning.forget()
+            picture = video.next(frame)
+        best = VideoSolver(problem, cold_iterations=100).next(frames[-1])
+        apart.append(np.linalg.norm(picture - best) / np.linalg.norm(best))
+    assert apart[0] < 0.85 * apart[1]
+
+
+@pytest.mark.parametrize("by", [(0.0, 3.0), (-2.5, 0.3)])
+def test_images_and_their_spectra_move_alike(by: tuple[float, float]) -> None:
+    smooth = gaussian_filter(np.random.default_rng(0).random((2, 24, 30)), (0, 3, 3), mode="wrap")
+    moved, spectra = smooth.copy(), np.fft.rfft2(smooth)
+    move(moved, *by)
+    move_spectra(spectra, *by, 30)
+    expected = np.stack([shift(image, by, order=3, mode="grid-wrap") for image in smooth])
+    np.testing.assert_allclose(moved, expected, atol=1e-3)
+    np.testing.assert_allclose(np.fft.irfft2(spectra, (24, 30)), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("prior", ["tv", "l1"])
+def test_depths_move_with_the_scene_and_take_new_data_at_once(prior: str) -> None:
+    scene = make_scene("beads", size=32, depths=3, density=0.5)
+    posed = stream_problem(scene.measurement, scene.calibration, prior=prior, estimate_background=False)
+    moved = np.roll(scene.measurement, 1, axis=1)
+    apart = []
+    for by in ((0.0, 1.0), (0.0, 0.0)):
+        video = VideoSolver(posed, cold_iterations=60, warm_iterations=1)
+        video.next(scene.measurement)
+        solver = video.solvers[0]
+        kept = solver._total.copy()
+        video._panning.next = lambda *_, by=by: by
+        picture = video.next(moved)
+        assert not np.array_equal(solver._total, kept)
+        best = VideoSolver(posed, cold_iterations=120).next(moved)
+        apart.append(np.linalg.norm(picture - best) / np.linalg.norm(best))
+    assert apart[0] < 0.5 * apart[1]

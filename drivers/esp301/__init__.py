@@ -1,0 +1,1 @@
+"""Newport ESP controllers: ESP301, ESP300 and ESP100."""
