@@ -81,6 +81,10 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
         (
             "tests/drivers/test_stream.py",
+            "tests/drivers/test_answers.py",
+            "tests/drivers/test_aravis.py",
+            "tests/drivers/test_basler.py",
+            "tests/drivers/test_micromanager.py",
             "tests/drivers/test_simulated_contracts.py",
             "tests/recon/video",
             "tests/recon/live",
