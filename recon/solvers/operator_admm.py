@@ -26,6 +26,7 @@ from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import IterationRecord
 from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
+from recon.solvers.moving import move
 from recon.solvers.prior_splits import ProxSplit, split_prior
 from recon.solvers.splitting import SensorData, Tuning, squares
 from recon.solvers.volume_admm import ExactAdmm
@@ -101,6 +102,11 @@ class OperatorAdmm(ExactAdmm):
         record = super().step()
         now = self.solution[window]
         return replace(record, change=float(np.sqrt(squares(now - before) / max(squares(now), 1e-300))))
+
+    def move(self, rows: float, columns: float) -> None:
+        """Move object and dual variables."""
+        super().move(rows, columns)
+        move(self.x, rows, columns)
 
     def _laplacian(self, weights: Array) -> Array:
         """Eigenvalues of T under cosine transforms."""

@@ -61,6 +61,10 @@ class LeanTotalVariation(VolumeAdmm):
             fft.rfft(start[0], out=self.X)
             np.maximum(start[0], 0, out=self.S[:, :, _POSITIVE])
 
+    @property
+    def _differences_state(self) -> Array:
+        return np.moveaxis(self.S, 2, 1)
+
     def _prepare_transfer(self) -> None:
         k = self._kernels
         nz, ny, nxh = self.g.shape
@@ -119,7 +123,7 @@ class LeanTotalVariation(VolumeAdmm):
         total = self._totals[0]
         for other in self._totals[1:]:
             total += other
-        return self.system.from_spectrum(total), np.asarray(self._statistics.sum(axis=0))
+        return self.system.from_spectrum(self._keep_total(total)), np.asarray(self._statistics.sum(axis=0))
 
     def _boundaries(self, starts: list[int], p: Array) -> tuple[dict[int, Array], dict[int, Array]]:
         """Return the estimate at each worker's first plane, and the z reflections of the plane before it."""
