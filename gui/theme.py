@@ -269,6 +269,7 @@ QComboBox QAbstractItemView {{ border: 1px solid {c.border}; padding: 0; }}
 QGraphicsView {{ border: 1px solid transparent; }}
 QGraphicsView:focus {{ border: 1px solid {c.accent}; }}
 *[refused="true"] {{ border: 2px solid {c.error}; color: {c.error}; font-weight: 700; }}
+QLineEdit[refused="true"], QComboBox[refused="true"] {{ padding: 2px 4px; }}
 QLabel[warns="warning"] {{ color: {c.warning}; font-weight: 700; }}
 QLabel[warns="error"] {{ color: {c.error}; font-weight: 700; }}
 QLabel#reason {{ color: {c.error}; font-size: {SMALL_PT}pt; }}

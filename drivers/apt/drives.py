@@ -75,7 +75,7 @@ class Motor:
         self._in_rack = link.controller.address == RACK
         self._address = BAY_1 + channel - 1 if self._in_rack else link.controller.address
         self._channel = 1
-        servo = link.controller.family == "servo"
+        servo = link.controller.family in ("servo", "brushless")
         self._scale = SPEED_SCALE[link.controller.family]
         self._status = MOT_GET_DCSTATUSUPDATE if servo else MOT_GET_STATUSUPDATE
         request = MOT_REQ_DCSTATUSUPDATE if servo else MOT_REQ_STATUSUPDATE

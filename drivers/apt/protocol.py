@@ -222,11 +222,17 @@ ActuatorName = Literal[
     "K10CR1",
     "LTS150",
     "LTS300",
+    "DDSM50",
+    "DDSM100",
+    "DDS220",
+    "DDS300",
+    "DDS600",
 ]
-ControllerName = Literal[
-    "KDC101", "TDC001", "BSC201", "BSC202", "BSC203", "KST101", "K10CR1", "LTS", "KIM101"
-]
-Family = Literal["servo", "stepper", "inertia"]
+ControllerName = (
+    Literal["KDC101", "TDC001", "BSC201", "BSC202", "BSC203", "KST101", "K10CR1", "LTS", "KIM101"]
+    | Literal["KBD101", "BBD201", "BBD202", "BBD203"]
+)
+Family = Literal["servo", "stepper", "inertia", "brushless"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +257,7 @@ class Controller:
     address: int
     channels: int
     serial_prefix: str
-    """The first two digits of the serial numbers of this type."""
+    """The first two digits of the serial numbers of this type; empty where they tell no type."""
 
 
 Z8_MM_PER_S = 3.0
@@ -277,6 +283,11 @@ ACTUATORS: Mapping[ActuatorName, Actuator] = {
     "K10CR1": Actuator("stepper", 409_600 * 120 / 360, 360, turns=True, built_into="K10CR1"),
     "LTS150": Actuator("stepper", 409_600, 150, built_into="LTS"),
     "LTS300": Actuator("stepper", 409_600, 300, built_into="LTS"),
+    "DDSM50": Actuator("brushless", 2000, 50, fastest=500.0),
+    "DDSM100": Actuator("brushless", 2000, 100, fastest=500.0),
+    "DDS220": Actuator("brushless", 20_000, 220, fastest=300.0),
+    "DDS300": Actuator("brushless", 20_000, 300, fastest=400.0),
+    "DDS600": Actuator("brushless", 20_000, 600, fastest=400.0),
 }
 
 CONTROLLERS: Mapping[ControllerName, Controller] = {
@@ -289,6 +300,10 @@ CONTROLLERS: Mapping[ControllerName, Controller] = {
     "K10CR1": Controller("stepper", USB_UNIT, 1, "55"),
     "LTS": Controller("stepper", USB_UNIT, 1, "45"),
     "KIM101": Controller("inertia", USB_UNIT, 4, "97"),
+    "KBD101": Controller("brushless", USB_UNIT, 1, "28"),
+    "BBD201": Controller("brushless", RACK, 1, ""),
+    "BBD202": Controller("brushless", RACK, 2, ""),
+    "BBD203": Controller("brushless", RACK, 3, ""),
 }
 
 
@@ -304,6 +319,7 @@ SPEED_SCALE: Mapping[Family, float] = {
     "servo": 65_536 * 2048 / 6e6,  # 65536 times the servo's sampling interval, in seconds
     "stepper": 53.68,
     "inertia": 1.0,
+    "brushless": 65_536 * 102.4e-6,
 }
 """What the controllers call a velocity, over counts a second."""
 
@@ -313,11 +329,12 @@ FASTEST_COUNTS_PER_S: Mapping[Family, float] = {
     "servo": _LONG / SPEED_SCALE["servo"],
     "stepper": 50 * 409_600,  # 3000 turns a minute, of 200 steps with 2048 microsteps each
     "inertia": 2000,
+    "brushless": _LONG / SPEED_SCALE["brushless"],
 }
 """The fastest a controller takes: what its message can hold, or its manual's limit where that is less."""
 
 SLOWEST_COUNTS_PER_S: Mapping[Family, float] = {family: 1 / scale for family, scale in SPEED_SCALE.items()}
 """The slowest speed that is not sent as zero: velocities are whole numbers."""
 
-SETTLING_COUNTS: Mapping[Family, int] = {"servo": 50, "stepper": 1, "inertia": 1}
-"""How far from its target a move may end; a servo holds its place within some of its counts (1.5 um)."""
+SETTLING_COUNTS: Mapping[Family, int] = {"servo": 50, "stepper": 1, "inertia": 1, "brushless": 10}
+"""How far from its target a move may end; servos hold it within some counts (1.5 um; 5 or 0.5)."""

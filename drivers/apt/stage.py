@@ -35,7 +35,7 @@ class AptAxis(AxisOptions):
 
     port: str = Field(min_length=1, description='Serial port of its controller, e.g. "/dev/ttyUSB0".')
     controller: ControllerName = Field(description="Type of the controller.")
-    channel: int = Field(1, ge=1, le=4, description="Channel of a KIM101, bay of a BSC20x, counted from 1.")
+    channel: int = Field(1, ge=1, le=4, description="Channel of a KIM101, bay of a BSC20x or BBD20x, from 1.")
     actuator: ActuatorName | None = Field(None, description="Type of the actuator; or say what a count is.")
     counts_per_mm: float | None = Field(
         None, gt=0, description="Encoder counts, microsteps or steps a millimetre of an actuator not listed."
@@ -141,7 +141,7 @@ _SPEED_TOLERANCE = 0.01
 
 
 class AptStage(PolledStage):
-    """Axes on KDC101, TDC001, BSC20x, KST101 or KIM101 controllers, K10CR1 and LTS stages, moved together.
+    """Axes on KDC101, TDC001, BSC20x, KST101, KBD101, BBD20x, KIM101, K10CR1 and LTS, moved together.
 
     Each controller has a port of its own. Limits are the actuator's travel, narrowed by ``bench.toml``: these
     controllers do not know it. An axis of a KIM101 has no reference; homing calls the present place zero, and
@@ -175,7 +175,12 @@ class AptStage(PolledStage):
         found = []
         for port in serial_ports():
             name = next(
-                (n for n, c in CONTROLLERS.items() if port.serial_number.startswith(c.serial_prefix)), None
+                (
+                    n
+                    for n, c in CONTROLLERS.items()
+                    if c.serial_prefix and port.serial_number.startswith(c.serial_prefix)
+                ),
+                None,
             )
             if port.usb_id != _THORLABS_USB or name is None:
                 continue

@@ -258,13 +258,14 @@ class _LayerRenderer:
     def _kernel(self, node_y: float, node_x: float) -> Image:
         """Point spread function of a node on fine pixels about its straight ray."""
         pitch = self.fine.pitch_um
-        shape = []
-        for side, half in zip(self.fine.shape, self.half_kernel, strict=True):
-            count = 2 * int(np.ceil(half / pitch))
-            shape.append(count + side % 2)
         center = (self.fine.center_um[0] + node_x * pitch, self.fine.center_um[1] + node_y * pitch)
         z = self.layer.z_um
         source = (-center[0] / self.magnification, -center[1] / self.magnification, z)
+        shape = []
+        extent = self.propagator.half_extent_um(z, float(np.hypot(*source[:2])) / z)
+        for side, half in zip(self.fine.shape, extent, strict=True):
+            count = 2 * int(np.ceil(half / pitch))
+            shape.append(count + side % 2)
         grid = PixelGrid((shape[0], shape[1]), pitch, center)
         kernel = self.propagator.psf(source, grid, self.spectrum, cell=self.oversampling == 1)
         kernel *= response_on(grid, source, self.propagator.distance_um, self.fall_off)
@@ -300,11 +301,11 @@ def _nodes_between(low: float, high: float, tolerance: float, widest: float) -> 
 
 
 def _march(end: float, tolerance: float, widest: float, start: float) -> npt.NDArray[np.float64]:
-    """Step outwards from ``start`` to ``end``; all steps shrink a little so that the last one arrives."""
+    """Step outwards from ``start`` until ``end`` is reached: pictures of any size share their nodes."""
     positions = [start]
     while positions[-1] < end:
         positions.append(positions[-1] + min(widest, tolerance / max(positions[-1], 1e-9)))
-    return np.asarray(start + (np.array(positions) - start) * (end - start) / (positions[-1] - start))
+    return np.asarray(positions)
 
 
 def _hat(nodes: npt.NDArray[np.float64], index: int, cells: range) -> tuple[Image, int]:

@@ -47,8 +47,8 @@ TILE_TOLERANCE = 0.04
 MOST_TILES = 256
 CELL_POINTS: FloatArray = np.array([-0.375, -0.125, 0.125, 0.375])
 """Places along each side of a square cell, in its sides, whose light is summed for the cell's."""
-KEPT_BYTES = 192 << 20
-"""Of the newest point spread functions: another picture in the place of one needs the same."""
+KEPT_BYTES = 256 << 20
+"""Of the newest point spread functions: another picture at the distance of one needs the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,10 +166,13 @@ class WavePropagator:
         contrast = self.diffuser.glass.index - self.diffuser.ambient.index
         return self._typical_slope * contrast * self._reduced_distance_um(z_um)
 
-    def half_extent_um(self, z_um: float) -> tuple[float, float]:
-        """Half height and width on the sensor that hold all light of a source at a distance, off axis too."""
+    def half_extent_um(self, z_um: float, angle: float = 0.7) -> tuple[float, float]:
+        """Half height and width on the sensor that hold all light of a source at a distance.
+
+        ``angle``: tangent of how far off the axis it is at the most.
+        """
         # 35 degrees off the axis; beyond, the little light that strays farther is cut off.
-        spread = self._spread_um((0.7 * z_um, 0.0, z_um), 650.0)
+        spread = self._spread_um((min(angle, 0.7) * z_um, 0.0, z_um), 650.0)
         scale = 1 + self.distance_um / z_um
         height, width = self.diffuser.aperture_um
         return (height / 2 + spread) * scale, (width / 2 + spread) * scale
@@ -276,16 +279,16 @@ class WavePropagator:
         diffuser = self.diffuser
         pitch = diffuser.pitch_um
         n_rows, n_columns = diffuser.heights_um.shape
-        row_window = _window(tile.rows, margin, n_rows, pitch, diffuser.aperture_um[0])
-        column_window = _window(tile.columns, margin, n_columns, pitch, diffuser.aperture_um[1])
-        if not row_window.any() or not column_window.any():
+        along_y = _window(tile.rows, margin, n_rows, pitch, diffuser.aperture_um[0])
+        along_x = _window(tile.columns, margin, n_columns, pitch, diffuser.aperture_um[1])
+        if along_y is None or along_x is None:
             return
-        shape = (fft.next_fast_len(len(row_window)), fft.next_fast_len(len(column_window)))
-        field = np.zeros(shape, np.complex64)
-        first_row, first_column = tile.rows.start - margin, tile.columns.start - margin
+        first_row, row_window, height = along_y
+        first_column, column_window, width = along_x
+        field = np.zeros((height, width), np.complex64)
         wavelength_um = wavelength_nm * 1e-3
         modulate(
-            field,
+            field.view(np.float32),
             diffuser.heights_um,
             row_window,
             column_window,
@@ -302,17 +305,18 @@ class WavePropagator:
         )
         spectrum = fft.fft2(field, overwrite_x=True, workers=self.workers)
         propagate(
-            spectrum,
-            fft.fftfreq(shape[0], pitch),
-            fft.fftfreq(shape[1], pitch),
+            spectrum.view(np.float32),
+            fft.fftfreq(height, pitch),
+            fft.fftfreq(width, pitch),
             np.pi * wavelength_um * rho_um / tile.cos,
             tile.tan_squared,
             tile.direction[0],
             tile.direction[1],
         )
         field = fft.ifft2(spectrum, overwrite_x=True, workers=self.workers)
-        inner = field[margin : margin + len(tile.rows), margin : margin + len(tile.columns)]
-        add_intensity(energy, inner, weight)
+        top, left = tile.rows.start - first_row, tile.columns.start - first_column
+        inner = field[top : top + len(tile.rows), left : left + len(tile.columns)]
+        add_intensity(energy, inner.view(np.float32), weight)
 
 
 def disc_kernel(diameter: float) -> npt.NDArray[np.float32]:
@@ -346,8 +350,20 @@ def _split(span: range, parts: int) -> list[range]:
 
 def _window(
     span: range, margin: int, samples: int, pitch: float, aperture_um: float
-) -> npt.NDArray[np.float32]:
-    """Amplitude along one axis for the samples ``span`` widened by ``margin``: aperture and soft cut."""
+) -> tuple[int, npt.NDArray[np.float32], int] | None:
+    """Amplitude along one axis of what lights the samples ``span``: aperture and soft cut.
+
+    Returns
+    -------
+    first : int
+        The sample at which both the amplitudes and the transform begin.
+    amplitude : ndarray, float32
+    length : int
+        Of the transform: light that goes half as far again as ``margin`` comes round only where nothing is
+        looked at.
+
+    None where the aperture lets no light through.
+    """
     index = np.arange(span.start - margin, span.stop + margin)
     low = (index - samples / 2) * pitch
     covered = np.minimum(low + pitch, aperture_um / 2) - np.maximum(low, -aperture_um / 2)
@@ -357,4 +373,11 @@ def _window(
     ramp = np.sin(np.pi / 2 * (np.arange(fade) + 0.5) / fade)
     amplitude[:fade] *= ramp
     amplitude[-fade:] *= ramp[::-1]
-    return np.asarray(amplitude, np.float32)
+    lit = index[amplitude > 0]
+    if not len(lit):
+        return None
+    begin, end = int(lit[0]), int(lit[-1]) + 1
+    first = min(begin, span.start)
+    reach = margin + margin // 2
+    length = max(end + reach - span.start, span.stop + reach - begin, span.stop - first, end - first)
+    return first, amplitude[first - index[0] : end - index[0]].astype(np.float32), fft.next_fast_len(length)

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.camera.base import Array
 from recon.errors import InputError
 from recon.reconstruction.choice import Decision
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.part import expects_background
-from recon.reconstruction.pilot import Pilot, pilot
+from recon.reconstruction.pilot import pilot
 from recon.reconstruction.problem import Problem
 
 MODEL_ERROR = 0.02
@@ -33,6 +34,9 @@ LIGHT = 0.11
 """Stray light is weak beside noise and hides in dark objects: a background that is light, this share of the
 data's or more, is taken where the mean square error falls by ``Taken.fall``. Beads under stray light: 0.26
 and 0.73, and 4.5 dB gained; of 24 scenes without any a background came to 0.07 at most, mostly below zero."""
+SURE = 0.5
+"""Share of ``GAIN`` that the pass without a background is brought down to, where it stops early: what is left
+of three channels is their mean."""
 BLACK, BRIGHTEST = 0.2, 99.5
 """A pixel is dark below this share of the brightest (percentile)."""
 
@@ -83,7 +87,8 @@ class Trial:
     Attributes
     ----------
     without, lit : float
-        Root mean square error there, in units of noise and usual error of the model.
+        Root mean square error there, in units of noise and usual error of the model; without a background
+        at most, where the pass ended as soon as it was small enough.
     light : float
         Mean of the background relative to that of the data.
     dark : float
@@ -100,6 +105,12 @@ class Trial:
     taken: Taken
     dim: bool = False
 
+    def asks(self, share: float = 1.0) -> bool:
+        """Whether held-out pixels ask for a background: it explains ``share`` of GAIN, or is light."""
+        fall = self.without**2 - self.lit**2
+        is_light = not self.dim and self.light >= LIGHT
+        return fall > share * GAIN or (is_light and fall >= self.taken.fall * self.without**2)
+
     @property
     def explains(self) -> bool:
         """Whether a background explains what nothing else does."""
@@ -108,14 +119,16 @@ class Trial:
     @property
     def helps(self) -> bool:
         """Whether a background explains what nothing else does, is light, or lies over a dark scene."""
-        fall = self.without**2 - self.lit**2
-        is_light = not self.dim and self.light >= LIGHT and fall >= self.taken.fall * self.without**2
-        return self.explains or is_light or (self.dark >= self.taken.dark and self.light >= self.taken.light)
+        return self.asks() or (self.dark >= self.taken.dark and self.light >= self.taken.light)
 
 
-def trial_of(channels: Sequence[Problem]) -> Trial:
-    """Try coarse problems of one channel each; errors are their root mean square."""
-    tried = [_tried(channel) for channel in channels]
+def trial_of(channels: Sequence[Problem], *, whole: bool = False) -> Trial:
+    """Try coarse problems of one channel each; errors are their root mean square.
+
+    Passes without a background end where what they explain leaves nothing to one, unless they are to be
+    compared with others: ``whole``.
+    """
+    tried = [_tried(channel, whole=whole) for channel in channels]
     without, lit = (
         float(np.sqrt(np.mean([getattr(t, side) ** 2 for t in tried]))) for side in ("without", "lit")
     )
@@ -123,7 +136,7 @@ def trial_of(channels: Sequence[Problem]) -> Trial:
     return Trial(without, lit, light, dark, tried[0].taken)
 
 
-def _tried(problem: Problem) -> Trial:
+def _tried(problem: Problem, *, whole: bool) -> Trial:
     data, valid = problem.data[0], problem.valid[0]
     spread2 = max(float(data[valid].var(dtype=np.float64)) - 1, 0.0)
     unit = np.float32(np.sqrt(1 + MODEL_ERROR**2 * spread2))
@@ -135,17 +148,12 @@ def _tried(problem: Problem) -> Trial:
     coarse = replace(
         problem, data=np.where(seen, data, 0)[None], valid=seen[None], noise=problem.noise * unit
     )
+    predicted = np.where(seen, 0, data)[unseen]  # what was not seen is to be predicted
 
-    def tried(smooth: bool, weight: float | None) -> tuple[Pilot, float]:
-        own = replace(coarse, smooth=smooth)
-        count = PLAIN_ITERATIONS if own.is_plain else ITERATIONS
-        found = pilot(own, count, weight=weight, solver="admm")
-        left = found.left[0] + np.where(seen, 0, data)  # what was not seen is to be predicted
-        error = float(np.sqrt(np.mean(left[unseen].astype(np.float64) ** 2)))
-        return found, error
+    def error(left: Array) -> float:
+        return float(np.sqrt(np.mean((left[0][unseen] + predicted).astype(np.float64) ** 2)))
 
-    lit, with_it = tried(True, None)
-    _, without = tried(False, lit.weight)  # one prior for both: less light has less of it
+    lit = pilot(replace(coarse, smooth=True), ITERATIONS, solver="admm")
     assert lit.background is not None
     light = float(lit.background[0][valid].mean()) / max(float(data[valid].mean()), 1e-30)
     rows, columns = problem.window
@@ -153,7 +161,17 @@ def _tried(problem: Problem) -> Trial:
     dark = float(np.mean(picture < BLACK * np.percentile(picture, BRIGHTEST)))
     lit_picture, volume = expects_background(problem), problem.n_planes > 1
     taken = VOLUME if volume else LIT_PICTURE if lit_picture else POINTS
-    return Trial(without, with_it, light, dark, taken)
+    trial = Trial(np.inf, error(lit.left), light, dark, taken)
+    plain = replace(coarse, smooth=False)
+    # One prior for both: less light has less of it.
+    found = pilot(
+        plain,
+        PLAIN_ITERATIONS if plain.is_plain else ITERATIONS,
+        weight=lit.weight,
+        solver="admm",
+        enough=None if whole else lambda left: not replace(trial, without=error(left)).asks(SURE),
+    )
+    return replace(trial, without=error(found.left))
 
 
 def beyond_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.solvers import SOLVERS
-from recon.solvers.base import Outcome, StoppingRules
+from recon.solvers.base import IterationRecord, Outcome, Solver, StoppingRules
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
@@ -21,6 +22,8 @@ Bools = npt.NDArray[np.bool_]
 FINE_PX = 3.0
 """Deviation of the Gaussian whose mean is taken off what is left, pixels: slow waves are left by unfinished
 iterations and stray light, and prefer smaller PSFs."""
+LOOKED_AT = 2
+"""Iterations between looks at whether it is enough: each costs one of several forward passes an iteration."""
 TILES = 4
 """Along each axis of the photograph, judged apart: how much they differ tells how sure the whole is."""
 
@@ -56,6 +59,7 @@ def pilot(
     weight: float | None = None,
     solver: str = "admm-sensor",
     cancel: threading.Event | None = None,
+    enough: Callable[[Array], bool] | None = None,
 ) -> Pilot:
     """Reconstruct a problem in few iterations; its channels together, or its only one.
 
@@ -69,6 +73,8 @@ def pilot(
         ADMM where that one refuses the problem.
     cancel : threading.Event, optional
         Set it to stop after the iteration in progress.
+    enough : callable, optional
+        ``enough(left)`` with what an iterate leaves of the data, at every :data:`LOOKED_AT`-th: True ends it.
     """
     offered = SOLVERS.named(solver)
     offered = offered if offered.accepts(problem) is None else SOLVERS.named("admm")
@@ -77,16 +83,31 @@ def pilot(
     try:
         part.weigh(None, weight)
         rules = StoppingRules(iterations=iterations, tolerance=0.0)
-        outcome = offered.make(part, None).run(rules, cancel=cancel)
-        solution = np.maximum(part.lifted(outcome.solution), 0)
-        background = None if part.removal is None else part.background(solution)
-        # Of the data as measured: a background holds what was expected of it.
-        left = problem.data.astype(part.dtype, copy=False) - part.camera.forward(solution)
-        if background is not None:
-            left -= background
+        ended = threading.Event()
+
+        def look(solver: Solver, record: IterationRecord) -> None:
+            stopped = cancel is not None and cancel.is_set()
+            if enough is not None and record.iteration % LOOKED_AT == 0:
+                stopped = stopped or enough(_said(part, solver.solution)[2])
+            if stopped:
+                ended.set()
+
+        outcome = offered.make(part, None).run(rules, callback=look, cancel=ended)
+        solution, background, left = _said(part, outcome.solution)
         return Pilot(solution, background, left, part.weight, outcome)
     finally:
         part.close()
+
+
+def _said(part: Part, iterate: Array) -> tuple[Array, Array | None, Array]:
+    """Return a solver's iterate as an object, the background that goes with it, and what both leave."""
+    solution = np.maximum(part.lifted(iterate), 0)
+    background = None if part.removal is None else part.background(solution)
+    # Of the data as measured: a background holds what was expected of it.
+    left = part.problem.data.astype(part.dtype, copy=False) - part.camera.forward(solution)
+    if background is not None:
+        left -= background
+    return solution, background, left
 
 
 def fine_structure(rest: Array, known: Bools) -> Array:

@@ -181,10 +181,16 @@ def field_of(
 STRAY_SHARE = 0.2
 """Share of the data's light, in a coarse l1 pass's smooth background, from which on there may be stray light
 in a picture: sparse ones without any had up to 0.15 there, dense ones, which l1 does not explain, 0.75."""
-SETTLED = {"convolution": 1e-3, "merged": 1e-3, "varying picture": 2e-3, "varying volume": 3e-3}
+SETTLED = {
+    "convolution": 1e-3,
+    "merged": 1e-3,
+    "varying picture": 2e-3,
+    "varying volume": 4.5e-3,
+    "varying points": 8e-3,
+}
 """Change an iteration at which pictures were seen to be within 0.2 dB of the end: the solver of varying PSFs,
-with its exact data term, goes further in one iteration. Merged colours have the light of all: less noise, and
-more to be gained at the end, in a third of the time."""
+with its exact data term, goes further in one iteration, and points in a volume (l1) are found early. Merged
+colours have the light of all: less noise, and more to be gained at the end, in a third of the time."""
 USUAL_ITERATIONS = {"convolution": 100, "varying": 60}
 
 

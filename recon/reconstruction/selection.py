@@ -155,7 +155,7 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     if looks and prevented is None:
         farther = with_planes_beyond(calibration)
         coarser = _coarse(data, valid, farther, problem.options.z_um, beyond=len(BEYOND))
-        again = _trial(problem, coarser, model)
+        again = _trial(problem, coarser, model, whole=True)
     beyond = beyond_of(trial, again, overrides, prevented)
     if beyond.value != "none" and again is not None:
         trial = again
@@ -177,7 +177,8 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
         solved = replace(problem, model="convolution", smooth=False)
         tolerance = solved.solver.tolerance_for(solved)
     elif tolerance is None:
-        varying = "merged" if one and picture else f"varying {'picture' if picture else 'volume'}"
+        shown = "picture" if picture else "points" if kind == "l1" else "volume"
+        varying = "merged" if one and picture else f"varying {shown}"
         tolerance = SETTLED["convolution" if model == "convolution" else varying]
     decisions = (
         by_model,
@@ -282,8 +283,18 @@ def _contrast(data: Array, valid: Array, deviation: Array) -> float:
     return max(s / max(float(n), 1e-30) for s, n in zip(spread, deviation, strict=True))
 
 
-def _trial(problem: Problem, coarse: list[Problem], model: ModelName) -> Trial:
-    """Try the coarse copies with the problem's prior; one that ADMM has no way for by what it counts."""
+def _trial(problem: Problem, coarse: list[Problem], model: ModelName, *, whole: bool = False) -> Trial:
+    """Try the coarse copies with the problem's prior; one that ADMM has no way for by what it counts.
+
+    Where PSFs vary the central ones are tried first, in a fraction of the time: what they explain without a
+    background the true camera explains as well, and its passes are less finished, which looks like light
+    that a background would take (four dense pictures without stray light lost 3.0 to 4.8 dB by one).
+    """
     name = problem.prior_name
     prior = name if name in volume_priors() else kind_of(name)
-    return trial_of([coarse_copy(c, model, prior, background=True) for c in coarse])
+
+    def tried(model: ModelName) -> Trial:
+        return trial_of([coarse_copy(c, model, prior, background=True) for c in coarse], whole=whole)
+
+    first = tried("convolution")
+    return tried(model) if first.helps and model != "convolution" else first

@@ -147,7 +147,8 @@ def _varying_admm(part: Part, camera: LinearOperator, start: Array | None) -> So
     from recon.solvers.operator_admm import OperatorAdmm
 
     prior = part.prior_on(part.mean_axis_weights, (False,) * 3)
-    return OperatorAdmm(camera, part.central, part.sensor_data, prior, initial=start)
+    shown = part.problem.window
+    return OperatorAdmm(camera, part.central, part.sensor_data, prior, initial=start, shown=shown)
 
 
 def _sensor_admm(part: Part, start: Array | None) -> Solver:

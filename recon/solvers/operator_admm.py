@@ -14,6 +14,7 @@ where this is Douglas-Rachford splitting).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -25,8 +26,9 @@ from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import IterationRecord
 from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
+from recon.solvers.moving import move
 from recon.solvers.prior_splits import ProxSplit, split_prior
-from recon.solvers.splitting import SensorData, Tuning
+from recon.solvers.splitting import SensorData, Tuning, squares
 from recon.solvers.volume_admm import ExactAdmm
 
 FIRST_ITERATIONS = 4
@@ -53,6 +55,9 @@ class OperatorAdmm(ExactAdmm):
         priors, and any other with an exact prox.
     initial : ndarray, ``camera.domain_shape``, optional
     tuning : Tuning, optional
+    shown : tuple of slice, optional
+        Rows and columns whose change an iteration is told, by default all: the field beyond the sensor, which
+        hardly bends the data, goes on moving long after what is shown has settled.
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
@@ -68,9 +73,10 @@ class OperatorAdmm(ExactAdmm):
         *,
         initial: Array | None = None,
         tuning: Tuning | None = None,
+        shown: tuple[slice, slice] = (slice(None), slice(None)),
     ) -> None:
         super().__init__(central, data, tuning, None, 1.7, self._bend)
-        self.camera = camera
+        self.camera, self.shown = camera, shown
         dtype = camera.dtype
         tv, self.separable, others = split_prior(prior, _is_not_periodic)
         self.kappa = dtype.type(self.tuning.kappa if tv else 1.0)
@@ -91,7 +97,16 @@ class OperatorAdmm(ExactAdmm):
     def step(self) -> IterationRecord:
         """Do one iteration; the first ones solve their data term better."""
         self.system.max_steps = FIRST_STEPS if self.iteration < FIRST_ITERATIONS else STEPS
-        return super().step()
+        window = (..., *self.shown)
+        before = self.solution[window]
+        record = super().step()
+        now = self.solution[window]
+        return replace(record, change=float(np.sqrt(squares(now - before) / max(squares(now), 1e-300))))
+
+    def move(self, rows: float, columns: float) -> None:
+        """Move object and dual variables."""
+        super().move(rows, columns)
+        move(self.x, rows, columns)
 
     def _laplacian(self, weights: Array) -> Array:
         """Eigenvalues of T under cosine transforms."""

@@ -19,6 +19,7 @@ from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
 from recon.solvers.base import Solver
 from recon.solvers.memory import Storage
+from recon.solvers.moving import move_spectra
 
 MOST_STEPS = 30
 """Conjugate gradient steps of one iteration at most."""
@@ -326,6 +327,20 @@ class VolumeSplitting(Solver):
         return self._on_device
 
     _on_device: Array | None = None
+    _total: Array | None = None
+    """Spectrum of what the planes cast but for the data term's step, once there is one."""
+
+    def _keep_total(self, total: Array) -> Array:
+        """Keep what the planes cast for data to come; return it."""
+        if self._total is None:
+            self._total = self.xp.empty_like(total)
+        self._total[...] = total
+        return total
+
+    def move(self, rows: float, columns: float) -> None:
+        """Move object and dual variables; what is left of the data is noise, which does not move."""
+        if self._total is not None:
+            move_spectra(self._total, rows, columns, self.operator.grid_shape[1])
 
     def _start(self) -> Array | None:
         return None  # zeros will do: a copy of a volume is too much to pay for a fall-back

@@ -85,9 +85,11 @@ def inertia_axis(controller: AptController, channel: int, **more: object) -> dic
         ("KST101", "KST101", "ZST213", "x_um", 2008.64563),
         ("LTS300", "LTS", "LTS300", "x_um", 409.6),
         ("K10CR1", "K10CR1", "K10CR1", "yaw_mrad", 409_600 * 120 / 6283.185307),
+        ("KBD101", "KBD101", "DDSM100", "x_um", 2.0),
+        ("BBD202", "BBD202", "DDS220", "x_um", 20.0),
     ],
 )
-def test_stepper_units_without_a_rack(
+def test_units_speeds_and_limits_of_each_family(
     tmp_path: Path, model: str, controller: str, actuator: str, axis: str, counts: float
 ) -> None:
     emulated = AptController(tmp_path / "unit", model, [MovingAxis(0, 200_000_000, 3e7, 0)], 45_000_001)
@@ -96,12 +98,18 @@ def test_stepper_units_without_a_rack(
         stage.home()
         assert stage.move_to({axis: 1000.0})[axis] == pytest.approx(1000.0, abs=1 / counts)
         assert emulated.axes[0].motion.place == pytest.approx(1000 * counts, abs=1)
+        assert stage.axes[0].speed_per_s == pytest.approx(3e7 / counts, rel=1e-4)
     emulated.close()
     assert emulated.strange == []
 
 
 def test_what_is_built_into_a_controller_is_driven_by_no_other() -> None:
-    for controller, actuator in (("KST101", "LTS150"), ("LTS", "NRT150"), ("K10CR1", "LTS300")):
+    for controller, actuator in (
+        ("KST101", "LTS150"),
+        ("LTS", "NRT150"),
+        ("K10CR1", "LTS300"),
+        ("KBD101", "Z825"),
+    ):
         with pytest.raises(ValidationError, match=f"a {controller} cannot drive a {actuator}"):
             stage_of(x_um={"port": "/dev/none", "controller": controller, "actuator": actuator})
 

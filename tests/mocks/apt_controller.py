@@ -58,8 +58,10 @@ class AptController:
         self.strange: list[int] = []
         """Numbers of messages that this type does not know."""
         self._unacknowledged = 0
-        self._servo = model[:3] in ("KDC", "TDC")
-        self._scale = 65_536 * 2048 / 6e6 if self._servo else 53.68
+        self._servo = model[:3] in ("KDC", "TDC", "KBD", "BBD")
+        self._in_rack = model[:3] in ("BSC", "BBD")
+        sampling_s = 102.4e-6 if model[1:3] == "BD" else 2048 / 6e6
+        self._scale = 65_536 * sampling_s if self._servo else 53.68
         if isinstance(port, Path):
             port.mkdir(exist_ok=True)
             self.port = PtyDevice(port, self.answer, split_messages)
@@ -81,7 +83,7 @@ class AptController:
 
     @property
     def _home(self) -> int:
-        return RACK if self.model.startswith("BSC") else USB
+        return RACK if self._in_rack else USB
 
     def answer(self, message: bytes) -> list[Answer]:
         number, first, second, to, _ = struct.unpack_from("<HBBBB", message)
@@ -102,7 +104,7 @@ class AptController:
         return found
 
     def _address(self, index: int) -> int:
-        return BAY + index if self.model.startswith("BSC") else USB
+        return BAY + index if self._in_rack else USB
 
     def _reply(self, number: int, first: int, second: int, to: int, data: bytes) -> bytes | None:
         if number == 0x0005 and to in (self._home, USB):
@@ -116,8 +118,8 @@ class AptController:
             return self._short(0x0061, first, 1 if first < len(self.axes) else 2, RACK)
         if self.model.startswith("KIM"):
             return self._inertia(number, first, second, data)
-        index = to - BAY if self.model.startswith("BSC") else 0
-        known = to == USB or (self.model.startswith("BSC") and 0 <= index < len(self.axes))
+        index = to - BAY if self._in_rack else 0
+        known = to == USB or (self._in_rack and 0 <= index < len(self.axes))
         return self._motor(self.axes[index], number, first, second, to, data) if known else None
 
     # Motors ---

@@ -16,6 +16,7 @@ from recon.camera.camera_model import CAMERAS, OfferedCamera
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.options import Overrides
+from recon.reconstruction.pilot import LOOKED_AT, pilot
 from recon.reconstruction.planes import put_back
 from recon.reconstruction.reduction import reduced, reduced_calibration
 from recon.reconstruction.rules import drift, precision_of
@@ -287,6 +288,25 @@ def test_pictures_of_one_convolution_stop_where_the_choice_says():
     assert usual.history[-1].change < usual.choice.tolerance
     assert wished.choice.tolerance == 5e-2
     assert len(wished.history) < len(usual.history)
+
+
+def test_an_unfinished_pass_through_varying_psfs_is_not_taken_for_stray_light():
+    scene = make_scene("dense-picture", size=44, grid=3, photons=2e4, density=0.6, seed=27)
+    choice = choose(scene.measurement, scene.calibration, z_um=float(scene.z_um[0]))
+    assert (choice.model, choice.background) == ("lowrank", False)
+    assert scene.background.max() == 0
+
+
+def test_a_pilot_ends_when_it_is_enough():
+    scene = make_scene("sparse-picture", size=24, grid=1)
+    problem = Problem.of(
+        recon.Measurement(scene.measurement), scene.calibration, Options(model="convolution")
+    )
+    left = []
+    ended = pilot(problem, 9, enough=lambda rest: left.append(rest) or len(left) == 2)
+    assert len(ended.outcome.history) == 2 * LOOKED_AT
+    np.testing.assert_array_equal(ended.left, left[-1])
+    assert len(pilot(problem, 9).outcome.history) == 9
 
 
 def test_soft_psfs_are_binned_and_sharp_ones_are_not():

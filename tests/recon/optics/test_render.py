@@ -142,3 +142,16 @@ def test_a_sensor_off_the_axis_sees_its_part_of_the_picture(propagator: WaveProp
     right = PixelGrid((120, 80), GRID.pitch_um, (40 * GRID.pitch_um, 0.0))
     whole, half = seen(GRID)[:, 80:], seen(right)
     assert np.linalg.norm(half - whole) < 0.02 * np.linalg.norm(whole)
+
+
+def test_another_picture_at_the_same_distance_needs_no_more_propagation(
+    propagator: WavePropagator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def shone(width_um: float) -> None:
+        layer = Layer(np.ones((20, 30, 3), np.float32), Z_UM, (7e3, width_um))
+        scene = Scene("even", layers=(layer,))
+        render(scene, GREEN_ONLY, GRID, propagator, no_fall_off, layer_photons=1.0, bead_photons=1.0)
+
+    shone(11e3)
+    monkeypatch.setattr(propagator, "caustic", None)
+    shone(9e3)

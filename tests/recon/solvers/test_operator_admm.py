@@ -103,6 +103,19 @@ def test_goes_on_from_a_checkpoint():
     np.testing.assert_array_equal(second.solution, whole.solution)
 
 
+def test_the_change_is_that_of_what_is_shown():
+    shown = slice(6, 14), slice(7, 13)
+    one, whole = solver(shown=shown), solver()
+    for _ in range(4):
+        before = one.solution
+        record, of_all = one.advance(), whole.advance()
+    now = one.solution
+    for (rows, columns), told in ((shown, record), ((slice(None),) * 2, of_all)):
+        change = np.linalg.norm((now - before)[..., rows, columns])
+        assert told.change == pytest.approx(change / np.linalg.norm(now[..., rows, columns]))
+    assert record.change != pytest.approx(of_all.change, rel=1e-3)
+
+
 def test_stops_on_nan_and_on_request():
     _, _, data = problem()
     bad = data.copy()
