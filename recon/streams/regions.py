@@ -147,7 +147,8 @@ def noise_of(frames: Floats) -> float:
     """
     from scipy.ndimage import uniform_filter
 
-    light, steps, apart = (np.zeros(frames.shape[1:]) for _ in range(3))
+    light: Array = np.zeros(frames.shape[1:])
+    steps, apart = np.zeros_like(light), np.zeros_like(light)
     before: deque[Floats] = deque(maxlen=APART)
     for frame in frames:
         smooth = uniform_filter(frame, 3)
