@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from matplotlib.figure import Figure
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.optics.grid import PixelGrid, mixed_spectrum
+from recon.optics.scene import Scene
 from recon.optics.sensor import Readout, expose
 
 Image = npt.NDArray[np.float32]
@@ -70,6 +72,11 @@ def main() -> None:
     near = timed("pco, 2x2 binned: PSF at 12 mm, one colour", pco.psf, (0.0, 0.0, 12e3), GREEN, 2)
     pco.scene_lit = True
     light = timed("pco, 2x2 binned: photograph of the picture", pco.photons_per_s, WHITE, 2)
+    timed("pco, whole sensor: photograph of the picture", pco.photons_per_s, WHITE)
+    assert pco.scene is not None
+    layer = pco.scene.layers[0]
+    pco.set_scene(Scene("negative", (replace(layer, radiance=1 - layer.radiance),)))
+    timed("pco, whole sensor: another picture in its place", pco.photons_per_s, WHITE)
     pattern = pco.fixed_pattern().binned(2)
     readout = Readout(0.46, 1.0, 100.0, 65535, 120_000.0, 3.0)
     exposure_s = 20_000 / float(light.max())

@@ -1,6 +1,6 @@
 """What warm starts gain in a video, and what a Dask worker costs.
 
-    python benchmarks/video.py [--height 270] [--width 480] [--frames 32] [--out FILE.json]
+    python benchmarks/video.py [--height 270] [--width 480] [--frames 32] [--planes 8] [--out FILE.json]
 
 Scenes are made on a grid three times finer than the sensor's (see dense_2d.py): one larger than the field
 that pans by 0, 1/6, 1/2 or 2 sensor pixels a frame, with photon noise of 1 %. Independent frames are solved
@@ -32,6 +32,7 @@ from pathlib import Path
 import numpy as np
 from dense_2d import FINE, binned, caustic, dense_scene
 from scipy import fft
+from scipy.ndimage import gaussian_filter
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -40,7 +41,9 @@ from instrument.reconstruction.video import VideoRequest, prepare_video
 from instrument.reconstruction.video_work import cluster, in_process, on_cluster
 from recon.base.metrics import psnr
 from recon.base.threads import set_threads
+from recon.camera.registration import rescaled
 from recon.streams.video import COLD_ITERATIONS, VideoSolver, stream_problem
+from recon.types import Calibration, Geometry
 from tests.mocks.recordings import write_recording
 
 PHOTONS = 1e4
@@ -56,11 +59,35 @@ def scenes(height: int, width: int):
     scene = dense_scene(*fine, seed=0)
     psf = caustic(FINE * height, FINE * width, seed=1)
     psf /= psf.sum(dtype=np.float64)
-    padded = np.zeros(fine, np.float32)
-    padded[: FINE * height, : FINE * width] = psf
-    padded = np.roll(padded, [-(FINE * (n // 2)) for n in (height, width)], (0, 1))
-    light = fft.irfft2(fft.rfft2(padded) * fft.rfft2(scene), s=fine)
-    return light, scene, binned(psf).astype(np.float32)
+    return cast(scene, psf), scene[None], binned(psf).astype(np.float32)
+
+
+def cast(scene, psf):
+    """Return the light of a scene through a PSF of half its sides."""
+    padded = np.zeros(scene.shape, np.float32)
+    padded[: psf.shape[0], : psf.shape[1]] = psf
+    padded = np.roll(padded, [-(n // 2) for n in psf.shape], (0, 1))
+    return fft.irfft2(fft.rfft2(padded) * fft.rfft2(scene), s=scene.shape)
+
+
+def volume_scenes(height: int, width: int, planes: int):
+    """Return the same of beads in several depths, whose patterns shrink by a third; a calibration."""
+    fine, rng = (2 * FINE * height, 2 * FINE * width), np.random.default_rng(3)
+    psf = caustic(FINE * height, FINE * width, seed=1)
+    light, scene, psfs, depths_um = np.zeros(fine), [], [], 1e4 * np.linspace(1, 1.5, planes)
+    for depth_um in depths_um:
+        beads = np.zeros(fine, np.float32)
+        places = tuple(rng.integers(0, n, beads.size // (4000 * planes)) for n in fine)
+        beads[places] = rng.uniform(0.5, 1.5, len(places[0]))
+        scene.append(gaussian_filter(beads, FINE))
+        own = rescaled(psf, depth_um / depths_um[0])
+        light += cast(scene[-1], own / own.sum(dtype=np.float64))
+        psfs.append(binned(own / own.sum(dtype=np.float64)))
+    points = np.column_stack([np.zeros((planes, 2)), depths_um])
+    calibration = Calibration(
+        np.stack(psfs)[:, None].astype(np.float32), points, geometry=Geometry(10.0, 1.0)
+    )
+    return light, np.stack(scene), calibration
 
 
 def panned(light, scene, height: int, width: int, pan: float, count: int):
@@ -73,7 +100,7 @@ def panned(light, scene, height: int, width: int, pan: float, count: int):
         clean = binned(light[window])
         counts = rng.poisson(clean * PHOTONS / clean.mean()) / PHOTONS * clean.mean()
         frames.append(counts.astype(np.float32))
-        truths.append(binned(scene[window]))
+        truths.append(np.stack([binned(plane[window]) for plane in scene]).squeeze())
     return frames, truths
 
 
@@ -187,6 +214,9 @@ def main() -> None:
     parser.add_argument("--height", type=int, default=270)
     parser.add_argument("--width", type=int, default=480)
     parser.add_argument("--frames", type=int, default=32)
+    parser.add_argument("--planes", type=int, default=1, help="beads in so many depths instead of a picture")
+    parser.add_argument("--prior", default="tv")
+    parser.add_argument("--pans", nargs="+", choices=list(PANS), default=list(PANS))
     parser.add_argument("--only", choices=("warm", "overhead", "offline"))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
@@ -201,12 +231,14 @@ def main() -> None:
             print(f"{width} x {height}: {offline(psf, frames):.1f} frames/s", flush=True)
         return
     height, width = options.height, options.width
-    light, scene, psf = scenes(height, width)
+    known = {"prior": options.prior, "estimate_background": False, "model": "convolution"}
+    several = options.planes > 1
+    light, scene, psf = volume_scenes(height, width, options.planes) if several else scenes(height, width)
     result: dict[str, object] = {}
     if options.only != "overhead":
-        for name, pan in PANS.items():
+        for name, pan in [(name, PANS[name]) for name in options.pans]:
             frames, truths = panned(light, scene, height, width, pan, options.frames)
-            camera = stream_problem(frames[0], psf)
+            camera = stream_problem(frames[0], psf, **known)
             curve = independent(camera, frames, truths)
             print(f"{name}: independent", [(n, round(db, 2), round(1e3 * s)) for n, db, s in curve])
             rows = []

@@ -12,7 +12,7 @@ from gui.jobs import words_for
 from gui.panel import Panel
 from gui.panels import PANELS
 from gui.session import BenchSession
-from gui.theme import dress
+from gui.theme import restyled
 from gui.widgets.building import PanelPlace, label, text_view
 
 _SLICE_S = 0.015
@@ -116,7 +116,8 @@ class PanelMaker(QObject):
     def _finish(self, name: str, panel: Panel) -> None:
         self._slices.pop(name, None)
         self.panels[name] = panel
-        dress(panel)  # where the theme was changed meanwhile
+        for _ in restyled(panel):  # where the theme was changed meanwhile
+            pass
         self._places[name].hold(panel)
         self.made.emit()
         for then in self._then.pop(name, ()):

@@ -173,16 +173,16 @@ def change_theme(name: str, window: QWidget, wholes: Sequence[QWidget]) -> Gener
         yield
         for part in parts:
             if isValid(part) and part.isVisible():
-                yield from _restyled(part)
+                yield from restyled(part)
     finally:
         if isValid(window):
             window.setUpdatesEnabled(True)
     yield
     for part in parts:
-        yield from _restyled(part)
+        yield from restyled(part)
 
 
-def _restyled(part: QWidget) -> Iterator[None]:
+def restyled(part: QWidget) -> Iterator[None]:
     """Give a part of a window the sheet, and its plots and pictures the colours of the theme in use, once."""
     own, app = sheet(), QApplication.instance()
     assert isinstance(app, QApplication)
@@ -198,8 +198,7 @@ def _restyled(part: QWidget) -> Iterator[None]:
 
 def dress(part: QWidget) -> None:
     """Give a new panel or dialogue the theme in use, which may be another than the program began with."""
-    for _ in _restyled(part):
-        pass
+    next(restyled(part), None)  # the sheet: there is nothing in it yet
 
 
 def _palette() -> QPalette:
@@ -269,6 +268,7 @@ QComboBox QAbstractItemView {{ border: 1px solid {c.border}; padding: 0; }}
 QGraphicsView {{ border: 1px solid transparent; }}
 QGraphicsView:focus {{ border: 1px solid {c.accent}; }}
 *[refused="true"] {{ border: 2px solid {c.error}; color: {c.error}; font-weight: 700; }}
+QLineEdit[refused="true"], QComboBox[refused="true"] {{ padding: 2px 4px; }}
 QLabel[warns="warning"] {{ color: {c.warning}; font-weight: 700; }}
 QLabel[warns="error"] {{ color: {c.error}; font-weight: 700; }}
 QLabel#reason {{ color: {c.error}; font-size: {SMALL_PT}pt; }}

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from pydantic import Field
 
 from drivers.camera import Roi
-from drivers.common.buffered_camera import BufferedCamera, RawFrame
+from drivers.common.buffered_camera import RawFrame
 from drivers.common.drops import FrameNumberCounter
 from drivers.common.pixels import Bytes, Pixels
-from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart
+from drivers.common.running_camera import RunningCamera
+from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, OwnSetting, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError
 from drivers.raspberry.modes import (
     RawFormat,
@@ -30,6 +31,7 @@ from drivers.raspberry.modes import (
 
 _MANUAL: Mapping[str, Any] = {"AeEnable": False, "AwbEnable": False, "AfMode": 0}
 """What would change pictures by itself, switched off where the camera has it."""
+_LOOKED_AFTER = frozenset((*_MANUAL, "ExposureTime", "AnalogueGain", "FrameDurationLimits"))
 _READ_BACK_MS = 500.0
 """Exposures up to this are read back from a frame; a line more or less is nothing to longer ones."""
 _SAME = 0.02
@@ -57,7 +59,7 @@ class RaspberryOptions(DriverOptions):
     )
 
 
-class RaspberryCamera(BufferedCamera):
+class RaspberryCamera(RunningCamera):
     """A camera on the CSI connector: raw Bayer or monochrome frames, 8 to 16 bit, packed or not.
 
     Exposure, white balance and focus do nothing by themselves. Frames are counted by the receiver's own
@@ -65,6 +67,7 @@ class RaspberryCamera(BufferedCamera):
     """
 
     Options = RaspberryOptions
+    _clock = time.CLOCK_BOOTTIME
     no_binning = "Give a smaller sensor mode by size."
     trigger_modes = ("free_run", "software")
 
@@ -75,9 +78,8 @@ class RaspberryCamera(BufferedCamera):
         self._done: deque[Any] = deque()
         self._came = threading.Condition()
         self._waking = False
-        self._triggers: deque[int] = deque()
-        self._scratch: Pixels | None = None
         self._black = 0.0
+        self._own: dict[str, bool | int | float] = dict(self.options.controls)
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
@@ -185,6 +187,37 @@ class RaspberryCamera(BufferedCamera):
             made[f"control.{name}"] = ", ".join(map(str, limits))
         return made
 
+    def own_settings(self) -> Mapping[str, OwnSetting]:
+        """Return libcamera's controls that are one number or switch, but for what the driver looks after."""
+        self._require()
+        found = {}
+        for name, (least, most, default) in sorted(self._camera.camera_controls.items()):
+            if name in _LOOKED_AFTER or not isinstance(least, bool | int | float):
+                continue
+            takes = "0 or 1" if isinstance(least, bool) else f"{least:g} to {most:g}"
+            found[name] = OwnSetting(self._own.get(name, default), takes)
+        return found
+
+    def set_own(self, name: str, value: str) -> Setting:
+        """Set a control by its libcamera name, a number; it holds for the frames from now on.
+
+        Returns the value that was set: libcamera reads back few of them.
+        """
+        known = self.own_settings().get(name)
+        if known is None:
+            return super().set_own(name, value)
+        least, most, _ = self._camera.camera_controls[name]
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not least <= number <= most or (not isinstance(least, float) and number != round(number)):
+            problem = f"control {name} does not take {value!r}."
+            raise LimitError(self.name, problem, f"It takes {known.takes}.")
+        self._own[name] = type(least)(number)
+        self._apply()
+        return self._own[name]
+
     # Exposure and gain -----------------------------------------------------------------------------
     @property
     def exposure_limits_ms(self) -> tuple[float, float]:
@@ -229,7 +262,7 @@ class RaspberryCamera(BufferedCamera):
             "AnalogueGain": self._gain,
             # Up to somewhat more than the exposure: a sensor's frame lasts a few lines longer.
             "FrameDurationLimits": (period_us, max(period_us, exposure_us + exposure_us // 10 + 10_000)),
-            **self.options.controls,
+            **self._own,
         }
         return {name: value for name, value in asked.items() if name in self._camera.camera_controls}
 
@@ -326,12 +359,10 @@ class RaspberryCamera(BufferedCamera):
         return float(self._controls()["FrameDurationLimits"][0]) / 1e6
 
     def _begin(self, n_buffers: int) -> FrameNumberCounter | None:
-        self._triggers.clear()
         self._waking = False
         if self._camera.camera_configuration()["buffer_count"] < n_buffers:
             self._configure(self._format, n_buffers)
-        whole = (self._whole.height, self._whole.width)
-        self._scratch = None if self._roi == self._whole else np.empty(whole, self._format.pixels.dtype)
+        self._make_ready((self._whole.height, self._whole.width))
         self._camera.set_controls(self._controls())
         try:
             self._camera.start()
@@ -386,14 +417,8 @@ class RaspberryCamera(BufferedCamera):
         for request in left:
             request.release()
 
-    def _decode(self, data: Bytes, out: Pixels) -> bool:
-        if self._scratch is None:
-            return decode(data, self._format, self._line_bytes, out, self.name)
-        if not decode(data, self._format, self._line_bytes, self._scratch, self.name):
-            return False
-        roi = self._roi
-        np.copyto(out, self._scratch[roi.top : roi.top + roi.height, roi.left : roi.left + roi.width])
-        return True
+    def _decode_whole(self, data: Bytes, out: Pixels) -> bool:
+        return decode(data, self._format, self._line_bytes, out, self.name)
 
     def _is_settled(self, raw: RawFrame) -> bool:
         """Whether a frame was exposed with what is set now: settings take some frames to arrive."""
@@ -403,19 +428,5 @@ class RaspberryCamera(BufferedCamera):
             and abs(raw.facts["gain"] - self._gain) <= 0.1 * self._gain
         )
 
-    # Triggers by software: the camera runs on, frames are let through ------------------------------
-    def _fire(self) -> None:
-        self._triggers.append(time.clock_gettime_ns(time.CLOCK_BOOTTIME))
-
     def _asked_for(self, raw: RawFrame) -> bool:
-        if not self.is_streaming and not self._is_settled(raw):
-            return False
-        if self._trigger_mode != "software":
-            return True
-        if not self._triggers:
-            return False
-        ended_ns = raw.device_time_ns
-        if ended_ns is None or ended_ns - round(raw.facts["exposure_ms"] * 1e6) < self._triggers[0]:
-            return False
-        self._triggers.popleft()
-        return True
+        return (self.is_streaming or self._is_settled(raw)) and super()._asked_for(raw)

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import time
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
-import numpy as np
 from pydantic import Field, PositiveInt
 
 from drivers.camera import Roi
-from drivers.common.buffered_camera import BufferedCamera, RawFrame
+from drivers.common.buffered_camera import RawFrame
 from drivers.common.camera_settings import GainScale, GainUnit
 from drivers.common.drops import FrameNumberCounter
 from drivers.common.pixels import Bytes, Pixels
+from drivers.common.running_camera import RunningCamera
 from drivers.device import DriverOptions, FoundDevice, OwnSetting, Setting, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceLostError, LimitError
 from drivers.registry.buses import lasting_name, video_devices
@@ -82,7 +80,7 @@ class V4l2Options(DriverOptions):
     )
 
 
-class V4l2Camera(BufferedCamera):
+class V4l2Camera(RunningCamera):
     """A V4L2 camera; lost frames are counted by the kernel's sequence numbers.
 
     V4L2 knows no trigger line. In mode ``"software"`` the camera runs on, and the driver hands out, for each
@@ -102,8 +100,6 @@ class V4l2Camera(BufferedCamera):
         self._subdevices = [
             Node(path, self.name, self.kernel, self._note_lost) for path in self.options.subdevices
         ]
-        self._triggers: deque[int] = deque()
-        self._scratch: Pixels | None = None
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
@@ -391,12 +387,7 @@ class V4l2Camera(BufferedCamera):
 
     # Streaming -------------------------------------------------------------------------------------
     def _begin(self, n_buffers: int) -> FrameNumberCounter | None:
-        self._triggers.clear()
-        whole = (self._images.made.height, self._images.made.width)
-        frame = self.frame_shape
-        self._scratch = None
-        if frame[:2] != whole:
-            self._scratch = np.empty((*whole, *frame[2:]), self.frame_dtype)
+        self._make_ready((self._images.made.height, self._images.made.width))
         self._device.start(n_buffers)
         return None if self._trigger_mode == "software" else FrameNumberCounter(_SEQUENCE_MODULUS)
 
@@ -429,27 +420,5 @@ class V4l2Camera(BufferedCamera):
     def _end(self) -> None:
         self._device.stop()
 
-    def _decode(self, data: Bytes, out: Pixels) -> bool:
-        if self._scratch is None:
-            return decode(data, self._images.format, self._images.made.bytesperline, out)
-        if not decode(data, self._images.format, self._images.made.bytesperline, self._scratch):
-            return False
-        roi = self._roi
-        np.copyto(out, self._scratch[roi.top : roi.top + roi.height, roi.left : roi.left + roi.width])
-        return True
-
-    # Triggers by software: the camera runs on, frames are let through ------------------------------
-    def _fire(self) -> None:
-        self._triggers.append(time.monotonic_ns())
-
-    def _asked_for(self, raw: RawFrame) -> bool:
-        if self._trigger_mode != "software":
-            return True
-        if not self._triggers:
-            return False
-        ended_ns = raw.device_time_ns if raw.device_time_ns is not None else time.monotonic_ns()
-        # Without the kernel's clock the arrival stands in for it; the exposure before it is an upper bound.
-        if ended_ns - round(self._exposure_ms * 1e6) < self._triggers[0]:
-            return False
-        self._triggers.popleft()
-        return True
+    def _decode_whole(self, data: Bytes, out: Pixels) -> bool:
+        return decode(data, self._images.format, self._images.made.bytesperline, out)

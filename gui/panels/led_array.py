@@ -13,7 +13,7 @@ from drivers.led_array import LedPattern, Rgb
 from gui.forms.fields import Behaviour, NumberField
 from gui.panel import DevicePanel, on_bench
 from gui.session import BenchSession
-from gui.theme import colours
+from gui.theme import colours, luminance
 from gui.widgets.building import after_rest, button, choice, fill, in_row, label
 from gui.widgets.dialogues import elided
 from gui.widgets.entry import NumberEdit
@@ -132,9 +132,10 @@ class LedPanel(DevicePanel):
         places = self._positions[:, :2]
         lit = dict(pattern.levels)
         now = colours()
+        dark = min(now.window, now.text, key=luminance)  # light is seen on it in every theme
+        self.plot.setBackground(dark)
         brushes = [
-            _brush(lit[i]) if max(lit.get(i, (0, 0, 0))) > 0 else pg.mkBrush(now.field)
-            for i in range(len(places))
+            _brush(lit[i]) if max(lit.get(i, (0, 0, 0))) > 0 else pg.mkBrush(dark) for i in range(len(places))
         ]
         self.spots.setData(
             x=places[:, 0],

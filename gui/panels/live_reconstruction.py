@@ -181,6 +181,11 @@ class LiveReconstructionPanel(Panel):
         self._reader = NewestOnly(self.jobs, "Loading the calibration", self._refuse)
         self._load(f"Loading {folder} …", lambda: find_calibration(folder))
 
+    def take(self, what: Path) -> None:
+        """Use the calibration that another panel hands on."""
+        self.file.setText(str(what))
+        self.load()
+
     def _load(self, words: str, find: Callable[[], Path | None]) -> None:
         """Load the calibration that is found in a job's thread, if one is."""
         self.status.setText(words)

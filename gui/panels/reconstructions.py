@@ -78,6 +78,9 @@ class ReconstructionsPanel(Panel):
         tip = "The PSF is turned or of another size for this photograph: fit it first, then reconstruct again"
         self.refine_button = button("Fit the PSF, and again", tip, self.refine)
         self.refine_button.hide()
+        tip = "Save the calibration with its PSF as it fits this photograph; form and live view use it"
+        self.keep_button = button("Keep the fitted PSF", tip, self.keep_fitted)
+        self.keep_button.hide()
         self.form = ReconstructForm()
         self.form.asked.connect(self.reconstruct)
         self.form.questioned.connect(self.explain)
@@ -125,7 +128,7 @@ class ReconstructionsPanel(Panel):
         yield
         top = fill(
             QWidget(),
-            in_row(self.heading, (self.place, 1), self.refine_button, self.export_button),
+            in_row(self.heading, (self.place, 1), self.refine_button, self.keep_button, self.export_button),
             (self.viewers, 1),
         )
         yield
@@ -186,6 +189,7 @@ class ReconstructionsPanel(Panel):
         misfit = any(_REFINABLE in warning for warning in result.warnings)
         tried = self.form.options.value("refine_psf")
         self.refine_button.setVisible(misfit and result.path == self._made and not tried)
+        self.keep_button.setVisible(result.fitted_from is not None)
         if result.volume is not None:
             self.viewers.setCurrentWidget(self.volume)
             self.volume.open(result.volume, result.grid)
@@ -199,6 +203,7 @@ class ReconstructionsPanel(Panel):
         self.volume.release()
         self.result = None
         self.refine_button.hide()
+        self.keep_button.hide()
         self.export_button.setEnabled(False)
 
     # Export --------------------------------------------------------------------------------------
@@ -343,6 +348,21 @@ class ReconstructionsPanel(Panel):
         self.form.options.set_values({"refine_psf": True})
         self.tabs.setCurrentWidget(self.form)
         return self.reconstruct()
+
+    def keep_fitted(self) -> None:
+        """Save the calibration as it was fitted to the photograph; the form and the live view take it."""
+        result = self.result
+        if result is None:
+            return
+        runs = self.session.runs_folder
+        job = self.follow(self.jobs.compute("Saving the fitted PSF", lambda _: result.keep_fitted(runs)))
+        job.succeeded.connect(self._kept)
+
+    def _kept(self, folder: Path) -> None:
+        self.keep_button.hide()
+        self.session.log("info", f"The PSF as it was fitted to the photograph: {folder}")
+        self.form.options.set_values({"calibration": folder, "refine_psf": False})
+        self.session.handed_on.emit("live_reconstruction", folder)
 
     def _show_nothing(self, words: str, *, busy: bool = False) -> None:
         """Take what was shown of another result away."""

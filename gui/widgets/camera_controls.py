@@ -78,7 +78,9 @@ class CameraForm(QWidget):
         self.temperature.setToolTip("Of the sensor or camera, degrees Celsius, where it has a thermometer")
         self._temperature_name = label("Temperature")
         tip = "Everything that the camera reports of itself; its own settings can be changed there"
-        self.all_button = button("All settings …", tip, self._show_all)
+        self.all_button = button(
+            "All settings …", tip, lambda: DeviceSettings(self._session, "camera", self).show()
+        )
         self.presets = KeptBar(self._session, "camera", "Presets", self._preset, self._use_preset, "Use")
         self.buttons = in_row(self._temperature_name, (self.temperature, 1), self.all_button)
         fill(self, self.form, self.presets, self.buttons)
@@ -222,11 +224,6 @@ class CameraForm(QWidget):
         self._temperature_name.setVisible(has_thermometer)
         if has_thermometer:
             self.temperature.setText(f"{state.temperature_c:.1f} °C")
-
-    def _show_all(self) -> None:
-        if self.state is not None:
-            lines = "\n".join(f"{name} = {value}" for name, value in sorted(self.state.settings.items()))
-            DeviceSettings(self._session, "camera", lines, self).show()
 
 
 _DISK_MS = 5000

@@ -45,5 +45,4 @@ class DeviceChips(QWidget):
         chip.setToolTip(state.text or state.condition)
 
     def _show_all(self, kind: Kind) -> None:
-        state = self._session.state(kind)
-        DeviceSettings(self._session, kind, state.text or state.condition, self).show()
+        DeviceSettings(self._session, kind, self).show()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
-from PySide6.QtCore import QRectF, QSignalBlocker, Qt, Signal
+from PySide6.QtCore import QRectF, QSignalBlocker, QSize, Qt, Signal
 from PySide6.QtGui import QColor, QPainter, QPaintEvent
 from PySide6.QtWidgets import QGraphicsItem, QWidget
 
@@ -23,6 +22,22 @@ from instrument.live.frame_view import FrameFigures, grouped
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
 
 
+class _Plot(pg.PlotWidget):  # type: ignore[misc] # pyqtgraph has no type annotations
+    """A plot in the colours of the theme, which is no larger than it must be where room is scarce."""
+
+    def sizeHint(self) -> QSize:  # noqa: N802 - Qt's name
+        """Return a small size: 640 x 480, a view's own, is the least beside a line that wraps."""
+        return QSize(160, 90).expandedTo(self.minimumSize())
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        now = colours()
+        self.setBackground(now.panel)
+        for axis in ("bottom", "left"):
+            self.getAxis(axis).setPen(now.line)
+            self.getAxis(axis).setTextPen(now.dim)
+
+
 def plot_widget(
     x_label: str = "", y_label: str = "", *, x_unit: str = "", y_unit: str = "", grid: bool = True
 ) -> Any:
@@ -30,8 +45,7 @@ def plot_widget(
 
     pyqtgraph has no type annotations, hence ``Any``.
     """
-    plot = pg.PlotWidget(enableMenu=False)
-    plot.restyle = partial(restyle, plot)
+    plot = _Plot(enableMenu=False)
     plot.restyle()
     plot.getPlotItem().layout.setContentsMargins(0, 0, 0, 4)  # letters that reach below the line
     plot.setLabel("bottom", _label(x_label, x_unit))
@@ -40,15 +54,6 @@ def plot_widget(
     for axis in ("bottom", "left"):
         plot.getAxis(axis).enableAutoSIPrefix(False)  # units are in the labels as people here say them
     return plot
-
-
-def restyle(plot: Any) -> None:
-    """Give a plot the colours of the theme in use."""
-    now = colours()
-    plot.setBackground(now.panel)
-    for axis in ("bottom", "left"):
-        plot.getAxis(axis).setPen(now.line)
-        plot.getAxis(axis).setTextPen(now.dim)
 
 
 _DASHES = (Qt.PenStyle.SolidLine, Qt.PenStyle.DashLine, Qt.PenStyle.DotLine, Qt.PenStyle.DashDotLine)

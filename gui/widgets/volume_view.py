@@ -178,10 +178,8 @@ class VolumeView(QWidget):
         grid.setColumnStretch(0, 3)
         grid.setColumnStretch(1, 2)
         modes = (self.brightest_button, self.slices_button, self.turning_button)
-        bar = in_row(*modes, self.measure_button, self.proportions, (self.slider, 1))
-        bar.addStretch()  # only where the slider is hidden
-        bar.addWidget(self.plane_label)
-        fill(self.views, (grid, 1))
+        bar = in_row(*modes, self.measure_button, self.proportions, None)
+        fill(self.views, (grid, 1), in_row((self.slider, 1), self.plane_label))
         self.stack.addWidget(self.views)
         self.stack.addWidget(self.turning)
         fill(self, bar, self.progress, (self.stack, 1), self.measured, self.levels)

@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if debug:
         words.remove("--debug")
     if words and words[0] == "help":
-        words = [*words[1:2], "--help"]  # help COMMAND is COMMAND --help
+        words = [*words[1:], "--help"]  # help COMMAND is COMMAND --help
     if not words or words[0] in ("--help", "-h"):
         sys.stdout.write(overview())
         return 0

@@ -84,7 +84,15 @@ class App(typer.Typer):
                     )
                 return found
 
+            def format_commands(self, ctx: Any, formatter: Any) -> None:
+                """List the commands with the first sentence of each, whole."""
+                rows = [(name, one.get_short_help_str(limit=1000)) for name, one in self.commands.items()]
+                with formatter.section("Commands"):
+                    formatter.write_dl(rows)
+
             def parse_args(self, context: Any, arguments: list[str]) -> list[str]:
+                if arguments[:1] == ["help"]:
+                    arguments = [*arguments[1:], "--help"]
                 if self.meant is not None and self.names_none(arguments[:1]):
                     arguments = [self.meant, *arguments]
                 return super().parse_args(context, arguments)

@@ -64,6 +64,12 @@ class GroupedCommand(TyperCommand):
         ]
         meant: list[str] = []
         for file in map(Path, files):
+            if len(meant) % 2:  # after an option that lacked its dashes
+                meant.append(str(file))
+                continue
+            if f"--{file}" in flags and not file.exists():
+                meant.append(f"--{file}")
+                continue
             named = [flag for flag in flags if flag[2:] in file.name.lower() and flag != "--out"]
             if (file / "calibration.json").exists() and "--calibration" in flags:
                 named = ["--calibration"]

@@ -75,9 +75,10 @@ def reconstruct(
     elif source.video:
         _video(asked, run)
     elif run is not None:
+        photograph = run.is_file() and "image" not in given
         raise BenchError(
-            "RUN: for videos; give --video as well, or leave it out."
-            + (f" A photograph is given by --image {run}, its PSF by --psf FILE." if run.is_file() else "")
+            f"{run}: no option says what it is for. With --video it is a video's run; else leave it out."
+            + (f" A photograph is given by --image {run}, its PSF by --psf FILE." if photograph else "")
         )
     else:
         _photograph(asked)

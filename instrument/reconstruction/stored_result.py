@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.atomic import refuse_input, whole_file
+from instrument.files.calibration_file import load_calibration, save_calibration
 from instrument.files.errors import FileError, size
 from instrument.files.images import read_image, write_image
 from instrument.files.orientation import AS_IT_IS, Orientation
@@ -27,8 +29,10 @@ from instrument.files.volumes import (
     write_volume_tiff,
     write_volume_zarr,
 )
+from instrument.reconstruction.job import find_calibration
 from recon.camera.grid import Grid
 from recon.errors import InputError
+from recon.reconstruction.psf_refinement import as_refined
 from recon.solvers.base import IterationRecord
 from recon.verdict.judge import Region
 
@@ -140,6 +144,28 @@ class StoredResult:
             f"z {z / 1e3:.5g} to {z_end / 1e3:.5g}, y {y / 1e3:.4g} to {y_end / 1e3:.4g}, "
             f"x {x / 1e3:.4g} to {x_end / 1e3:.4g} mm; {size(4 * int(np.prod(grid.shape)))}"
         )
+
+    @property
+    def fitted_from(self) -> Path | None:
+        """The calibration whose PSFs were fitted to the photograph; None where none were."""
+        record = self.record
+        refinement = (record.get("provenance") or {}).get("psf_refinement") or {}
+        calibration = (record.get("inputs") or {}).get("calibration")
+        return Path(str(calibration)) if calibration and refinement.get("used") else None
+
+    def keep_fitted(self, runs: Path) -> Path:
+        """Save the calibration with its PSFs as they were fitted to the photograph, in a folder of its own.
+
+        Returns the folder of the calibration, below that of the runs.
+
+        Raises FileError when there is none, the calibration is not there any more, or the disk is full.
+        """
+        if self.fitted_from is None:
+            raise FileError(self.path, "was not made with a calibration whose PSFs were fitted to it.")
+        calibration = load_calibration(find_calibration(self.fitted_from))
+        made = as_refined(calibration, self.record["provenance"]["psf_refinement"])
+        folder = runs / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_fitted-to-{stem_of(self.path)}"
+        return save_calibration(made, folder / "calibration")
 
     def facts(self) -> list[tuple[str, str]]:
         """Return what is known of it as names and values, to be shown; verdict and model first."""

@@ -47,7 +47,7 @@ TILE_TOLERANCE = 0.04
 MOST_TILES = 256
 CELL_POINTS: FloatArray = np.array([-0.375, -0.125, 0.125, 0.375])
 """Places along each side of a square cell, in its sides, whose light is summed for the cell's."""
-KEPT_BYTES = 192 << 20
+KEPT_BYTES = 256 << 20
 """Of the newest point spread functions: another picture at the distance of one needs the same."""
 
 

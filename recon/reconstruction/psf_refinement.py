@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement, product
 from typing import Any
@@ -112,15 +112,7 @@ class Refinement:
         """Return the calibration with the copy, and its sources where they then are; as given if no help."""
         if not self.helps:
             return calibration
-        positions = calibration.source_positions_um.copy()
-        # A pattern that is turned or enlarged is that of a source elsewhere: (x, y) is (column, row).
-        positions[:, 1::-1] = positions[:, 1::-1] @ self.transformation.matrix.T
-        return replace(
-            calibration,
-            psfs=transformed(calibration.psfs, self.transformation),
-            source_positions_um=positions,
-            provenance={**calibration.provenance, "psf_refined": self.to_json()},
-        )
+        return as_refined(calibration, self.to_json())
 
     def to_json(self) -> dict[str, Any]:
         """Return all of it for a file."""
@@ -149,6 +141,32 @@ class Refinement:
         if not self.told:
             return "taken as it is: this photograph does not tell how its PSF is turned and how large it is"
         return f"taken as it is: {copy} it fits no better for certain ({left} on held-out pixels)"
+
+
+def as_refined(calibration: Calibration, refinement: Mapping[str, Any]) -> Calibration:
+    """Return a calibration with its PSFs as they fitted a photograph, and its sources where they then are.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    refinement : mapping
+        As :meth:`Refinement.to_json` has it: ``scale`` and ``rotation_deg`` count.
+
+    Raises InputError when these are no numbers that PSFs can be turned and enlarged by.
+    """
+    try:
+        how = Transformation(scale=refinement["scale"], rotation_deg=refinement["rotation_deg"])
+    except (KeyError, TypeError) as error:
+        raise InputError(f"A refinement of PSFs has scale and rotation_deg, not {refinement}.") from error
+    positions = calibration.source_positions_um.copy()
+    # A pattern that is turned or enlarged is that of a source elsewhere: (x, y) is (column, row).
+    positions[:, 1::-1] = positions[:, 1::-1] @ how.matrix.T
+    return replace(
+        calibration,
+        psfs=transformed(calibration.psfs, how),
+        source_positions_um=positions,
+        provenance={**calibration.provenance, "psf_refined": dict(refinement)},
+    )
 
 
 def refined(

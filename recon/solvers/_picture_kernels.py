@@ -18,15 +18,14 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from recon.camera._kernels import FAST
+
 # Columns of ``sums``
 # (squared norms; CHANGE: of a split variable; MULTIPLIER: of its scaled dual variable)
 TV, L1 = 0, 1
 PRIMAL_U, CHANGE_U, NORM_U, MULTIPLIER_U = 2, 3, 4, 5
 PRIMAL_W, CHANGE_W, NORM_W, MULTIPLIER_W = 6, 7, 8, 9
 N_SUMS = 10
-
-# Reordering sums is fine (it is the same for every strip); NaN and infinity must stay what they are.
-FAST = {"reassoc", "contract", "nsz"}
 
 
 @njit(inline="always")
@@ -168,8 +167,6 @@ N_SENSOR_SUMS = 7
 STEP, STATE = 0, 1
 N_GRID_SUMS = 2
 
-# Reordering sums is fine (it is the same for every row); NaN and infinity must stay what they are.
-
 
 @njit(inline="always")
 def _frequencies(
@@ -197,7 +194,7 @@ def _frequencies(
     return step, state
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def solve(
     start: int, stop: int, Y: Any, T: Any, Q: Any, H: Any, P: Any, rows: Any, columns: Any,
     mu_v: Any, relax: Any, nyquist: bool, sums: Any,
@@ -220,7 +217,7 @@ def solve(
         sums[i, STATE] = first_sums[1] + inner_sums[1] + inner_sums[1] + last_sums[1]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def see(
     start: int, stop: int, band: Any, left: int, t: Any, data: Any, weight: Any, mu: Any, relax: Any,
     sums: Any,
@@ -231,16 +228,17 @@ def see(
     ``t`` the sensor's part of the one before. Out: ``t`` the new one, ``band`` ``q``, zero off the sensor.
     """
     for i in range(start, stop):
-        row = band[i]
+        for j in range(left):
+            band[i, j] = 0
+        for j in range(left + t.shape[1], band.shape[1]):
+            band[i, j] = 0
+        # Slices: an index with an offset may be negative for all the compiler knows, and costs the vectors.
+        row, state, pixels, weights = band[i, left : left + t.shape[1]], t[i], data[i], weight[i]
         zero = mu - mu
         residual, primal, change, norm, multiplier = zero, zero, zero, zero, zero
         step_sum, state_sum = zero, zero
-        for j in range(left):
-            row[j] = zero
-        for j in range(left + t.shape[1], row.size):
-            row[j] = zero
-        for j in range(t.shape[1]):
-            w, b, before, new = weight[i, j], data[i, j], t[i, j], row[left + j]
+        for j in range(state.shape[0]):
+            w, b, before, new = weights[j], pixels[j], state[j], row[j]
             share = w / (w + mu)
             step = (new - before) / relax
             p = before - share * (before - b)
@@ -254,14 +252,14 @@ def see(
             multiplier += q * q
             step_sum += step * step
             state_sum += new * new
-            t[i, j] = new
-            row[left + j] = q
+            state[j] = new
+            row[j] = q
         out = sums[i]
         out[DATA], out[PRIMAL], out[CHANGE], out[NORM] = residual, primal, change, norm
         out[MULTIPLIER], out[STEP_SEEN], out[STATE_SEEN] = multiplier, step_sum, state_sum
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def predict(
     start: int, stop: int, Y: Any, E: Any, H: Any, laplace_rows: Any, laplace_columns: Any,
     mu_u: Any, mu_w: Any, MY: Any,
@@ -279,7 +277,7 @@ def predict(
             MY[i, j] = complex(hr * yr - hi * yi, hr * yi + hi * yr)
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def curvature(
     start: int, stop: int, P: Any, H: Any, laplace_rows: Any, laplace_columns: Any, mu_u: Any, mu_w: Any,
     even_width: bool, sums: Any,
@@ -304,7 +302,7 @@ def _weighted_power(p: Any, h: Any, scale: Any) -> Any:
     return (p.real * p.real + p.imag * p.imag) * (h.real * h.real + h.imag * h.imag) / scale
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def weigh(
     start: int, stop: int, P: Any, H: Any, laplace_rows: Any, laplace_columns: Any, mu_u: Any, mu_w: Any
 ) -> None:
@@ -316,7 +314,7 @@ def weigh(
             P[i, j] *= (h.real * h.real + h.imag * h.imag) / (row + mu_u * laplace_columns[j])
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def advance(
     start: int, stop: int, Y: Any, E: Any, P: Any, H: Any, laplace_rows: Any, laplace_columns: Any,
     mu_u: Any, mu_w: Any, length: Any,
@@ -328,24 +326,27 @@ def advance(
             scale = length / (row + mu_u * laplace_columns[j])
             hr, hi = H[i, j].real, H[i, j].imag
             pr, pi = P[i, j].real, P[i, j].imag
-            E[i, j] += complex(length * pr, length * pi)
-            Y[i, j] += complex((hr * pr + hi * pi) * scale, (hr * pi - hi * pr) * scale)
+            e, y = E[i, j], Y[i, j]  # adding to an element in place costs the vectors
+            E[i, j] = complex(e.real + length * pr, e.imag + length * pi)
+            Y[i, j] = complex(y.real + (hr * pr + hi * pi) * scale, y.imag + (hr * pi - hi * pr) * scale)
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
 def residual(start: int, stop: int, r: Any, seen: Any, left: int, data: Any, e: Any) -> None:
     """``r <- data - seen - e``."""
     for i in range(start, stop):
+        row = seen[i, left : left + data.shape[1]]
         for j in range(data.shape[1]):
-            r[i, j] = data[i, j] - seen[i, left + j] - e[i, j]
+            r[i, j] = data[i, j] - row[j] - e[i, j]
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
 def reduce_residual(start: int, stop: int, r: Any, p: Any, image: Any, left: int, length: Any) -> None:
     """``r <- r - length (p + image)``."""
     for i in range(start, stop):
+        row = image[i, left : left + r.shape[1]]
         for j in range(r.shape[1]):
-            r[i, j] -= length * (p[i, j] + image[i, left + j])
+            r[i, j] -= length * (p[i, j] + row[j])
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)

@@ -27,7 +27,6 @@ from numba import njit
 
 from recon.camera._kernels import (
     FAST,
-    add_conjugate_product,
     add_product,
     conjugate_product,
     from_spectrum,
@@ -37,6 +36,7 @@ from recon.camera._kernels import (
 STATISTICS = 9
 SCRATCH_PLANES = 4
 SCRATCH_ROWS = 8
+TINY = np.finfo(np.float32).tiny
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
@@ -66,11 +66,12 @@ def _split_row(s: Any, x: Any, neighbour: Any, v: Any, w: Any, p: Any, st: Any) 
     st[4] += y
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def _clip_factor_row(s0: Any, s1: Any, s2: Any, t: Any, k: Any) -> None:
     """Isotropic: ``k`` such that the multiplier is ``k s`` and the split variable ``(1 - k) s``."""
+    least = max(t, t - t + TINY)
     for i in range(k.shape[0]):
-        k[i] = t / max(np.sqrt(s0[i] * s0[i] + s1[i] * s1[i] + s2[i] * s2[i]), t)
+        k[i] = t / max(np.sqrt(s0[i] * s0[i] + s1[i] * s1[i] + s2[i] * s2[i]), least)
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
@@ -198,16 +199,27 @@ def z_reflection(
         out[y] = rows[0]
 
 
+@njit(nogil=True, cache=True, fastmath=FAST)
+def _keep_and_add(total: Any, g: Any, R: Any, X: Any) -> None:
+    """``X = R`` and ``total += conj(g) R`` for one plane."""
+    for y in range(total.shape[0]):
+        for i in range(total.shape[1]):
+            v = R[y, i]
+            X[y, i] = v
+            total[y, i] += np.conj(g[y, i]) * v
+
+
 @njit(nogil=True, cache=True)
 def plane_sweep(
     X: Any, S: Any, g: Any, totals: Any, group: Any, w: Any, p: Any, isotropic: bool, st: Any, z0: int,
-    z1: int, first: Any, last: Any, vz_before: Any, planes: Any, rows: Any,
+    z1: int, first: Any, last: Any, vz_before: Any, planes: Any, spectrum: Any, rows: Any,
 ) -> None:  # fmt: skip
     """States, right-hand side, its transform and its sum with ``conj(g)``, for planes ``z0 <= z < z1``.
 
     ``X`` enters as the spectrum of the estimate and leaves as that of the right-hand side. ``first`` and
     ``last`` are the estimate at planes ``z0`` and ``z1``, ``vz_before`` the z reflections of plane
-    ``z0 - 1``: other workers may have overwritten what they come from.
+    ``z0 - 1``: other workers may have overwritten what they come from. Transforms along columns stay within
+    ``spectrum``, which the core's cache holds; ``X`` is read and written once, row after row.
     """
     nz = X.shape[0]
     x, x_next, r, vz = planes[0], planes[1], planes[2], planes[3]
@@ -216,7 +228,8 @@ def plane_sweep(
         x[:] = first
         vz[:] = vz_before
     else:
-        from_spectrum(X[z0], x)
+        spectrum[:] = X[z0]
+        from_spectrum(spectrum, x)
         vz[:] = 0
     for z in range(z0, z1):
         if z + 1 == nz:
@@ -224,27 +237,33 @@ def plane_sweep(
         elif z + 1 == z1:
             x_next[:] = last
         else:
-            from_spectrum(X[z + 1], x_next)
+            spectrum[:] = X[z + 1]
+            from_spectrum(spectrum, x_next)
         r[:] = 0
         st[z] = 0
         for y in range(ny):
             below = y + 1 if y + 1 < ny else 0
             _update_row(S[z, y], x[y], x[below], x_next[y], rows, r[y], w[z], p, isotropic, st[z])
             _divergence_row(r[y], r[below], vz[y], rows)
-        to_spectrum(r, X[z])
-        add_conjugate_product(totals[group[z]], g[z], X[z])
+        to_spectrum(r, spectrum)
+        _keep_and_add(totals[group[z]], g[z], spectrum, X[z])
         x, x_next = x_next, x
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
-def _forward_tile(
-    R: Any, before: Any, ratio: Any, ratio_before: Any, dx2: Any, row: Any, wx2: Any, wz2: Any, wb2: Any
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
+def _pivot_tile(
+    ratio: Any, ratio_before: Any, inverse: Any, dx2: Any, row: Any, wx2: Any, wz2: Any, wb2: Any
 ) -> None:
     for i in range(dx2.shape[0]):
-        inverse = 1 / (row + wx2 * dx2[i] - wb2 * ratio_before[i])
-        ratio[i] = wz2 * inverse
-        R[2 * i] = (R[2 * i] + wb2 * before[2 * i]) * inverse
-        R[2 * i + 1] = (R[2 * i + 1] + wb2 * before[2 * i + 1]) * inverse
+        inverse[i] = 1 / (row + wx2 * dx2[i] - wb2 * ratio_before[i])
+        ratio[i] = wz2 * inverse[i]
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def _forward_tile(R: Any, before: Any, inverse: Any, wb2: Any) -> None:
+    for i in range(inverse.shape[0]):
+        R[2 * i] = (R[2 * i] + wb2 * before[2 * i]) * inverse[i]
+        R[2 * i + 1] = (R[2 * i + 1] + wb2 * before[2 * i + 1]) * inverse[i]
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
@@ -268,10 +287,12 @@ def solve_rows(
     """``R <- T^-1 R``, and ``+ g E`` where ``add``, on spectral rows ``y0 <= y < y1``.
 
     Thomas' algorithm along z, without wrap-around. ``R``, ``g`` and ``E`` are real views (..., 2 Nxh) of the
-    spectra; ``dy2`` and ``dx2`` the squared magnitudes of the lateral differences' transfer functions.
+    spectra; ``dy2`` and ``dx2`` the squared magnitudes of the lateral differences' transfer functions;
+    ``ratio`` scratch (n_z + 1, columns taken together).
     """
     nz = R.shape[0]
     tile = ratio.shape[1]
+    inverse = ratio[nz]
     zero = kappa - kappa
     for y in range(y0, y1):
         for i0 in range(0, dx2.shape[0], tile):
@@ -282,10 +303,10 @@ def solve_rows(
                 wz2 = w[z, 0] * w[z, 0] if z + 1 < nz else zero
                 wb2 = w[b, 0] * w[b, 0] if z > 0 else zero
                 row = kappa + wz2 + wb2 + w[z, 1] * w[z, 1] * dy2[y]
-                _forward_tile(
-                    R[z, y, 2 * i0 : 2 * i1], R[b, y, 2 * i0 : 2 * i1], ratio[z, :n], ratio[b, :n],
-                    dx2[i0:i1], row, w[z, 2] * w[z, 2], wz2, wb2,
-                )  # fmt: skip
+                _pivot_tile(
+                    ratio[z, :n], ratio[b, :n], inverse[:n], dx2[i0:i1], row, w[z, 2] * w[z, 2], wz2, wb2
+                )
+                _forward_tile(R[z, y, 2 * i0 : 2 * i1], R[b, y, 2 * i0 : 2 * i1], inverse[:n], wb2)
             e = E[y, 2 * i0 : 2 * i1]
             for z in range(nz - 2, -1, -1):
                 _backward_tile(R[z, y, 2 * i0 : 2 * i1], R[z + 1, y, 2 * i0 : 2 * i1], ratio[z, :n])

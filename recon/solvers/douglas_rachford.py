@@ -34,6 +34,7 @@ from recon.camera.convolution import Convolution, PlaneGroups
 from recon.errors import StructureError
 from recon.priors.base import Prior, Separable
 from recon.solvers.base import IterationRecord
+from recon.solvers.moving import move
 from recon.solvers.prior_splits import require_exact
 from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, is_due, residual_norm, squares
 
@@ -225,6 +226,17 @@ class DouglasRachford(VolumeSplitting):
         self.system.set_curvature(self._power * self._power.dtype.type(self._used_gamma))
         self.system.solve(self.data - forward_z, self.e)
 
+    def set_data(self, data: SensorData) -> None:
+        """Go on with other data, the data term solved for them at once."""
+        super().set_data(data)
+        if self._total is not None:
+            self._solve_data_term(self.system.from_spectrum(self._total.copy()))
+
+    def move(self, rows: float, columns: float) -> None:
+        """Move the object."""
+        super().move(rows, columns)
+        move(self.z, rows, columns)
+
     def step(self) -> IterationRecord:
         """Do one iteration. ``objective`` and ``data_residual`` are those of x, and of u in the prior."""
         residual = residual_norm(self.e)
@@ -235,7 +247,7 @@ class DouglasRachford(VolumeSplitting):
         if self.balance and is_due(self.iteration) and size > 0 and dual > 0:
             self.gamma *= float(np.clip(np.sqrt(size / dual), 0.2, 5.0))
         self.system.follow(gap)
-        self._solve_data_term(self.system.from_spectrum(total))
+        self._solve_data_term(self.system.from_spectrum(self._keep_total(total)))
         objective, change = 0.5 * residual**2 + float(value), self.relaxation * gap
         return IterationRecord(0, 0.0, objective, residual, primal_residual=gap, change=change)
 
@@ -305,6 +317,7 @@ class SparseDouglasRachford(DouglasRachford):
             np.negative(plane, out=self.z[z])
         self.watch.bring_back(missing)
         self._regroup()
+        self._total = None  # it has nothing of them
         return True
 
     def _peaks(self) -> Array:

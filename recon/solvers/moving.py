@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from recon.base import fft
+from recon.base.namespace import namespace_of
 from recon.base.threads import over_rows
 from recon.camera.base import Array
 
@@ -13,12 +15,18 @@ def move(images: Array, rows: float, columns: float) -> None:
 
     Half a millisecond for 540 x 960: a tenth of Fourier's way, which leaves no more for a solver to mend.
     """
+    xp = namespace_of(images)
+    if xp is not np:
+        spectra = fft.rfft(images)
+        move_spectra(spectra, rows, columns, images.shape[-1])
+        images[...] = fft.irfft(spectra, images.shape[-1])
+        return
     from recon.solvers import _picture_kernels
 
     by, weights = zip(*(_taps(d, images.dtype) for d in (rows, columns)), strict=True)
     result = np.empty(images.shape[-2:], images.dtype)
     for place in np.ndindex(images.shape[:-2]):
-        over_rows(_picture_kernels.move_rows, result, images[place], *by, *weights)
+        over_rows(_picture_kernels.move_rows, result, np.ascontiguousarray(images[place]), *by, *weights)
         images[place] = result
 
 
@@ -31,7 +39,7 @@ def move_spectra(spectra: Array, rows: float, columns: float, width: int) -> Non
         along[height // 2] = along[height // 2].real
     if width % 2 == 0:
         across[half - 1] = across[half - 1].real
-    phases = along[:, None] * across
+    phases = namespace_of(spectra).asarray(along[:, None] * across)
     for place in np.ndindex(spectra.shape[:-2]):
         spectra[place] *= phases
 

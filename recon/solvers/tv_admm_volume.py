@@ -23,7 +23,7 @@ from recon.solvers.volume_admm import VolumeAdmm, is_lateral_periodic
 _POSITIVE = 3
 """Which of the four states is that of non-negativity."""
 _TILE = 256
-"""Spectral columns solved together: all planes of a tile fit a core's second-level cache."""
+"""Spectral columns solved together, about: all planes of a tile fit a core's second-level cache."""
 
 
 class LeanTotalVariation(VolumeAdmm):
@@ -61,6 +61,10 @@ class LeanTotalVariation(VolumeAdmm):
             fft.rfft(start[0], out=self.X)
             np.maximum(start[0], 0, out=self.S[:, :, _POSITIVE])
 
+    @property
+    def _differences_state(self) -> Array:
+        return np.moveaxis(self.S, 2, 1)
+
     def _prepare_transfer(self) -> None:
         k = self._kernels
         nz, ny, nxh = self.g.shape
@@ -68,13 +72,19 @@ class LeanTotalVariation(VolumeAdmm):
             self.operator.transfer_plane(z, out=self.g[z])
 
         def job(y0: int, y1: int) -> None:
-            ratio = np.zeros((nz, min(_TILE, nxh)), self._q.dtype)
+            ratio = self._ratios()
             row = np.empty((nz, nxh), self.g.dtype)
             k.solve_transfer_rows(
                 self.g, self.axis_weights, self._dy2, self._dx2, self.kappa, self._q, y0, y1, ratio, row
             )
 
         in_blocks(job, ny)
+
+    def _ratios(self) -> Array:
+        """Return a worker's scratch for tiles of equal width: one of a last column costs as many pages."""
+        nz, _, columns = self.g.shape
+        tiles = max(round(columns / _TILE), 1)
+        return np.zeros((nz + 1, -(-columns // tiles)), self._q.dtype)
 
     @property
     def solution(self) -> Array:
@@ -97,6 +107,7 @@ class LeanTotalVariation(VolumeAdmm):
 
         def worker(i0: int, i1: int) -> None:
             planes = np.empty((k.SCRATCH_PLANES, ny, nx), dtype)
+            spectrum = np.empty_like(self._totals[0])
             rows = np.empty((k.SCRATCH_ROWS, nx), dtype)
             for i in range(i0, i1):
                 end = starts[i + 1] if i + 1 < workers else groups.count
@@ -105,14 +116,14 @@ class LeanTotalVariation(VolumeAdmm):
                 k.plane_sweep(
                     self.X, self.S, self.g, self._totals, groups.of_plane, self.axis_weights, p,
                     self.isotropic, self._statistics, z0, z1, first.get(z0, none), following,
-                    before.get(z0, none), planes, rows,
+                    before.get(z0, none), planes, spectrum, rows,
                 )  # fmt: skip
 
         in_blocks(worker, workers)
         total = self._totals[0]
         for other in self._totals[1:]:
             total += other
-        return self.system.from_spectrum(total), np.asarray(self._statistics.sum(axis=0))
+        return self.system.from_spectrum(self._keep_total(total)), np.asarray(self._statistics.sum(axis=0))
 
     def _boundaries(self, starts: list[int], p: Array) -> tuple[dict[int, Array], dict[int, Array]]:
         """Return the estimate at each worker's first plane, and the z reflections of the plane before it."""
@@ -138,7 +149,7 @@ class LeanTotalVariation(VolumeAdmm):
         X, g, E = self.X.view(dtype), self.g.view(dtype), E.view(dtype)
 
         def job(y0: int, y1: int) -> None:
-            ratio = np.zeros((len(g), min(_TILE, len(self._dx2))), dtype)
+            ratio = self._ratios()
             k.solve_rows(X, g, E, self.axis_weights, self._dy2, self._dx2, self.kappa, True, y0, y1, ratio)
 
         in_blocks(job, len(self._dy2))

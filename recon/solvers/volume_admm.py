@@ -33,6 +33,7 @@ from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import IterationRecord
 from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
+from recon.solvers.moving import move, move_spectra
 from recon.solvers.prior_splits import ProxSplit, split_prior
 from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, is_due, residual_norm, squares
 
@@ -77,6 +78,18 @@ class ExactAdmm(VolumeSplitting):
         self.penalty = FIRST_PENALTY * float(power.mean()) if first is None else float(first)
         self._used_penalty = self.penalty
         self._misfit = 0.5 * squares(self.e)
+
+    def move(self, rows: float, columns: float) -> None:
+        """Move object and dual variables."""
+        super().move(rows, columns)
+        move(self._differences_state, rows, columns)
+        for one in self.splits:
+            one.move(rows, columns)
+
+    @property
+    def _differences_state(self) -> Array:
+        """The state of the differences as images, (..., height, width)."""
+        return self.S
 
     # What depends on the camera ----------------------------------------------------------------------
     def _iterate(self) -> Array:
@@ -240,6 +253,28 @@ class VolumeAdmm(ExactAdmm):
         seen = None if start is None else self._forward(self.xp.asarray(start[0]))
         self._begin(tv, seen, operator.power())
 
+    _cast: Array | None = None
+    """Spectrum of ``e / mu`` as X has it, where it was moved since."""
+
+    def set_data(self, data: SensorData) -> None:
+        """Go on with other data, the data term solved for them at once."""
+        super().set_data(data)
+        if self._total is None:
+            return
+        before = self._weighted_spectrum().copy() if self._cast is None else self._cast
+        self.system.solve(self.data - self.system.from_spectrum(self._total.copy()), self.e)
+        change, self._cast = self._weighted_spectrum() - before, None
+        for X, g in zip(self.X, self.g, strict=True):
+            X += g * change
+
+    def move(self, rows: float, columns: float) -> None:
+        """Move object and dual variables."""
+        super().move(rows, columns)
+        width = self.operator.grid_shape[1]
+        self._cast = self._weighted_spectrum().copy()
+        for spectra in (self.X, self._cast):
+            move_spectra(spectra, rows, columns, width)
+
     # Steps that compiled code replaces ---------------------------------------------------------------
     def _allocate(self, start: Array | None) -> None:
         """Make the state and what it is updated with: X, S, g, q."""
@@ -310,7 +345,7 @@ class VolumeAdmm(ExactAdmm):
 
     def _predict(self, r: Array) -> Array:
         self.X = fft.rfft(r[0])
-        return self.system.from_spectrum((self.xp.conj(self.g) * self.X).sum(axis=0))
+        return self.system.from_spectrum(self._keep_total((self.xp.conj(self.g) * self.X).sum(axis=0)))
 
     def _update(self) -> None:
         self.X = self._solve_depths(self.X) + self.g * self._weighted_spectrum()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,20 @@ class HangingCamera(FreeRunningCamera):
 
 def light_is_off(bench: Bench) -> bool:
     return bench.led_array is not None and bench.led_array.pattern.description == "off"
+
+
+@pytest.mark.usefixtures("mock_drivers")
+def test_a_device_that_takes_a_while_to_close_is_not_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = bench_with(FreeRunningCamera())
+    closed = threading.Event()
+
+    def close() -> None:
+        time.sleep(0.3)
+        closed.set()
+
+    monkeypatch.setattr(bench.camera, "close", close)
+    bench.close()
+    assert closed.is_set()
 
 
 @pytest.mark.usefixtures("mock_drivers", "soon")

@@ -87,6 +87,20 @@ def test_frames_say_what_they_were_exposed_with() -> None:
         assert camera.snap().metadata.exposure_ms == 5_000 // LINE_US * LINE_US / 1e3
 
 
+def test_its_own_controls_can_be_set() -> None:
+    with camera_of(controls={"LensPosition": 2.0}) as camera:
+        (own,) = camera.own_settings().items()
+        assert (own[0], own[1].value, own[1].takes) == ("LensPosition", 2.0, "0 to 32")
+        assert camera.set_own("LensPosition", "7.5") == 7.5
+        assert camera._camera._controls["LensPosition"] == 7.5
+        for wrong in ("33", "near", "nan"):
+            with pytest.raises(LimitError, match=r"LensPosition does not take .*It takes 0 to 32"):
+                camera.set_own("LensPosition", wrong)
+        with pytest.raises(LimitError, match="no setting 'ExposureTime'"):
+            camera.set_own("ExposureTime", "100")
+        assert camera.own_settings()["LensPosition"].value == 7.5
+
+
 def test_a_pulled_cable_is_said(library: type[Picamera2], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_START_S", 0.1)
     with camera_of() as camera:

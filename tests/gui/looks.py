@@ -39,6 +39,10 @@ def faults(root: QWidget) -> list[str]:
 
 def cut_off(root: QWidget) -> Iterator[str]:
     """Yield what is too small for its words, or lies outside of what shows it."""
+    for part in _visible(root, QLineEdit, QComboBox, QAbstractButton):
+        inner = isinstance(part.parentWidget(), QComboBox) or isinstance(part, QCommandLinkButton)
+        if not inner and part.height() < part.sizeHint().height() - _SLACK_PX:
+            yield f"{_where(part)}: {part.height()} px high, and needs {part.sizeHint().height()}"
     for part in _visible(root, QAbstractButton, QLabel, QComboBox, QTabBar):
         if isinstance(part, QTabBar):
             if part.usesScrollButtons() and part.sizeHint().width() > part.width() + _SLACK_PX:

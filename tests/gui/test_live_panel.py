@@ -417,25 +417,32 @@ def test_a_cameras_own_settings_are_set_where_all_are_shown(
     def set_own(name: str, value: str) -> str:
         if value == "9":
             raise LimitError("camera", "takes no Trim '9'.", "It takes 0 to 5.")
-        now[name] = value
+        now.update({name: value, "Trim": "1"})  # which goes with the fan
         return value
 
-    own = {"Fan": OwnSetting("Off", "Off, On", ("Off", "On")), "Trim": OwnSetting("3", "0 to 5")}
-    monkeypatch.setattr(live.session.bench.camera, "own_settings", lambda: own)
+    def own() -> dict[str, OwnSetting]:
+        return {
+            "Fan": OwnSetting(now["Fan"], "Off, On", ("Off", "On")),
+            "Trim": OwnSetting(now["Trim"], "0 to 5"),
+        }
+
+    monkeypatch.setattr(live.session.bench.camera, "own_settings", own)
     monkeypatch.setattr(live.session.bench.camera, "set_own", set_own)
     qtbot.waitUntil(live.form.isEnabled, timeout=WAIT_MS)
     qtbot.mouseClick(live.form.all_button, Qt.MouseButton.LeftButton)
     (shown,) = live.findChildren(DeviceSettings)
-    assert "exposure" in shown.view.toPlainText()
     qtbot.waitUntil(lambda: set(shown.fields) == {"Fan", "Trim"}, timeout=WAIT_MS)
+    assert "exposure" in shown.view.toPlainText()
     fan, trim = shown.fields["Fan"], shown.fields["Trim"]
     assert isinstance(fan, QComboBox)
     assert isinstance(trim, QLineEdit)
     qtbot.keyClick(fan, Qt.Key.Key_Down)
     qtbot.waitUntil(lambda: now["Fan"] == "On" and "On now" in shown.note.text(), timeout=WAIT_MS)
+    assert "Trim is 1" in shown.note.text()
+    assert trim.text() == "1"
     trim.setText("9")
     qtbot.keyClick(trim, Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: "0 to 5" in shown.note.text(), timeout=WAIT_MS)
     assert trim.property("refused")
-    assert now["Trim"] == "3"
+    assert now["Trim"] == "1"
     shown.close()

@@ -231,7 +231,7 @@ def test_a_theme_can_be_chosen_and_another_before_it_is_there(
     qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
     assert window.updatesEnabled()
     assert settings.value("theme") == name
-    late = window.panel("tasks")  # made under the theme that is not the program's first
+    late = window.panel("films")  # made under the theme that is not the program's first
     question = Question(window, "Title", "Text", ("Yes", "No"), lambda _: None)
     assert window.statusBar().palette().window().color() == QColor(THEMES[name].panel)
     for part in (window, window.tabs, late, question):

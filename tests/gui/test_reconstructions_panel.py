@@ -21,12 +21,14 @@ from gui.session import BenchSession
 from gui.theme import apply_theme, change_theme
 from gui.widgets.dialogues import Question
 from gui.widgets.entry import NumberEdit
+from instrument.files.calibration_file import load_calibration, newest_calibration, save_calibration
 from instrument.files.images import read_image, write_image
 from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.stored_result import StoredResult, open_result
 from recon.camera.transformed import Transformation
 from recon.reconstruction.options import Overrides
+from recon.types import Calibration
 from recon.verdict.calibration_check import GIVEN, CalibrationCheck, Fit, Score
 
 WAIT_MS = 60_000
@@ -378,6 +380,35 @@ def test_a_psf_that_does_not_fit_is_fitted_by_a_button(
     assert asked == [True]
     panel.show_result(panel.result)
     assert panel.refine_button.isHidden(), "it was fitted already"
+
+
+def test_a_fitted_psf_is_kept_and_used_from_then_on(
+    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path
+) -> None:
+    spot = np.zeros((1, 1, 40, 60), np.float32)
+    spot[0, 0, 20, 45] = 1.0
+    saved = save_calibration(Calibration(spot, np.array([[500.0, 0.0, 2e4]])), tmp_path / "cal")
+    write_image(tmp_path / "p.tif", np.zeros((20, 30), np.float32))
+    fitted = {"psf_refinement": {"scale": 1.2, "rotation_deg": 0.0, "used": True}}
+    record = {"inputs": {"calibration": str(saved)}, "provenance": fitted}
+    given: list[tuple[str, object]] = []
+    panel.session.handed_on.connect(lambda name, what: given.append((name, what)))
+    panel.show()
+    for used in (False, True):
+        fitted["psf_refinement"]["used"] = used
+        panel.show_result(StoredResult(tmp_path / "p.tif", np.zeros((20, 30), np.float32), None, record))
+        assert panel.keep_button.isHidden() is not used
+    qtbot.mouseClick(panel.keep_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: bool(given), timeout=WAIT_MS)
+    ((name, folder),) = given
+    assert name == "live_reconstruction"
+    assert panel.form.options.value("calibration") == folder == newest_calibration(panel.session.runs_folder)
+    made = load_calibration(folder)
+    assert np.unravel_index(made.psfs[0, 0].argmax(), (40, 60)) == (
+        20,
+        48,
+    )  # 15 pixels from the middle, 18 now
+    assert made.source_positions_um[0] == pytest.approx([600.0, 0.0, 2e4])
 
 
 @pytest.mark.parametrize("opened_during", ["the name", "the question"])

@@ -47,6 +47,8 @@ MISTAKES: list[tuple[list[str], str]] = [
     ([*RECONSTRUCT, "--calibration", "near", "--image", "photo.tif", "--z-mm", "30"], "has one depth, 20 mm"),
     (["demo", "nothing"], "there are camera, film, display"),
     (["plan", "shwo"], "Did you mean show?"),
+    (["chart", "hologram", "head"], "Did you mean --hologram head?"),
+    ([*PAIR, "photo.tif"], "photo.tif: no option says what it is for"),
     ([*PAIR, "--figure", "o.gif"], ".png, .pdf or .svg"),
     (["reconstruct", *PAIR[3:], "--out", "/proc/o.tif"], "Choose another place"),
     (["reconstruct", *PAIR[3:], "--out", "o.jpg"], "must end in .tif"),

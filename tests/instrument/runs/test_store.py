@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -15,10 +16,11 @@ from ome_zarr_models.v05 import Image
 from drivers.frame import FrameMetadata
 from instrument.files.atomic import write_json
 from instrument.plan import Part, Plan
-from instrument.runs.log import AppendOnlyLog, BadLine, FrameRecord, read_lines
+from instrument.runs.inspection import run_paths, verify
+from instrument.runs.log import AppendOnlyLog, BadLine, FrameRecord, Gap, read_lines
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_files import RunError
-from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
+from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter, free_name
 
 BENCH = BenchRecord(
     {"bench": {"name": "b"}},
@@ -185,13 +187,77 @@ def test_a_frame_of_another_shape_or_place_is_refused(tmp_path: Path) -> None:
     assert sorted(run.records) == [0]
 
 
-def test_two_runs_of_one_second_get_two_folders(tmp_path: Path) -> None:
-    names = []
+def test_a_name_that_is_taken_gets_a_number_and_two_runs_of_one_second_two_folders(tmp_path: Path) -> None:
+    for name in ("a.txt", "a-2.txt", "a-3.txt"):
+        path = free_name(tmp_path, "a", ".txt")
+        assert path.name == name
+        path.touch()
+    paths = set()
     for _ in range(3):
-        with new_run(tmp_path) as writer:
-            names.append(writer.path.name)
-    assert names[1:] == [f"{names[0]}-2", f"{names[0]}-3"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
+        with new_run(tmp_path / "runs") as writer:
+            paths.add(writer.path)
+    assert set((tmp_path / "runs").iterdir()) == paths
+    assert len(paths) == 3
+
+
+def test_what_is_no_image_is_not_stored_and_hidden_runs_are_none(tmp_path: Path) -> None:
+    with new_run(tmp_path) as writer:
+        writer.start()
+        with pytest.raises((TypeError, RunError), match="float64"):
+            writer.write([FrameToStore(0, np.zeros((6, 8)), metadata())])  # type: ignore[arg-type]
+        writer.write([frame(0)])
+        writer.finish(FinishReason.ABORTED)
+    record = Run.open(writer.path).records[0]
+    assert record.shape_and_type() == ((6, 8), "uint16")
+    assert replace(record, n_bytes=6 * 8 * 3).shape_and_type() == ((6, 8, 3), "uint8")
+    with pytest.raises(ValueError, match="95 bytes are no image of 6 x 8 pixels"):
+        replace(record, n_bytes=95).shape_and_type()
+    (tmp_path / "no run").mkdir()
+    assert run_paths(tmp_path) == [writer.path]
+    writer.path.rename(tmp_path / ".hidden")
+    assert run_paths(tmp_path) == run_paths(tmp_path / "missing") == []
+
+
+BINNED = FrameToStore(2, frame(2).image, replace(metadata(2), binning=2))
+ODD = FrameToStore(1, frame(1).image, replace(metadata(1), binning=2, roi=(1, 1, 13, 17)))
+
+
+@pytest.mark.parametrize(
+    ("steps", "frames", "gaps", "problem"),
+    [
+        (plan(3), (0, ODD, 2), (), ""),
+        (plan(2), (frame(0, (6, 8, 3)), frame(1, (6, 8, 3))), (), ""),
+        (plan(5), (0, 2), (), "marked as completed, but frames 1, 3-4 are not there"),
+        (plan(2, 2), (0, 1), (), "frame 0 averages 1, planned were 2; frame 1 averages 1, planned were 2"),
+        (plan(3), (0, 1, BINNED), (), "frame 2: its region (0, 0, 6, 8) at binning 2 is not 6 x 8 pixels"),
+        (None, (0, 3), ((1, 2),), ""),
+        (None, (0, 1), ((2, 2),), ""),
+        (None, (0, 1, 2), ((1, 1),), "frames 1 are both stored and lost"),
+        (None, (0, 3), (), "frames 1-2 are neither stored nor accounted for as lost"),
+        (None, (0, 4), ((1, 2),), "frames 3 are neither stored nor accounted for as lost"),
+    ],
+)
+def test_what_a_run_says_against_itself_is_found(
+    tmp_path: Path,
+    steps: Plan | None,
+    frames: tuple[int | FrameToStore, ...],
+    gaps: tuple[tuple[int, int], ...],
+    problem: str,
+) -> None:
+    with new_run(tmp_path, plan=steps) as writer:
+        writer.start()
+        writer.write([frame(n) if isinstance(n, int) else n for n in frames])
+        for first, count in gaps:
+            writer.gap(Gap(first, count, 0))
+        open_yet = "; ".join(verify(Run.open(writer.path)).problems)
+        writer.finish(FinishReason.COMPLETED)
+    assert "; ".join(verify(Run.open(writer.path)).problems) == problem
+    assert open_yet == ("" if problem.startswith("marked") else problem)
+    if steps is None:
+        Run.open(writer.path).array.resize(9)
+        assert "the image array is for 9 frames, the log knows" in "".join(
+            verify(Run.open(writer.path)).problems
+        )
 
 
 def test_what_is_no_run_is_refused_in_words(tmp_path: Path) -> None:

@@ -183,3 +183,22 @@ def test_images_and_their_spectra_move_alike(by: tuple[float, float]) -> None:
     expected = np.stack([shift(image, by, order=3, mode="grid-wrap") for image in smooth])
     np.testing.assert_allclose(moved, expected, atol=1e-3)
     np.testing.assert_allclose(np.fft.irfft2(spectra, (24, 30)), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("prior", ["tv", "l1"])
+def test_depths_move_with_the_scene_and_take_new_data_at_once(prior: str) -> None:
+    scene = make_scene("beads", size=32, depths=3, density=0.5)
+    posed = stream_problem(scene.measurement, scene.calibration, prior=prior, estimate_background=False)
+    moved = np.roll(scene.measurement, 1, axis=1)
+    apart = []
+    for by in ((0.0, 1.0), (0.0, 0.0)):
+        video = VideoSolver(posed, cold_iterations=60, warm_iterations=1)
+        video.next(scene.measurement)
+        solver = video.solvers[0]
+        kept = solver._total.copy()
+        video._panning.next = lambda *_, by=by: by
+        picture = video.next(moved)
+        assert not np.array_equal(solver._total, kept)
+        best = VideoSolver(posed, cold_iterations=120).next(moved)
+        apart.append(np.linalg.norm(picture - best) / np.linalg.norm(best))
+    assert apart[0] < 0.5 * apart[1]
