@@ -189,8 +189,14 @@ def display_of_pattern(
 ) -> Display:
     """Return the bench's display as a pattern was computed for it, by the facts beside the pattern.
 
-    ``size`` is the SLM's shape and pitch in micrometres. Errors as ``bench_display``.
+    ``size`` is the SLM's shape and pitch in micrometres. Errors as ``bench_display``; BenchError for a
+    pattern that needs no lens.
     """
+    if (away_mm := facts.get("options", {}).get("distance_mm")) is not None:
+        raise BenchError(
+            f"The pattern's picture is {away_mm:g} mm away without a lens; photographs are registered "
+            "behind the bench's Fourier lens. Show it without --capture."
+        )
     display = bench_display(
         config, size, expansion=facts.get("expansion"), wavelength_nm=facts.get("wavelength_nm")
     )

@@ -178,6 +178,8 @@ class HologramsPanel(Panel):
             return ""
         try:
             q = self.form.value("expansion")
+            if self.form.value("distance_mm") is not None:
+                return ""  # said when it is computed
         except BenchError:
             return ""  # refused at its own field
         limit_mm = depth_limit_mm(self.session.config, (slm.shape, slm.pixel_pitch_um), expansion=q)

@@ -89,6 +89,12 @@ def hologram(
         options.display_of(bench_display(config, size, expansion=options.expansion, wavelength_nm=nm))
         for nm in lasers
     ]
+    if options.distance_mm is not None:
+        typer.echo(
+            f"Without a lens: the picture is {displays[0].field_mm:.4g} mm wide, {options.distance_mm:g} mm "
+            "behind the mask.",
+            err=True,
+        )
     if inputs.alignment is not None:
         found = load_alignment(inputs.alignment)
         displays = [found.of(display) for display in displays]

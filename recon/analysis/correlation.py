@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -125,8 +126,8 @@ def spot_px(psf: Array) -> float:
     return float(np.sqrt(widths[0] * widths[1]))
 
 
-def critical_scale(psf: Array, level: float) -> float:
-    """Return the enlargement at which a PSF is only ``level`` similar to itself; infinite beyond 2.
+def critical_scales(psf: Array, *levels: float) -> tuple[float, ...]:
+    """Return the enlargements at which a PSF is only so similar to itself; infinite beyond 2.
 
     Doubled from a tenth of a pixel at the PSF's edge until it is less similar, then bisected twice; linear
     between what is left. Of large PSFs :data:`SAMPLES` pixels, taken at random, are compared.
@@ -143,25 +144,25 @@ def critical_scale(psf: Array, level: float) -> float:
     off_centre = np.array(np.unravel_index(places, light.shape)) - centre
     spline = ndimage.spline_filter(light, order=3)
 
+    @cache
     def seen(by: float) -> float:
         nearer = centre + off_centre / (1.0 + by)
         enlarged = ndimage.map_coordinates(spline, nearer, order=3, prefilter=False)
         return similarity(values, np.maximum(enlarged, min(float(light.min()), 0.0)))
 
-    low, at_low = 0.0, 1.0
-    high = 0.1 / (0.5 * max(light.shape))
-    while (at_high := seen(high)) > level:
-        low, at_low = high, at_high
-        high *= 2
-        if high > 1:
-            return float("inf")
-    for _ in range(2):
-        middle = 0.5 * (low + high)
-        if (at_middle := seen(middle)) > level:
-            low, at_low = middle, at_middle
-        else:
-            high, at_high = middle, at_middle
-    return float(1.0 + low + (high - low) * (at_low - level) / (at_low - at_high))
+    def scale(level: float) -> float:
+        low, high = 0.0, 0.1 / (0.5 * max(light.shape))
+        while seen(high) > level:
+            low, high = high, 2 * high
+            if high > 1:
+                return float("inf")
+        for _ in range(2):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if seen(middle) > level else (low, middle)
+        at_low, at_high = (seen(by) if by else 1.0 for by in (low, high))
+        return float(1.0 + low + (high - low) * (at_low - level) / (at_low - at_high))
+
+    return tuple(scale(level) for level in levels)
 
 
 def cut_to_light(image: Array) -> Array:

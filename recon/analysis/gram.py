@@ -13,6 +13,7 @@ sensor which is told that nothing is outside the window, at the cost of some sma
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -26,6 +27,7 @@ from recon.errors import InputError
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
 Direction = Literal["x", "z", "xz"]
 
 WORST = 1e7
@@ -183,7 +185,7 @@ class WindowProblem:
         # Circulant embedding: the window's A^T A is a compression of it, so its norm bounds ours.
         self._lipschitz = float(np.linalg.eigvalsh(self._gram)[:, -1].max())
 
-    def adjoint(self, data: Array) -> Floats:
+    def adjoint(self, data: Array) -> Single:
         """Return ``A^T b`` in the window; columns have norm 1."""
         spectrum = self._spectrum(data)
         return np.stack(
@@ -192,11 +194,11 @@ class WindowProblem:
 
     def solve(
         self, data: Array, *, iterations: int = MOST_ITERATIONS, tolerance: float = TOLERANCE
-    ) -> Floats:
+    ) -> Single:
         """Reconstruct from an image (height, width): accelerated projected gradient with restart.
 
         The step is 1 over a bound of the norm of ``A^T A``. It ends where a relative change is below
-        ``tolerance``. Returns float64, (n_z, rows, columns) of the window, in units of the PSFs as given.
+        ``tolerance``. Returns float32, (n_z, rows, columns) of the window, in units of the PSFs as given.
         """
         if data.shape != self.sensor_shape:
             raise InputError(f"The image is {data.shape}, the PSFs are {self.sensor_shape}.")
@@ -208,31 +210,31 @@ class WindowProblem:
             step = new - x
             if float(np.vdot(y - new, step)) > 0:  # the momentum points against the descent
                 t = 1.0
-            t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
+            t_next = (1 + math.sqrt(1 + 4 * t * t)) / 2
             y = new + (t - 1) / t_next * step
             x, t = new, t_next
             size = float(np.linalg.norm(x))
             if size == 0 or float(np.linalg.norm(step)) / size < tolerance:
                 break
-        return np.asarray(x / self._norms[:, None, None])
+        return np.asarray(x / self._norms[:, None, None], np.float32)
 
-    def _normal(self, x: Floats) -> Floats:
+    def _normal(self, x: Single) -> Single:
         """``A^T A x`` in the window."""
         rows, columns = (2 * h + 1 for h in self.half)
-        padded = np.zeros((self.n_z, *self._small))
+        padded = np.zeros((self.n_z, *self._small), np.float32)
         padded[:, :rows, :columns] = x
         spectra = fft.rfft(padded).reshape(self.n_z, -1)
         seen = np.matmul(self._gram, spectra.T[:, :, None])[:, :, 0].T
         shape = (self.n_z, *fft.spectrum_shape(self._small))
         return fft.irfft(np.ascontiguousarray(seen).reshape(shape), self._small[1])[:, :rows, :columns]
 
-    def _correlations(self, reach: list[int]) -> npt.NDArray[np.complex128]:
-        gram = np.empty((self.n_z, self.n_z, *fft.spectrum_shape(self._small)), np.complex128)
+    def _correlations(self, reach: list[int]) -> npt.NDArray[np.complex64]:
+        gram = np.empty((self.n_z, self.n_z, *fft.spectrum_shape(self._small)), np.complex64)
         for j in range(self.n_z):
             for k in range(j, self.n_z):
                 product = np.conj(self._spectra[j]) * self._spectra[k]
                 near = self._around(fft.irfft(product, self._grid[1]), (reach[0], reach[1]))
-                kernel = np.zeros(self._small)
+                kernel = np.zeros(self._small, np.float32)
                 kernel[: near.shape[0], : near.shape[1]] = near
                 kernel = np.roll(kernel, (-reach[0], -reach[1]), (0, 1))
                 gram[j, k] = fft.rfft(kernel)
@@ -240,10 +242,10 @@ class WindowProblem:
         return np.ascontiguousarray(gram.reshape(self.n_z, self.n_z, -1).transpose(2, 0, 1))
 
     def _spectrum(self, image: Array) -> Array:
-        padded = np.zeros(self._grid)
+        padded = np.zeros(self._grid, np.float32)
         padded[: image.shape[0], : image.shape[1]] = image
         return fft.rfft(padded)
 
-    def _around(self, correlation: Floats, half: tuple[int, int]) -> Floats:
+    def _around(self, correlation: Single, half: tuple[int, int]) -> Single:
         rows, columns = (np.arange(-h, h + 1) for h in half)
         return correlation[np.ix_(rows, columns)]

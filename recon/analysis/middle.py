@@ -21,7 +21,7 @@ from recon.types import Calibration
 
 Array = npt.NDArray[Any]
 
-LARGEST_PX = 100_000
+LARGEST_PX = 80_000
 """Of larger sensors the middle is taken."""
 RIM_PX = 24
 """Kept dark around patterns, for shifts."""

@@ -32,10 +32,9 @@ from recon.analysis.resolution import (
     LateralResolution,
     VoxelGrid,
     across_depth,
-    axial_resolution,
+    axial_resolutions,
     axial_spacing_per_um,
     gaussian_response,
-    lateral_resolution,
     lateral_spacing_um,
     support_extent_px,
     voxel_grid,
@@ -217,15 +216,20 @@ def analyse(
     depths, stack = central_psfs(small)
     planes = stack.mean(axis=1)
     on_progress("resolution", 0.0)
-    z_um = settings.z_um or _depth_to_analyse(depths, planes, distance_um, notes)
+
+    @cache
+    def axial_at(k: int) -> tuple[AxialResolution, ...]:
+        return axial_resolutions(planes[k], float(depths[k]), distance_um, RESOLUTION_LEVEL, INNER_PRODUCT)
+
+    z_um = settings.z_um or _depth_to_analyse(depths, lambda k: axial_at(k)[1].step_per_um, notes)
     # Resolution is a matter of measured pixels: of the calibrated PSF nearest to the depth, not of a blend.
     nearest = int(np.argmin(np.abs(1 / depths - 1 / z_um)))
     psf = planes[nearest]
-    lateral = lateral_resolution(psf, RESOLUTION_LEVEL)
-    lateral_inner = lateral_resolution(psf, INNER_PRODUCT)
-    axial = axial_resolution(psf, float(depths[nearest]), distance_um, RESOLUTION_LEVEL)
-    axial_inner = axial_resolution(psf, float(depths[nearest]), distance_um, INNER_PRODUCT)
-    correlation = autocorrelation_cut(psf, 1)
+    cuts = [autocorrelation_cut(psf, axis) for axis in (0, 1)]
+    lateral, lateral_inner = (
+        LateralResolution.of(cuts, level) for level in (RESOLUTION_LEVEL, INNER_PRODUCT)
+    )
+    axial, axial_inner = axial_at(nearest)
 
     support = support_extent_px(psf)
     cutoff = settings.cutoff_deg or (None, None)
@@ -301,7 +305,7 @@ def analyse(
         distance_um=distance_um,
         sensor_shape=sensor_shape,
         psf=psf,
-        autocorrelation=correlation[len(correlation) // 2 :],
+        autocorrelation=cuts[1][len(cuts[1]) // 2 :],
         support_px=support,
         lateral=lateral,
         lateral_inner=lateral_inner,
@@ -333,19 +337,17 @@ def analyse(
     )
 
 
-def _depth_to_analyse(depths: Floats, planes: Array, distance_um: float, notes: list[str]) -> float:
+def _depth_to_analyse(depths: Floats, step_per_um: Callable[[int], float], notes: list[str]) -> float:
     """Return the middle of the range in 1/z, or the nearest to it about which depth can be tested at all.
 
-    Far away the planes of the tests along the axis, evenly spaced in 1/z, would reach beyond infinity.
+    Far away the planes of the tests along the axis, evenly spaced in 1/z, would reach beyond infinity:
+    ``step_per_um(k)`` apart at the ``k``-th depth.
     """
     middle = float(2 / (1 / depths[0] + 1 / depths[-1]))
     reach = max(CONDITION_PLANES, PLANES) // 2
     for z_um in (middle, *sorted((float(z) for z in depths if z < middle), reverse=True)):
         nearest = int(np.argmin(np.abs(1 / depths - 1 / z_um)))
-        step = axial_resolution(
-            planes[nearest], float(depths[nearest]), distance_um, INNER_PRODUCT
-        ).step_per_um
-        if 1 / z_um > reach * step / 2:
+        if 1 / z_um > reach * step_per_um(nearest) / 2:
             if z_um != middle:
                 notes.append(
                     f"Analysed at {z_um / 1e3:.3g} mm, not in the middle of the range "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from recon.analysis.correlation import (
     autocorrelation_cut,
     centre_of_light,
     correlate,
-    critical_scale,
+    critical_scales,
     half_width,
     similarity,
 )
@@ -185,11 +185,16 @@ class LateralResolution:
         """Return the step in the object's plane at a depth (Eq. 3.1)."""
         return self.mean_px * pitch_um * z_um / distance_um
 
+    @classmethod
+    def of(cls, cuts: Sequence[Floats], level: float) -> LateralResolution:
+        """Measure the cuts of an autocorrelation along rows and columns."""
+        y, x = (half_width(cut, level) for cut in cuts)
+        return cls(level, (y, x))
+
 
 def lateral_resolution(psf: Array, level: float = RESOLUTION_LEVEL) -> LateralResolution:
     """Measure the autocorrelation's half width of a PSF (height, width)."""
-    y, x = (half_width(autocorrelation_cut(psf, axis), level) for axis in (0, 1))
-    return LateralResolution(level, (y, x))
+    return LateralResolution.of([autocorrelation_cut(psf, axis) for axis in (0, 1)], level)
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,8 +231,17 @@ def axial_resolution(
     psf: Array, z_um: float, distance_um: float, level: float = INNER_PRODUCT
 ) -> AxialResolution:
     """Find how much a PSF (height, width) taken at ``z_um`` must grow to look different (sec. 3.2)."""
-    scale = critical_scale(psf, level)
-    return AxialResolution(level, scale, (scale - 1) * (1 + distance_um / z_um) / distance_um)
+    return axial_resolutions(psf, z_um, distance_um, level)[0]
+
+
+def axial_resolutions(
+    psf: Array, z_um: float, distance_um: float, *levels: float
+) -> tuple[AxialResolution, ...]:
+    """Return :func:`axial_resolution` at several levels."""
+    return tuple(
+        AxialResolution(level, scale, (scale - 1) * (1 + distance_um / z_um) / distance_um)
+        for level, scale in zip(levels, critical_scales(psf, *levels), strict=True)
+    )
 
 
 def support_extent_px(psf: Array) -> tuple[float, float]:

@@ -119,6 +119,10 @@ def rfft_strip(x: RealArray, start: int, out: ComplexArray) -> ComplexArray:
         Place of the first of them.
     out : ndarray, complex, (n, height, width // 2 + 1)
     """
+    if (xp := namespace_of(x)) is not np:
+        whole = xp.zeros((len(x), out.shape[1], x.shape[2]), x.dtype)
+        whole[:, start : start + x.shape[1]] = x
+        return rfft(whole, out=out)
     _kernels().forward_strip(np.ascontiguousarray(x), out, start, get_threads())
     return out
 
@@ -128,13 +132,21 @@ def irfft_strip(X: ComplexArray, start: int, out: RealArray) -> RealArray:
 
     ``X`` (n, height, width // 2 + 1) is overwritten.
     """
+    if namespace_of(X) is not np:
+        return _onto(irfft(X, out.shape[2])[:, start : start + out.shape[1]], out)
     scale = 1.0 / (float(X.shape[1]) * out.shape[2])
     _kernels().inverse_strip(X, out, start, scale, get_threads())
     return out
 
 
 def multiply(X: ComplexArray, H: ComplexArray, *, conjugate: bool = False) -> None:
-    """Multiply ``X`` (n, height, width) in place by ``H`` (n or 1, height, width) or its conjugate."""
+    """Multiply ``X`` (n, height, width) in place by ``H`` (n or 1, height, width) or its conjugate.
+
+    ``H`` may be real.
+    """
+    if namespace_of(X) is not np:
+        X *= H.conj() if conjugate else H
+        return
     kernel = _kernels().multiply
     in_blocks(lambda a, b: kernel(X, H, conjugate, a, b), X.shape[0] * X.shape[1], grain=64)
 
@@ -150,7 +162,7 @@ def ensure_compiled(dtype: np.dtype[Any]) -> None:
 
 
 def dct(x: RealArray, out: RealArray) -> RealArray:
-    """Orthonormal cosine transform (type 2) of an image (height, width), written into ``out``."""
+    """Orthonormal cosine transform (type 2) of an image or volume over all its axes, written into ``out``."""
     return _cosine(x, out, 2)
 
 
@@ -161,7 +173,10 @@ def idct(X: RealArray, out: RealArray) -> RealArray:
 
 def _cosine(x: RealArray, out: RealArray, kind: int) -> RealArray:
     _check(out, x.shape, x.dtype)
-    _kernels().cosine(x, out, np.array([0, 1]), kind, 0.5 / float(np.sqrt(x.size)), get_threads())
+    shape = [n for n in x.shape if n > 1] or [1]  # an axis of one element is copied element by element
+    scale = float(np.prod(2.0 * np.array(shape))) ** -0.5
+    kernel = _kernels().cosine
+    kernel(x.reshape(shape), out.reshape(shape), np.arange(len(shape)), kind, scale, get_threads())
     return out
 
 

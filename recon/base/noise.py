@@ -46,7 +46,7 @@ _PAIR: Stencil = ((0, 0, 1.0), (0, 1, -1.0))
 ENOUGH = 256
 """Stencils from which a median is trusted as it is: with fewer, the one that says least, errors included, as
 structure only ever adds."""
-FEW = 16
+FEW = 12
 """Stencils below which nothing is said."""
 
 TILE = 16

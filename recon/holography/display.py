@@ -122,6 +122,9 @@ class Display:
         pixels; ``dy, dx`` on nodes that span the mask from edge to edge, bilinear in between.
     learned : Learned or None
         What photographs taught of it; ``dc`` is part of that then.
+    distance_mm : float or None
+        Without a Fourier lens: where the picture is behind the mask, and ``wavelength_nm distance_mm /
+        mask_pitch_um`` wide (Fresnel diffraction). ``focal_mm`` does not count then.
     """
 
     slm_shape: tuple[int, int]
@@ -133,11 +136,14 @@ class Display:
     mask_fill: float = 0.0
     displacement: npt.NDArray[np.float64] | None = None
     learned: Learned | None = None
+    distance_mm: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("slm_pitch_um", "wavelength_nm", "focal_mm"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} must be above 0, not {getattr(self, name)!r}.")
+        if self.distance_mm is not None and not self.distance_mm > 0:
+            raise InputError(f"distance_mm must be above 0, not {self.distance_mm!r}.")
         if not 0 <= self.mask_fill <= 1:
             raise InputError(f"mask_fill lies in 0 to 1, not {self.mask_fill:g}.")
         height, width = self.slm_shape
@@ -174,20 +180,47 @@ class Display:
         """Return the Fresnel factor of a plane as a product of a column and a row (Eqs. 7.21, 7.22).
 
         ``z_mm`` is the plane's distance from the Fourier lens' focal plane, away from the lens. With
-        ``u = X / (lambda f1)`` the phase is ``pi z X^2 / (lambda f1^2)``. The constant phase is left out.
+        ``u = X / (lambda f1)`` the phase is ``pi z X^2 / (lambda f1^2)``; without a lens, ``d`` in front of
+        the picture, it is ``pi X^2 / (lambda (d + z))``. The constant phase is left out.
 
-        Raises InputError when the factor turns by more than pi between mask pixels at the aperture's edge:
-        the plane would be aliased.
+        Raises InputError when the factor turns by more than pi between mask pixels at the aperture's edge,
+        where the plane would be aliased; without a lens, nearer than :attr:`nearest_mm`.
         """
-        require_defocus(
-            z_mm, greatest_defocus_mm(self.mask.shape, self.mask_pitch_um, self.wavelength_nm, self.focal_mm)
-        )
-        curvature = np.pi * z_mm / (self.wavelength_nm * 1e-6 * self.focal_mm**2)
+        wavelength_mm = self.wavelength_nm * 1e-6
+        if self.distance_mm is None:
+            shape, pitch_um = self.mask.shape, self.mask_pitch_um
+            require_defocus(z_mm, greatest_defocus_mm(shape, pitch_um, self.wavelength_nm, self.focal_mm))
+            curvature = np.pi * z_mm / (wavelength_mm * self.focal_mm**2)
+        else:
+            away_mm, least_mm = self.distance_mm + z_mm, self.nearest_mm
+            if away_mm < least_mm:
+                raise InputError(
+                    f"Without a lens a picture {away_mm:g} mm away is too near for this display: it is shown "
+                    f"rightly from {least_mm:.4g} mm on."
+                )
+            curvature = np.pi / (wavelength_mm * away_mm)
         factors = []
         for n in self.mask.shape:
             x_mm = (np.arange(n) - (n - 1) / 2) * self.mask_pitch_um * 1e-3
             factors.append(np.exp(1j * curvature * x_mm**2))
         return factors[0], factors[1]
+
+    @property
+    def nearest_mm(self) -> float:
+        """Distance without a lens from which on pictures are as computed.
+
+        Twice that at which the Fresnel factor turns by pi between mask pixels. Nearer, that the envelope of
+        a pixel is centred before the pixel and not on the axis changes the picture: against light propagated
+        by itself its correlation is 0.93 at 1.1 times, 0.975 at 1.8, 0.994 at 3.5, 0.999 at 7.
+        """
+        extent_mm = (max(self.mask.shape) - 1) * self.mask_pitch_um * 1e-3
+        return 2 * extent_mm * self.mask_pitch_um * 1e-3 / (self.wavelength_nm * 1e-6)
+
+    @property
+    def field_mm(self) -> float:
+        """Width of the field in the focal plane, or ``distance_mm`` away."""
+        away_mm = self.focal_mm if self.distance_mm is None else self.distance_mm
+        return self.wavelength_nm * 1e-3 * away_mm / self.mask_pitch_um
 
     def envelope(self, shape: tuple[int, int]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Return the mask pixels' intensity envelope over the field, in FFT order, as two factors."""

@@ -125,6 +125,18 @@ class HologramOptions:
         metavar="Q",
         group=_SLM,
     )
+    distance_mm: float | None = option(
+        None,
+        help="Without a Fourier lens: the picture is so far behind the mask, or the SLM where there is none "
+        "(Fresnel diffraction); planes are counted from there.",
+        default_words="behind the bench's Fourier lens",
+        unit="mm",
+        above=0,
+        metavar="MM",
+        label="Distance",
+        group=_SLM,
+        applies=_OF_PICTURES,
+    )
     frames: int = option(
         1,
         help="Time-multiplexed frames, whose intensities average.",
@@ -272,5 +284,6 @@ class HologramOptions:
         return foveal_weights((256, 256), centre=self.centre, radius=self.radius, periphery=self.periphery)
 
     def display_of(self, display: Display) -> Display:
-        """Return the display as it is modelled: without the envelope where it is ignored."""
-        return replace(display, mask_fill=0.0) if self.envelope == "ignore" else display
+        """Return the display as it is modelled: without an envelope that is ignored, without its lens."""
+        fill = 0.0 if self.envelope == "ignore" else display.mask_fill
+        return replace(display, mask_fill=fill, distance_mm=self.distance_mm)

@@ -46,7 +46,7 @@ erased as well."""
 CLIPPED_BLOCK, MOST_CLIPPED = 0.1, 0.5
 """Shares of pixels at full scale: of a block's, from which it is erased, and of all used, from which nobody
 is called foreign: what is left is what was dark."""
-CONTRADICTIONS = ((Fit.OFF, Fit.FITS), (Fit.FITS, Fit.FOREIGN))
+CONTRADICTIONS = ((Fit.OFF, Fit.FITS), (Fit.FITS, Fit.FOREIGN), (Fit.UNTOLD, Fit.FOREIGN))
 """What the quick and the thorough way may say: then the photograph does not tell."""
 MOST_PLANES = 6
 """Depths that take part, evenly spaced."""

@@ -19,7 +19,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from recon.base.threads import get_threads
+from recon.base import fft
 from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import Convolution
 from recon.priors.base import Prior
@@ -88,6 +88,7 @@ class OperatorAdmm(ExactAdmm):
         self._pixels = float(self.kappa) * len(self.splits)
         weights = None if tv is None else tv.axis_weights
         self._eigenvalues = None if weights is None else self._laplacian(weights)
+        self._cosines = np.empty_like(self.x[0] if weights is not None else self.x[:0])
         self._psi = tv.differences(self.x) if tv else None
         self.S = np.zeros(0, dtype) if self._psi is None else self._psi.forward(self.x)
         power = central.power()[0]
@@ -133,12 +134,10 @@ class OperatorAdmm(ExactAdmm):
             if self._pixels != 1:
                 x /= x.dtype.type(self._pixels)
             return x
-        from scipy.fft import dctn, idctn
-
-        X = dctn(x[0], norm="ortho", overwrite_x=True, workers=get_threads())
+        X = fft.dct(x[0], self._cosines)
         X /= self._eigenvalues
-        back: Array = idctn(X, norm="ortho", overwrite_x=True, workers=get_threads())
-        return back[None]
+        fft.idct(X, x[0])
+        return x
 
     def _bend(self, e: Array) -> Array:
         """Return ``A T^-1 A^H e / mu``."""

@@ -77,7 +77,9 @@ class SensorSystem:
         self.dtype = np.dtype(dtype)
         self.set_background(measured.background)
         self._mask = None if valid is None or valid.all() else xp.asarray(valid.astype(self.dtype))
-        self._plane = xp.zeros(grid_shape, self.dtype)
+        # The grid's rows that hold the sensor; no others are ever transformed to or from real space.
+        rows = (1, window[0].stop - window[0].start, grid_shape[1])
+        self._cast, self._seen = xp.zeros(rows, self.dtype), xp.empty(rows, self.dtype)
         self._spectrum = xp.empty(fft.spectrum_shape(grid_shape), fft.complex_dtype(self.dtype))
         self._q = xp.zeros(fft.spectrum_shape(grid_shape), self.dtype)
         self._preconditioner = xp.ones_like(self._q)
@@ -101,10 +103,6 @@ class SensorSystem:
         """
         floor = 10 * float(np.finfo(self.dtype).eps)
         self.tolerance = float(np.clip(0.02 * progress, floor, 1e-4))
-
-    def crop(self, plane: Array) -> Array:
-        """``C``: what the sensor says of a plane. A copy."""
-        return self.masked(plane[self.window].copy())
 
     def masked(self, image: Array) -> Array:
         """Take out, in place, what says nothing: pixels that are not valid, a smooth background."""
@@ -134,17 +132,19 @@ class SensorSystem:
 
     def spectrum_of(self, e: Array) -> Array:
         """``F C^T e``, in an array that the next call overwrites."""
-        self._plane[...] = 0
-        self._plane[self.window] = self.weighed(e)
-        return fft.rfft(self._plane, out=self._spectrum)
+        rows, columns = self.window
+        self._cast[0, :, columns] = self.weighed(e)
+        spectrum: Array = fft.rfft_strip(self._cast, rows.start, self._spectrum[None])[0]
+        return spectrum
 
     def from_spectrum(self, X: Array) -> Array:
         """``C F^-1 X``; overwrites ``X``."""
-        return self.crop(fft.irfft(X, self._plane.shape[1], out=self._plane))
+        rows, columns = self.window
+        return self.masked(fft.irfft_strip(X[None], rows.start, self._seen)[0, :, columns].copy())
 
     def _filtered(self, e: Array, transfer: Array) -> Array:
         X = self.spectrum_of(e)
-        X *= transfer
+        fft.multiply(X[None], transfer[None])
         return self.from_spectrum(X)
 
     def _bend(self, e: Array) -> Array:

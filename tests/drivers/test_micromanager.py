@@ -97,6 +97,18 @@ class TestCamera(CameraContract):
         return camera_on(self.manager)
 
 
+def test_a_long_exposure_is_waited_for(manager: MicroManager) -> None:
+    with camera_on(manager) as camera:
+        waits = []
+        for exposure_ms in (10.0, 2000.0, 4000.0):
+            camera.set_exposure_ms(exposure_ms)
+            waits.append(camera.longest_wait_s)
+        frames = 3 + camera.frames_to_skip
+    assert waits[0] >= camera.longest_silence_s
+    assert waits[2] - waits[1] == pytest.approx(2.0 * frames, rel=0.05)
+    assert waits[1] - waits[0] == pytest.approx(1.99 * frames, rel=0.05)
+
+
 class TestStage(StageContract):
     @pytest.fixture(autouse=True)
     def _manager(self, manager: MicroManager) -> None:

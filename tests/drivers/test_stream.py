@@ -117,9 +117,14 @@ def test_memory_is_that_of_the_ring_however_long_it_runs() -> None:
     addresses = set()
     with FrameStream(camera, 5) as stream:
         reader = stream.reader()
+        thread = stream._thread
+        assert reader.missed == (0, 0)
         while (frame := reader.next_frame(0.5)) is not None:
             addresses.add(frame.image.ctypes.data)
+            assert len(stream.ring) <= 5
     assert len(addresses) <= 7
+    assert thread is not None
+    assert not thread.is_alive()
 
 
 def test_a_closed_stream_holds_no_buffers_whoever_keeps_it_or_its_error(

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calibration_routines.display.hologram_photograph import display_of_pattern
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
 from instrument.display.hologram import bench_display, prepare_target
@@ -59,6 +61,18 @@ def test_the_pattern_file_shows_the_picture(capsys):
     assert found == pytest.approx(facts["metrics"][0]["psnr_db"], abs=0.3)
     assert found > 20
     assert read_image("slm-preview.png").is_colour
+
+
+@pytest.mark.usefixtures("here")
+def test_without_a_lens_the_fields_size_is_said_and_photographs_are_refused(capsys):
+    assert main(["hologram", "picture.png", "--iterations", "3", "--distance-mm", "80"]) == 0
+    display = replace(bench(), distance_mm=80.0)
+    assert f"the picture is {display.field_mm:.4g} mm wide, 80 mm behind the mask" in capsys.readouterr().err
+    _, facts = read_slm_image("slm.png")
+    assert facts["options"]["distance_mm"] == 80.0
+    config = parse_config(Path("bench.toml").read_text(), Path("bench.toml"))
+    with pytest.raises(BenchError, match="80 mm away without a lens"):
+        display_of_pattern(config, ((96, 128), 8.0), facts)
 
 
 def test_eight_bits_and_binning_survive_the_file():
@@ -214,6 +228,8 @@ def test_an_existing_file_is_spared_and_quality_ends_the_work(capsys):
         (["picture.png", "picture.png"], "Give --z-mm once for each"),
         (["picture.png", "--color"], "needs a colour picture"),
         (["picture.png", "--z-mm", "100000"], "too far"),
+        (["picture.png", "--distance-mm", "2"], "too near for this display: it is shown rightly from"),
+        (["picture.png", "--distance-mm", "-2"], "distance"),
     ],
 )
 def test_mistakes_end_in_a_sentence(capsys, arguments, words):

@@ -81,6 +81,10 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
         (
             "tests/drivers/test_stream.py",
+            "tests/drivers/test_answers.py",
+            "tests/drivers/test_aravis.py",
+            "tests/drivers/test_basler.py",
+            "tests/drivers/test_micromanager.py",
             "tests/drivers/test_simulated_contracts.py",
             "tests/recon/video",
             "tests/recon/live",
@@ -144,7 +148,13 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "recon/camera/two_part.py",
             "recon/camera/varying_psfs.py",
         ),
-        ("tests/recon/camera", "tests/golden/test_golden.py"),
+        (
+            "tests/recon/camera",
+            "tests/recon/blind/test_points.py",
+            "tests/recon/test_bayer_and_noise.py",
+            "tests/recon/test_patterned.py",
+            "tests/golden/test_golden.py",
+        ),
     ),
 }
 """Of each area its modules, and its tests; a test may notice a change in any area."""

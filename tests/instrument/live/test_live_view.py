@@ -125,10 +125,21 @@ def test_iterating_shows_every_picture_and_ends_with_the_view() -> None:
     view = LiveView(FrameStream(camera, 3), Slow(0.005))
     for count, result in enumerate(view):
         assert result.metadata.frame_id >= 0
+        worker = view._thread
         if count == 3:
             break
     view.close()
     assert not camera.is_streaming
+    assert worker is not None
+    assert not worker.is_alive()
+
+
+def test_the_status_is_of_the_last_pictures() -> None:
+    view = LiveView(FrameStream(FreeRunningCamera(), 3), Slow(0.0))
+    assert np.isnan(view.status.pictures_per_s)
+    view._done.extend((0.5 * n, float(n)) for n in range(101))
+    status = view.status
+    assert (status.pictures_per_s, status.latency_median_ms, status.latency_p99_ms) == (2.0, 50.0, 99.0)
 
 
 def test_a_running_stream_is_left_running() -> None:

@@ -149,3 +149,11 @@ def test_import_is_light():
         "sys.exit('numba' in sys.modules or 'scipy' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("shape", [(5, 6), (1, 5, 6), (3, 4, 5), (1, 1, 1)])
+def test_cosine_transforms_over_all_axes(shape):
+    image = np.random.default_rng(0).random(shape)
+    spectrum = fft.dct(image, np.empty_like(image))
+    np.testing.assert_allclose(spectrum, scipy.fft.dctn(image, norm="ortho"), atol=1e-12)
+    np.testing.assert_allclose(fft.idct(spectrum, np.empty_like(image)), image, atol=1e-12)

@@ -11,6 +11,7 @@ from recon.analysis import analyse, middle
 from recon.analysis.correlation import half_light_deg
 from recon.analysis.middle import Middle
 from recon.analysis.points import Noise, Reached, TriedPair
+from recon.analysis.resolution import axial_resolution
 from recon.evaluation import two_points
 from recon.evaluation.two_points import reached, shifted, stated_px
 from recon.types import Calibration, Geometry
@@ -67,6 +68,25 @@ def test_the_default_picture_reaches_a_little_less_than_the_pixels(monkeypatch: 
     assert found.focus_um is not None
     assert 30e3 < found.focus_um[0] < 50.001e3
     assert 49.999e3 < found.focus_um[1] < 200e3
+
+
+def test_depths_of_the_middle_are_spread_as_its_extent_is_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = _calibration((160, 180))
+    step = axial_resolution(whole.psfs[0, 0], 50e3, 5e3).step_per_um
+    assert Middle.of(whole, 50e3, step).spread == 1
+    monkeypatch.setattr(middle, "LARGEST_PX", 60 * 60)
+    part = Middle.of(whole, 50e3, step)
+    np.testing.assert_array_equal(part.psf_at(50e3), whole.psfs[0, 0, 50:110, 60:120])
+    # Mean distance from the middle, of 80 x 90 lit pixels and of 60 x 60.
+    assert part.spread == pytest.approx(np.hypot(40, 45) / np.hypot(30, 30), rel=0.2)
+    lost = np.square(whole.psfs).sum() / np.square(part.psf_at(50e3)).sum()
+    dimmer = part.psf_at(50e3).max() / whole.psfs.max()
+    assert part.noise(Noise(100.0, 2.0)).electrons == pytest.approx(100 * lost * dimmer, rel=1e-4)
+    dark = Middle.of(whole, 50e3, step, dark_rim=True)
+    assert not dark.psf_at(50e3)[:24].any()
+    assert dark.spread > part.spread
+    farther = Middle.of(whole, 50e3, step, reach=0.9 / 50e3)
+    assert farther.part > part.part
 
 
 def test_a_small_colour_sensor_has_room_for_one_pair_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:

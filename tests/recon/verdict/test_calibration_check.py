@@ -108,7 +108,7 @@ def test_a_photograph_mostly_at_full_scale_has_its_noise_and_makes_nobody_foreig
     assert [fit(image, seen[1])[0] for image in (seen[0], clipped)] == [Fit.FOREIGN, Fit.UNTOLD]
 
 
-@pytest.mark.parametrize("said", [(Fit.OFF, Fit.FITS), (Fit.FITS, Fit.FOREIGN)])
+@pytest.mark.parametrize("said", decoys.CONTRADICTIONS)
 def test_what_contradicts_itself_is_not_told(
     seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, said: tuple[Fit, Fit]
 ) -> None:
