@@ -36,7 +36,7 @@ class Detail:
         return pixels if len(self.planes) == len(z_um) else f"{pixels}, {self.depths(z_um)}"
 
     def depths(self, z_um: Depths_um) -> str:
-        """Return which planes it has, in words: ``"4 of 8 depths (10, 11.14, 12.29, 13.43 mm)"``."""
+        """Return which planes it has, in words: ``"4 of 8 depths (10, 11.14, 12.86, 14 mm)"``."""
         count = f"{len(z_um)} depths"
         if len(self.planes) == len(z_um):
             return count
@@ -73,25 +73,31 @@ def ladder(central: Floats, binnings: Sequence[int], plane: int | None) -> dict[
     held = {detail: _held_by_pixels(central[n_planes // 2], detail.binning) for detail in whole}
     every = 2
     while every < n_planes:
-        first = (n_planes - 1) % every // 2 if plane is None else plane % every
-        planes = every_plane[first::every]
-        share = _held_by_planes(central, planes)
+        planes = _spread(n_planes, -(-n_planes // every), plane)
+        explained = _held_by_planes(central, planes)
         work = (SENSOR_WORK + len(planes)) / (SENSOR_WORK + n_planes)
-        if len(planes) > 1:
-            for detail in whole:
-                fewer = Detail(detail.binning, planes, detail.binning / work**0.5)
-                held[fewer] = share * held[detail]
+        for detail in whole:
+            fewer = Detail(detail.binning, planes, detail.binning / work**0.5)
+            held[fewer] = explained * held[detail]
         every *= 2
     best, worthwhile = -1.0, []
     for detail in sorted(held, key=lambda d: -d.coarseness):
         if held[detail] > best:
             best = held[detail]
             worthwhile.append(detail)
-    steps = worthwhile[-1:]
-    for detail in worthwhile[-2::-1]:
+    steps = whole[:1]
+    for detail in reversed(worthwhile):
         if (steps[-1].coarseness / detail.coarseness) ** 2 <= HELPED:
             steps.append(detail)
     return {detail.coarseness: detail for detail in steps}
+
+
+def _spread(n_planes: int, count: int, plane: int | None) -> tuple[int, ...]:
+    """Return so many planes from the first to the last, ``plane`` in the place of its nearest."""
+    kept = np.linspace(0, n_planes - 1, count).round().astype(int)
+    if plane is not None:
+        kept[np.argmin(np.abs(kept - plane))] = plane
+    return tuple(kept.tolist())
 
 
 def _held_by_pixels(psf: Floats, binning: int) -> float:

@@ -45,7 +45,7 @@ class LiveReconstructor:
 
     For one thread. It never waits and keeps no queue: feed it the newest frame whenever it is done with the
     one before (:class:`instrument.live.live.LiveView` does). Where the machine is too slow, pictures get
-    coarser (binning, or every second depth or fewer, see :func:`recon.streams.detail.ladder`) and then
+    coarser (binning, or half of the depths or fewer, see :func:`recon.streams.detail.ladder`) and then
     rougher (fewer iterations, at last a Wiener filter), and say so; they do not get late.
 
     The first picture of a scene is a Wiener filter's, at once; from the next on, or by :meth:`refine`, it is
