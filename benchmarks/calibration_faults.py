@@ -7,7 +7,8 @@
 Each trial carries a routine out twice as a person would, on a bench without faults and on one with this fault
 alone, everything else alike, and holds the results against one another. The change is relative; of PSFs it is
 the largest of three: their shape once registered, their brightness relative to one another, and their places
-relative to the first (a tenth of a pixel counts as 1 %); a common shift and a common brightness are none. Of
+relative to the first (a tenth of a pixel counts as 1 %); a common shift and a common brightness are none, nor
+is a photograph's brightness. Of
 the angular and of the field's response it is the largest difference, of the SLM's table in turns.
 
 =========  ==============================================================================================
@@ -139,6 +140,10 @@ def _relative(found: Array, usual: Array) -> float:
     return float(np.linalg.norm(found - usual) / np.linalg.norm(usual))
 
 
+def _but_for_brightness(found: Array, usual: Array) -> float:
+    return _relative(found * (np.vdot(found, usual) / np.vdot(found, found)), usual)
+
+
 def _of_psfs(found: Array, usual: Array) -> float:
     """Return the largest change of shape, relative brightness and relative place (0.1 pixels: 1 %)."""
     first, second = (psfs.mean(axis=1).astype(np.float32) for psfs in (found, usual))
@@ -226,7 +231,7 @@ TRIALS = {
         TINY, _routine("angular", _response, largest_deg=9.0, step_deg=3.0, z_um=80e3), _largest
     ),
     "field": Trial(TINY, _field, _largest),
-    "photograph": Trial(TINY, _routine("photograph", _picture), _relative),
+    "photograph": Trial(TINY, _routine("photograph", _picture), _but_for_brightness),
     "dpc": Trial(
         _LED, _routine("dpc", _height, objective_na=0.1, magnification=4.0), _relative, display=True
     ),

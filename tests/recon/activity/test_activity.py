@@ -251,3 +251,15 @@ def test_a_cell_of_one_pixel_whose_light_hops_is_found_by_its_width() -> None:
         above = seen - baseline(seen, 200, 20.0)
         found.append([r.centre for r in find_regions(above, noise=noise_of(seen)).regions])
     assert found == [[], [pytest.approx((12, 14.5), abs=1.0)]]
+
+
+def test_noise_that_lasts_from_frame_to_frame_counts_in_full() -> None:
+    rng = np.random.default_rng(0)
+    fresh = rng.normal(0, 1, (200, *SHAPE)).astype(np.float32)
+    lasting = np.empty_like(fresh)
+    lasting[0] = fresh[0]
+    for n in range(1, len(fresh)):
+        lasting[n] = 0.6 * lasting[n - 1] + 0.8 * fresh[n]  # of variance 1 as well
+    own, kept = noise_of(10 + fresh), noise_of(10 + lasting)
+    assert own == pytest.approx(1 / 3, rel=0.05)
+    assert kept > 0.85 * own  # 0.63 from frame to frame
