@@ -89,6 +89,9 @@ def hologram(
         options.display_of(bench_display(config, size, expansion=options.expansion, wavelength_nm=nm))
         for nm in lasers
     ]
+    for display in displays:
+        for z in depths:
+            display.defocus(z)  # refuses what is too far or too near before anything is said or made
     if options.distance_mm is not None:
         typer.echo(
             f"Without a lens: the picture is {displays[0].field_mm:.4g} mm wide, {options.distance_mm:g} mm "
