@@ -89,6 +89,9 @@ def hologram(
         options.display_of(bench_display(config, size, expansion=options.expansion, wavelength_nm=nm))
         for nm in lasers
     ]
+    for display in displays:
+        for z in depths:
+            display.defocus(z)  # refuses what is too far or too near before anything is said or made
     if options.distance_mm is not None:
         typer.echo(
             f"Without a lens: the picture's field is {min(d.field_mm for d in displays):.4g} mm wide, "
