@@ -123,7 +123,10 @@ CAMERAS = {
     "lowrank": {"model": "lowrank", "estimate_background": False},
     "background": {"model": "local", "estimate_background": True},
     "planes": {"model": "convolution", "estimate_background": False},
+    "stack": {"model": "convolution", "estimate_background": False},
 }
+STACKS = {"planes": (8, FAR_UM), "stack": (32, 10_500.0)}
+"""Depths, and the last: well apart, and as a z-stage steps them."""
 
 
 def near(height: int, width: int, kind: str):
@@ -140,8 +143,9 @@ def near(height: int, width: int, kind: str):
         moved = np.column_stack([matrix, centre + shift - matrix @ centre])
         return cv2.warpAffine(psf, moved, (width, height), flags=cv2.INTER_LINEAR)
 
-    depths = np.linspace(NEAR_UM, FAR_UM, 8) if kind == "planes" else [NEAR_UM]
-    steps = (0,) if kind == "planes" else (-1, 0, 1)
+    n_depths, far_um = STACKS.get(kind, (1, NEAR_UM))
+    depths = np.linspace(NEAR_UM, far_um, n_depths)
+    steps = (0,) if kind in STACKS else (-1, 0, 1)
     reach = half * PITCH_UM * NEAR_UM / D_UM
     places = np.array([(i * reach[0], j * reach[1], z) for z in depths for j in steps for i in steps])
     calibration = Calibration(
@@ -149,7 +153,7 @@ def near(height: int, width: int, kind: str):
     )
     rng = np.random.default_rng(2)
     points = rng.uniform(-1, 1, (100, 2)) * reach
-    z = rng.uniform(NEAR_UM, FAR_UM, 100) if kind == "planes" else np.full(100, NEAR_UM)
+    z = rng.uniform(NEAR_UM, far_um, 100)
     stray = 1.0 + 0.5 * np.cos(np.linspace(0, np.pi, width)) if kind == "background" else 0.0
     frames = []
     for number in range(8):
@@ -174,13 +178,14 @@ def run(
         seen = view.wait_newer(None, 120.0)
         began_s = time.monotonic()
         used = os.times()
-        binnings, iterations, late, words = [], [], 0, ""
+        binnings, iterations, planes, late, words = [], [], [], 0, ""
         while time.monotonic() - began_s < seconds:
             seen = view.wait_newer(seen, 1.0) or seen
             if seen.refined:
                 continue
             binnings.append(seen.picture.binning)
             iterations.append(seen.picture.iterations)
+            planes.append(len(seen.picture.planes))
             late += seen.picture.work_ms > 1.5 * budget_ms
             words = seen.picture.quality
             phase = seen.metadata.frame_id % len(frames)
@@ -195,10 +200,12 @@ def run(
         "size": f"{width} x {height}",
         "budget_ms": budget_ms,
         "pictures_per_s": round(status.pictures_per_s, 1),
+        "iterated_share": round(float(np.mean(np.array(iterations) > 0)), 2),
         "latency_median_ms": round(status.latency_median_ms, 1),
         "latency_p99_ms": round(status.latency_p99_ms, 1),
         "late_share": round(late / len(binnings), 3),
         "binning": int(np.median(binnings)),
+        "planes": int(np.median(planes)),
         "iterations": float(np.median(iterations)),
         "cores_used": round((now.user + now.system - used.user - used.system) / elapsed_s, 2),
         "cpu_ms_per_picture": round(

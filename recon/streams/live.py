@@ -35,7 +35,8 @@ Array = npt.NDArray[Any]
 LEAST_SIDE = 16
 """Pixels of a picture's short side below which no binning goes."""
 AT_ONCE = 150_000
-"""Pixels of the first picture, at most: its filter is made and applied in about a tenth of a second."""
+"""Pixels of the first picture times PSFs that iterations go through, at most: its filter is made and applied
+in a tenth of a second, and its solver is soon there."""
 
 _POLL_S = 0.005
 
@@ -104,6 +105,8 @@ class LiveReconstructor:
             raise InputError(f"plane {live.plane} is none of the {self._n_planes} depths, counted from 0.")
         self.budget_ms = live.budget_ms
         self._sensor = checked.sensor_shape
+        n_psfs = len(checked.calibration.psfs) if checked.varies else self._n_planes
+        self._first_work = n_psfs * int(np.prod(self._sensor))
         binnings = range(live.finest, live.coarsest + 1)
         fine_enough = [b for b in binnings if min(self._sensor) >= LEAST_SIDE * b]
         self._details = ladder(checked.depths.central, fine_enough or [live.finest], live.plane)
@@ -330,8 +333,8 @@ class LiveReconstructor:
 
     def _first_detail(self) -> Detail:
         """Return the most at which a first picture takes no time to speak of."""
-        n_pixels, details = int(np.prod(self._sensor)), [self._details[c] for c in self._pace.levels]
-        return next((d for d in details if n_pixels <= AT_ONCE * d.binning**2), details[-1])
+        details = [self._details[c] for c in self._pace.levels]
+        return next((d for d in details if self._first_work <= AT_ONCE * d.coarseness**2), details[-1])
 
     def _make(self, detail: Detail, frame: Floats) -> None:
         """Begin to make a level for a frame on the calibration's pixels."""
