@@ -25,6 +25,7 @@ from PySide6.QtTest import QTest
 
 from gui.app import application
 from gui.jobs import JobRunner
+from gui.panel import whole
 from gui.theme import apply_theme
 from gui.widgets.volume_view import VolumeView
 from instrument.reconstruction.stored_result import export_result, open_result
@@ -49,7 +50,7 @@ def main() -> None:
         path = _write(Path(folder), shape, given.format)
         size_mb = sum(p.stat().st_size for p in ([path] if path.is_file() else path.rglob("*"))) / 1e6
         print(f"{given.shape} {given.format}, {size_mb:.0f} MB; SIMULATED voxels")
-        view = VolumeView(JobRunner())
+        view = whole(VolumeView(JobRunner()))
         view.resize(900, 700)
         view.show()
         late = _Lateness()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from PySide6.QtCore import QTimer
 from PySide6.QtGui import QGuiApplication
@@ -131,14 +131,18 @@ class Panel(QWidget):
             return None
 
 
-_P = TypeVar("_P", bound=Panel)
+class _InParts(Protocol):
+    def parts(self) -> Iterator[None]: ...
 
 
-def whole(panel: _P) -> _P:
-    """Return a panel with all its parts made, at once."""
-    for _ in panel.parts():
+_P = TypeVar("_P", bound=_InParts)
+
+
+def whole(widget: _P) -> _P:
+    """Return a panel, or what else is made in parts, with all of them made, at once."""
+    for _ in widget.parts():
         pass
-    return panel
+    return widget
 
 
 class DevicePanel(Panel):

@@ -152,7 +152,8 @@ def test_the_window_offers_them(fresh: Fresh) -> None:
         "from PySide6.QtWidgets import QApplication, QComboBox",
         "app = QApplication([])",
         "from gui.forms.reconstruct import ReconstructForm",
-        "form = ReconstructForm()",
+        "from gui.panel import whole",
+        "form = whole(ReconstructForm())",
         "boxes = form.findChildren(QComboBox)",
         "print({box.itemText(n) for box in boxes for n in range(box.count())})",
     )

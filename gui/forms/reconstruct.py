@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,7 +57,7 @@ class _KindOptions:
 
 
 class ReconstructForm(QWidget):
-    """The options of a reconstruction, its progress, and the buttons that start and end it.
+    """The options of a reconstruction, its progress, and the buttons that start and end it; made in parts.
 
     Signals
     -------
@@ -79,6 +79,10 @@ class ReconstructForm(QWidget):
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self._depths_mm: tuple[str, ...] = ()
+        self._kind = CALIBRATION
+
+    def parts(self) -> Iterator[None]:
+        """Make the fields, then what goes round them."""
         source = [o for o in options_of(SourceOptions) if o.name in ("image", *SOURCES.values())]
         output = [o for o in options_of(OutputOptions) if o.name in ("out", "rotate_deg", "checkpoint")]
         iterated = Behaviour(enabled_when=_one_shot)
@@ -100,6 +104,7 @@ class ReconstructForm(QWidget):
             },
             folded=_FOLDED,
         )
+        yield
         self.widgets = self.options.widgets
         tip = "Reconstruct with these settings (Ctrl+Return)"
         self.start = button(
@@ -115,7 +120,7 @@ class ReconstructForm(QWidget):
         fill(self, (scrolled(self.options), 1), self.note, self.progress, buttons)
         self.options.refused.connect(self.refused)
         self.options.settled.connect(lambda name: self._show_kind() if name == "kind" else None)
-        self._kind = CALIBRATION
+        yield
         self._show_kind()
         self.show_depths(())
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QWidget
+from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QTabWidget, QWidget
 
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
@@ -21,7 +21,7 @@ from gui.panel import Panel
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
 from gui.theme import as_shown
-from gui.widgets.building import Hint, button, fill, in_row, label, split, tabs
+from gui.widgets.building import Hint, button, fill, in_row, label, split
 from gui.widgets.dialogues import Question, choose_path
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
@@ -38,8 +38,9 @@ from instrument.reconstruction.stored_result import (
     find_results,
     open_result,
 )
-from recon.base.declare import Imports, expression
+from recon.base.declare import Imports, expression, options_of
 from recon.reconstruction.choice import Choice
+from recon.reconstruction.options import ReconstructionOptions
 
 _REFINABLE = "--refine-psf fits"
 """In the verdict's sentence, where fitting the PSF to the photograph is what helps."""
@@ -60,9 +61,23 @@ class ReconstructionsPanel(Panel):
         self._made: Path | None = None
         """The result that the form as it stands has made."""
 
+    @classmethod
+    def prepare(cls) -> None:
+        """Look for methods that installed packages add: the form offers them."""
+        for offered in options_of(ReconstructionOptions):
+            _ = offered.words
+
     def parts(self) -> Iterator[None]:
-        """Make the widgets."""
+        """Make what holds the widgets, then those: each takes its looks when it gets its place."""
         session = self.session
+        self.tabs, self.viewers = QTabWidget(), QStackedWidget()
+        self.tabs.setDocumentMode(True)
+        top = QWidget()
+        below = split()
+        right = split(top, below, sizes=[520, 170], down=True, stretch=1)
+        right.setStretchFactor(0, 3)
+        fill(self.body, split(self.tabs, right, sizes=[330, 840], stretch=1))
+        yield
         self.list = QListWidget()
         self.list.setAccessibleName("Reconstructions")
         self.list.setToolTip("Reconstructions in the data folder, the newest first (Enter opens)")
@@ -74,6 +89,8 @@ class ReconstructionsPanel(Panel):
         self.refresh_button = button("Refresh", "Look into the data folder again", self.refresh)
         tip = "Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)"
         self.export_button = button("Export…", tip, self._choose_export, enabled=False)
+        buttons = in_row(self.open_button, self.refresh_button)
+        self.tabs.addTab(fill(QWidget(), (self.list, 1), buttons, margins=(0, 6, 0, 0)), "Results")
         yield
         tip = "The PSF is turned or of another size for this photograph: fit it first, then reconstruct again"
         self.refine_button = button("Fit the PSF, and again", tip, self.refine)
@@ -82,34 +99,45 @@ class ReconstructionsPanel(Panel):
         self.keep_button = button("Keep the fitted PSF", tip, self.keep_fitted)
         self.keep_button.hide()
         self.form = ReconstructForm()
+        yield from self.form.parts()
         self.form.asked.connect(self.reconstruct)
         self.form.questioned.connect(self.explain)
         self.form.stopped.connect(self._stop)
         self.form.refused.connect(self.refused)
         yield
-        self.picture = PictureView(session)
-        yield
-        self.volume = VolumeView(self.jobs)
-        self.volume.failed.connect(lambda why: self.refused(None, why))
-        yield
-        self.facts = FactsView()
-        self.convergence = ConvergenceView()
+        self.tabs.addTab(self.form, "Reconstruct")
         yield
         self.heading = label(selectable=True)
         self.place = label(role="dim")
         self.place.setAlignment(Qt.AlignmentFlag.AlignRight)
         self.place.setMinimumWidth(10)
-        for hovered in (self.picture.hovered, self.volume.hovered):
-            hovered.connect(self.place.setText)
         self.empty = Hint(
             "Nothing is open: choose a result on the left, or reconstruct a photograph.",
             "Reconstruct…",
             lambda: self.tabs.setCurrentWidget(self.form),
         )
-        self.viewers = QStackedWidget()
-        for widget in (self.empty, self.picture, self.volume):
-            self.viewers.addWidget(widget)
-        yield from self._arrange()
+        self.viewers.addWidget(self.empty)
+        ends = (self.refine_button, self.keep_button, self.export_button)
+        fill(top, in_row(self.heading, (self.place, 1), *ends), (self.viewers, 1))
+        yield
+        self.picture = PictureView(session)
+        self.viewers.addWidget(self.picture)
+        yield
+        self.volume = VolumeView(self.jobs)
+        yield from self.volume.parts()
+        yield
+        self.viewers.addWidget(self.volume)
+        self.volume.failed.connect(lambda why: self.refused(None, why))
+        for hovered in (self.picture.hovered, self.volume.hovered):
+            hovered.connect(self.place.setText)
+        yield
+        self.facts = FactsView()
+        below.addWidget(self.facts)
+        yield
+        self.convergence = ConvergenceView()
+        below.addWidget(self.convergence)
+        below.setSizes([330, 330])
+        yield
         session.run_finished.connect(lambda _: self.refresh())
         folder = self.session.runs_folder / "reconstructions"
         self._names = SuggestedName(self.jobs, self.form.options, folder, ".tif")
@@ -118,23 +146,6 @@ class ReconstructionsPanel(Panel):
         self._newest = NewestOnly(self.jobs, "Looking for the newest calibration")
         self.form.options.settled.connect(self._settled)
         self.refresh()
-
-    def _arrange(self) -> Iterator[None]:
-        buttons = in_row(self.open_button, self.refresh_button)
-        results = fill(QWidget(), (self.list, 1), buttons, margins=(0, 6, 0, 0))
-        self.tabs = tabs({"Results": results, "Reconstruct": self.form})
-        yield
-        below = split(self.facts, self.convergence, sizes=[330, 330])
-        yield
-        top = fill(
-            QWidget(),
-            in_row(self.heading, (self.place, 1), self.refine_button, self.keep_button, self.export_button),
-            (self.viewers, 1),
-        )
-        yield
-        right = split(top, below, sizes=[520, 170], down=True, stretch=1)
-        right.setStretchFactor(0, 3)
-        fill(self.body, split(self.tabs, right, sizes=[330, 840], stretch=1))
 
     def refused(self, field: QWidget | None, why: str) -> None:
         """Show why something was refused, in the words of the form."""

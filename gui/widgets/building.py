@@ -293,12 +293,16 @@ def after_rest(parent: QObject, rest_ms: int, call: Callable[[], object]) -> QTi
 
 # Places that scroll ------------------------------------------------------------------------------------
 def scrolled(form: QWidget) -> QScrollArea:
-    """Return a frameless place for a form, which scrolls up and down."""
-    scroll = QScrollArea()
+    """Return a frameless place for a form, which scrolls up and down.
+
+    It takes the form only when it has its own place: else it measures all of the form at once.
+    """
+    scroll, holder = QScrollArea(), QWidget()
     scroll.setWidgetResizable(True)
     scroll.setFrameShape(QFrame.Shape.NoFrame)
     scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-    scroll.setWidget(form)
+    scroll.setWidget(holder)
+    fill(holder, form)
     return scroll
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -51,7 +51,8 @@ class Slice:
 class VolumeView(QWidget):
     """Four views of one volume, and what is under the mouse in words.
 
-    Nothing is read in the window's thread: projections and slices are read in jobs.
+    Nothing is read in the window's thread: projections and slices are read in jobs. It is there once its
+    ``parts`` are made.
 
     Parameters
     ----------
@@ -85,14 +86,19 @@ class VolumeView(QWidget):
         """Plane, row and column through which the slices go."""
         self.mode: Mode = "brightest"
 
+    def parts(self) -> Iterator[None]:
+        """Make the widgets, with a ``yield`` after each part."""
         self.front, self.coloured = StretchedImage(), StretchedImage()
         self.bar = LengthBar(self.front)
+        yield
         self.side, self.top = StretchedImage(keep_aspect=False), StretchedImage(keep_aspect=False)
+        yield
         self.profile = plot_widget("plane")
         self._along: Any = self.profile.plot(pen=curve_pen(0))
         self._here: Any = pg.InfiniteLine(pen=colours().dim)
         self.profile.addItem(self._here)
         self.profile.setToolTip("Values along depth through the chosen pixel, of the views' resolution")
+        yield
         self._titles = [label(role="heading") for _ in range(4)]
         self._lines = {view: (_line(view, 90), _line(view, 0)) for view in (self.front, self.side, self.top)}
         self.front.clicked.connect(lambda column, row: self.go_to(self.point[0], row, column))
@@ -105,7 +111,7 @@ class VolumeView(QWidget):
             view.setMinimumSize(70, 50)
             view.hovered.connect(self.hovered)
         self.profile.setMinimumSize(70, 50)
-
+        yield
         self.brightest_button = button(
             "Brightest",
             "The brightest voxels along each axis (Ctrl+B)",
@@ -127,7 +133,8 @@ class VolumeView(QWidget):
             shortcut="Ctrl+T",
             checkable=True,
         )
-        self.turning = TurningView(jobs)
+        yield
+        self.turning = TurningView(self._jobs)
         self.turning.failed.connect(self.failed)
         self.turning.opened.connect(self._measure_again)
         self.views, self.stack = QWidget(), QStackedWidget()
@@ -159,8 +166,10 @@ class VolumeView(QWidget):
         self.progress = QProgressBar()
         self.progress.setFormat("reading plane %v of %m")
         self.progress.hide()
+        yield
         self.levels = LevelsBar()
         self.levels.changed.connect(self._show)
+        yield
         self._arrange()
         self.set_mode("brightest")
 

@@ -128,16 +128,15 @@ class Operator:
         boxes = [box for box in self.window.findChildren(QMessageBox) if box.isVisible()]
         self.click(next(b for box in boxes for b in box.buttons() if b.text() == words))
 
-    def reads_and_closes(self) -> str:
-        """Close the text in front and return it."""
+    def reads_and_closes(self, words: str) -> None:
+        """Wait until the text in front has some words, and close it."""
         shown: list[TextWindow] = []
         self.wait(
             lambda: shown.extend(w for w in self.window.findChildren(TextWindow) if w.isVisible()) or shown
         )
-        text = shown[0].view.toPlainText()
+        self.wait(lambda: words in shown[0].view.toPlainText())
         self.click(next(b for b in shown[0].findChildren(QPushButton) if "Close" in b.text()))
         self.window.activateWindow()
-        return text
 
     def ends(self) -> None:
         """Close the window and wait until the bench is closed."""
@@ -191,7 +190,7 @@ def _(o: Operator) -> None:
 @step("F1 tells what it is for")
 def _(o: Operator) -> None:
     o.keys(KEY.Key_F1)
-    assert "Try the camera" in o.reads_and_closes()
+    o.reads_and_closes("Try the camera")
 
 
 @step("the live view says that it needs a bench")
@@ -339,7 +338,7 @@ def _(o: Operator) -> None:
 @step("all settings of the camera are read")
 def _(o: Operator) -> None:
     o.click(o.panel("live").form.all_button)
-    assert "exposure" in o.reads_and_closes()
+    o.reads_and_closes("exposure")
 
 
 @step("the lines of Python are copied")
@@ -624,7 +623,7 @@ def _(o: Operator) -> None:
 @step("the device says who it is")
 def _(o: Operator) -> None:
     o.click(o.window.chips.chips["stage"])
-    assert "SIM" in o.reads_and_closes()
+    o.reads_and_closes("SIM")
 
 
 @step("the day ends: light off, nothing moving, all closed")

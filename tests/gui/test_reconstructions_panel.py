@@ -94,6 +94,9 @@ def choose(panel: ReconstructionsPanel, **values: object) -> None:
 def run(qtbot: QtBot, panel: ReconstructionsPanel) -> None:
     qtbot.mouseClick(panel.form.start, Qt.MouseButton.LeftButton)
     assert panel.job is not None, panel._note.text()
+    while not panel.job.is_over:  # as long as compiling takes where nothing is compiled yet
+        qtbot.wait(5)
+    assert panel.job.state is JobState.SUCCEEDED, panel.job.error
     qtbot.waitUntil(lambda: panel.result is not None, timeout=WAIT_MS)
 
 

@@ -11,6 +11,7 @@ from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
 from gui.jobs import JobRunner
+from gui.panel import whole
 from gui.widgets.volume_view import VolumeView
 from instrument.files.volumes import volume_in_memory
 from recon.camera.grid import Grid, metric_volume
@@ -21,7 +22,7 @@ def test_a_volume_is_turned_stepped_through_and_measured(qtbot: QtBot) -> None:
     voxels = np.zeros((8, 30, 40), np.float32)
     voxels[5, 10:20, 10:30] = 3.0
     jobs = JobRunner()
-    view = VolumeView(jobs)
+    view = whole(VolumeView(jobs))
     qtbot.addWidget(view)
     view.resize(600, 500)
     view.show()
@@ -63,7 +64,7 @@ def test_a_perspective_volume_is_shown_in_true_proportions(qtbot: QtBot) -> None
     grid = Grid(voxels.shape, (15, 20), z_um, 2e-3 * z_um)
     metric, on = metric_volume(voxels, grid)
     jobs = JobRunner()
-    view = VolumeView(jobs)
+    view = whole(VolumeView(jobs))
     qtbot.addWidget(view)
     view.resize(700, 500)
     view.show()
