@@ -17,9 +17,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "images"
 CHARTS = {
-    "reconstruction": ["--scene", "sparse-picture", "--size", "96"],
-    "hologram": ["--hologram", "portrait", "--slm", "135x240"],
-    "calibration": ["--calibrations"],
+    "reconstruction": ["scene", "sparse-picture", "--size", "96"],
+    "hologram": ["hologram", "portrait", "--slm", "135x240"],
+    "calibration": ["calibrations"],
 }
 
 

@@ -129,7 +129,7 @@ def _prepare_camera(folder: Path) -> None:
         if not (folder / f"{scene}.tif").exists():
             _do("snap", "--bench", bench, "--exposure-ms", exposure_ms, "--out", folder / f"{scene}.tif")
     if not (folder / "chart" / "chart.json").exists():
-        _do("chart", "--scene", "sparse-picture", "--size", 32, "--budget", 30, "--out", folder / "chart")
+        _do("chart", "scene", "sparse-picture", "--size", 32, "--budget", 30, "--out", folder / "chart")
     bench.write_text(CAMERA)
 
 

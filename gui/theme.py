@@ -6,6 +6,7 @@ from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
@@ -120,6 +121,10 @@ SMALL_PT, BODY_PT, LARGE_PT, TITLE_PT = 9, 10, 12, 16
 _now = [DARK]
 
 
+_half: WeakSet[QWidget] = WeakSet()
+"""Parts that have a theme's sheet and, as another was chosen meanwhile, not all of its colours."""
+
+
 def colours() -> Colours:
     """Return the colours in use."""
     return _now[0]
@@ -184,21 +189,28 @@ def change_theme(name: str, window: QWidget, wholes: Sequence[QWidget]) -> Gener
 
 def restyled(part: QWidget) -> Iterator[None]:
     """Give a part of a window the sheet, and its plots and pictures the colours of the theme in use, once."""
-    own, app = sheet(), QApplication.instance()
-    assert isinstance(app, QApplication)
-    if not isValid(part) or (part.styleSheet() or app.styleSheet()) == own:
+    if not isValid(part) or (_is_dressed(part) and part not in _half):
         return
-    part.setStyleSheet(own)
+    _half.add(part)
+    dress(part)
     yield
     for widget in (part, *part.findChildren(QWidget)):
         if isValid(widget) and hasattr(widget, "restyle"):
             widget.restyle()
             yield
+    _half.discard(part)
 
 
 def dress(part: QWidget) -> None:
     """Give a new panel or dialogue the theme in use, which may be another than the program began with."""
-    next(restyled(part), None)  # the sheet: there is nothing in it yet
+    if not _is_dressed(part):
+        part.setStyleSheet(sheet())
+
+
+def _is_dressed(part: QWidget) -> bool:
+    app = QApplication.instance()
+    assert isinstance(app, QApplication)
+    return (part.styleSheet() or app.styleSheet()) == sheet()
 
 
 def _palette() -> QPalette:

@@ -157,6 +157,6 @@ def test_stability_maps_are_drawn_and_gone_on_with(here: Path, command: Command)
 
 def test_a_chart_is_gone_on_with(here: Path, command: Command) -> None:
     before = len(json.loads((here / "chart/chart.json").read_text())["points"])
-    command("chart", "--scene", "sparse-picture", "--size", "16", "--budget", "1", "--out", "chart")
+    command("chart", "scene", "sparse-picture", "--size", "16", "--budget", "1", "--out", "chart")
     assert len(json.loads((here / "chart/chart.json").read_text())["points"]) >= before
     assert (here / "chart/chart.png").exists()

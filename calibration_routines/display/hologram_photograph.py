@@ -192,15 +192,19 @@ def display_of_pattern(
     ``size`` is the SLM's shape and pitch in micrometres. Errors as ``bench_display``; BenchError for a
     pattern that needs no lens.
     """
-    if (away_mm := facts.get("options", {}).get("distance_mm")) is not None:
-        raise BenchError(
-            f"The pattern's picture is {away_mm:g} mm away without a lens; photographs are registered "
-            "behind the bench's Fourier lens. Show it without --capture."
-        )
+    _require_lens(facts.get("options", {}).get("distance_mm"))
     display = bench_display(
         config, size, expansion=facts.get("expansion"), wavelength_nm=facts.get("wavelength_nm")
     )
     return display if alignment is None else alignment.of(display)
+
+
+def _require_lens(distance_mm: float | None) -> None:
+    if distance_mm is not None:
+        raise BenchError(
+            f"The pattern's picture is {distance_mm:g} mm away without a lens; photographs are registered "
+            "behind the bench's Fourier lens. Show it without a photograph."
+        )
 
 
 def options_of_pattern(facts: Mapping[str, Any]) -> HologramOptions:
@@ -238,8 +242,10 @@ def photograph_hologram(
     display has the mask's displacement where it is known; ``progress(round, psnr_db)`` is called when
     refining.
 
-    Raises InputError when the speckle is not recognised; DeviceError when a device fails.
+    Raises InputError when the speckle is not recognised; DeviceError when a device fails; BenchError for a
+    display without its lens.
     """
+    _require_lens(display.distance_mm)
     options = options or CaptureOptions()
     seen = HologramCamera.registered(io, display, computed)
     refined = None

@@ -8,6 +8,7 @@ the value alone. Commands that set answer nothing: errors wait in a queue that `
 from __future__ import annotations
 
 import math
+import threading
 from typing import Self
 
 from pydantic import Field, model_validator
@@ -75,6 +76,8 @@ class Esp301Stage(PortStage):
         self.axis_options = options.axes
         self._errors: dict[int, list[str]] = {}
         """What the controller has said of each axis, 0: of none, and nobody was told."""
+        self._hearing = threading.RLock()
+        """Held from a command until its refusal was asked for: no other thread's question takes it."""
         name = f"stage (esp301, {options.port})"
         link = SerialTransport(options.port, name, baud_rate=options.baud_rate, probe=_VERSION)
         super().__init__(options, link)
@@ -86,8 +89,13 @@ class Esp301Stage(PortStage):
         question = f"{self._number(name)}{words}?\r".encode()
         return float(self._link.request(question, reply_line(_NUMBER))[-1])
 
+    def _heard_of(self, number: int) -> list[str]:
+        """Empty the controller's queue of errors; returns those of an axis, and of none."""
+        with self._hearing:
+            self._hear_errors()
+            return self._errors.pop(number, []) + self._errors.pop(0, [])
+
     def _hear_errors(self) -> None:
-        """Empty the controller's queue of errors."""
         for _ in range(_QUEUE):
             line = self._link.request(b"TB?\r", reply_line(_ERROR))[-1].decode("ascii", "replace")
             code, *rest = (word.strip() for word in line.split(","))
@@ -102,9 +110,10 @@ class Esp301Stage(PortStage):
         Raises DeviceError with the controller's words when it was not.
         """
         number = self._number(name)
-        self._link.send_now(f"{number}{words}\r".encode())
-        self._hear_errors()
-        if said := self._errors.pop(number, []) + self._errors.pop(0, []):
+        with self._hearing:
+            self._link.send_now(f"{number}{words}\r".encode())
+            said = self._heard_of(number)
+        if said:
             raise DeviceError(self.name, f"axis {number} refuses {words!r}: {', '.join(said)}.")
 
     def _identify(self) -> tuple[str, str, str]:
@@ -134,9 +143,10 @@ class Esp301Stage(PortStage):
 
     def _axis_state(self, name: str) -> AxisState:
         moving = self._value(name, "MD") == 0
-        self._hear_errors()
-        said = self._errors.pop(self._number(name), []) + self._errors.pop(0, [])
-        if self._came_home(name, moving=moving) and not said:
+        said = self._heard_of(self._number(name))
+        if said:  # whoever asked: the controller says it once, and this homing found no reference
+            self._homing.pop(name, None)
+        if self._came_home(name, moving=moving):
             self._homed.add(name)
         return AxisState(self._value(name, "TP"), moving, name in self._homed, ", ".join(said))
 

@@ -8,6 +8,8 @@ from typing import Literal
 
 from drivers.errors import DeviceError, LimitError
 
+_ONCE = "Once"
+"""Of automatics: what is set by itself now, after which the feature reads "Off" (SFNC)."""
 FeatureValue = str | bool | int | float
 FeatureKind = Literal["number", "choice", "switch", "command", "text"]
 
@@ -119,7 +121,7 @@ class Features(ABC):
             )
         with self.words(f"take {entry} for its {name}"):
             self._write_text(name, entry)
-        if (said := self.text(name)) != entry:
+        if (said := self.text(name)) != entry and entry != _ONCE:
             raise DeviceError(self.name, f"was told {name} = {entry} and has {said}.", "See its firmware.")
         return said
 

@@ -208,6 +208,14 @@ def _text(value: PropertyValue) -> str:
     return str(int(value)) if isinstance(value, bool) else str(value)
 
 
+def _same(one: str, other: str) -> bool:
+    """Whether two values are the same word, or number: real ones are read back with four decimals."""
+    try:
+        return one == other or float(one) == float(other)
+    except ValueError:
+        return False
+
+
 class Part:
     """One loaded device, by its label.
 
@@ -297,7 +305,7 @@ class Part:
             )
         self.call(f"set {name!r} to {wanted!r}", "setProperty", name, wanted)
         said = self.text(name)
-        if choices and said != wanted:
+        if choices and not _same(said, wanted):
             raise DeviceError(self.name, f"was told {name} = {wanted} and has {said}.", "See its adapter.")
         return said
 

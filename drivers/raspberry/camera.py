@@ -31,7 +31,11 @@ from drivers.raspberry.modes import (
 
 _MANUAL: Mapping[str, Any] = {"AeEnable": False, "AwbEnable": False, "AfMode": 0}
 """What would change pictures by itself, switched off where the camera has it."""
-_LOOKED_AFTER = frozenset((*_MANUAL, "ExposureTime", "AnalogueGain", "FrameDurationLimits"))
+_LOOKED_AFTER = frozenset(
+    (*_MANUAL, "ExposureTime", "ExposureTimeMode", "AnalogueGain", "AnalogueGainMode", "FrameDurationLimits")
+)
+_ARRAYS = frozenset(("ColourGains", "ColourCorrectionMatrix"))
+"""Controls of several numbers, for whose limits libcamera names one."""
 _READ_BACK_MS = 500.0
 """Exposures up to this are read back from a frame; a line more or less is nothing to longer ones."""
 _SAME = 0.02
@@ -192,7 +196,7 @@ class RaspberryCamera(RunningCamera):
         self._require()
         found = {}
         for name, (least, most, default) in sorted(self._camera.camera_controls.items()):
-            if name in _LOOKED_AFTER or not isinstance(least, bool | int | float):
+            if name in _LOOKED_AFTER | _ARRAYS or not isinstance(least, bool | int | float):
                 continue
             takes = "0 or 1" if isinstance(least, bool) else f"{least:g} to {most:g}"
             found[name] = OwnSetting(self._own.get(name, default), takes)

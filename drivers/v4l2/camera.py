@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import ClassVar
 
@@ -149,38 +150,38 @@ class V4l2Camera(RunningCamera):
                     api.S_INPUT, api.InputNumber(self.options.input), f"take input {self.options.input}"
                 )
             self._identity = self._device.identity()
-            self._controls = Controls((self._device, *self._subdevices))
-            self._find_quantities()
-            self._controls.switch_automatics_off()
+            Controls((self._device, *self._subdevices)).switch_automatics_off()
             self._trigger_mode = "free_run"
             self._images = Images(self._device, self.options.size, self.options.frames_per_s)
             self._roi = self._images.whole
+            self._look_at_controls()
             for name, value in self.options.controls.items():
                 self.set_control(name, value)
-            self._exposure_ms = self._read_exposure()
-            self._gain = self._read_gain()
         except BaseException:
             self._disconnect()
             raise
 
     def _disconnect(self) -> None:
-        for node in (self._device, *self._subdevices):
-            node.close()
+        with ExitStack() as each:  # whether or not the one before it could be closed
+            for node in (self._device, *self._subdevices):
+                each.callback(node.close)
 
-    def _find_quantities(self) -> None:
-        options, controls = self.options, self._controls
+    def _look_at_controls(self) -> None:
+        """Read the controls' ranges, which others change (an exposure fits into a frame), and the values."""
+        options, controls = self.options, Controls((self._device, *self._subdevices))
         absolute, lines = controls.find(api.CID_EXPOSURE_ABSOLUTE), controls.find(api.CID_EXPOSURE)
-        self._exposure_control: Quantity | None = None
+        exposure: Quantity | None = None
         if absolute is not None:
-            self._exposure_control = Quantity(controls, absolute, GainScale("factor", _EXPOSURE_COUNT_MS, 0))
+            exposure = Quantity(controls, absolute, GainScale("factor", _EXPOSURE_COUNT_MS, 0))
         elif lines is not None and options.exposure_line_us is not None:
-            scale = GainScale("factor", options.exposure_line_us / 1e3, 0)
-            self._exposure_control = Quantity(controls, lines, scale)
+            exposure = Quantity(controls, lines, GainScale("factor", options.exposure_line_us / 1e3, 0))
+        self._controls, self._exposure_control = controls, exposure
         gain, black = controls.find(api.CID_ANALOGUE_GAIN, api.CID_GAIN), controls.find(api.CID_BLACK_LEVEL)
         self._gain_control = gain and Quantity(
             controls, gain, GainScale(options.gain_unit, options.gain_per_count, gain.minimum)
         )
         self._black_control = black and Quantity(controls, black, GainScale("factor", 1, 0))
+        self._exposure_ms, self._gain = self._read_exposure(), self._read_gain()
 
     def settings(self) -> Mapping[str, Setting]:
         """Read all settings, the driver's controls under ``control.NAME``."""
@@ -211,7 +212,9 @@ class V4l2Camera(RunningCamera):
         """
         if not self._connected:
             self._require()
-        return self._controls.set(self._controls.named(name), value)
+        made = self._controls.set(self._controls.named(name), value)
+        self._look_at_controls()
+        return made
 
     def own_settings(self) -> Mapping[str, OwnSetting]:
         """Return the controls that can be set, but for what the driver looks after."""
@@ -365,8 +368,7 @@ class V4l2Camera(RunningCamera):
     def _apply_format(self, wanted: V4l2Format) -> None:
         self._images.apply(wanted)
         self._roi = self._images.whole
-        if self._exposure_control is None:
-            self._exposure_ms = self._read_exposure()
+        self._look_at_controls()
 
     def set_roi(self, roi: Roi | None) -> Roi:
         """Set the region, by the camera where it can, else cut out of each image by this driver.
@@ -380,8 +382,7 @@ class V4l2Camera(RunningCamera):
         if roi is not None and not (whole.contains(roi) and whole.contains(wanted)):
             raise self._no_region(roi, f"Its images have {whole.height} x {whole.width} pixels.")
         self._roi = images.cut(wanted)
-        if self._exposure_control is None:
-            self._exposure_ms = self._read_exposure()
+        self._look_at_controls()
         self._remember("roi", lambda: self.set_roi(roi))
         return self._roi
 

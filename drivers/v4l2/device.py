@@ -96,9 +96,10 @@ class VideoDevice(Node):
         """Close the node; closing twice does nothing."""
         if self._fd is None:
             return
-        self.stop()
-        super().close()
-        os.close(self._wake_fd)
+        with contextlib.ExitStack() as each:  # whether or not the one before it failed; stop comes first
+            each.callback(os.close, self._wake_fd)
+            each.callback(super().close)
+            each.callback(self.stop)
 
     def capability(self) -> api.Capability:
         """Ask what the device is; ``device_caps`` are those of this node."""

@@ -207,8 +207,10 @@ class MyCamera(BufferedCamera):
         wanted = whole if roi is None else roi.inside(_STEP)
         if not (whole.contains(roi or whole) and whole.contains(wanted)):
             raise self._no_region(roi or whole, f"The sensor has {whole.height} x {whole.width} pixels.")
-        asked = {"x": wanted.left, "y": wanted.top, "width": wanted.width, "height": wanted.height}
-        left, top, width, height = (self._write(name, value) for name, value in asked.items())
+        for name in ("x", "y"):  # a camera refuses a region that sticks out, also on the way to another
+            self._write(name, 0)
+        width, height = self._write("width", wanted.width), self._write("height", wanted.height)
+        left, top = self._write("x", wanted.left), self._write("y", wanted.top)
         self._roi = Roi(top, left, height, width)
         self._remember("roi", lambda: self.set_roi(roi))
         return self._roi
@@ -232,13 +234,14 @@ class MyCamera(BufferedCamera):
         return RawFrame(buffer.data, buffer.number, buffer.time_ns, buffer.complete, buffer)
 
     def _give_back(self, raw: RawFrame) -> None:
-        assert self._camera is not None
         assert isinstance(raw.buffer, sdk.Buffer)
-        self._camera.queue(raw.buffer)
+        with self._calling() as camera:
+            camera.queue(raw.buffer)
 
     def _wake(self) -> None:
         if (camera := self._camera) is not None:
-            camera.abort()
+            with contextlib.suppress(sdk.SdkError):  # the sequence is ended all the same
+                camera.abort()
 
     def _end(self) -> None:
         if self._camera is not None:

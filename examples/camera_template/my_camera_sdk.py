@@ -62,7 +62,7 @@ class Camera:
         self._changed = threading.Condition()
         self._fired = threading.Semaphore(0)
         self._aborted = False
-        self._running: threading.Event | None = None
+        self._running: tuple[threading.Event, threading.Thread] | None = None
 
     def read(self, register: str) -> int:
         self._check()
@@ -70,6 +70,9 @@ class Camera:
 
     def write(self, register: str, value: int) -> None:
         self._check()
+        at = self._registers | {register: value}
+        if at["x"] + at["width"] > WIDTH or at["y"] + at["height"] > HEIGHT:
+            raise SdkError(f"{register} {value}: the region sticks out of the sensor")
         # As cameras do: an exposure is a whole number of lines, whatever was asked for.
         self._registers[register] = value // 10 * 10 if register == "exposure_us" else value
 
@@ -79,8 +82,10 @@ class Camera:
         self._free = deque(np.empty(n_bytes, np.uint8) for _ in range(n_buffers))
         self._full.clear()
         self._aborted, self._fired = False, threading.Semaphore(0)
-        self._running = threading.Event()
-        threading.Thread(target=self._expose, args=(self._running,), daemon=True).start()
+        ended = threading.Event()
+        exposing = threading.Thread(target=self._expose, args=(ended,), daemon=True)
+        self._running = ended, exposing
+        exposing.start()
 
     def wait(self, timeout_ms: int) -> Buffer | None:
         """Wait for a full buffer; None after the time, or after ``abort``."""
@@ -102,7 +107,9 @@ class Camera:
 
     def stop(self) -> None:
         if self._running is not None:
-            self._running.set()
+            ended, exposing = self._running
+            ended.set()
+            exposing.join()  # else its last frame would be in the next sequence
             self._running = None
 
     def close(self) -> None:

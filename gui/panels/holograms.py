@@ -162,7 +162,7 @@ class HologramsPanel(Panel):
         """Take over what an option of the target is now."""
         if name in ("picture", "fit", "srgb"):
             self._picture_changed()
-        elif name == "expansion":  # it sets how far the depths reach
+        elif name in ("expansion", "distance_mm"):  # they set how far the depths reach
             self.form.recheck("z_mm", "further")
         elif name == "counts":
             self._show_mode()

@@ -33,7 +33,7 @@ from gui.widgets.building import (
     text_view,
 )
 from gui.widgets.sweep_views import Picture
-from instrument.tasks import CHARTS, DISPLAY, TASKS, VIDEOS
+from instrument.tasks import CHARTS, TASKS, VIDEOS
 from instrument.tasks.task import WRITTEN, Desk, Done, Task
 from recon.base.declare import Imports, Option, expression
 
@@ -180,8 +180,7 @@ class TasksPanel(Panel):
         for widget in form.widgets.values():
             if isinstance(widget, QLineEdit):
                 widget.setPlaceholderText(form.in_its_words(widget.placeholderText()))
-        if TASKS[name].group == DISPLAY:
-            form.set_values({"bench": self.session.config.path})
+        form.set_values({"bench": self.session.config.path})
         names = None
         if place is not None:
             suffix = "".join(place.suffixes).replace(".pdf", ".png")  # what can be shown beside the form
@@ -198,18 +197,11 @@ class TasksPanel(Panel):
 
         def made() -> dict[str, object]:
             return {
-                parameter: cls(**{o.name: self._value(page.form, o.name) for o in offered})
+                parameter: cls(**{o.name: page.form.value(o.name) for o in offered})
                 for parameter, (cls, offered) in page.task.parts.items()
             }
 
         return self.asked(made)
-
-    def _value(self, form: OptionsForm, name: str) -> Any:
-        """Return an option's value; the bench of a hologram's chart is the window's, where none is given."""
-        value = form.value(name)
-        if name == "bench" and value is None and "hologram" in form.fields and form.value("hologram"):
-            return self.session.config.path
-        return value
 
     def as_python(self) -> str:
         """Return lines that carry out the task as the form stands."""
@@ -364,7 +356,7 @@ def _names_files(o: Option) -> bool:
 
 def _behaviour(o: Option, *, needed: bool) -> Behaviour:
     """Return how a path is chosen: what is written by a new name, what is read by what is there."""
-    folder = o.declaration.metavar.removesuffix("...") in _FOLDERS
+    folder = o.declaration.metavar.removesuffix("...").strip("[]") in _FOLDERS
     if o.name in WRITTEN:
         return Behaviour(browse="folder" if folder else "save", needed=needed)
     exists = o.kinds == (Path,)

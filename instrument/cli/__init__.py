@@ -85,7 +85,7 @@ COMMANDS: Mapping[str, Command] = {
     "analyze": _task(ANALYSIS, "analyze"),
     "compare": _task(ANALYSIS, "compare"),
     "optics": _task(ANALYSIS, "optics"),
-    "chart": _task(ANALYSIS, "chart"),
+    "chart": Command(ANALYSIS, "time and memory against error, for every method", "tasks:chart"),
     "stability": _task(ANALYSIS, "stability"),
     "refocus": _task(ANALYSIS, "refocus"),
     "hologram": Command(

@@ -77,12 +77,26 @@ class App(typer.Typer):
                 found = super().get_command(context, name)
                 if found is None and not context.resilient_parsing:
                     near = difflib.get_close_matches(name, self.commands, 1)
-                    hint = f" Did you mean {near[0]}?" if near else ""
-                    known = ", ".join(self.commands)
-                    raise BenchError(
-                        f"{context.command_path}: there is no {name!r}; there are {known}.{hint}"
-                    )
+                    self.refuse(context, f"there is no {name!r}", near[0] if near else "")
                 return found
+
+            def refuse(self, context: Any, why: str, meant: str) -> None:
+                """Say which commands there are, and which is likely to be meant."""
+                hint = f" Did you mean {meant}?" if meant else ""
+                raise BenchError(
+                    f"{context.command_path}: {why}; there are {', '.join(self.commands)}.{hint}"
+                )
+
+            def named_by(self, typed: Sequence[str]) -> str:
+                """Return the command whose name was typed as an option; else one that has all the options."""
+                flags = {word.partition("=")[0] for word in typed if word.startswith("-")}
+                named = [name for name in self.commands if f"--{name}" in flags]
+                having = [
+                    name
+                    for name, one in self.commands.items()
+                    if flags <= {flag for param in one.params for flag in param.opts}
+                ]
+                return next(iter([*named, *having]), "")
 
             def format_commands(self, ctx: Any, formatter: Any) -> None:
                 """List the commands with the first sentence of each, whole."""
@@ -95,6 +109,10 @@ class App(typer.Typer):
                     arguments = [*arguments[1:], "--help"]
                 if self.meant is not None and self.names_none(arguments[:1]):
                     arguments = [self.meant, *arguments]
+                if arguments and self.names_none(arguments[:1]):
+                    meant = self.named_by(arguments)
+                    hint = f"{context.command_path} {meant} ..." if meant else ""
+                    self.refuse(context, f"a name comes before {arguments[0]}", hint)
                 return super().parse_args(context, arguments)
 
         super().__init__(

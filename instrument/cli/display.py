@@ -94,8 +94,8 @@ def hologram(
             display.defocus(z)  # refuses what is too far or too near before anything is said or made
     if options.distance_mm is not None:
         typer.echo(
-            f"Without a lens: the picture is {displays[0].field_mm:.4g} mm wide, {options.distance_mm:g} mm "
-            "behind the mask.",
+            f"Without a lens: the picture's field is {min(d.field_mm for d in displays):.4g} mm wide, "
+            f"{options.distance_mm:g} mm behind the mask.",
             err=True,
         )
     if inputs.alignment is not None:

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from instrument.cli import COMMANDS
 from instrument.cli.app import INTERRUPTED, App, examples
 from instrument.cli.progress import first_interrupt_cancels, one_task
 from instrument.tasks import TASKS
@@ -19,11 +20,14 @@ from instrument.tasks.task import Advance, Done, Printed, Task
 
 
 def __getattr__(name: str) -> App:
-    """Give the application of a task by its command's name."""
-    if name not in TASKS:
+    """Give the application of a command: of one task, or of several that are its sub-commands."""
+    found = [words for words in TASKS if words.split()[0] == name]
+    if not found:
         raise AttributeError(name)
-    app, task = App(), TASKS[name].load()
-    app.command(name, epilog=examples(*task.examples))(_function(task))
+    app = App("" if found == [name] else f"{COMMANDS[name].help.capitalize()}.")
+    for words in found:
+        task = TASKS[words].load()
+        app.command(words.split()[-1], epilog=examples(*task.examples))(_function(task))
     return app
 
 

@@ -374,7 +374,8 @@ class Alignment:
     def of(self, display: Display) -> Display:
         """Return the display with this mask's displacement.
 
-        Raises FileError when the alignment is another mask's.
+        Raises FileError when the alignment is another mask's, or was learned with the lens of a display that
+        has none.
         """
         if display.mask.shape != self.mask_shape:
             raise FileError(
@@ -384,6 +385,12 @@ class Alignment:
         displacement = self.pose.displacement(self.mask_shape) + self.rest
         if self.learned is None:
             return replace(display, displacement=displacement)
+        if display.distance_mm is not None:
+            raise FileError(
+                "alignment",
+                "holds what was learned behind the display's Fourier lens, and the picture is shown without "
+                "one: give the alignment from align mask, without what was learned.",
+            )
         turns = display.mask.design_wavelength_nm / display.wavelength_nm
         return replace(display, displacement=displacement).taught(self.learned.at(turns))
 

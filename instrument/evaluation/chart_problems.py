@@ -30,12 +30,9 @@ EXPANSIONS = (4, 16)
 def problem_of_scene(family: str, size: int, seed: int) -> tuple[ChartProblem, dict[str, Any]]:
     """Return a test scene to chart on, and what to say of it.
 
-    Raises BenchError when there is no such scene.
+    Raises InputError when there is no such scene.
     """
-    try:
-        scene = make_scene(family, size=size, seed=seed, grid=3)  # type: ignore[arg-type]
-    except InputError as error:
-        raise BenchError(f"--scene {family}: {error}") from error
+    scene = make_scene(family, size=size, seed=seed, grid=3)  # type: ignore[arg-type]
     problem = ChartProblem.of_scene(scene)
     about = {"scene": family, "size": size, "seed": seed, "simulated": True}
     return problem, {**about, "left_out": list(problem.left_out())}
@@ -167,7 +164,5 @@ def _picture(name: str) -> Any:
     if name in SAMPLES and not Path(name).exists():
         return np.asarray(SAMPLES[name].load())
     if not Path(name).exists() and not Path(name).suffix:
-        raise BenchError(
-            f"--hologram {name}: there is no such file, and no such sample picture ({', '.join(SAMPLES)})."
-        )
+        raise BenchError(f"{name}: there is no such file, and no such sample picture ({', '.join(SAMPLES)}).")
     return read_image(Path(name)).pixels

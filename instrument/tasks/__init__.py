@@ -70,8 +70,17 @@ TASKS: Mapping[str, TaskEntry] = {
         "the dissertation's comparison of methods, also without aliasing",
         "display:table",
     ),
-    "chart": TaskEntry(
-        CHARTS, "Chart settings", "time and memory against error, for every method", "chart:chart"
+    "chart scene": TaskEntry(
+        CHARTS, "Chart a simulated scene", "time and memory against error, for every method", "chart:scene"
+    ),
+    "chart photograph": TaskEntry(
+        CHARTS, "Chart your photograph", "every method on your own, by pixels held out", "chart:photograph"
+    ),
+    "chart hologram": TaskEntry(
+        CHARTS, "Chart holograms", "every loss, method and number of frames of a picture", "chart:hologram"
+    ),
+    "chart calibrations": TaskEntry(
+        CHARTS, "Chart calibrations", "what more photographs of a calibration buy", "chart:calibrations"
     ),
     "stability": TaskEntry(
         CHARTS,
@@ -110,4 +119,4 @@ TASKS: Mapping[str, TaskEntry] = {
         "calibrations:refocus",
     ),
 }
-"""By the names of their commands, or of what a command does besides."""
+"""By the names of their commands, with sub-commands, or of what a command does besides."""

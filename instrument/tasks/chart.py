@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 from instrument.files.errors import BenchError
 from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.tasks.task import BenchFile, Desk, Done, Given, Only, bench_of, saying_what_is_left, task
 from recon.base.declare import option
 from recon.base.option_text import size as size_of
+from recon.reconstruction.options import ReconstructionOptions
 
 if TYPE_CHECKING:
     from instrument.evaluation.chart import ChartData
@@ -24,104 +25,10 @@ _LEAST_S = 1.0
 """For settings, where photographs took all of the budget: so that each call comes further."""
 
 
-class _Subject(NamedTuple):
-    """What is charted: as options are declared to apply to it, and as people ask for it."""
-
-    word: str
-    title: str
-    of_photographs: tuple[str, ...] = ()
-
-
-_SCENE = _Subject("scene", "--scene")
-_OWN = _Subject("photograph", "--calibration (or --psf) and --image", ("picture", "volume"))
-_COMPARED = _Subject(
-    "comparison of calibrations", "--calibrations with --calibration and --image", ("volume",)
-)
-_SIMULATED = _Subject("simulated calibration", "--calibrations")
-_HOLOGRAM = _Subject("hologram", "--hologram")
-_HOLOGRAMS, _PHOTOGRAPHS = (_HOLOGRAM.word,), (_OWN.word, _COMPARED.word)
-
-
 @dataclass(frozen=True, kw_only=True)
-class ChartOptions:
-    """What is charted, and for how long."""
+class ChartFiles:
+    """For how long is charted, and where it goes."""
 
-    scene: str | None = option(
-        None,
-        help="A simulated scene with ground truth: dense-picture, sparse-picture, beads, dense-volume, "
-        "microscope.",
-        metavar="NAME",
-        group="What to chart",
-    )
-    calibration: tuple[Path, ...] = option(
-        (),
-        help="Your calibration; with --volume PSF images of several depths will do. With --calibrations: "
-        "one or more, to be compared.",
-        metavar="FOLDER",
-        flags=("--calibration", "-c"),
-        group="What to chart",
-    )
-    calibrations: bool = option(
-        False,
-        help="Calibrations: your own (--calibration, --image), whole and thinned; else of a simulated "
-        "microscope: one PSF, axial, 3 x 3, 5 x 5, blind from beads.",
-        group="What to chart",
-    )
-    hologram: tuple[str, ...] = option(
-        (),
-        help="A picture to be shown by the bench's SLM, once for each plane: a file, or portrait, relief, "
-        "head, leaves, clouds.",
-        metavar="TARGET",
-        group="What to chart",
-    )
-    volume: bool = option(
-        False,
-        help="With --image: a volume of all calibrated depths.",
-        applies=_PHOTOGRAPHS,
-        group="What to chart",
-    )
-    z_um: tuple[float, ...] = option(
-        (),
-        help="Distance of a flat scene, of several depths; of each hologram's plane, behind the focal plane.",
-        unit="um",
-        shown_unit="mm",
-        shown_factor=1000.0,
-        flags=("--z-mm",),
-        applies=(*_PHOTOGRAPHS, *_HOLOGRAMS),
-        group="What to chart",
-    )
-    expansion: tuple[int, ...] = option(
-        (),
-        help="Étendue expansions; repeatable.",
-        default_words="4, 16 and the bench's",
-        flags=("--expansion", "-q"),
-        applies=_HOLOGRAMS,
-        group="Holograms",
-    )
-    frames: tuple[int, ...] = option(
-        (1, 2, 3),
-        help="Time-multiplexed frames; repeatable.",
-        default_words="1, 2, 3",
-        least=1,
-        applies=_HOLOGRAMS,
-        group="Holograms",
-    )
-    slm: tuple[int, int] | None = option(
-        None,
-        help="Other SLM pixels than the bench's: few, for a quick chart.",
-        metavar="HxW",
-        parse=size_of,
-        applies=_HOLOGRAMS,
-        group="Holograms",
-    )
-    size: int | None = option(
-        None,
-        help="Pixels of the side of a scene (default 48) or of the microscope's sensor (about; 90).",
-        least=16,
-        applies=(_SCENE.word, _SIMULATED.word),
-        group="Simulated scenes",
-    )
-    seed: int = option(0, help="Of the scene.", least=0, group="Simulated scenes")
     budget_s: float = option(
         300.0,
         help="Time for all settings together.",
@@ -140,150 +47,228 @@ class ChartOptions:
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class SceneChart:
+    """Which simulated scene."""
+
+    name: str = option(
+        help="dense-picture, sparse-picture, beads, dense-volume, microscope, text, filaments, gradient, "
+        "texture, lights.",
+        metavar="NAME",
+        label="Scene",
+        positional=True,
+        group="Scene",
+    )
+    size: int = option(48, help="Pixels of its side.", least=16, group="Scene")
+    seed: int = option(0, help="Another one: another scene of this kind.", least=0, group="Scene")
+
+
 @task(
-    "diffuserbench chart --scene sparse-picture",
-    "diffuserbench chart --scene beads --size 40 --budget 120 --out beads-chart",
-    "diffuserbench chart --calibration demo/calibration --image photo.tif --z-mm 30",
-    "diffuserbench chart --psf psf.tif --image photo.tif --bin 8",
-    "diffuserbench chart --calibration axial/calibration --image photo.tif --volume",
-    "diffuserbench chart --hologram picture.png --slm 135x240 --out hologram-chart",
-    "diffuserbench chart --calibrations --out calibration-chart",
-    "diffuserbench chart --calibrations -c grid/calibration -c beads/calibration -i photo.tif --z-mm 30",
-    "diffuserbench chart --hologram near.png --hologram far.png --z-mm 0 --z-mm 40",
+    "diffuserbench chart scene sparse-picture",
+    "diffuserbench chart scene beads --size 40 --budget 120 --out beads-chart",
+    out=Path("scene-chart"),
 )
-def chart(
+def scene(desk: Desk, subject: SceneChart, files: ChartFiles) -> Done:
+    """Chart every way to reconstruct a simulated scene against its ground truth.
+
+    Method, model, prior, iterations, binning and precision, each setting in a process of its own, quick ones
+    first; the error is PSNR, SSIM and NRMSE. The same command goes on where it stopped.
+    """
+    from instrument.evaluation.chart_problems import problem_of_scene
+
+    return _charted(desk, *problem_of_scene(subject.name, subject.size, subject.seed), files)
+
+
+@task(
+    "diffuserbench chart photograph --calibration demo/calibration --image photo.tif --z-mm 30",
+    "diffuserbench chart photograph --psf psf.tif --image photo.tif --bin 8",
+    "diffuserbench chart photograph --volume axial/calibration --image photo.tif",
+    out=Path("photograph-chart"),
+    needed=("image",),
+)
+def photograph(
     desk: Desk,
-    options: ChartOptions,
-    source: Annotated[SourceOptions, Only("psf", "image")],
+    source: Annotated[SourceOptions, Only("image", "psf", "calibration", "volume")],
     inputs: Annotated[InputOptions, Only("dark", "crop", "binning")],
-    bench: BenchFile,
+    place: Annotated[ReconstructionOptions, Only("z_um")],
+    files: ChartFiles,
     given: Given,
 ) -> Done:
-    """Chart what every setting costs against how good it is, each in a process of its own, quick ones first.
+    """Chart every way to reconstruct your own photograph, by pixels held out.
 
-    Reconstructions (of --scene, or of --image with --calibration or --psf): method, model, prior, iterations,
-    binning and precision. With a ground truth the error is PSNR, SSIM and NRMSE; without one the error on 5 %
-    of the pixels, which are held out and predicted from the rest. Holograms (--hologram): loss, method,
-    expansion, frames and iterations. Calibrations (--calibrations): the number of photographs against the
-    error of what is reconstructed with them. Run the same command again to go on where it stopped.
+    As of a scene; but without a ground truth the error is that on 5 % of the pixels, which are held out and
+    predicted from the rest. The same command goes on where it stopped.
     """
-    subject = _subject(given)
-    given.refuse(subject.title, subject.word, *subject.of_photographs)
-    if bench.bench is not None and subject is not _HOLOGRAM:
-        raise BenchError(f"--bench is for holograms; it does not apply with {subject.title}.")
+    from instrument.evaluation.chart_problems import problem_of_job
+
+    is_volume = source.volume is not None
+    if is_volume:
+        given.refuse("--volume", "volume")
+    job = _job(desk, source, inputs, place)
+    return _charted(desk, *problem_of_job(job, place.z_um, volume=is_volume), files)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HologramChart:
+    """What is shown, and what is tried."""
+
+    targets: tuple[str, ...] = option(
+        help="The picture to be shown by the bench's SLM, or one per plane: a file, or portrait, relief, "
+        "head, leaves, clouds.",
+        metavar="TARGET...",
+        label="Pictures",
+        positional=True,
+        group="Hologram",
+    )
+    z_mm: tuple[float, ...] = option(
+        (),
+        help="Depth of each target behind the focal plane; once a target.",
+        default_words="0",
+        unit="mm",
+        group="Hologram",
+    )
+    expansion: tuple[int, ...] = option(
+        (),
+        help="Étendue expansions; repeatable.",
+        default_words="4, 16 and the bench's",
+        flags=("--expansion", "-q"),
+        group="Hologram",
+    )
+    frames: tuple[int, ...] = option(
+        (1, 2, 3),
+        help="Time-multiplexed frames; repeatable.",
+        default_words="1, 2, 3",
+        least=1,
+        group="Hologram",
+    )
+    slm: tuple[int, int] | None = option(
+        None,
+        help="Other SLM pixels than the bench's: few, for a quick chart.",
+        metavar="HxW",
+        parse=size_of,
+        group="Hologram",
+    )
+
+
+@task(
+    "diffuserbench chart hologram picture.png --slm 135x240 --out hologram-chart",
+    "diffuserbench chart hologram near.png far.png --z-mm 0 --z-mm 40",
+    out=Path("hologram-chart"),
+)
+def hologram(desk: Desk, subject: HologramChart, bench: BenchFile, files: ChartFiles) -> Done:
+    """Chart every way to compute a picture's hologram for the bench's SLM: loss, method, expansion, frames.
+
+    Each setting in a process of its own, quick ones first, as it iterates; expansions do not compete, each
+    shows another field of view. The same command goes on where it stopped.
+    """
+    from instrument.evaluation.chart_problems import problem_of_pictures
+
+    about = subject.targets, subject.z_mm, subject.expansion, subject.frames, subject.slm
+    return _charted(desk, *problem_of_pictures(bench_of(desk, bench), *about), files)
+
+
+_SIMULATED = "simulated microscope"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationsChart:
+    """Which calibrations."""
+
+    folders: tuple[Path, ...] = option(
+        (),
+        help="Your own calibrations, with --image.",
+        metavar="[FOLDER]...",
+        label="Calibrations",
+        default_words=f"those of a {_SIMULATED}",
+        positional=True,
+        group="Calibrations",
+    )
+    volume: bool = option(
+        False, help="A volume of all calibrated depths.", applies=("volume",), group="Calibrations"
+    )
+    size: int = option(
+        90,
+        help="Pixels of the simulated sensor's side, about.",
+        least=16,
+        applies=(_SIMULATED,),
+        group="Calibrations",
+    )
+
+
+@task(
+    "diffuserbench chart calibrations --out calibration-chart",
+    "diffuserbench chart calibrations grid/calibration beads/calibration --image photo.tif --z-mm 30",
+    out=Path("calibration-chart"),
+)
+def calibrations(
+    desk: Desk,
+    subject: CalibrationsChart,
+    source: Annotated[SourceOptions, Only("image")],
+    inputs: Annotated[InputOptions, Only("dark", "crop", "binning")],
+    place: Annotated[ReconstructionOptions, Only("z_um")],
+    files: ChartFiles,
+    given: Given,
+) -> Done:
+    """Chart how many photographs a calibration needs, against the error of what is reconstructed with it.
+
+    Your own calibrations, whole and thinned, by the pixels that are held out of your photograph. Without any:
+    one PSF, axial, 3 x 3, 5 x 5, several depths, blind from beads, of a simulated microscope. The same
+    command goes on where it stopped.
+    """
+    if not subject.folders:
+        given.refuse("no FOLDER", _SIMULATED)
+        began = time.monotonic()
+        found = _simulated(desk, subject.size, files.out, files.budget_s)
+        # Its photographs are taken out of the budget.
+        return _charted(desk, *found, files, spent_s=time.monotonic() - began)
+    depths = "volume" if subject.volume else "picture"
+    given.refuse("FOLDER and --volume" if subject.volume else "FOLDER", depths)
+    if repeated := [str(folder) for folder in subject.folders if subject.folders.count(folder) > 1]:
+        raise BenchError(f"{repeated[0]} is given twice.")
+    from instrument.evaluation.chart_problems import problem_of_calibrations
+
+    jobs = {}
+    for folder in subject.folders:
+        own = replace(source, volume=folder) if subject.volume else replace(source, calibration=folder)
+        jobs[folder] = _job(desk, own, inputs, place)
+    return _charted(desk, *problem_of_calibrations(jobs, place.z_um, volume=subject.volume), files)
+
+
+def _job(desk: Desk, source: SourceOptions, inputs: InputOptions, place: ReconstructionOptions) -> Job:
+    """Return a photograph with its calibration, as a reconstruction has them; say what is to be known."""
+    if source.image is None:
+        raise BenchError("Give your photograph with --image FILE.")
+    from instrument.reconstruction.request import request_of
+
+    job = request_of(source, inputs, place).prepare()
+    for name, text in job.notes.items():
+        desk.fact(name, text)
+    return job
+
+
+def _charted(
+    desk: Desk, problem: Subject[Any], about: dict[str, Any], files: ChartFiles, *, spent_s: float = 0.0
+) -> Done:
+    """Try every setting in what is left of the budget; tell, draw, write."""
     from instrument.evaluation.figures import write_charts
 
-    out = options.out
-    began = time.monotonic()
-    problem, about = _problem(desk, subject, options, (source, inputs), bench)
-    # Photographs of a simulated microscope are taken out of the budget.
-    spent_s = time.monotonic() - began if subject is _SIMULATED else 0.0
+    out = files.out
     if about.get("simulated"):
         desk.say("SIMULATED   what is charted, or its input, comes from a simulation")
     out.mkdir(parents=True, exist_ok=True)
     record = out / "chart.json"
-    data = _made(desk, problem, about, record, max(options.budget_s - spent_s, _LEAST_S))
+    data = _made(desk, problem, about, record, max(files.budget_s - spent_s, _LEAST_S))
     if not data.points:
         if not data.failed:
             raise BenchError("There was no time for any setting: give a longer --budget.")
         raise BenchError("No setting could be run: " + "; ".join(f"{k}: {v}" for k, v in data.failed.items()))
     with desk.step("drawing"):
-        files = write_charts(out, data)
+        chart_files = write_charts(out, data)
     _tell(desk, data)
-    return Done((record, *files))
+    return Done((record, *chart_files))
 
 
-def _problem(
-    desk: Desk,
-    subject: _Subject,
-    options: ChartOptions,
-    photographs: tuple[SourceOptions, InputOptions],
-    bench: BenchFile,
-) -> tuple[Subject[Any], dict[str, Any]]:
-    """Return what is charted, and what to say of it."""
-    from instrument.evaluation.chart_problems import (
-        problem_of_calibrations,
-        problem_of_job,
-        problem_of_pictures,
-        problem_of_scene,
-    )
-
-    if subject is _SCENE:
-        assert options.scene is not None
-        return problem_of_scene(options.scene, options.size or 48, options.seed)
-    z_mm = [1e-3 * z_um for z_um in options.z_um]
-    if subject is _HOLOGRAM:
-        return problem_of_pictures(
-            bench_of(desk, bench), options.hologram, z_mm, options.expansion, options.frames, options.slm
-        )
-    if subject is _SIMULATED:
-        return _calibrations(desk, options.size or 90, options.out, options.budget_s)
-    if len(z_mm) > 1 or (z_mm and options.volume):
-        raise BenchError("--z-mm is the distance of a flat scene: give it once, and without --volume.")
-    z_um = options.z_um[0] if options.z_um else None
-    source, inputs = photographs
-    compared = subject is _COMPARED
-    jobs = {
-        folder: _job(folder, source, inputs, volume=options.volume)
-        for folder in _folders(options.calibration, compared=compared)
-    }
-    prepared = list(jobs.values()) or [_job(None, source, inputs, volume=options.volume)]
-    for job in prepared:
-        for name, text in job.notes.items():
-            desk.say(f"{name:<12}{text}")
-    if compared:
-        return problem_of_calibrations(jobs, z_um, volume=options.volume)
-    return problem_of_job(prepared[0], z_um, volume=options.volume)
-
-
-def _folders(given: Sequence[Path], *, compared: bool) -> Sequence[Path]:
-    if compared and not given:
-        raise BenchError("--calibrations with --image compares your own: give --calibration, once or more.")
-    if not compared and len(given) > 1:
-        raise BenchError("Several --calibration are compared with --calibrations; else give one.")
-    if repeated := [str(folder) for folder in given if given.count(folder) > 1]:
-        raise BenchError(f"--calibration {repeated[0]} is given twice.")
-    return given
-
-
-def _subject(given: Given) -> _Subject:
-    """Return what is to be charted.
-
-    Raises BenchError when none or more than one is given.
-    """
-    own = any(name in given for name in ("calibration", "psf", "image"))
-    found = [s for s, name in ((_SCENE, "scene"), (_HOLOGRAM, "hologram")) if name in given]
-    if "calibrations" in given and ("calibration" in given or "image" in given):
-        found.append(_COMPARED)
-    elif "calibrations" in given:
-        found += [_OWN, _SIMULATED] if own else [_SIMULATED]
-    elif own:
-        found.append(_OWN)
-    if len(found) != 1:
-        both = f"; {' and '.join(s.title for s in found)} exclude each other" if found else ""
-        raise BenchError(
-            f"Give one of --scene NAME, --hologram TARGET, --calibrations, or your own {_OWN.title}{both}."
-        )
-    return found[0]
-
-
-def _job(folder: Path | None, source: SourceOptions, inputs: InputOptions, *, volume: bool) -> Job:
-    image, psf = source.image, source.psf
-    if image is None or (folder is None) == (psf is None):
-        raise BenchError("Your own chart needs --image FILE, and either --calibration FOLDER or --psf FILE.")
-    if psf is not None and volume:
-        raise BenchError("--volume needs --calibration: one PSF image is of one depth.")
-    from instrument.reconstruction.job import job_from_calibration, job_from_files
-    from instrument.reconstruction.request import volume_job
-
-    if psf is not None:
-        return job_from_files(psf, image, inputs)
-    assert folder is not None
-    prepared = volume_job if volume else job_from_calibration
-    return prepared(folder, image, inputs)
-
-
-def _calibrations(desk: Desk, size: int, out: Path, budget_s: float) -> tuple[Subject[Any], dict[str, Any]]:
+def _simulated(desk: Desk, size: int, out: Path, budget_s: float) -> tuple[Subject[Any], dict[str, Any]]:
     from instrument.evaluation.bench_photographs import OutOfTimeError, photographs
     from recon.evaluation.chart_calibration import CalibrationProblem
 

@@ -284,6 +284,10 @@ class HologramOptions:
         return foveal_weights((256, 256), centre=self.centre, radius=self.radius, periphery=self.periphery)
 
     def display_of(self, display: Display) -> Display:
-        """Return the display as it is modelled: without an envelope that is ignored, without its lens."""
+        """Return the display as it is modelled: without an envelope that is ignored, without its lens.
+
+        A display that has none by itself stays as it is where no distance is given.
+        """
         fill = 0.0 if self.envelope == "ignore" else display.mask_fill
-        return replace(display, mask_fill=fill, distance_mm=self.distance_mm)
+        away_mm = display.distance_mm if self.distance_mm is None else self.distance_mm
+        return replace(display, mask_fill=fill, distance_mm=away_mm)

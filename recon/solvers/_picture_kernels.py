@@ -370,7 +370,7 @@ def move_rows(
         c, d = image[(i - down + 1) % height], image[(i - down + 2) % height]
         for j in range(width):
             row[j + 1] = along[0] * a[j] + along[1] * b[j] + along[2] * c[j] + along[3] * d[j]
-        row[0], row[width + 1], row[width + 2] = row[width], row[1], row[2]
+        row[0], row[width + 1], row[width + 2] = row[width], row[1], row[1 + 1 % width]
         for first, last, to in ((0, width - turn, turn), (width - turn, width, turn - width)):
             for j in range(first, last):
                 out[i, j + to] = (

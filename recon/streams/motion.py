@@ -19,6 +19,11 @@ LEAST_PX = 0.05
 EXPLAINED = 0.5
 """Share of the change between two frames, beyond noise, that moving one of them must take away for the scene
 to have moved as a whole."""
+FARTHER = 0.8
+"""The same share where details have moved farther than they are wide: few lights that go on and off come to
+0.5 at times."""
+SMOOTHED = 0.3
+"""Share of the noise of a difference that interpolation takes away at most: half a pixel along both axes."""
 SHORT_SIDE, MOST_BINNED = 128, 4
 """Frames are registered on pixels binned to about this many along the short side, by this much at most: a
 twentieth of a solver's iteration, and right to 0.04 pixels for half a pixel at 270 x 480."""
@@ -66,7 +71,11 @@ class Panning:
         noise = 2 * len(frame) / (binning * COARSER) ** 2 * float(np.mean(window**2)) * size
         known = still - noise > 5 * noise * np.sqrt(2 / size)  # what noise alone may come to
         # Moved the other way it would lie off by twice as much, with the noise as interpolation leaves it.
-        explained = back - there > 4 * EXPLAINED * (still - noise)
+        # What has moved farther than its details are wide lies off as much as that already.
+        change = still - noise
+        explained = (
+            back - there > 4 * EXPLAINED * change or still - there > FARTHER * change + SMOOTHED * noise
+        )
         return (rows, columns) if known and explained else (0.0, 0.0)
 
     @staticmethod

@@ -99,6 +99,7 @@ def test_a_hardware_trigger_sets_line_and_edge(camera: BaslerCamera, monkeypatch
     with pytest.raises(DeviceError, match=r"was told TriggerSelector = .* and has FrameStart"):
         camera.set_trigger_mode("free_run")
     assert camera.trigger_mode == "hardware"
+    assert camera._features.choose("ExposureAuto", "Once") == "Off"  # which it is when it is done
 
 
 def test_a_camera_that_is_unplugged_is_lost_and_comes_back(

@@ -16,7 +16,7 @@ from drivers.camera import Roi
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError
 from drivers.led_array import LedPattern
 from drivers.micromanager.camera import MicroManagerCamera, MicroManagerCameraOptions, genicam_name
-from drivers.micromanager.core import LoadedDevice, MicroManager, MicroManagerOptions
+from drivers.micromanager.core import LoadedDevice, MicroManager, MicroManagerOptions, Part
 from drivers.micromanager.light import Channel, MicroManagerLight, MicroManagerLightOptions
 from drivers.micromanager.slm import MicroManagerSlm, MicroManagerSlmOptions
 from drivers.micromanager.stage import MicroManagerAxis, MicroManagerStage, MicroManagerStageOptions
@@ -95,6 +95,27 @@ class TestCamera(CameraContract):
 
     def make(self) -> MicroManagerCamera:
         return camera_on(self.manager)
+
+
+def test_a_choice_that_is_read_back_with_more_decimals_is_that_choice() -> None:
+    part = Part(FactorsCore(), "Cam", "camera")
+    assert part.set("Factor", 0.5) == "0.5000"
+    with pytest.raises(DeviceError, match=r"was told Factor = 2\.0 and has 0\.5000"):
+        part.set("Factor", 2.0)
+
+
+class FactorsCore:
+    """An adapter whose only property takes two values, keeps the first, and writes it at length."""
+
+    def getLoadedDevices(self) -> tuple[str, ...]:
+        return ("Cam",)
+
+    def __getattr__(self, function: str) -> Any:
+        said = {
+            **{"hasProperty": True, "getPropertyType": None, "hasPropertyLimits": False},
+            **{"getAllowedPropertyValues": ("0.5", "2.0"), "setProperty": None, "getProperty": "0.5000"},
+        }
+        return lambda *_: said[function]
 
 
 def test_a_long_exposure_is_waited_for(manager: MicroManager) -> None:

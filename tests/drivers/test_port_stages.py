@@ -158,6 +158,12 @@ def test_esp301_failures_are_said_and_its_units_are_kept(tmp_path: Path) -> None
             DeviceError, match=r"axis 1 refuses 'PA999': maximum value exceeded \(error 105\)"
         ):
             stage._tell("x_um", "PA999")
+        stage._start_homing()
+        controller.errors.append((113, "HOME SWITCH NOT FOUND"))
+        stage.position()  # of somebody who only looks: the controller does not say it again
+        while stage.is_moving or stage._homing:
+            time.sleep(0.02)
+        assert not stage.is_homed
     controller.units = {1: 0, 2: 2}
     for number, words in ((1, "axis 1 counts in steps: it cannot be x_um"), (2, "axis 2 moves along a line")):
         controller.units[1] = 0 if number == 1 else 3

@@ -319,6 +319,7 @@ def test_controls_of_the_sensors_own_node_are_the_cameras() -> None:
     del kernel.controls[fake.EXPOSURE], kernel.controls[fake.GAIN]
     kernel.of_subdevice = {
         0x980911: fake.FakeControl("Exposure", 1, 4, 2000, 1, 500, 500),
+        0x9E0901: fake.FakeControl("Vertical Blanking", 1, 4, 9000, 1, 20, 20),
         0x9E0903: fake.FakeControl("Analogue Gain", 1, 0, 100, 1, 0, 7),
         fake.BLACK: fake.FakeControl("Black Level", 1, 0, 4095, 1, 64, 64),
     }
@@ -331,6 +332,10 @@ def test_controls_of_the_sensors_own_node_are_the_cameras() -> None:
         assert camera.set_gain(3.0) == 3.0
         assert kernel.of_subdevice[0x9E0903].value == 2
         assert camera.black_level == 16  # of the node that comes first
+        kernel.of_subdevice[0x980911].maximum, kernel.of_subdevice[0x980911].value = 4000, 400
+        camera.set_control("vertical_blanking", 2020)  # longer frames hold longer exposures
+        assert camera.exposure_limits_ms == (0.08, 80.0)
+        assert camera.exposure_ms == 8.0
         kernel.unplugged = True
         with pytest.raises(DeviceLostError, match="v4l-subdev0 is gone"):
             camera.set_gain(2.0)

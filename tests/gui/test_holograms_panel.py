@@ -424,6 +424,10 @@ def test_a_depth_out_of_reach_is_refused_at_its_field(
     assert bool(z_mm.property("refused")) == (wide_mm <= 0)
     type_in(qtbot, expansion, "4")
     assert bool(z_mm.property("refused")) == (0.98 * wide_mm > limit_mm)
+    type_in(qtbot, z_mm, f"{1.02 * limit_mm:.6g}")
+    assert z_mm.property("refused")
+    type_in(qtbot, panel.form.widgets["distance_mm"], "300")  # the limit is the lens'
+    assert not z_mm.property("refused")
 
 
 def test_the_depth_limit_is_that_of_the_display_itself() -> None:

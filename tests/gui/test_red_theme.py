@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor, QImage
+from PySide6.QtWidgets import QWidget
 from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.panels.log import LogPanel
-from gui.theme import DARK, RED, as_shown, colours
+from gui.theme import DARK, RED, as_shown, change_theme, colours
+from gui.widgets.building import fill
 from gui.widgets.image_view import ImageView
+from gui.widgets.plots import plot_widget
 
 WAIT_MS = 60_000
 _MOST_OTHER = 130
@@ -81,6 +84,22 @@ def test_a_coloured_picture_is_shown_by_its_brightness_in_the_red_map(qtbot: QtB
     assert (as_shown(picture, 0, 120, "grey")[20, 10] == (0, 255, 0)).all()
     view.set_colour_map("grey")
     assert view.item.image.shape == (40, 60, 3)
+
+
+def test_a_theme_chosen_twice_in_haste_reaches_every_plot(qtbot: QtBot) -> None:
+    part, plot = QWidget(), plot_widget()
+    window = fill(QWidget(), fill(part, plot))
+    qtbot.addWidget(window)
+    window.show()
+    try:
+        hasty = change_theme("red", window, [part])
+        while not part.styleSheet():
+            next(hasty)
+        hasty.close()  # as when the key repeats itself
+        list(change_theme("red", window, [part]))
+        assert plot.backgroundBrush().color() == QColor(RED.panel)
+    finally:
+        list(change_theme("dark", window, [part]))
 
 
 def test_a_line_of_the_log_keeps_what_its_colour_says(qtbot: QtBot, window: MainWindow) -> None:

@@ -47,7 +47,7 @@ def run(*arguments):
 
 def test_a_chart_is_written_and_gone_on_with(quick, tmp_path):
     out = tmp_path / "chart"
-    result = run("--scene", "sparse-picture", "--size", 32, "--out", out)
+    result = run("scene", "sparse-picture", "--size", 32, "--out", out)
     assert result.exit_code == 0, result.output
     assert "SIMULATED" in result.output
     assert "Pareto front" in result.output
@@ -64,7 +64,7 @@ def test_a_chart_is_written_and_gone_on_with(quick, tmp_path):
     assert (out / "chart.png").stat().st_size > 5000
     # Nothing is computed twice.
     assert quick == ["wiener convolution none", "admm convolution tv"]
-    assert run("--scene", "sparse-picture", "--size", 32, "--out", out).exit_code == 0
+    assert run("scene", "sparse-picture", "--size", 32, "--out", out).exit_code == 0
     assert len(quick) == 2
 
 
@@ -84,7 +84,7 @@ def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_
     path = tmp_path / "chart.json"
     arguments = {"budget_s": 100.0, "on_progress": lambda *_: None}
     monkeypatch.setattr(job, "in_own_process", cut)
-    assert run("--scene", "sparse-picture", "--size", 32, "--out", out).exit_code == 0
+    assert run("scene", "sparse-picture", "--size", 32, "--out", out).exit_code == 0
     data = job.make_chart(problem, about, path, **arguments)
     assert [p.iterations for p in data.points] == [0, 2]
     assert data.missing == ("admm convolution tv",)
@@ -125,8 +125,8 @@ def test_the_noise_that_the_photograph_tells_is_used():
 
 @pytest.mark.usefixtures("quick")
 def test_another_scene_does_not_mix_with_a_chart(tmp_path):
-    assert run("--scene", "sparse-picture", "--size", 32, "--out", tmp_path).exit_code == 0
-    other = run("--scene", "sparse-picture", "--size", 32, "--seed", 5, "--out", tmp_path)
+    assert run("scene", "sparse-picture", "--size", 32, "--out", tmp_path).exit_code == 0
+    other = run("scene", "sparse-picture", "--size", 32, "--seed", 5, "--out", tmp_path)
     assert other.exit_code != 0
     assert "chart of something else" in str(other.exception)
 
@@ -134,20 +134,19 @@ def test_another_scene_does_not_mix_with_a_chart(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ((), "Give one of --scene"),
-        (("--scene", "bead"), "not known"),
-        (("--image", "x.tif"), "either --calibration FOLDER or --psf FILE"),
-        (("--scene", "beads", "--hologram", "leaves"), "exclude each other"),
-        (("--calibrations", "--seed", 1, "--volume"), "do not apply: --volume"),
-        (("--hologram", "leaves", "--size", 40), "do not apply: --size"),
-        (("--scene", "beads", "--frames", 2), "do not apply: --frames (for a hologram)"),
-        (("--hologram", "leaves", "--volume"), "do not apply: --volume"),
-        (("--hologram", "levaes"), "no such file, and no such sample picture"),
-        (("--hologram", "leaves", "--hologram", "clouds"), "--z-mm once for each"),
-        (("--hologram", "leaves", "--hologram", "clouds", "--z-mm", 1, "--z-mm", 1), "a depth of its own"),
-        (("--hologram", "leaves", "-q", 5), "must be a square"),
-        (("--psf", "p", "--image", "i", "--volume"), "--volume needs --calibration"),
-        (("--scene", "beads", "--bin", 2), "do not apply: --bin"),
+        (("--scene", "beads"), "Did you mean root scene ...?"),
+        (("--size", 40, "--hologram", "leaves"), "Did you mean root hologram ...?"),
+        (("--calibrations", "-c", "a", "-c", "b"), "Did you mean root calibrations ...?"),
+        (("-c", "a", "--image", "i"), "Did you mean root photograph ...?"),
+        (("scene", "bead"), "not known"),
+        (("photograph", "--image", "x.tif"), "either --psf FILE or --calibration FOLDER"),
+        (("photograph", "--psf", "p"), "--image FILE"),
+        (("photograph", "--psf", "p", "--image", "i", "--volume", "v"), "do not apply: --psf"),
+        (("calibrations", "--volume"), "do not apply: --volume"),
+        (("hologram", "levaes"), "no such file, and no such sample picture"),
+        (("hologram", "leaves", "clouds"), "--z-mm once for each"),
+        (("hologram", "leaves", "clouds", "--z-mm", 1, "--z-mm", 1), "a depth of its own"),
+        (("hologram", "leaves", "-q", 5), "must be a square"),
     ],
 )
 def test_mistakes_are_named(arguments, said, tmp_path):
@@ -197,7 +196,7 @@ def test_holograms_are_charted(monkeypatch, tmp_path):
         return problem.run(setting, limit_s=limit_s, counts=(1, 2))
 
     monkeypatch.setattr(job, "in_own_process", here)
-    arguments = ("--hologram", "leaves", "--slm", "16x24", "-q", 4, "-q", 9, "--frames", 1, "--frames", 2)
+    arguments = ("hologram", "leaves", "--slm", "16x24", "-q", 4, "-q", 9, "--frames", 1, "--frames", 2)
     result = run(*arguments, "--out", tmp_path)
     assert result.exit_code == 0, result.output
     for told in ("Pareto front 4x", "Pareto front 9x", "SIMULATED", "no second frame"):
@@ -378,9 +377,8 @@ def test_own_calibrations_are_compared(own, monkeypatch, tmp_path):
 
     monkeypatch.setattr(module, "ITERATIONS", 3)
     monkeypatch.setattr(job, "in_own_process", lambda problem, setting, limit_s: problem.run(setting))
-    folders = ("--calibration", own / "fine", "--calibration", own / "one")
     out = tmp_path / "chart"
-    result = run("--calibrations", *folders, "--image", own / "photo.tif", "--out", out)
+    result = run("calibrations", own / "fine", own / "one", "--image", own / "photo.tif", "--out", out)
     assert result.exit_code == 0, result.output
     record = json.loads((out / "chart.json").read_text())
     _, *told = result.output.split("Held out    best ")  # one for each group
@@ -403,17 +401,26 @@ def test_own_calibrations_are_compared(own, monkeypatch, tmp_path):
     assert (out / "chart.png").stat().st_size > 5000
 
 
+def test_an_own_photograph_is_charted_by_pixels_held_out(own, quick):
+    result = run("photograph", "-c", own / "one", "-i", own / "photo.tif", "--out", own / "c")
+    assert result.exit_code == 0, result.output
+    assert "Held out" in result.output
+    assert quick == ["wiener convolution none", "admm convolution tv"]
+    points = json.loads((own / "c" / "chart.json").read_text())["points"]
+    assert all(p["held_out"] > 0 and p["psnr_db"] is None for p in points)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--calibrations", "-i", "photo.tif"), "give --calibration, once or more"),
-        (("-c", "fine", "-c", "one", "-i", "photo.tif"), "compared with --calibrations"),
-        (("--calibrations", "-c", "fine", "-c", "fine", "-i", "photo.tif"), "given twice"),
-        (("--calibrations", "-c", "fine"), "needs --image"),
-        (("--calibrations", "-c", "fine", "-i", "photo.tif", "--size", 40), "do not apply: --size"),
-        (("-c", "nothing", "-i", "photo.tif"), "nothing"),
-        (("-c", "fine", "-i", "nothing.tif"), "nothing.tif"),
-        (("-c", "fine", "-i", "small.tif"), "20 x 20"),
+        (("calibrations", "-i", "photo.tif"), "With no FOLDER these do not apply: --image"),
+        (("calibrations", "fine", "fine", "-i", "photo.tif"), "given twice"),
+        (("calibrations", "fine"), "--image FILE"),
+        (("calibrations", "fine", "-i", "photo.tif", "--size", 40), "do not apply: --size"),
+        (("calibrations", "fine", "-i", "photo.tif", "--volume", "--z-mm", 3), "do not apply: --z-mm"),
+        (("photograph", "-c", "nothing", "-i", "photo.tif"), "nothing"),
+        (("photograph", "-c", "fine", "-i", "nothing.tif"), "nothing.tif"),
+        (("photograph", "-c", "fine", "-i", "small.tif"), "20 x 20"),
     ],
 )
 def test_mistakes_with_own_files_are_named(own, monkeypatch, arguments, said):
@@ -428,7 +435,7 @@ def test_mistakes_with_own_files_are_named(own, monkeypatch, arguments, said):
 )
 def test_a_damaged_chart_is_refused_by_name(quick, tmp_path, content):
     (tmp_path / "chart.json").write_text(content)
-    result = run("--scene", "sparse-picture", "--size", 32, "--out", tmp_path)
+    result = run("scene", "sparse-picture", "--size", 32, "--out", tmp_path)
     assert result.exit_code != 0
     assert "chart.json" in str(result.exception)
     assert not quick

@@ -10,16 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration_routines.display.hologram_photograph import display_of_pattern
+from calibration_routines.display.hologram_photograph import display_of_pattern, photograph_hologram
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
-from instrument.display.hologram import bench_display, prepare_target
+from instrument.display.hologram import Alignment, bench_display, prepare_target
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image, write_image
 from instrument.files.sample_images import SAMPLES, load_sample
 from instrument.files.slm_image import levels_phase, phase_levels, read_slm_image
 from recon.holography import HologramModel, HologramOptions, spot_array
 from recon.holography.judge import compare
+from recon.holography.learned import Learned
+from recon.holography.pose import Pose
 from recon.holography.spot_list import SpotField
 from recon.holography.target import EVERYWHERE
 
@@ -67,12 +69,23 @@ def test_the_pattern_file_shows_the_picture(capsys):
 def test_without_a_lens_the_fields_size_is_said_and_photographs_are_refused(capsys):
     assert main(["hologram", "picture.png", "--iterations", "3", "--distance-mm", "80"]) == 0
     display = replace(bench(), distance_mm=80.0)
-    assert f"the picture is {display.field_mm:.4g} mm wide, 80 mm behind the mask" in capsys.readouterr().err
+    assert (
+        f"the picture's field is {display.field_mm:.4g} mm wide, 80 mm behind the mask"
+        in capsys.readouterr().err
+    )
     _, facts = read_slm_image("slm.png")
     assert facts["options"]["distance_mm"] == 80.0
     config = parse_config(Path("bench.toml").read_text(), Path("bench.toml"))
     with pytest.raises(BenchError, match="80 mm away without a lens"):
         display_of_pattern(config, ((96, 128), 8.0), facts)
+    with pytest.raises(BenchError, match="80 mm away without a lens"):  # as the window asks for it
+        photograph_hologram(None, [], display, None)
+    taught, still = Learned.nothing(display), np.zeros((1, 1, 2))
+    learned = Alignment(Pose(), {}, still, 1.0, {}, display.mask.shape, simulated=True, learned=taught)
+    assert learned.of(replace(display, distance_mm=None)).learned is not None
+    with pytest.raises(FileError, match="learned behind the display's Fourier lens"):
+        learned.of(display)
+    assert HologramOptions().display_of(display).distance_mm == 80.0
 
 
 def test_eight_bits_and_binning_survive_the_file():

@@ -47,7 +47,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     ([*RECONSTRUCT, "--calibration", "near", "--image", "photo.tif", "--z-mm", "30"], "has one depth, 20 mm"),
     (["demo", "nothing"], "there are camera, film, display"),
     (["plan", "shwo"], "Did you mean show?"),
-    (["chart", "hologram", "head"], "Did you mean --hologram head?"),
+    (["chart", "--hologram", "head"], "Did you mean diffuserbench chart hologram ...?"),
     ([*PAIR, "photo.tif"], "photo.tif: no option says what it is for"),
     ([*PAIR, "--figure", "o.gif"], ".png, .pdf or .svg"),
     (["reconstruct", *PAIR[3:], "--out", "/proc/o.tif"], "Choose another place"),
@@ -64,7 +64,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["analyze", "plain"], "--volume FOLDER"),
     (["compare", "cal", "plain"], "--volume FOLDER"),
     (["refocus", "psf.tif", "--z-mm", "20", "--out", "near"], "--psf FILE"),
-    (["chart", "--calibration", "plain", "--image", "photo.tif"], "--volume FOLDER"),
+    (["chart", "photograph", "--calibration", "plain", "--image", "photo.tif"], "--volume FOLDER"),
     (["show", "plain"], "plain"),
     (["verify", "cal"], "is no run folder"),
 ]

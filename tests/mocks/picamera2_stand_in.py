@@ -25,6 +25,8 @@ CONTROLS = {
     "AnalogueGain": (1.0, 16.0, 1.0),
     "FrameDurationLimits": (4_000, 1_000_000, 33_333),
     "LensPosition": (0.0, 32.0, 1.0),
+    "ColourGains": (0.0, 32.0, None),  # of two numbers, though their limits are one's
+    "ExposureTimeMode": (0, 1, 0),
 }
 
 

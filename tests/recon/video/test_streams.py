@@ -174,6 +174,38 @@ def test_what_a_solver_knows_moves_with_a_scene_that_moves_as_a_whole(camera: st
     assert apart[0] < 0.85 * apart[1]
 
 
+def test_motion_farther_than_details_are_wide_is_told_from_lights_that_go_on_and_off() -> None:
+    rng = np.random.default_rng(0)
+    places = rng.integers(0, 64, 90), rng.integers(0, 160, 90)
+
+    def seen(by: float, lit: np.ndarray) -> np.ndarray:
+        scene = np.zeros((64, 160))
+        np.add.at(scene, places, lit)
+        light = shift(gaussian_filter(scene, 1), (0, by), order=1)[:, 32:128]
+        return (20 * light / light.std() + rng.normal(0, 1, light.shape)).astype(np.float32)[None]
+
+    moves, blinks = Panning(), Panning()
+    valid, lit = np.ones((1, 64, 96), bool), np.ones(90)
+    told = [moves.next(seen(7.0 * n, lit), valid) for n in range(4)]
+    np.testing.assert_allclose(told, [(0, 0)] + [(0, 7)] * 3, atol=0.2)
+    assert {blinks.next(seen(0, rng.random(90) > 0.5), valid) for _ in range(12)} == {(0.0, 0.0)}
+
+
+@pytest.mark.parametrize("prior", ["tv", "l1"])
+def test_what_is_known_through_varying_psfs_moves_with_the_scene(prior: str) -> None:
+    scene = make_scene("beads", size=24, depths=2, grid=3)
+    posed = stream_problem(
+        scene.measurement, scene.calibration, prior=prior, model="lowrank", estimate_background=False
+    )
+    video = VideoSolver(posed, cold_iterations=3, warm_iterations=1)
+    video.next(scene.measurement)
+    (solver,) = video.solvers
+    before = solver.solution
+    solver.move(0.0, 2.0)
+    np.testing.assert_array_equal(solver.solution, np.roll(before, 2, axis=-1))
+    assert np.isfinite(video.next(scene.measurement)).all()
+
+
 @pytest.mark.parametrize("by", [(0.0, 3.0), (-2.5, 0.3)])
 def test_images_and_their_spectra_move_alike(by: tuple[float, float]) -> None:
     smooth = gaussian_filter(np.random.default_rng(0).random((2, 24, 30)), (0, 3, 3), mode="wrap")
