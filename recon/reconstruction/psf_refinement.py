@@ -64,6 +64,8 @@ LEAST = 1e-12
 """Mean square of what is left, below which tiles do not differ."""
 TOLD_DEG, TOLD_SCALE = 1.0, 0.02
 """Standard deviations of turn and scale from which the photograph tells nothing."""
+STRUCTURE = 0.1
+"""Of the noise, left on held-out pixels: a photograph with less is flat, and what fits it is rounding."""
 CERTAIN = 3.0
 """Standard errors by which held-out pixels, and the parameters, must differ for a copy to be the better."""
 
@@ -106,7 +108,11 @@ class Refinement:
     @property
     def told(self) -> bool:
         """Whether the photograph tells size and turn: else errors of the model alone may look like a fit."""
-        return 0 < self.rotation_error_deg <= TOLD_DEG and (self.scale_error or 0.0) <= TOLD_SCALE
+        return (
+            self.given > STRUCTURE
+            and 0 < self.rotation_error_deg <= TOLD_DEG
+            and (self.scale_error or 0.0) <= TOLD_SCALE
+        )
 
     def of(self, calibration: Calibration) -> Calibration:
         """Return the calibration with the copy, and its sources where they then are; as given if no help."""

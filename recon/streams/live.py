@@ -22,6 +22,7 @@ from recon.reconstruction.reconstruct import given, reconstruct
 from recon.reconstruction.reduction import on_blocks, reduced_calibration
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import Progress
+from recon.streams.detail import Detail, ladder
 from recon.streams.fit import CalibrationWatch
 from recon.streams.live_picture import NOISE_ONLY, ComingLevel, Level, LiveOptions, LivePicture
 from recon.streams.pace import Pace, Spent
@@ -44,14 +45,14 @@ class LiveReconstructor:
 
     For one thread. It never waits and keeps no queue: feed it the newest frame whenever it is done with the
     one before (:class:`instrument.live.live.LiveView` does). Where the machine is too slow, pictures get
-    coarser (binning) and then rougher (fewer iterations, at last a Wiener filter), and say so; they do not
-    get late.
+    coarser (binning, or half of the depths or fewer, see :func:`recon.streams.detail.ladder`) and then
+    rougher (fewer iterations, at last a Wiener filter), and say so; they do not get late.
 
     The first picture of a scene is a Wiener filter's, at once; from the next on, or by :meth:`refine`, it is
     iterated. While the scene is still, frames are averaged and iterations go on from frame to frame, so that
     the picture converges. While it moves, they go on from the picture before. After a cut, they begin anew.
-    Another binning is prepared in a thread of its own while pictures go on. One that finds no memory is said
-    in ``warnings`` and not tried again until :meth:`restart`; pictures go on as they are.
+    Other pixels or depths are prepared in a thread of its own while pictures go on. Those that find no memory
+    are said in ``warnings`` and not tried again until :meth:`restart`; pictures go on as they are.
 
     Raises InputError when the calibration or an option is unusable, or no solver has a way for them.
 
@@ -98,15 +99,15 @@ class LiveReconstructor:
         checked = self._checked()
         self.calibration, self._options = checked.calibration, checked.options
         self.warnings = self._doubts = checked.warnings
-        self._n_planes = checked.n_planes
+        self._n_planes, self._z_um = checked.n_planes, checked.depths.z_um
         if live.plane is not None and live.plane >= self._n_planes:
             raise InputError(f"plane {live.plane} is none of the {self._n_planes} depths, counted from 0.")
         self.budget_ms = live.budget_ms
         self._sensor = checked.sensor_shape
         binnings = range(live.finest, live.coarsest + 1)
         fine_enough = [b for b in binnings if min(self._sensor) >= LEAST_SIDE * b]
-        self._binnings = fine_enough or [live.finest]
-        self._pace = Pace(self._binnings)
+        self._details = ladder(checked.depths.central, fine_enough or [live.finest], live.plane)
+        self._pace = Pace(list(self._details))
         self._level: Level | None = None
         self._coming: ComingLevel | None = None
         self._watch = SceneWatch(live.average)
@@ -158,7 +159,7 @@ class LiveReconstructor:
         small = block_mean(frame, level.binning, about_axis=True)
         self._scene = self._watch.see(small)
         self._dark = not self._sees_light(level, frame)
-        affordable = self._pace.affordable(level.binning, self.budget_ms)
+        affordable = self._pace.affordable(level.detail.coarseness, self.budget_ms)
         cut = self._scene is SceneState.NEW and not self._greeted
         too_slow = affordable < 1 and self._scene is not SceneState.STILL
         self._greeted = self._scene is SceneState.NEW
@@ -227,13 +228,20 @@ class LiveReconstructor:
         measurement = Measurement(pixels, **self._known)
         return reconstruct(measurement, self._given, self.options, on_progress=on_progress, cancel=cancel)
 
-    def shown(self, volume: Floats) -> Floats:
-        """Return the picture of depths (n_z, ...): of the one chosen, else each pixel's brightest."""
+    def shown(self, volume: Floats, planes: tuple[int, ...] | None = None) -> Floats:
+        """Return the picture of depths (n_z, ...): of the one chosen, else each pixel's brightest.
+
+        Parameters
+        ----------
+        planes : tuple of int, optional
+            Which depths of the calibration the volume has; default all.
+        """
         if len(volume) == 1:  # one depth, or the filter's picture of one
             return np.ascontiguousarray(volume[0])
-        return np.ascontiguousarray(
-            volume.max(axis=0) if self.live.plane is None else volume[self.live.plane]
-        )
+        plane = self.live.plane
+        if plane is None:
+            return np.ascontiguousarray(volume.max(axis=0))
+        return np.ascontiguousarray(volume[plane if planes is None else planes.index(plane)])
 
     def restart(self) -> None:
         """Forget the scene, the machine's timing and the noise, and give up what solvers hold.
@@ -243,7 +251,7 @@ class LiveReconstructor:
         if self._level is not None and self._level.solver is not None:
             self._level.solver.close()
         self._level = self._coming = None
-        self._pace = Pace(self._binnings)
+        self._pace = Pace(list(self._details))
         self.warnings = self._doubts
         self._shape = ()
         self._watch.forget()
@@ -258,9 +266,9 @@ class LiveReconstructor:
             return False
         if not level.lit and self._coming is None:
             self._level = replace(level, lit=True)  # once, also where there is no memory for another
-            self._make(level.binning, frame)
+            self._make(level.detail, frame)
         self._fit.see(
-            lambda: level.problem.with_data(mean.copy()), level.binning, self._scene, self._watch.count
+            lambda: level.whole.with_data(mean.copy()), level.binning, self._scene, self._watch.count
         )
         if self._fit.advice and self._fit.advice not in self.warnings:
             self.warnings = (*self.warnings, self._fit.advice)
@@ -270,7 +278,7 @@ class LiveReconstructor:
         self, level: Level, began: Spent, at_most: int | None, newer: Callable[[], bool]
     ) -> tuple[int, Spent]:
         """Do one iteration, and more while they fit into the budget; return how many, and what they took."""
-        cost = self._pace.cost(level.binning)
+        cost = self._pace.cost(level.detail.coarseness)
         assert level.solver is not None
         ahead_ms = 0.0 if cost is None else cost.step.wall_ms + 0.5 * cost.fixed.wall_ms
         first = _now()
@@ -287,41 +295,48 @@ class LiveReconstructor:
         """Return the level for the next frame: the one there is, until another is made."""
         if self._level is None:
             try:
-                self._level = self._level_of(self._first_binning(), frame.copy())
+                self._level = self._level_of(self._first_detail(), frame.copy())
             except InputError:
                 self._shape = ()  # a frame that is refused settles nothing
                 raise
-            self._pace.enter(self._level.binning)
-            self._coming = ComingLevel(self._level.binning, self._level.solving)
+            self._pace.enter(self._level.detail.coarseness)
+            self._coming = ComingLevel(self._level.detail, self._level.solving)
         elif self._coming is not None:
             if self._coming.wait(0):
                 self._take_up(self._coming)
         elif self._level.solver is None:  # there was no memory for it
-            coarser = next((b for b in self._pace.levels if b > self._level.binning), None)
+            coarser = next((c for c in self._pace.levels if c > self._level.detail.coarseness), None)
             if coarser is not None:
-                self._make(coarser, frame)
-        elif (wanted := self._pace.next_level(self.budget_ms)) != self._level.binning:
-            self._make(wanted, frame)
+                self._make(self._details[coarser], frame)
+        elif (wanted := self._pace.next_level(self.budget_ms)) != self._level.detail.coarseness:
+            self._make(self._details[wanted], frame)
         return self._level
 
-    def _level_of(self, binning: int, frame: Floats) -> Level:
-        """Return the level of a binning, without a solver, for a frame on the calibration's pixels."""
+    def _level_of(self, detail: Detail, frame: Floats) -> Level:
+        """Return the level of some detail, without a solver, for a frame on the calibration's pixels."""
+        binning, planes = detail.binning, detail.planes
         valid = np.broadcast_to(True if self._valid is None else self._valid, frame.shape)
         measurement = on_blocks(frame, valid, self._known.get("noise"), binning, flat=len(self._shape) == 2)
         calibration = reduced_calibration(self.calibration, binning, None)
-        plane = self._n_planes // 2 if self.live.plane is None else self.live.plane
-        problem = stream_problem(measurement, calibration, self._options, choosing=False)
-        return Level.of(problem, binning, plane)
+        problem = whole = stream_problem(measurement, calibration, self._options, choosing=False)
+        if len(planes) < self._n_planes:
+            fewer = reduced_calibration(calibration, 1, planes)
+            problem = stream_problem(measurement, fewer, self._options, choosing=False)
+        return Level.of(problem, detail, whole, planes.index(self._filtered_plane(detail)))
 
-    def _first_binning(self) -> int:
-        """Return the finest binning at which a first picture takes no time to speak of."""
-        n_pixels, levels = int(np.prod(self._sensor)), self._pace.levels
-        return next((b for b in levels if n_pixels <= AT_ONCE * b**2), levels[-1])
+    def _filtered_plane(self, detail: Detail) -> int:
+        """Return the depth that a Wiener filter shows: the one chosen, else the middle one there is."""
+        return detail.planes[len(detail.planes) // 2] if self.live.plane is None else self.live.plane
 
-    def _make(self, binning: int, frame: Floats) -> None:
+    def _first_detail(self) -> Detail:
+        """Return the most at which a first picture takes no time to speak of."""
+        n_pixels, details = int(np.prod(self._sensor)), [self._details[c] for c in self._pace.levels]
+        return next((d for d in details if n_pixels <= AT_ONCE * d.binning**2), details[-1])
+
+    def _make(self, detail: Detail, frame: Floats) -> None:
         """Begin to make a level for a frame on the calibration's pixels."""
         kept = frame.copy()
-        self._coming = ComingLevel(binning, lambda: self._level_of(binning, kept).solving())
+        self._coming = ComingLevel(detail, lambda: self._level_of(detail, kept).solving())
 
     def _solving_level(self, newer: Callable[[], bool]) -> Level | None:
         """Return the level in use once it has a solver; None when a newer frame comes first."""
@@ -340,20 +355,19 @@ class LiveReconstructor:
             level = coming.result()
         except MemoryError:
             self._coming = None
-            self._do_without(coming.binning)
+            self._do_without(coming.detail)
         else:
             self._enter(level)
 
-    def _do_without(self, binning: int) -> None:
-        """Say that there is no memory for a binning, and give it up."""
+    def _do_without(self, detail: Detail) -> None:
+        """Say that there is no memory for these pixels and depths, and give them up."""
         assert self._level is not None
-        self._pace.give_up(binning)
-        present = self._level.binning
+        self._pace.give_up(detail.coarseness)
         how = "are a Wiener filter's," if self._level.solver is None else "go on"
         self.warnings = (
             *self.warnings,
-            f"There was no memory to iterate pictures binned {binning} x {binning}: they {how} binned "
-            f"{present} x {present}. End what else needs memory, then begin anew.",
+            f"There was no memory to iterate pictures {detail.words(self._z_um)}: they {how} "
+            f"{self._level.detail.words(self._z_um)}. End what else needs memory, then begin anew.",
         )
 
     def _enter(self, level: Level) -> None:
@@ -362,7 +376,8 @@ class LiveReconstructor:
         if level.binning != self._level.binning:
             self._watch.forget()
             self._greeted = True  # a scene already shown is iterated at once
-            self._pace.enter(level.binning)
+        if level.detail != self._level.detail:
+            self._pace.enter(level.detail.coarseness)
         if self._level.solver is not None:
             self._level.solver.close()
         self._level, self._coming = level, None
@@ -409,12 +424,11 @@ class LiveReconstructor:
 
     def _picture(self, level: Level, volume: Floats, done: int, began: Spent) -> LivePicture:
         """Return a picture: of the filter, or of ``done`` iterations."""
-        filtered, of = done == 0, f"of {self._n_planes} depths"
-        plane = self.live.plane
-        if filtered and plane is None:
-            plane = self._n_planes // 2
+        filtered, detail = done == 0, level.detail
+        plane = self._filtered_plane(detail) if filtered else self.live.plane
+        of = f"{self._n_planes} depths" if filtered else detail.depths(self._z_um)
         return LivePicture(
-            image=self.shown(volume),
+            image=self.shown(volume, detail.planes),
             binning=level.binning,
             method="wiener" if filtered else level.method,
             iterations=done,
@@ -425,11 +439,12 @@ class LiveReconstructor:
             work_ms=(_now() - began).wall_ms,
             budget_ms=self.budget_ms,
             volume=volume if len(volume) > 1 else None,
+            planes=(plane,) if filtered and plane is not None else detail.planes,
             shown=""
             if self._n_planes == 1
-            else f"brightest {of}"
+            else f"brightest of {of}"
             if plane is None
-            else f"depth {plane} {of}",
+            else f"depth {plane} of {of}",
             doubt=NOISE_ONLY if self._dark else self._fit.doubt,
         )
 

@@ -18,6 +18,7 @@ from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
 from recon.solvers.wiener import WienerFilter, cross_validated
+from recon.streams.detail import Detail
 from recon.streams.stillness import SceneState, has_light
 from recon.streams.video import VideoSolver
 
@@ -40,7 +41,7 @@ class LiveOptions:
 
     budget_ms: float = option(
         33.0,
-        help="Time for one picture: pixels and iterations give way to it.",
+        help="Time for one picture: pixels, depths and iterations give way to it.",
         unit="ms",
         above=0,
         group=_LIVE,
@@ -97,8 +98,10 @@ class LivePicture:
     budget_ms: float
     """Time that it was allowed."""
     volume: Floats | None = None
-    """(n_z, height, width[, n_channels]): all depths, where several are reconstructed; None for a filter's
-    picture."""
+    """(n_z, height, width[, n_channels]): the depths ``planes``, where several are reconstructed; None for a
+    filter's picture."""
+    planes: tuple[int, ...] = (0,)
+    """Depths of the calibration that were reconstructed, the nearest is 0: all, or fewer in short time."""
     shown: str = ""
     """Which of several depths ``image`` shows, in words."""
     doubt: str = ""
@@ -121,15 +124,17 @@ class LivePicture:
 
 @dataclass(frozen=True)
 class Level:
-    """Live pictures at one binning.
+    """Live pictures of some pixels and planes.
 
     Brightness does not depend on the binning: one binned pixel holds the light of all its pixels.
     """
 
     problem: Problem
-    """Of a first frame on binned pixels, which settles noise, scales and weights."""
-    binning: int
-    """Pixels averaged along each axis."""
+    """Of a first frame on binned pixels and these planes, which settles noise, scales and weights."""
+    detail: Detail
+    """Pixels and planes."""
+    whole: Problem
+    """Of the same frame and every plane: what the calibration is judged by."""
     preview: Part
     """Of the same frame through one PSF, without a background: what the filter is for."""
     filter: WienerFilter
@@ -139,18 +144,23 @@ class Level:
     """None until it was made: a filter is made in a moment, for the first picture."""
 
     @classmethod
-    def of(cls, problem: Problem, binning: int, plane: int) -> Level:
-        """Return a level without a solver, whose filter is for one of the depths."""
+    def of(cls, problem: Problem, detail: Detail, whole: Problem, plane: int) -> Level:
+        """Return a level without a solver, whose filter is for one of its depths."""
         plain = problem if problem.together else _preview(problem, plane)
         part = Part(plain, slice(0, plain.n_channels))
         operator = part.picture_operator
         wiener = WienerFilter(operator, cross_validated(operator, part.data))
-        return cls(problem, binning, part, wiener, has_light(_filled(problem), problem.noise))
+        return cls(problem, detail, whole, part, wiener, has_light(_filled(problem), problem.noise))
 
     def sees_light(self, frame: Floats, count: int) -> bool:
         """Tell whether the mean of ``count`` frames, shaped as those that came, holds more than noise."""
         seen = self.problem.with_data(frame)
         return has_light(_filled(seen), self.problem.noise / np.float32(count) ** 0.5)
+
+    @property
+    def binning(self) -> int:
+        """Pixels averaged along each axis."""
+        return self.detail.binning
 
     @cached_property
     def method(self) -> str:
@@ -207,8 +217,8 @@ def _preview(problem: Problem, plane: int) -> Problem:
 class ComingLevel:
     """A level being made in a thread of its own, while pictures go on at the one before."""
 
-    def __init__(self, binning: int, make: Callable[[], Level]) -> None:
-        self.binning = binning
+    def __init__(self, detail: Detail, make: Callable[[], Level]) -> None:
+        self.detail = detail
         pool = ThreadPoolExecutor(1, "live level")
         self._made = pool.submit(make)
         pool.shutdown(wait=False)

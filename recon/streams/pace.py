@@ -1,8 +1,9 @@
-"""How fine a live picture the machine affords at present: binning and iterations for a budget of time.
+"""How fine a live picture the machine affords at present: pixels, planes and iterations for a budget of time.
 
 Knows no clock: it is told what things took. Two times are told apart: the work of the picture's thread, which
 pixels cost, and its waiting for a processor that others use, which coarser pixels may or may not lessen. What
-a binning takes is measured while it is in use; a coarser one that did not help is left again.
+a binning takes is measured while it is in use; a coarser one that did not help is left again. Planes left out
+are levels like binnings: a level's work is less by its square (:class:`recon.streams.detail.Detail`).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ SOON = 60
 MEMORY = 7
 """Pictures whose median tells what things take: of single ones it says nothing."""
 HELPED = 0.8
-"""A coarser binning has helped when its pictures take at most this share of the finer one's time."""
+"""A coarser level has helped when its pictures take at most this share of the finer one's time."""
 LEAST_WORK = 0.2
 """Share of a picture's time that must be work for coarser pixels to be worth trying."""
 HOLD = 150
@@ -95,14 +96,14 @@ class Pace:
 
     Parameters
     ----------
-    levels : sequence of int
-        Binnings to choose from, ascending.
+    levels : sequence of float
+        Coarsenesses to choose from, ascending: a binning's is its factor.
     """
 
-    def __init__(self, levels: Sequence[int]) -> None:
+    def __init__(self, levels: Sequence[float]) -> None:
         self.levels = tuple(levels)
-        self._records: dict[int, _Record] = {}
-        self._known: dict[int, Cost] = {}
+        self._records: dict[float, _Record] = {}
+        self._known: dict[float, Cost] = {}
         """Of binnings that were in use before: their work still tells, their waiting does not."""
         self._level = self.levels[0]
         self._votes = 0
@@ -110,7 +111,7 @@ class Pace:
         """Pictures since the binning in use was entered."""
         self._held = 0
         """Pictures for which no coarser binning is tried."""
-        self._came_from: tuple[int, float] | None = None
+        self._came_from: tuple[float, float] | None = None
         """The finer binning that was left for this one, and what its pictures took."""
         self._went_finer = False
         self._patience = PATIENCE_FINER
@@ -132,7 +133,7 @@ class Pace:
             step_ms = record.least_step_ms * spent.wall_ms / record.least_filter_ms
             record.step.append(Spent(step_ms, min(_median(record.step).work_ms, step_ms)))
 
-    def cost(self, level: int) -> Cost | None:
+    def cost(self, level: float) -> Cost | None:
         """Return what a level takes, another's guessed from the one in use; None where that is not known."""
         here = self._record.cost
         if level == self._level or here is None:
@@ -142,19 +143,19 @@ class Pace:
             return here.scaled((self._level / level) ** 2)
         return Cost(here.fixed.for_work(known.fixed.work_ms), here.step.for_work(known.step.work_ms))
 
-    def affordable(self, level: int, budget_ms: float) -> int:
+    def affordable(self, level: float, budget_ms: float) -> int:
         """Return how many iterations fit into a budget at a level; the least before anything is known."""
         cost = self.cost(level)
         if cost is None:
             return LEAST_ITERATIONS
         return max(int((budget_ms - cost.fixed.wall_ms) / max(cost.step.wall_ms, 1e-3)), 0)
 
-    def fits(self, level: int, budget_ms: float) -> bool:
+    def fits(self, level: float, budget_ms: float) -> bool:
         """Whether a level leaves time for enough iterations."""
         return self.affordable(level, budget_ms) >= LEAST_ITERATIONS
 
     # The binning -----------------------------------------------------------------------------------
-    def enter(self, level: int) -> None:
+    def enter(self, level: float) -> None:
         """Go on at another level."""
         before = self._record.cost
         if before is not None:
@@ -169,13 +170,13 @@ class Pace:
         self._level, self._votes, self._since = level, 0, 0
         self._records[level] = _Record()
 
-    def give_up(self, level: int) -> None:
+    def give_up(self, level: float) -> None:
         """Choose a level no more that cannot be had, nor finer ones unless one of those is in use."""
         self.levels = tuple(b for b in self.levels if b > level or (level > self._level and b != level))
         self._came_from = None
         self._votes = 0
 
-    def next_level(self, budget_ms: float) -> int:
+    def next_level(self, budget_ms: float) -> float:
         """Return the level for the pictures to come: another one only when several in a row asked for it."""
         self._since += 1
         self._held = max(self._held - 1, 0)
@@ -203,12 +204,14 @@ class Pace:
         if self._came_from is None or len(self._record.step) < MEMORY:
             return False
         cost = self._record.cost
-        helped = cost is not None and cost.least.wall_ms <= HELPED * self._came_from[1]
+        finer, took_ms = self._came_from
+        share = max(HELPED, (1 + (finer / self._level) ** 2) / 2)  # half of what a small step can save
+        helped = cost is not None and cost.least.wall_ms <= share * took_ms
         if helped:
             self._came_from = None
         return not helped
 
-    def _right(self, budget_ms: float) -> int:
+    def _right(self, budget_ms: float) -> float:
         level, cost = self._level, self._record.cost
         if cost is None or len(self._record.step) < PATIENCE_COARSER:
             return level

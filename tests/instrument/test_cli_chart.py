@@ -401,6 +401,15 @@ def test_own_calibrations_are_compared(own, monkeypatch, tmp_path):
     assert (out / "chart.png").stat().st_size > 5000
 
 
+def test_an_own_photograph_is_charted_by_pixels_held_out(own, quick):
+    result = run("photograph", "-c", own / "one", "-i", own / "photo.tif", "--out", own / "c")
+    assert result.exit_code == 0, result.output
+    assert "Held out" in result.output
+    assert quick == ["wiener convolution none", "admm convolution tv"]
+    points = json.loads((own / "c" / "chart.json").read_text())["points"]
+    assert all(p["held_out"] > 0 and p["psnr_db"] is None for p in points)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

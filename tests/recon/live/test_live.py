@@ -200,7 +200,7 @@ def test_a_coarser_binning_without_memory_is_told_once_and_pictures_go_on(lackin
         taking(reconstructor, fixed_ms=10, step_ms=60)
         picture = reconstructor.feed(photograph(0.5 * (len(tried) % 2), len(tried)))
         if reconstructor._coming is not None:
-            tried.append(reconstructor._coming.binning)
+            tried.append(reconstructor._coming.detail.binning)
             reconstructor._coming.wait()
     assert tried == [2, 3]
     assert picture.binning == 3
@@ -224,7 +224,7 @@ def test_a_finer_binning_without_memory_is_not_tried_again(
     for n in range(12):
         picture = reconstructor.feed(photograph(0.5 * (n % 2), n))
         if reconstructor._coming is not None:
-            tried.append(reconstructor._coming.binning)
+            tried.append(reconstructor._coming.detail.binning)
             reconstructor._coming.wait()
     assert tried == [1]
     assert (picture.binning, picture.method) == (4, "admm-sensor")

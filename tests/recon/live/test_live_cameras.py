@@ -10,14 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
-from recon import InputError, reconstruct
+from recon import Calibration, InputError, reconstruct
 from recon.camera.camera_model import CAMERAS
 from recon.evaluation.scene import make_scene
 from recon.priors import PRIORS
 from recon.reconstruction.solvers import SOLVERS
+from recon.streams.detail import ladder
 from recon.streams.live import LiveReconstructor
 from recon.streams.live_picture import LivePicture
+from recon.streams.pace import Spent
 from recon.streams.video import VideoSolver, stream_problem
 
 OWN = Path(__file__).parents[3] / "examples" / "own_methods"
@@ -118,6 +121,56 @@ def test_of_several_depths_the_brightest_is_shown_or_one_that_is_chosen(channels
         assert chosen.volume is not None
         np.testing.assert_array_equal(chosen.image, chosen.volume[plane])
         assert f"depth {plane} of 2 depths" in chosen.quality
+
+
+def caustics(likeness: float, depths: int = 16) -> np.ndarray:
+    """PSFs (depths, 1, SIZE, SIZE), each alike to the one before to ``likeness``."""
+    rng = np.random.default_rng(0)
+    patterns = [gaussian_filter(rng.normal(size=(SIZE, SIZE)), 1.5)]
+    for _ in range(depths - 1):
+        other = gaussian_filter(rng.normal(size=(SIZE, SIZE)), 1.5)
+        patterns.append(likeness * patterns[-1] + (1 - likeness**2) ** 0.5 * other)
+    return (np.stack(patterns)[:, None] - np.min(patterns)).astype(np.float32)
+
+
+@pytest.mark.parametrize(("likeness", "first"), [(0.999, "planes"), (0.2, "pixels")])
+def test_planes_hardly_told_apart_go_before_pixels_and_others_after(likeness: float, first: str) -> None:
+    whole, then, *_, last = ladder(caustics(likeness), (1, 2), 5).values()
+    assert (whole.binning, whole.planes) == (1, tuple(range(16)))
+    assert ("pixels" if then.binning > 1 else "planes") == first
+    assert last.binning == 2
+    assert 5 in then.planes
+    assert 5 in last.planes
+    assert len(ladder(caustics(likeness, 2), (1, 2), None)) == 2  # of two depths both are kept
+
+
+def test_depths_give_way_to_the_budget_are_said_and_come_back() -> None:
+    psfs, z_um = caustics(0.97), 1e3 * np.linspace(10, 13, 16)
+    calibration = Calibration(psfs / psfs.sum(axis=(2, 3), keepdims=True), np.c_[np.zeros((16, 2)), z_um])
+    frames = [1e3 * psfs[5, 0] + np.random.default_rng(n).normal(0, 1, (SIZE, SIZE)) for n in range(8)]
+    live = LiveReconstructor(
+        calibration, prior="l1", estimate_background=False, noise=1.0, plane=5, coarsest=1, budget_ms=10.0
+    )
+    live.feed(frames[0])
+
+    def taking(step_ms: float, pictures: int) -> LivePicture:
+        """Feed frames, each of which is believed to take 1 ms and so much an iteration."""
+        for n in range(pictures):
+            for _ in range(7):
+                live._pace.note(Spent(1.0, 1.0), Spent(step_ms, step_ms), 1)
+            picture = live.feed(frames[n % 8])
+            if live._coming is not None:
+                live._coming.wait()
+        return picture
+
+    assert "depth 5 of 16 depths," in taking(2.0, 3).quality
+    fewer = taking(6.0, 4)
+    assert fewer.planes == (0, 2, 5, 6, 9, 11, 13, 15)
+    assert fewer.volume is not None
+    np.testing.assert_array_equal(fewer.image, fewer.volume[2])
+    assert "depth 5 of 8 of 16 depths (10, 10.4, ..., 13 mm)" in fewer.quality
+    live.budget_ms = 20.0
+    assert taking(4.0, 25).planes == tuple(range(16))
 
 
 def test_a_frame_that_is_refused_settles_nothing() -> None:
