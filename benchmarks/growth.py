@@ -2,6 +2,7 @@
 
     python benchmarks/growth.py [--most 1.0] [--out growth] [--iterations 30]
     python benchmarks/growth.py --told            # what reconstructions say early, and what they took
+    python benchmarks/growth.py --before          # memory that volumes say before they are solved
 
 Cases run in processes of their own on points seen through random lenslets (SIMULATED): first the
 forecast that ``reconstruct --explain`` gives, from six iterations, then the whole of it. Written are
@@ -16,6 +17,7 @@ import argparse
 import csv
 import multiprocessing
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -106,16 +108,21 @@ def measure(case: Case, iterations: int, foretold: bool, answer: Any) -> None:
 
 def measured(case: Case, iterations: int) -> tuple[float, float, float, float]:
     """Forecast and run a case, each in a process of its own."""
-    found: list[float] = []
-    for foretold in (True, False):
-        context = multiprocessing.get_context("spawn")
-        ours, theirs = context.Pipe(duplex=False)
-        process = context.Process(target=measure, args=(case, iterations, foretold, theirs))
-        process.start()
-        theirs.close()
-        found += ours.recv()
-        process.join()
-    return found[0], found[1], found[2], found[3]
+    told = in_process(measure, case, iterations, True)
+    took = in_process(measure, case, iterations, False)
+    return told[0], told[1], took[0], took[1]
+
+
+def in_process(work: Callable[..., None], *arguments: object) -> tuple[float, float]:
+    """Do what sends two numbers in a process of its own."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=work, args=(*arguments, theirs))
+    process.start()
+    theirs.close()
+    first, second = ours.recv()
+    process.join()
+    return first, second
 
 
 def tell_default(size: int) -> None:
@@ -136,6 +143,42 @@ def tell_default(size: int) -> None:
         )
 
 
+def take_volume(case: Case, prior: str, answer: Any) -> None:
+    """Reconstruct a volume; sends what was said of memory before the first iteration, and its bytes."""
+    set_threads(case.threads)
+    options = ReconstructionOptions(
+        model="convolution", prior=prior, iterations=14, tolerance=0.0, judged=False
+    )
+    small = scene(Case(side=48, planes=case.planes))
+    reconstruct(small[0][0], small[1], options, iterations=2)  # kernels are compiled
+    (photograph,), calibration = scene(case)
+    said: list[str] = []
+    meter = MemoryMeter()
+    reconstruct(photograph, calibration, options, on_stage=lambda _, what: said.append(what))
+    number, unit = next(what for what in said if "takes about" in what).split()[-4:-2]
+    answer.send((float(number) * (GIB if unit == "GiB" else 2**20), meter.peak_mib() * 2**20))
+
+
+def tell_before() -> None:
+    """Print what volumes say they take before they are solved, and what they took; a process each."""
+    for planes, side, threads in (
+        (4, 192, 1),
+        (8, 128, 1),
+        (8, 192, 2),
+        (16, 192, 1),
+        (16, 192, 2),
+        (32, 128, 2),
+    ):
+        for prior in ("tv", "l1"):
+            case = Case(side=side, planes=planes, threads=threads)
+            told, took = in_process(take_volume, case, prior)
+            print(
+                f"{prior:<3}{planes:4} planes of {side} x {side}, {threads} threads: "
+                f"{took / 2**20:6.1f} MiB (told {told / took - 1:+.0%})",
+                flush=True,
+            )
+
+
 def slope(sizes: list[int], values: list[float]) -> float:
     """Return the exponent of growth over the two largest sizes."""
     ratio = np.log(sizes[-1] / sizes[-2])
@@ -148,11 +191,15 @@ def main() -> None:
     parser.add_argument("--most", type=float, default=1.0, help="pixels, times those of 1024 x 1024")
     parser.add_argument("--iterations", type=int, default=30)
     parser.add_argument("--told", action="store_true", help="only: what is told early, by default options")
+    parser.add_argument("--before", action="store_true", help="only: memory said before the first iteration")
     parser.add_argument("--only", help="one of pixels, planes, PSFs, frames, threads")
     parser.add_argument("--out", type=Path, default=Path("growth"))
     options = parser.parse_args()
     if options.told:
         tell_default(96)
+        return
+    if options.before:
+        tell_before()
         return
     options.out.mkdir(parents=True, exist_ok=True)
     wanted = {k: v for k, v in cases(options.most).items() if options.only in (None, k)}

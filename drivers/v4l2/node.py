@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 from collections.abc import Callable, Iterator
@@ -61,7 +62,10 @@ class Node:
         """Close the node; closing twice does nothing."""
         fd, self._fd = self._fd, None
         if fd is not None:
-            self._kernel.close(fd)
+            with contextlib.suppress(
+                OSError
+            ):  # what a driver says at the end: the node is closed all the same
+                self._kernel.close(fd)
 
     # Calls -----------------------------------------------------------------------------------------
     def call(self, request: int, argument: Structure, doing: str) -> None:

@@ -77,10 +77,15 @@ class HologramsPanel(Panel):
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
         session = self.session
+        across = split(left := QWidget())
+        fill(self.body, across)
         self.form = self._make_form()
         yield
         self._names = SuggestedName(self.jobs, self.form, session.runs_folder / "holograms", ".png")
         self.views = HologramViews()
+        yield
+        across.addWidget(self.views)
+        across.setStretchFactor(1, 1)
         yield
         self.target = self.views.target
         tip = "Take off all that was painted (left button paints, right button rubs out)"
@@ -102,8 +107,8 @@ class HologramsPanel(Panel):
         self.capture_button = button("Show and photograph", tip, self.photograph)
         self.progress = share_bar()
         yield
-        left = fill(
-            QWidget(),
+        fill(
+            left,
             (scrolled(self.form), 1),
             self.clear,
             self.views.plane,
@@ -111,8 +116,7 @@ class HologramsPanel(Panel):
             in_row(self.preview_button, self.compute_button, self.stop_button),
             in_row(self.show_button, self.capture_button),
         )
-        yield
-        fill(self.body, split(left, self.views, sizes=[330, 850], stretch=1))
+        across.setSizes([330, 850])
         yield
         self.form.refused.connect(self.refused)
         self.form.settled.connect(self._settled)

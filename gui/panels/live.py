@@ -60,11 +60,12 @@ class LivePanel(Panel):
 
     @classmethod
     def prepare(cls) -> None:
-        """Compile what shows a frame."""
+        """Compile what shows a frame, and one that is turned."""
         for dtype in (np.uint8, np.uint16):
             blank = np.zeros((2, 2), dtype)
             blank.flags.writeable = False  # as a frame's
-            fill_indices(blank, index_table(dtype, 0, 1), 1, np.zeros((2, 2), np.uint8))
+            for turned in (blank, blank.T, blank[::-1]):
+                fill_indices(turned, index_table(dtype, 0, 1), 1, np.zeros((2, 2), np.uint8))
 
     def parts(self) -> Iterator[None]:
         """Make the widgets."""

@@ -367,10 +367,13 @@ class ReconstructionsPanel(Panel):
             return
         runs = self.session.runs_folder
         job = self.follow(self.jobs.compute("Saving the fitted PSF", lambda _: result.keep_fitted(runs)))
-        job.succeeded.connect(self._kept)
+        self.keep_button.setEnabled(False)  # once is enough
+        job.ended.connect(lambda: self.keep_button.setEnabled(True))
+        job.succeeded.connect(lambda folder: self._kept(result, folder))
 
-    def _kept(self, folder: Path) -> None:
-        self.keep_button.hide()
+    def _kept(self, result: StoredResult, folder: Path) -> None:
+        if self.result is result:  # else the button is that of another's
+            self.keep_button.hide()
         self.session.log("info", f"The PSF as it was fitted to the photograph: {folder}")
         self.form.options.set_values({"calibration": folder, "refine_psf": False})
         self.session.handed_on.emit("live_reconstruction", folder)

@@ -323,7 +323,9 @@ class PanelPlace(QScrollArea):
     def hold(self, content: QWidget) -> None:
         """Put a panel here."""
         self.content = content
-        self.setWidget(_Holder(content))
+        holder = _Holder(content)
+        self.setWidget(holder)  # first: each new parent has all of a panel take its looks again
+        holder.take()
 
 
 class _Holder(QWidget):
@@ -335,9 +337,14 @@ class _Holder(QWidget):
     def __init__(self, content: QWidget) -> None:
         super().__init__()
         self._content = content
-        content.setParent(self)
-        content.installEventFilter(self)
-        content.show()
+
+    def take(self) -> None:
+        """Have the child inside."""
+        self._content.setParent(self)
+        self._content.installEventFilter(self)
+        self._content.resize(self.size())
+        self._content.show()
+        self.updateGeometry()
 
     def minimumSizeHint(self) -> QSize:  # noqa: N802 - Qt's name
         """Return the least size that the child can have."""

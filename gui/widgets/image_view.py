@@ -279,6 +279,8 @@ class ImageView(QWidget):
             if key != self._table_key:
                 self._table, self._table_key = index_table(image.dtype, low, high, full_scale), key
             if image.ndim == 2:
+                image = image.view()
+                image.flags.writeable = False  # as a frame is: for another kind it would be compiled here
                 fill_indices(image, self._table, step, self._indices)
                 return
             height, width = self._indices.shape[:2]

@@ -160,7 +160,7 @@ class ConvergenceView(QWidget):
             "Residual in units of what the noise explains (1: nothing is left to explain), "
             "and relative change of the result an iteration"
         )
-        self.legend = label()
+        self.legend = label(wraps=True)
         self.legend.setMinimumWidth(10)
         self.against_time = QCheckBox("seconds")
         self.against_time.setToolTip("Horizontal axis: wall seconds of the solver instead of iterations")

@@ -23,6 +23,8 @@ Array = npt.NDArray[Any]
 
 LARGEST_PX = 80_000
 """Of larger sensors the middle is taken."""
+DIMMEST = 0.25
+"""Light of the middle, an area's squares, relative to the whole's: of a darker one more pixels are taken."""
 RIM_PX = 24
 """Kept dark around patterns, for shifts."""
 
@@ -76,14 +78,15 @@ class Middle:
         pixels = LARGEST_PX
         while True:
             middle = cls._within(calibration, z_um, step_per_um, pixels, dark_rim)
-            if middle.part == 1 or middle.spread * reach < 1 / z_um:
+            if middle is not None and (middle.part == 1 or middle.spread * reach < 1 / z_um):
                 return middle
             pixels *= 2
 
     @classmethod
     def _within(
         cls, calibration: Calibration, z_um: float, step_per_um: float, pixels: int, dark_rim: bool
-    ) -> Middle:
+    ) -> Middle | None:
+        """Return a middle of so many pixels; None where too little light falls on them."""
         whole = calibration.psfs.shape[-2:]
         shape = _largest(whole, pixels)
         if shape == whole:
@@ -101,9 +104,12 @@ class Middle:
         )
         rims = [RIM_PX if dark_rim and m < n else 0 for n, m in zip(whole, shape, strict=True)]
         lit = tuple(m - 2 * rim for m, rim in zip(shape, rims, strict=True))
-        psf = np.pad(_middle(psf_at(cut, z_um), lit), [(rim, rim) for rim in rims])
         part = _middle(nearest, lit)
-        lost = float(np.square(nearest, dtype=np.float64).sum() / np.square(part, dtype=np.float64).sum())
+        light, held = (float(np.square(image, dtype=np.float64).sum()) for image in (nearest, part))
+        if held <= DIMMEST * light * part.size / nearest.size:
+            return None
+        lost = light / held
+        psf = np.pad(_middle(psf_at(cut, z_um), lit), [(rim, rim) for rim in rims])
         distance_um = 1e3 * (calibration.geometry.diffuser_distance_mm or 0.0)
         step = axial_resolution(psf, z_um, distance_um).step_per_um
         return cls(

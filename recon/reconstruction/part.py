@@ -172,21 +172,13 @@ class Part:
             raise NoMemoryError(f"This picture needs {self.plan}. Bin the images, or allow more.")
 
     def _convolution(self, psfs: Array) -> Convolution:
-        height, width = self.problem.sensor_shape
         camera = Convolution(
             psfs,
-            (height, width),
+            self.problem.sensor_shape,
             dtype=self.dtype,
             allocate=lambda shape, dtype: self.storage.zeros(shape, dtype, lasting=True),
         )
-        self.plan = memory.plan(
-            kind_of(self.problem.prior_name),
-            camera.domain_shape,
-            psfs.size,
-            len(psfs) * height * width,
-            itemsize=self.dtype.itemsize,
-            available=self._limit,
-        )
+        self.plan = volume_plan(self.problem)
         if not self.plan.fits:
             scratch = memory.scratch_for(self.plan, self.problem.options.scratch)
             self.storage = memory.Storage(scratch, self.plan.room)
@@ -373,6 +365,21 @@ class Part:
     def noise_norm(self) -> float:
         """Expected norm of the noise in the data."""
         return float(np.sqrt(np.count_nonzero(self.valid)))
+
+
+def volume_plan(problem: Problem) -> memory.MemoryPlan:
+    """Return the memory that one channel takes through one PSF a depth."""
+    n_z, _, *psf = problem.levelled[0].central.shape
+    field, _ = field_of(problem.sensor_shape, (psf[0], psf[1]))
+    limit = problem.options.memory_gib
+    return memory.plan(
+        kind_of(problem.prior_name),
+        (1, n_z, *fft.fast_shape(field)),
+        n_z * psf[0] * psf[1],
+        n_z * problem.sensor_shape[0] * problem.sensor_shape[1],
+        itemsize=np.dtype(problem.precision).itemsize,
+        available=None if limit is None else int(limit * memory.GIB),
+    )
 
 
 def parts_of(problem: Problem) -> list[slice]:

@@ -85,15 +85,16 @@ def reconstruct(
     known, options = given(overrides, options)
     if not isinstance(measurement, Measurement):
         measurement = Measurement(measurement)
+    course = Course(options, on_stage)
     problem = Problem.of(replace(measurement, **known), calibration, options)
     require_two_images(problem)
     if options.uncertainty and (reason := refused(problem)) is not None:
         raise InputError(f"{reason[0].upper()}{reason[1:]}.")
-    course, refinement = Course(options, on_stage), None
+    refinement = None
     if options.refine_psf:
         problem, refinement = refined(problem, on_stage=course.stage("refine"), cancel=cancel)
     problem = choose(problem, on_stage=course.stage("choose"))
-    watch = course.iterations(on_progress, len(parts_of(problem)), problem.stop_tolerance)
+    watch = course.iterations(on_progress, len(parts_of(problem)), problem)
     result = solve(problem, warm=warm, on_progress=watch, cancel=cancel, keeper=keeper)
     if options.uncertainty:
         result = uncertain(result, problem, on_stage=course.stage("uncertainty"), cancel=cancel)

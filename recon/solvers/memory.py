@@ -106,7 +106,13 @@ def plan(
     real = n_z * height * width * itemsize
     volumes = 2 * spectrum + 4 * real if kind == "tv" else spectrum + real
     plane = height * (width // 2 + 1) * 2 * itemsize
-    work = (psf_values + result_values) * itemsize + plane * (GROUPS + 6 * get_threads() + 8)
+    groups, result = min(GROUPS, n_z), result_values * itemsize
+    if kind == "tv":  # the sweep's scratch, or, when that is over, a copy of the solution and the result
+        scratch = (4 + 5 * min(get_threads(), n_z) + 0.6 * groups) * plane
+        beside = max(scratch, result + real + 2 * plane)
+    else:
+        beside = result + (9 + 0.5 * groups) * plane
+    work = psf_values * itemsize + groups * plane + int(beside)
     # TV: the spectra X (twice read and written) and g (twice read), four states read and written. l1: z read
     # and written, the transfer functions read.
     traffic = 6 * spectrum + 8 * real if kind == "tv" else spectrum + 2 * real
@@ -152,6 +158,11 @@ class MemoryMeter:
             yield
         finally:
             self._before += _reset_peak_mib() - present
+
+
+def resident_bytes() -> float:
+    """Return the memory that this process takes now; NaN where the system does not say."""
+    return _status_mib("VmRSS") * 2**20
 
 
 def _reset_peak_mib() -> float:

@@ -57,7 +57,7 @@ class OperatorAdmm(ExactAdmm):
     tuning : Tuning, optional
     shown : tuple of slice, optional
         Rows and columns whose change an iteration is told, by default all: the field beyond the sensor, which
-        hardly bends the data, goes on moving long after what is shown has settled.
+        hardly bends the data, goes on moving long after what is shown has settled. All where they are dark.
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
@@ -102,7 +102,10 @@ class OperatorAdmm(ExactAdmm):
         before = self.solution[window]
         record = super().step()
         now = self.solution[window]
-        return replace(record, change=float(np.sqrt(squares(now - before) / max(squares(now), 1e-300))))
+        size = squares(now)
+        if size == 0:  # all light is beyond what is shown, and decides
+            return record
+        return replace(record, change=float(np.sqrt(squares(now - before) / size)))
 
     def move(self, rows: float, columns: float) -> None:
         """Move object and dual variables."""

@@ -58,8 +58,8 @@ class Panning:
         window = _window(image)
         spectrum = _spectrum(image, window)
         before, self._before = self._before, (image, spectrum)
-        if before is None or before[0].shape != image.shape:
-            return 0.0, 0.0
+        if before is None or before[0].shape != image.shape or min(image.shape) < 2 * COARSER:
+            return 0.0, 0.0  # of a few rows edges fade out all
         by = _shift(spectrum, before[1], image.shape)
         rows, columns = (binning * float(d) for d in by)
         if np.hypot(rows, columns) < LEAST_PX:

@@ -118,11 +118,14 @@ def test_a_camera_that_hangs_ends_a_live_view_and_every_reader_that_waits(
         stream.reader().next_frame()
     camera.let_go.set()
     stream.close()
-    let_go = threading.Event()
+    let_go, stopped = threading.Event(), threading.Event()
     monkeypatch.setattr(camera, "start_sequence", lambda _: let_go.wait(30))
+    monkeypatch.setattr(camera, "stop_sequence", stopped.set)
     with pytest.raises(DeviceTimeoutError, match="hangs: starting its sequence"):
         FrameStream(camera).start()
+    assert not stopped.is_set()
     let_go.set()
+    assert stopped.wait(5), "a sequence that began after all runs on"
 
 
 @pytest.mark.usefixtures("mock_drivers", "soon")

@@ -402,6 +402,7 @@ def test_a_fitted_psf_is_kept_and_used_from_then_on(
         panel.show_result(StoredResult(tmp_path / "p.tif", np.zeros((20, 30), np.float32), None, record))
         assert panel.keep_button.isHidden() is not used
     qtbot.mouseClick(panel.keep_button, Qt.MouseButton.LeftButton)
+    assert not panel.keep_button.isEnabled()
     qtbot.waitUntil(lambda: bool(given), timeout=WAIT_MS)
     ((name, folder),) = given
     assert name == "live_reconstruction"

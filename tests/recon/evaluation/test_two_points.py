@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -87,6 +89,19 @@ def test_depths_of_the_middle_are_spread_as_its_extent_is_smaller(monkeypatch: p
     assert dark.spread > part.spread
     farther = Middle.of(whole, 50e3, step, reach=0.9 / 50e3)
     assert farther.part > part.part
+
+
+def test_a_pattern_that_is_dark_in_the_middle_is_seen_farther_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(middle, "LARGEST_PX", 60 * 60)
+    ring = _calibration((160, 180))
+    y, x = np.indices((160, 180))
+    ring.psfs[..., np.hypot(y - 80, x - 90) < 45] = 0
+    for rim in (False, True):
+        found = Middle.of(ring, 50e3, 2e-6, dark_rim=rim)
+        assert found.part > 0.2
+        assert found.psf_at(50e3).any()
+    small = replace(ring, psfs=np.where(y + x < 60, _calibration((160, 180)).psfs.max(), 0 * ring.psfs))
+    assert Middle.of(small, 50e3, 2e-6).part == 1
 
 
 def test_a_small_colour_sensor_has_room_for_one_pair_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:

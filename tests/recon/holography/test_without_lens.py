@@ -63,3 +63,22 @@ def test_planes_are_counted_from_there_and_what_is_too_near_is_refused() -> None
         HologramModel(replace(DISPLAY, distance_mm=30.0), [Target(picture)])
     with pytest.raises(InputError, match="distance_mm"):
         HologramOptions(distance_mm=-1.0)
+
+
+def test_behind_a_lens_planes_above_zero_lie_towards_it_where_phases_are_delays() -> None:
+    side, pitch_mm, nm, f_mm = 256, 8e-3, 532.0, 35.0
+    mask = no_mask((side, side), design_wavelength_nm=nm)
+    _, factor = Display((side, side), mask, slm_pitch_um=8.0, wavelength_nm=nm, focal_mm=f_mm).defocus(3.0)
+    x = (np.arange(1 << 16) - (1 << 15)) * 5e-4
+    column = np.floor(x / pitch_mm + side / 2).astype(int)
+    lit = (column >= 0) & (column < side)
+    field = np.zeros(len(x), complex)
+    field[lit] = factor.conj()[column[lit]]  # a focus in the model's plane
+    f, wavelength_mm = fft.fftfreq(len(x), 5e-4), nm * 1e-6
+
+    def further(field: np.ndarray, mm: float) -> np.ndarray:
+        return fft.ifft(fft.fft(field) * np.exp(-1j * np.pi * wavelength_mm * mm * f**2))
+
+    behind = further(field, f_mm) * np.exp(-1j * np.pi * x**2 / (wavelength_mm * f_mm))
+    before, after = (abs(further(behind, f_mm + z_mm)[1 << 15]) ** 2 for z_mm in (-3.0, 3.0))
+    assert before > 10 * after

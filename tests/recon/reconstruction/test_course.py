@@ -1,14 +1,21 @@
 from __future__ import annotations
 
+import tracemalloc
+from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
-from recon import reconstruct
+from recon import Calibration, reconstruct
 from recon.evaluation.scene import make_scene
 from recon.reconstruction import reconstruct as door
 from recon.reconstruction.course import TOLD_AT, expected_iterations
+from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import volume_plan
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.solve import solve
 from recon.solvers.base import IterationRecord
 
 
@@ -32,6 +39,41 @@ def test_one_measure_of_all_stages_that_never_goes_back(channels, options):
     usual = ["choosing", "iteration", "judging", "judged"]
     more = ["fitting", "choosing", "iteration", "uncertainty", "judging", "judged"]
     assert stages == (more if "refine_psf" in options else usual)
+
+
+@pytest.mark.parametrize("prior", ["tv", "l1"])
+def test_a_volume_says_its_memory_before_the_first_iteration(prior):
+    scene = make_scene("beads", size=24, depths=3)
+    asked = {"model": "convolution", "prior": prior, "iterations": 2, "judged": False}
+    said = []
+    reconstruct(scene.measurement, scene.calibration, on_stage=lambda _, what: said.append(what), **asked)
+    first = next(i for i, what in enumerate(said) if what.startswith("iteration 1,"))
+    assert said[first - 1].startswith("solving: takes about ")
+    assert said[first].endswith(said[first - 1].removeprefix("solving").removeprefix(": "))
+    said.clear()
+    one = replace(scene.calibration, psfs=scene.calibration.psfs[:1], source_positions_um=np.zeros((1, 3)))
+    reconstruct(scene.measurement, one, on_stage=lambda _, what: said.append(what), **asked)
+    assert not any("memory" in what for what in said), "of pictures it is not foreseen"
+
+
+def test_the_plan_counts_what_solvers_of_volumes_take():
+    """Within 10 % of what NumPy says it took at the peak, for two volumes of each prior."""
+    rng = np.random.default_rng(0)
+    for prior, planes in (("tv", 3), ("tv", 12), ("l1", 3), ("l1", 12)):
+        psfs = (rng.random((planes, 1, 48, 48)) ** 30).astype(np.float32)
+        places = np.stack([np.zeros(planes), np.zeros(planes), 1e4 + 1e3 * np.arange(planes)], 1)
+        asked = ReconstructionOptions(
+            model="convolution", prior=prior, iterations=3, tolerance=0.0, judged=False
+        )
+        photograph = rng.poisson(200 * psfs[1, 0] + 5).astype(np.float32)
+        problem = Problem.of(Measurement(photograph), Calibration(psfs, places), asked)
+        plan = volume_plan(problem)
+        solve(problem)  # what is made once is there
+        tracemalloc.start()
+        solve(problem)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert plan.total == pytest.approx(peak, rel=0.1), (prior, planes)
 
 
 def test_an_error_in_the_check_of_the_calibration_leaves_the_verdict(monkeypatch):

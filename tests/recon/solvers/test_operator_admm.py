@@ -116,6 +116,17 @@ def test_the_change_is_that_of_what_is_shown():
     assert record.change != pytest.approx(of_all.change, rel=1e-3)
 
 
+def test_where_nothing_is_shown_the_light_beyond_goes_on_until_it_is_settled():
+    camera, central, data = problem()
+    prior = L1(0.2 * float(np.abs(camera.adjoint(data)).max())) + NonNegativity()
+    rules = StoppingRules(iterations=300, tolerance=1e-4)
+    dark = slice(0, 3), slice(-3, None)
+    one, whole = (OperatorAdmm(camera, central, data, prior, **k) for k in ({"shown": dark}, {}))
+    first, other = one.run(rules), whole.run(rules)
+    assert not first.solution[(..., *dark)].any()
+    assert 5 < len(first.history) == len(other.history) < 300
+
+
 def test_stops_on_nan_and_on_request():
     _, _, data = problem()
     bad = data.copy()

@@ -188,6 +188,8 @@ def test_motion_farther_than_details_are_wide_is_told_from_lights_that_go_on_and
     valid, lit = np.ones((1, 64, 96), bool), np.ones(90)
     told = [moves.next(seen(7.0 * n, lit), valid) for n in range(4)]
     np.testing.assert_allclose(told, [(0, 0)] + [(0, 7)] * 3, atol=0.2)
+    line = Panning()
+    assert {line.next(seen(7.0 * n, lit)[:, :1], valid[:, :1]) for n in range(3)} == {(0.0, 0.0)}
     assert {blinks.next(seen(0, rng.random(90) > 0.5), valid) for _ in range(12)} == {(0.0, 0.0)}
 
 
