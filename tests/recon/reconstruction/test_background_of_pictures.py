@@ -11,7 +11,7 @@ import pytest
 from recon import reconstruct
 from recon.evaluation.scene import Family, TestScene, make_scene
 from recon.reconstruction import selection
-from recon.reconstruction.background import DARKEST, DARKEST_PERCENTILE, LIT_PICTURE, Trial, floor
+from recon.reconstruction.background import DARKEST, DARKEST_PERCENTILE, LIT_PICTURE, Trial, floor, trial_of
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
@@ -42,6 +42,15 @@ def test_without_room_for_stray_light_nobody_looks(monkeypatch: pytest.MonkeyPat
     scene = lit(0.0)
     image = scene.measurement - np.percentile(scene.measurement, 10)
     assert reconstruct(image, scene.calibration.psfs[0, 0], iterations=5, judged=False).background is None
+
+
+def test_no_channels_pass_ends_early_where_several_are_judged_together() -> None:
+    scene = make_scene("texture", size=32, photons=3000.0, seed=4)
+    options = ReconstructionOptions(z_um=float(scene.z_um[0]))
+    one = Problem.of(Measurement(scene.measurement), scene.calibration, options)
+    alone, wholly = trial_of([one]), trial_of([one], whole=True)
+    assert alone.without > wholly.without  # a bound: nothing was left to decide
+    assert trial_of([one, one]).without == pytest.approx(wholly.without)
 
 
 @pytest.mark.parametrize(
