@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -121,6 +122,7 @@ SMALL_PT, BODY_PT, LARGE_PT, TITLE_PT = 9, 10, 12, 16
 _now = [DARK]
 
 
+_log = logging.getLogger(__name__)
 _half: WeakSet[QWidget] = WeakSet()
 """Parts that have a theme's sheet and, as another was chosen meanwhile, not all of its colours."""
 
@@ -196,7 +198,10 @@ def restyled(part: QWidget) -> Iterator[None]:
     yield
     for widget in (part, *part.findChildren(QWidget)):
         if isValid(widget) and hasattr(widget, "restyle"):
-            widget.restyle()
+            try:
+                widget.restyle()
+            except Exception:  # noqa: BLE001 - the parts after it get theirs
+                _log.exception("%s keeps the colours of the theme before", type(widget).__name__)
             yield
     _half.discard(part)
 

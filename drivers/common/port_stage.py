@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -157,8 +158,14 @@ class PortStage(PolledStage):
         for name in self.axis_options:
             self._homed.discard(name)
             self._left.discard(name)
-            self._send_home(name)
-            self._homing[name] = time.monotonic()
+            self._homing[name] = math.inf  # from now on a stop, and what the controller says, are of it
+            try:
+                self._send_home(name)
+            except DeviceError:
+                self._homing.pop(name, None)
+                raise
+            if name in self._homing:
+                self._homing[name] = time.monotonic()
 
     def _came_home(self, name: str, *, moving: bool) -> bool:
         """Whether an axis that was sent home has just come to rest, for controllers that do not tell."""

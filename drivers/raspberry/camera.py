@@ -218,8 +218,13 @@ class RaspberryCamera(RunningCamera):
         if not least <= number <= most or (not isinstance(least, float) and number != round(number)):
             problem = f"control {name} does not take {value!r}."
             raise LimitError(self.name, problem, f"It takes {known.takes}.")
+        before = dict(self._own)
         self._own[name] = type(least)(number)
-        self._apply()
+        try:
+            self._apply()
+        except DeviceError:
+            self._own = before
+            raise
         return self._own[name]
 
     # Exposure and gain -----------------------------------------------------------------------------

@@ -61,6 +61,7 @@ class Watcher:
                 self._nobody.set()
 
     def _watch(self, nobody: threading.Event) -> None:
+        logged = ""
         while not nobody.is_set():
             self.trouble = ""
             if not self._is_operated():
@@ -69,8 +70,10 @@ class Watcher:
                 except (DeviceError, BenchError) as error:
                     self.trouble = "" if self._is_operated() else str(error)
                 except Exception as error:  # noqa: BLE001 - the page says it, and the next try follows
-                    _log.exception("the camera could not be watched")
                     self.trouble = f"The camera could not be watched: {type(error).__name__}: {error}."
+                    if self.trouble != logged:  # not at every try
+                        _log.exception("the camera could not be watched")
+                    logged = self.trouble
             nobody.wait(_RETRY_S)
 
     def _is_operated(self) -> bool:

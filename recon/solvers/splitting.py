@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -329,6 +330,11 @@ class VolumeSplitting(Solver):
     _on_device: Array | None = None
     _total: Array | None = None
     """Spectrum of what the planes cast but for the data term's step, once there is one."""
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint of a solver of the same problem; what was cast before is not its."""
+        super().restore(state)
+        self._total = None
 
     def _keep_total(self, total: Array) -> Array:
         """Keep what the planes cast for data to come; return it."""

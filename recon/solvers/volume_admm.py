@@ -256,6 +256,11 @@ class VolumeAdmm(ExactAdmm):
     _cast: Array | None = None
     """Spectrum of ``e / mu`` as X has it, where it was moved since."""
 
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint of a solver of the same problem."""
+        super().restore(state)
+        self._cast = None
+
     def set_data(self, data: SensorData) -> None:
         """Go on with other data, the data term solved for them at once."""
         super().set_data(data)

@@ -133,6 +133,11 @@ def lasts(course: Array) -> bool:
     return variance > 0 and float(np.mean(np.diff(course) ** 2)) < LASTING * variance
 
 
+def _own(change: Array) -> Array:
+    """Return a change less what the whole field does: light that comes and goes is no noise."""
+    return np.asarray(change - np.median(change))
+
+
 def noise_of(frames: Floats) -> float:
     """Return the noise of frames, deviation of means of 3 x 3 pixels, where half of the light is.
 
@@ -153,9 +158,9 @@ def noise_of(frames: Floats) -> float:
     for frame in frames:
         smooth = uniform_filter(frame, 3)
         if before:
-            steps += np.square(smooth - before[-1])
+            steps += np.square(_own(smooth - before[-1]))
         if len(before) == APART:
-            apart += np.square(smooth - before[0])
+            apart += np.square(_own(smooth - before[0]))
         light += smooth
         before.append(smooth)
     bright = light >= brightness(light)

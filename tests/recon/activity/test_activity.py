@@ -263,3 +263,9 @@ def test_noise_that_lasts_from_frame_to_frame_counts_in_full() -> None:
     own, kept = noise_of(10 + fresh), noise_of(10 + lasting)
     assert own == pytest.approx(1 / 3, rel=0.05)
     assert kept > 0.85 * own  # 0.63 from frame to frame
+
+
+def test_light_that_breathes_over_the_whole_field_is_no_noise() -> None:
+    fresh = 10 + np.random.default_rng(3).normal(size=(80, 24, 24)).astype(np.float32)
+    breath = 5 * np.sin(np.arange(80) / 8).astype(np.float32)
+    assert noise_of(fresh + breath[:, None, None]) == pytest.approx(noise_of(fresh), rel=0.1)
