@@ -15,6 +15,7 @@ from pytestqt.qtbot import QtBot
 
 import gui.panels.live_reconstruction as live_reconstruction
 from gui.main_window import MainWindow
+from gui.panels.live import LivePanel
 from gui.panels.live_reconstruction import LiveReconstructionPanel
 from gui.session import BenchSession
 from instrument.files.calibration_file import load_calibration, save_calibration
@@ -42,7 +43,10 @@ def measure_psf(session: BenchSession, folder: Path) -> Path:
 @pytest.fixture
 def panel(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> LiveReconstructionPanel:
     session = window.session
-    qtbot.waitUntil(lambda: not session.jobs.device_jobs, timeout=WAIT_MS)
+    # With its first frame the live view lights the scene where it is dark: not after a test has put it out.
+    live = window.show_panel("live")
+    assert isinstance(live, LivePanel)
+    qtbot.waitUntil(lambda: live.picture.frame is not None and not session.jobs.device_jobs, timeout=WAIT_MS)
     folder = measure_psf(session, tmp_path / "calibration")
     panel = window.show_panel("live_reconstruction")
     assert isinstance(panel, LiveReconstructionPanel)
