@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from typing import ClassVar
 
@@ -213,7 +213,8 @@ class V4l2Camera(RunningCamera):
         if not self._connected:
             self._require()
         made = self._controls.set(self._controls.named(name), value)
-        self._look_at_controls()
+        with suppress(DeviceLostError):  # it was set; what comes next says that the camera has gone since
+            self._look_at_controls()
         return made
 
     def own_settings(self) -> Mapping[str, OwnSetting]:

@@ -314,6 +314,25 @@ def test_gain_is_a_factor_by_the_configured_unit() -> None:
         assert camera.set_gain(2.0) == pytest.approx(10 ** (30 * 0.2 / 20))
 
 
+def test_a_control_that_unplugs_the_camera_is_set_and_what_comes_next_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    kernel = FakeKernel()
+    with camera_on(kernel) as camera:
+        camera.start_sequence(4)
+        set_value = kernel._s_ctrl
+
+        def unplugs(data: object) -> int:
+            kernel.unplugged = True
+            return set_value(data)
+
+        monkeypatch.setattr(kernel, "_s_ctrl", unplugs)
+        camera.set_control("pan_reset", 1)  # a button: nothing is read back
+        assert not camera.is_open
+        with pytest.raises(DeviceLostError, match="is gone"):
+            camera.next_frame(5.0)
+
+
 def test_controls_of_the_sensors_own_node_are_the_cameras() -> None:
     kernel = FakeKernel()
     del kernel.controls[fake.EXPOSURE], kernel.controls[fake.GAIN]
