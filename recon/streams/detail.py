@@ -93,11 +93,14 @@ def ladder(central: Floats, binnings: Sequence[int], plane: int | None) -> dict[
 
 
 def _spread(n_planes: int, count: int, plane: int | None) -> tuple[int, ...]:
-    """Return so many planes from the first to the last, ``plane`` in the place of its nearest."""
-    kept = np.linspace(0, n_planes - 1, count).round().astype(int)
-    if plane is not None:
-        kept[np.argmin(np.abs(kept - plane))] = plane
-    return tuple(kept.tolist())
+    """Return so many planes from the first to the last, ``plane`` in the place of its nearest between."""
+    kept = np.linspace(0, n_planes - 1, count).round().astype(int).tolist()
+    if plane is None or plane in kept:
+        return tuple(kept)
+    between = kept[1:-1]
+    if between:
+        between.remove(min(between, key=lambda k: abs(k - plane)))
+    return tuple(sorted({kept[0], *between, plane, kept[-1]}))
 
 
 def _held_by_pixels(psf: Floats, binning: int) -> float:

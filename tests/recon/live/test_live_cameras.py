@@ -259,3 +259,12 @@ def test_stray_light_that_a_photograph_would_have_a_background_for_is_said(stray
     picture = reconstructor.feed(scene.measurement)
     assert any("--background" in text for text in reconstructor.warnings) == bool(stray)
     assert not picture.doubt
+
+
+@pytest.mark.parametrize("shown", [0, 1, 4, 6, 7])
+def test_the_first_the_last_and_the_depth_shown_are_never_left_out(shown: int) -> None:
+    base = np.random.default_rng(0).random((24, 24)).astype(np.float32)
+    alike = np.array([base + 1e-3 * k * base**2 for k in range(8)], np.float32)[:, None]
+    offered = ladder(alike, [1, 2], shown).values()
+    assert min(len(detail.planes) for detail in offered) < 8
+    assert all({0, shown, 7} <= set(detail.planes) for detail in offered)
