@@ -212,13 +212,14 @@ def changed(value: Any, number: float) -> Any:
 
 def soon() -> None:
     """Shorten the waits for a device that hangs."""
-    from drivers.common import stream
+    from drivers.common import checked, stream
     from instrument.bench import bench, photograph, safety
 
     for module in (stream, bench, safety):
         setattr(module, "STOP_ANSWER_S", SOON_S)  # noqa: B010 # its type is final
     for module in (stream, photograph):
         setattr(module, "CALL_MARGIN_S", SOON_S)  # noqa: B010
+    checked.call_limit_s = lambda *_: SOON_S
     SimulatedCamera.longest_silence_s = SOON_S
 
 
