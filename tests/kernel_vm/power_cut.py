@@ -55,7 +55,7 @@ def _logged(mount: Path) -> None:
         writer.start(steps=FRAMES)
         for index in range(FRAMES):
             writer.write([FrameToStore(index, np.full((4, 5), index, np.uint8), METADATA)])
-            _do("dmsetup", "message", "logged", 0, "mark", f"frame {index}")
+            _do("dmsetup", "message", "logged", 0, "mark", f"frame-{index}")
         writer.finish(FinishReason.COMPLETED)
     _do("dmsetup", "message", "logged", 0, "mark", "completed")
     _do("umount", mount)
@@ -83,7 +83,7 @@ def _problems(mount: Path, promised: Sequence[str]) -> list[str]:
     _do("mount", "-o", "loop", _HERE / "cut", mount)
     try:
         runs = [path for path in mount.iterdir() if path.name[0] != "." and path.name != "lost+found"]
-        frames = {int(words.removeprefix("frame ")) for words in promised if words.startswith("frame")}
+        frames = {int(words.removeprefix("frame-")) for words in promised if words.startswith("frame")}
         if not runs:
             return [f"no run, and {len(frames)} frames promised"] * bool(frames)
         run = Run.open(runs[0])

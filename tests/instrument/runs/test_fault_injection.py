@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from instrument.runs.acquire import prepare, prepare_resume
 from instrument.runs.inspection import verify
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_files import RunError
+from instrument.runs.runner import RunStatus
 from tests.mocks.devices import MockDevice, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")
@@ -210,3 +212,18 @@ def test_a_stage_that_fails_mid_run_loses_nothing(tmp_path: Path) -> None:
     assert sorted(run.records) == [0, 1, 2, 3, 4]
     assert "stalled" in run.error
     assert np.all(run.frame(4) > 0)
+
+
+@pytest.mark.parametrize("deleted", [".", ".."])
+def test_a_run_whose_folder_is_deleted_meanwhile_ends_dark_and_says_so(tmp_path: Path, deleted: str) -> None:
+    def delete(status: RunStatus) -> None:
+        if status.done == 3:
+            shutil.rmtree((runner.path / deleted).resolve(), ignore_errors=True)
+
+    with open_mock_bench() as bench:
+        runner = prepare(bench, PLAN, tmp_path / "runs", on_progress=delete)
+        with pytest.raises(RunError) as caught:
+            runner.execute()
+        assert_safe(bench)
+    assert "which is gone" in "".join(caught.value.__notes__)
+    assert "no run folder" not in str(caught.value)
