@@ -206,8 +206,11 @@ def test_a_stage_that_fails_mid_run_loses_nothing(tmp_path: Path) -> None:
                     stall("stage (mock)")
 
         patch.setattr(MockDevice, "_call", call)
-        with pytest.raises(DeviceError, match=r"stalled.*Free its way"):
+        with pytest.raises(DeviceError, match=r"stalled.*Free its way") as caught:
             runner.execute()
+    assert f"5 of {len(PLAN)} frames are kept. For the others: diffuserbench resume" in "".join(
+        caught.value.__notes__
+    )
     run = Run.open(runner.path)
     assert sorted(run.records) == [0, 1, 2, 3, 4]
     assert "stalled" in run.error
