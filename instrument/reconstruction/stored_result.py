@@ -242,7 +242,10 @@ class StoredResult:
         if self.volume is None:
             assert self.image is not None
             text = " x ".join(map(str, self.image.shape)) + " pixels"
-            return text if self.pitch_um is None else f"{text} of {_length(self.pitch_um)}"
+            angle = self._grid("pixel_mrad")
+            sizes = [] if self.pitch_um is None else [_length(self.pitch_um)]
+            sizes += [] if angle is None else [f"{angle:.3g} mrad"]
+            return f"{text} of {' or '.join(sizes)}" if sizes else text
         colours = f", {n} channels" if (n := self.volume.n_channels) > 1 else ""
         text = " x ".join(map(str, self.volume.shape)) + f" voxels (planes, rows, columns){colours}"
         if (planes := self.planes_um) is not None:
