@@ -2,10 +2,10 @@
 
     python benchmarks/analysis_points.py [--pairs 20] [--only across along sixteen]
 
-The simulated bench's preset ``tiny``, calibrated at two depths with noise. Then points alone, at places between
-pixels and planes that the analysis has not seen, by wave optics: pairs across in a picture as the default
-reconstruction makes it; pairs along the axis and sixteen in x and z in the window that states them. Printed
-is how many are told apart at the stated distance and at 0.8 of it.
+The simulated bench's preset ``tiny``, calibrated at two depths with noise. Then points alone, at places
+between pixels and planes that the analysis has not seen, by wave optics: pairs across in a picture as the
+default reconstruction makes it; pairs along the axis and sixteen in x and z in the window that states them.
+Printed is how many are told apart at the stated distance and at 0.8 of it.
 """
 
 from __future__ import annotations
