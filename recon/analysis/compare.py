@@ -98,12 +98,14 @@ def _binned_alike(old: Calibration, new: Calibration) -> tuple[Calibration, Cali
 
     Raises InputError where they cannot be laid on one another: another camera, or another region of interest.
     """
-    pitches = [c.geometry.pixel_pitch_um for c in (old, new)]
-    sides = [old.psfs.shape[-1], new.psfs.shape[-1]]
-    ratio = sides[0] / sides[1] if None in pitches else float(np.divide(pitches[1], pitches[0]))
+    before_um, after_um = (c.geometry.pixel_pitch_um for c in (old, new))
+    ratio = old.psfs.shape[-1] / new.psfs.shape[-1]
+    if before_um is not None and after_um is not None:
+        ratio = after_um / before_um
+    known = None not in (before_um, after_um)
     factor = round(max(ratio, 1 / ratio))
     fine, coarse = (old, new) if ratio > 1 else (new, old)
-    same_pitch = None in pitches or math.isclose(max(ratio, 1 / ratio), factor, rel_tol=_SAME_PITCH)
+    same_pitch = not known or math.isclose(max(ratio, 1 / ratio), factor, rel_tol=_SAME_PITCH)
     shape = fine.psfs.shape[1], *(n // factor for n in fine.psfs.shape[2:])
     if shape != coarse.psfs.shape[1:] or not same_pitch:
         raise InputError(
