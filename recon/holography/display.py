@@ -179,13 +179,12 @@ class Display:
     def defocus(self, z_mm: float) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.complex128]]:
         """Return the Fresnel factor of a plane as a product of a column and a row (Eqs. 7.21, 7.22).
 
-        ``z_mm`` is the plane's distance from the Fourier lens' focal plane. With ``u = X / (lambda f1)`` the
-        phase is ``pi z X^2 / (lambda f1^2)``; without a lens, ``d`` in front of the picture, it is
-        ``pi X^2 / (lambda (d + z))``. The constant phase is left out.
+        ``z_mm`` is the plane's distance from the Fourier lens' focal plane, away from the lens. With
+        ``u = X / (lambda f1)`` the phase is ``-pi z X^2 / (lambda f1^2)``; without a lens, ``d`` in front of
+        the picture, it is ``pi X^2 / (lambda (d + z))``. The constant phase is left out.
 
-        Which way ``z`` counts depends on the SLM. Where a larger phase is a longer way, the picture without a
-        lens is real, ``d + z`` behind the mask, and with one ``z > 0`` lies towards the lens. Where it is a
-        shorter way, ``z > 0`` lies away from the lens, and the picture without one is virtual.
+        Both hold for an SLM whose larger phase is a longer way. Where it is a shorter way, ``z > 0`` lies
+        towards the lens, and the picture without one is virtual.
 
         Raises InputError when the factor turns by more than pi between mask pixels at the aperture's edge,
         where the plane would be aliased; without a lens, nearer than :attr:`nearest_mm`.
@@ -194,7 +193,7 @@ class Display:
         if self.distance_mm is None:
             shape, pitch_um = self.mask.shape, self.mask_pitch_um
             require_defocus(z_mm, greatest_defocus_mm(shape, pitch_um, self.wavelength_nm, self.focal_mm))
-            curvature = np.pi * z_mm / (wavelength_mm * self.focal_mm**2)
+            curvature = -np.pi * z_mm / (wavelength_mm * self.focal_mm**2)
         else:
             away_mm, least_mm = self.distance_mm + z_mm, self.nearest_mm
             if away_mm < least_mm:

@@ -151,7 +151,7 @@ class Target:
     image : ndarray, real, (height, width)
         Linear intensity, non-negative, any size and scale; row 0 is the field's top.
     z_mm : float
-        Distance of the plane from the Fourier lens' focal plane.
+        Distance of the plane from the Fourier lens' focal plane, away from the lens.
     white : float or None
         The value that PSNR counts as peak; the image's maximum by default.
     window : Window or None

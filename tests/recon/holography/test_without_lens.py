@@ -65,20 +65,29 @@ def test_planes_are_counted_from_there_and_what_is_too_near_is_refused() -> None
         HologramOptions(distance_mm=-1.0)
 
 
-def test_behind_a_lens_planes_above_zero_lie_towards_it_where_phases_are_delays() -> None:
+def test_behind_a_lens_and_without_one_larger_depths_lie_farther_from_an_slm_that_delays() -> None:
     side, pitch_mm, nm, f_mm = 256, 8e-3, 532.0, 35.0
     mask = no_mask((side, side), design_wavelength_nm=nm)
-    _, factor = Display((side, side), mask, slm_pitch_um=8.0, wavelength_nm=nm, focal_mm=f_mm).defocus(3.0)
+    lens = Display((side, side), mask, slm_pitch_um=8.0, wavelength_nm=nm, focal_mm=f_mm)
+    bare = replace(lens, distance_mm=200.0)
     x = (np.arange(1 << 16) - (1 << 15)) * 5e-4
     column = np.floor(x / pitch_mm + side / 2).astype(int)
     lit = (column >= 0) & (column < side)
-    field = np.zeros(len(x), complex)
-    field[lit] = factor.conj()[column[lit]]  # a focus in the model's plane
     f, wavelength_mm = fft.fftfreq(len(x), 5e-4), nm * 1e-6
+    kz = 2 * np.pi * np.sqrt(np.maximum(wavelength_mm**-2 - f**2, 0))
 
     def further(field: np.ndarray, mm: float) -> np.ndarray:
-        return fft.ifft(fft.fft(field) * np.exp(-1j * np.pi * wavelength_mm * mm * f**2))
+        return fft.ifft(fft.fft(field) * np.exp(1j * kz * mm))
 
-    behind = further(field, f_mm) * np.exp(-1j * np.pi * x**2 / (wavelength_mm * f_mm))
-    before, after = (abs(further(behind, f_mm + z_mm)[1 << 15]) ** 2 for z_mm in (-3.0, 3.0))
-    assert before > 10 * after
+    def in_the_middle(display: Display, z_mm: float, mm: float) -> float:
+        """Return the light on the axis, ``mm`` behind lens or SLM, of a focus in the model's plane."""
+        field = np.zeros(len(x), complex)
+        field[lit] = display.defocus(z_mm)[1].conj()[column[lit]]
+        if display.distance_mm is None:
+            field = further(field, f_mm) * np.exp(-1j * np.pi * x**2 / (wavelength_mm * f_mm))
+        return float(abs(further(field, mm)[1 << 15]) ** 2)
+
+    for z_mm in (-3.0, 3.0):
+        assert in_the_middle(lens, z_mm, f_mm + z_mm) > 10 * in_the_middle(lens, z_mm, f_mm - z_mm)
+    for z_mm in (-60.0, 60.0):
+        assert in_the_middle(bare, z_mm, 200 + z_mm) > 5 * in_the_middle(bare, z_mm, 200 - z_mm)
