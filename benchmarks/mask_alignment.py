@@ -149,8 +149,8 @@ def pulls(world: DisplayWorld, report: AlignmentReport, mask_shape: tuple[int, i
     found, _ = split_field(report.displacement(mask_shape), mask_shape)
     deep = [NAMES.index(name) for name in ("z_um", "pitch_mrad", "yaw_mrad")]
     true[deep], found[deep] = true_pose(world).vector()[deep], report.pose.vector()[deep]
-    known = zip(NAMES, (found - true) / report.error, strict=True)
-    return {f"pull_{name}": round(float(pull), 2) for name, pull in known if name != "cubic"}
+    known = zip(NAMES, found - true, report.error, strict=True)
+    return {f"pull_{name}": round(float(off / error), 2) for name, off, error in known if name != "cubic"}
 
 
 def one_start(
@@ -241,7 +241,8 @@ def main() -> None:
         write(path, lines)
     good = [line for line in lines if str(line["success"]) == "True"]
     print(f"SIMULATED: {len(good)} of {len(lines)} starts aligned")
-    pulled = [abs(float(str(line[name]))) for line in good for name in line if name.startswith("pull_") and line[name]]
+    told = [str(line[name]) for line in good for name in line if name.startswith("pull_")]
+    pulled = [abs(float(pull)) for pull in told if pull]
     if pulled:
         shares = ", ".join(f"{np.mean(np.array(pulled) <= sigma):.0%} within {sigma}" for sigma in (1, 2, 5))
         print(f"errors over stated uncertainties: {shares}, largest {max(pulled):.1f}")
