@@ -147,6 +147,6 @@ def off_middle(planes: Sequence[PsfQuality], geometry: Geometry) -> str:
     who = "the diffuser or the source stands" if one_depth else "the diffuser stands"
     return (
         f"Middle: the pattern's light lies {column:+.1f}, {row:+.1f} pixels (x, y) beside the sensor's "
-        f"middle: {who} beside it, by {off_um / 1e3:.2f} mm on the sensor, or the rail leans by {lean_mrad:.1f} "
-        "mrad; the sweep cannot tell which. PSFs are right for the places that they were taken at."
+        f"middle: {who} beside it, by {off_um / 1e3:.2f} mm on the sensor, or the rail leans by "
+        f"{lean_mrad:.1f} mrad; the sweep cannot tell which. PSFs are right where they were taken."
     )
