@@ -121,8 +121,8 @@ def _in_time(device: Device, name: str, call: Callable[[], _T]) -> _T:
     except Exception:
         raise
     except BaseException:  # Ctrl-C: nothing moves on, or is lit late, that nobody waits for
-        if name in _MOVES and undo is not None:
-            within(STOP_ANSWER_S, device.name, "stopping", undo)
+        if name in _MOVES:
+            within(STOP_ANSWER_S, device.name, "stopping", cast(Stage, device).stop)
         for thread in left:
             thread.join(_INTERRUPTED_S)
         raise
