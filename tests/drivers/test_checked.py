@@ -194,6 +194,7 @@ def test_a_call_has_the_time_that_its_device_needs() -> None:
     times_s = [call_limit_s(stage, name) for name in ("settings", "open", "move_to", "home")]
     assert times_s == [30, 120, 3000, 3000]  # three times 1 m at 1 mm/s
     assert [call_limit_s(leds, name) for name in ("set_pattern", "open", "arm")] == [30, 120, 600]
+    assert call_limit_s(made(MockCamera), "snap") == pytest.approx(2 + 3 * 0.01 + 20)
     assert call_limit_s(made(type("Bare", (MockStage,), {"axes": ()})), "wait") == 600
 
 
