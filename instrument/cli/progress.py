@@ -32,7 +32,7 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
-from instrument.cli import kept_times
+from instrument.files import kept_times
 from instrument.files.errors import duration
 from instrument.tasks.task import Advance
 
