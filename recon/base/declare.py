@@ -13,7 +13,7 @@ import enum
 import functools
 import math
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from pathlib import Path, PurePath
@@ -44,6 +44,8 @@ class Declaration:
         Unit that people type and read, and how much of ``unit`` one of it is (1000 for mm of um).
     least, most, above, below : float
         Limits of a number: ``least <= x <= most`` and ``above < x < below``.
+    infinity : float, optional
+        What the word ``inf`` stands for, in ``unit``; None: it is no value.
     choices : callable or sequence of str
         Words it can be; a callable is asked each time, so that what is registered later appears.
     group : str
@@ -81,6 +83,7 @@ class Declaration:
     most: float = math.inf
     above: float = -math.inf
     below: float = math.inf
+    infinity: float | None = None
     choices: Callable[[], Sequence[str]] | Sequence[str] = ()
     group: str = ""
     flags: tuple[str, ...] = ()
@@ -199,6 +202,8 @@ class Option:
         said = self.declaration
         kind = Integral if self.is_whole else Real
         is_number = isinstance(value, kind) and not isinstance(value, bool)
+        if value == math.inf and said.infinity is not None:
+            return None
         # A NaN fails every comparison.
         if is_number and said.least <= value <= said.most and said.above < value < said.below:  # type: ignore[operator]
             return None
@@ -233,6 +238,7 @@ class Option:
         number = ", ".join(["a whole number" if self.is_whole else "a number", *self.limits(typed=typed)])
         unit = (said.shown_unit if typed else "") or said.unit
         number += f" ({unit})" if unit else ""
+        number += ", or inf" if said.infinity is not None else ""
         if Path in self.kinds:
             words.append("the name of a file")
         return f"{', '.join(words)} or {number}" if words else number
@@ -306,16 +312,21 @@ def with_overrides(options: _T, overrides: Mapping[str, Any]) -> _T:
 
     Raises InputError for a name that is no option, with the nearest one that is.
     """
-    known = [field.name for field in dataclasses.fields(options)]  # type: ignore[arg-type]
-    for name in overrides:
+    require_known(overrides, type(options))
+    return dataclasses.replace(options, **overrides) if overrides else options  # type: ignore[type-var]
+
+
+def require_known(names: Iterable[str], *classes: type) -> None:
+    """Raise InputError for a name that is no option of these classes, with the one that may be meant."""
+    known = [field.name for cls in classes for field in dataclasses.fields(cls)]
+    for name in names:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1)
             hint = f" Did you mean {near[0]!r}?" if near else f" There are {', '.join(known)}."
             flag = f"--{name.replace('_', '-')}"  # an old name goes on working on the command line
-            if new := next((o.name for o in options_of(options) if flag in o.flags), ""):
+            if new := next((o.name for cls in classes for o in options_of(cls) if flag in o.flags), ""):
                 hint = f" It is called {new!r}."
-            raise InputError(f"{type(options).__name__} has no option {name!r}.{hint}")
-    return dataclasses.replace(options, **overrides) if overrides else options  # type: ignore[type-var]
+            raise InputError(f"{classes[0].__name__} has no option {name!r}.{hint}")
 
 
 def settled(options: _T, **values: Any) -> _T:
