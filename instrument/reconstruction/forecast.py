@@ -154,7 +154,7 @@ class Foretold:
         if like is not None:
             from numba.core import event
 
-            self._timers.enter_context(event.install_timer("numba:compile", self._compiled))  # type: ignore[no-untyped-call]
+            self._timers.enter_context(event.install_timer("numba:compile", self._compiled))
 
     def _compiled(self, seconds: float) -> None:
         self._compiled_s += seconds
