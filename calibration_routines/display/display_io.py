@@ -293,10 +293,12 @@ def laser_of(bench: Bench, wavelength_nm: float) -> LedPattern:
 
 
 # Files ------------------------------------------------------------------------------------------------
-def require_slm(bench: Bench) -> Slm:
-    """Return the bench's SLM; BenchError where it has none."""
+def require_slm(bench: Bench, only_phases: str = "") -> Slm:
+    """Return the bench's SLM; BenchError where it has none, or mirrors where ``only_phases`` says why not."""
     if bench.slm is None:
         raise BenchError(f"{bench.label} has no [slm].")
+    if only_phases and bench.slm.mirrors:
+        raise BenchError(f"{bench.slm.name} has mirrors that send light or not: {only_phases}.")
     return bench.slm
 
 

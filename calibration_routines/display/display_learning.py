@@ -16,7 +16,6 @@ from calibration_routines.procedure import Checked, Listener, Outcome, Outlook, 
 from instrument.bench.bench import Bench
 from instrument.display.hologram import Alignment, bench_display, load_alignment, save_alignment
 from instrument.files.atomic import require_new
-from instrument.files.errors import BenchError
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
 from recon.base.declare import option
@@ -81,9 +80,7 @@ class LearningProcedure(SeenAgain, Checked, Procedure):
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse a bench without SLM or with mirrors, files that cannot be read or do not fit or exist."""
-        slm = require_slm(bench)
-        if slm.mirrors:
-            raise BenchError(f"{slm.name} has mirrors that send light or not: only phases can be learned.")
+        slm = require_slm(bench, "only phases can be learned")
         if self.out is not None:
             require_new(self.out, overwrite=self.overwrite)
         if self.slm_calibration is not None:

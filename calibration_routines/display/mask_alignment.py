@@ -257,8 +257,8 @@ class AlignmentProcedure(Procedure):
     settings: AlignmentSettings = field(default_factory=AlignmentSettings)
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
-        """Refuse a bench without SLM, a display that does not fit, files that exist or cannot be read."""
-        slm = require_slm(bench)
+        """Refuse a bench without phase SLM, a display that does not fit, files that exist or are wrong."""
+        slm = require_slm(bench, "a mask is aligned by the spots of a phase SLM in their place")
         if (out := self.settings.out) is not None:
             for file in (out, out.with_suffix(".png")):
                 require_new(file, overwrite=self.settings.overwrite)

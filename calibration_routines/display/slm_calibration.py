@@ -227,8 +227,8 @@ class SlmProcedure(SeenAgain, Checked, Procedure):
         return self.levels + references + 2 + (_FLATNESS_FRAMES if self.alignment is not None else 0)
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
-        """Refuse a bench without SLM, an alignment that cannot be read, a file that exists."""
-        require_slm(bench)
+        """Refuse a bench without phase SLM, an alignment that cannot be read, a file that exists."""
+        require_slm(bench, "they have no phase that their levels could be measured by")
         if self.out is not None:
             require_new(self.out, overwrite=self.overwrite)
         if self.alignment is not None:
