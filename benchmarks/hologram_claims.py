@@ -17,8 +17,11 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import cv2
 import numpy as np
 
+from instrument.display.hologram import field_picture
+from instrument.files.images import read_image
 from instrument.files.sample_images import load_sample
 from recon.base.threads import set_threads
 from recon.holography import (
@@ -104,18 +107,22 @@ def complex_slm(slm: tuple[int, int], iterations: int) -> list[tuple[str, float]
     return lines
 
 
-def frames(slm: tuple[int, int], iterations: int) -> list[tuple[str, float]]:
-    """One, two, four and eight frames that are optimised together."""
-    lines = []
+def frames(slm: tuple[int, int], iterations: int, picture: Path | None) -> Iterator[tuple[str, float]]:
+    """One, two, four and eight frames that are optimised together; of a picture file, or the samples."""
     for q in (4, 16):
         display = display_of(slm, q)
+        shape = display.mask.shape
+        if picture is None:
+            images = [load_sample(name, shape) for name in PICTURES]
+        else:
+            own = field_picture(read_image(picture).pixels)
+            images = [cv2.resize(own, shape[::-1], interpolation=cv2.INTER_AREA).clip(0, 1)]
         for count in (1, 2, 4, 8):
             found = []
-            for name in PICTURES:
-                target = Target(load_sample(name, display.mask.shape), white=1.0)
+            for image in images:
+                target = Target(image, white=1.0)
                 found.append(psnr(solve(display, target, iterations, frames=count), display, target))
-            lines.append((f"{q}x, {count} frame(s)", float(np.mean(found))))
-    return lines
+            yield f"{q}x, {count} frame(s)", float(np.mean(found))
 
 
 def windowed(name: str, shape: tuple[int, int]) -> Target:
@@ -190,6 +197,7 @@ def main() -> None:
     parser.add_argument("--slm", default="135x240")
     parser.add_argument("--iterations", type=int, default=100)
     parser.add_argument("--only", choices=["dc", "complex", "frames", "warm", "mirrors"], help="one")
+    parser.add_argument("--picture", type=Path, help="a file for --only frames, instead of the samples")
     parser.add_argument("--out", type=Path, default=Path("hologram-claims.csv"))
     options = parser.parse_args()
     rows, columns = (int(n) for n in options.slm.split("x"))
@@ -200,7 +208,7 @@ def main() -> None:
         parts = {
             "dc": lambda: dc_term((rows, columns), options.iterations),
             "complex": lambda: complex_slm((rows, columns), options.iterations),
-            "frames": lambda: frames((rows, columns), options.iterations),
+            "frames": lambda: frames((rows, columns), options.iterations, options.picture),
             "warm": lambda: warm_start((rows, columns)),
             "mirrors": lambda: mirrors((rows, columns), options.iterations),
         }

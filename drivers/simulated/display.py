@@ -98,6 +98,13 @@ class DisplayOptions(CommonOptions):
     vignetting: float = Field(
         0.0, ge=0, le=1, description="Light lost by lens and camera at the middle of the field's border."
     )
+    source_mrad: float = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="Angular size of the light source seen from the SLM, standard deviation: partly coherent "
+        "light; 0 is a laser's.",
+    )
     mask_depth: float = Field(
         1.0, gt=0, description="Depth of the mask's steps over the one that it was made for."
     )

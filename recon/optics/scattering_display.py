@@ -81,6 +81,9 @@ class DisplaySpec:
     wavefront_seed : int
     vignetting : float
         Part of the light that the lens and the camera lose at the middle of the field's border.
+    source_mrad : float
+        Angular size (standard deviation) of the light source seen from the SLM: its points shine without a
+        fixed phase, and each shows the picture elsewhere. 0 is fully coherent.
     """
 
     slm_pitch_um: float = 8.0
@@ -105,6 +108,7 @@ class DisplaySpec:
     wavefront_rad: float = 0.0
     wavefront_seed: int = 0
     vignetting: float = 0.0
+    source_mrad: float = 0.0
 
     @property
     def field_um(self) -> float:
@@ -241,10 +245,12 @@ class ScatteringDisplay:
         light = far.real**2 + far.imag**2
         spectrum = scipy.fft.rfft2(light, overwrite_x=True, workers=self.threads)
         pixel = spec.sensor_pitch_um / spec.field_um
+        source = spec.source_mrad * spec.focal_mm / spec.field_um
         lags = scipy.fft.fftfreq(light.shape[0]), scipy.fft.rfftfreq(light.shape[1])
+        periods = [lag * 2 * cells for lag, cells in zip(lags, self._coarse, strict=True)]
         down, across = (
-            np.sinc(lag * 2 * cells * pixel).astype(np.complex64)
-            for lag, cells in zip(lags, self._coarse, strict=True)
+            (np.sinc(f * pixel) * np.exp(-2 * (np.pi * f * source) ** 2)).astype(np.complex64)
+            for f in periods
         )
         _propagate(spectrum, down, across)
         # Three samples a step: eight of them then make any place between, to a part in a thousand.

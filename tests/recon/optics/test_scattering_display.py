@@ -121,3 +121,20 @@ def test_offset_and_distortion_move_the_picture_on_the_camera():
     offset = see(replace(SPEC, sensor_offset_um=(0.0, 3 * SPEC.sensor_pitch_um)))
     np.testing.assert_allclose(offset[:, :-4], see()[:, 3:-1], rtol=1e-2, atol=1e-2)
     assert np.abs(see(replace(SPEC, lens_distortion=0.05)) - see()).max() > 0.1
+
+
+def test_partly_coherent_light_is_the_sum_of_its_sources_pictures():
+    """Each point of the source shows the far field elsewhere: a camera that is moved sees the same."""
+    angles, weights = np.polynomial.hermite_e.hermegauss(7)
+    weights /= weights.sum()
+    moved_um = 0.5e-3 * SPEC.focal_mm * 1e3 * angles
+    expected = sum(
+        wy * wx * see(replace(SPEC, sensor_offset_um=(y, x)))
+        for wy, y in zip(weights, moved_um, strict=True)
+        for wx, x in zip(weights, moved_um, strict=True)
+    )
+    partly = see(replace(SPEC, source_mrad=0.5))
+    inside = (slice(5, -5), slice(5, -5))  # beyond the field's border is only as much as is read there
+    assert partly[inside] == pytest.approx(expected[inside], abs=0.01)
+    assert partly.std() < 0.9 * see().std()
+    assert partly.mean() == pytest.approx(see().mean(), rel=0.02)
