@@ -185,6 +185,7 @@ class WindowProblem:
         reach = [2 * h for h in half]
         self._grid = fft.fast_shape([n + r for n, r in zip(self.sensor_shape, reach, strict=True)])
         self._spectra = np.stack([self._spectrum(p / n) for p, n in zip(planes, self._norms, strict=True)])
+        self._turned = np.ascontiguousarray(np.conj(self._spectra).transpose(1, 0, 2))
         self._products = self._correlations((reach[0], reach[1]))
         down, right = (np.arange(-h, h + 1) for h in half)
         height, width = self._grid
@@ -199,7 +200,9 @@ class WindowProblem:
         """Return ``A^T b`` in the window; columns have norm 1."""
         # Few shifts are asked for: their sums over frequencies cost less than whole transforms.
         down, right = self._waves
-        return np.asarray(((down @ (self._spectrum(data) * np.conj(self._spectra))) @ right).real, np.float32)
+        seen = self._spectrum(data)[:, None] * self._turned  # (rows, n_z, columns) of frequencies
+        some = (down @ seen.reshape(len(seen), -1)).reshape(-1, self.n_z, seen.shape[2])
+        return np.ascontiguousarray((some @ right).real.transpose(1, 0, 2))
 
     def solve(self, data: Array) -> Single:
         """Reconstruct from an image (height, width) by an active set (Lawson and Hanson).

@@ -40,6 +40,7 @@ PLANES = 17
 """Planes of the window in depth, half an axial step (inner product 0.8) apart: the spacing of Sec. 4.4."""
 HALF_WINDOW = (4, 24)
 """Rows and columns that the window reaches from the axis, voxels."""
+_PARTS = 4  # of a plane, at which points' PSFs are made
 FARTHEST = 12.0
 """Pixels, or planes, between two points at most."""
 FACTORS = (1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.4, 2.8, 3.4)
@@ -106,7 +107,7 @@ class PointTrial:
     separation_planes: float
     """``separation_px`` and ``separation_planes``: between neighbours."""
     dip: float
-    """The smallest dip between any two neighbours, of all draws but the worst tenth."""
+    """The smallest dip between any two neighbours, of all draws but the worst twentieth."""
     map: Floats
     """(n_z, width): the reconstruction of the last draw, summed over rows."""
 
@@ -138,7 +139,7 @@ def try_points(
     """Reconstruct a grid of points; see :class:`PointTrial`. Draws end where too many are not resolved."""
     rng = np.random.default_rng(seed)
     dips: list[float] = []
-    while len(dips) < trials and sum(dip < DIP for dip in dips) <= trials // 10:
+    while len(dips) < trials and sum(dip < DIP for dip in dips) <= trials // 20:
         # Where the grid's points lie between voxels differs from draw to draw.
         phase_x, phase_z = rng.uniform(-0.5, 0.5, 2)
         x = (np.arange(grid.columns) - (grid.columns - 1) / 2) * grid.separation_px + phase_x
@@ -153,7 +154,7 @@ def try_points(
         seen = problem.solve(noise.expose(light, rng)).sum(axis=1)
         places = np.stack(np.meshgrid(z, x + problem.half[1], indexing="ij"), axis=-1)
         dips.append(smallest_dip(seen, places))
-    told = sorted(dips)[min(trials // 10, len(dips) - 1)]
+    told = sorted(dips)[min(trials // 20, len(dips) - 1)]
     return PointTrial(grid.separation_px, grid.separation_planes, float(told), seen)
 
 
@@ -321,12 +322,10 @@ def point_tests(
             "the axis only. Choose a nearer depth for tests along it."
         )
     planes = np.stack([psf_at(float(1 / v)) for v in inverse])
-    make = image or _Shifted(psf_at, planes.shape[1:])
+    shifted = _Shifted(psf_at, inverse, planes.shape[1:])
 
     def point(columns: float, s: float) -> Array:
-        # Places between planes, evenly in 1/z.
-        at = float(np.interp(s, np.arange(len(inverse)), inverse)) if len(inverse) > 1 else inverse[0]
-        return make(columns, 1 / at)
+        return shifted(columns, s) if image is None else image(columns, shifted.depth_um(s))
 
     on_progress(0.1)
     middle = len(planes) // 2
@@ -396,24 +395,34 @@ def _sixteen(
 
 
 class _Shifted:
-    """Images (height, width) of points: PSFs shifted between pixels by a linear phase."""
+    """Images (height, width) of points: PSFs between planes, shifted between pixels by a linear phase."""
 
-    def __init__(self, psf_at: Callable[[float], Array], shape: tuple[int, ...]) -> None:
-        self._psf_at, self._light = psf_at, shape
-        self._spectra: dict[float, Array] = {}
+    def __init__(self, psf_at: Callable[[float], Array], inverse: Floats, shape: tuple[int, ...]) -> None:
+        self._psf_at, self._inverse, self._light = psf_at, inverse, shape
+        self._spectra: dict[int, Array] = {}
         # Room on both sides for the shift, which otherwise would wrap around.
         self._shape = fft.fast_shape((shape[0], shape[1] + 4 * HALF_WINDOW[1]))
 
-    def __call__(self, columns: float, z_um: float) -> Array:
+    def depth_um(self, s: float) -> float:
+        """Return the depth of a place between planes, evenly in 1/z."""
+        return float(1 / np.interp(s, np.arange(len(self._inverse)), self._inverse))
+
+    def __call__(self, columns: float, s: float) -> Array:
         height, width = self._light
-        key = round(z_um, 6)
-        if key not in self._spectra:
-            padded = np.zeros(self._shape)
-            padded[:height, :width] = self._psf_at(z_um)
-            if len(self._spectra) > 2 * PLANES:
-                self._spectra.clear()
-            self._spectra[key] = fft.rfft(padded)
+        part = int(_PARTS * s)
+        share = _PARTS * s - part if len(self._inverse) > 1 else 0.0
+        spectrum = (1 - share) * self._spectrum(part)
+        if share > 0:
+            spectrum = spectrum + share * self._spectrum(part + 1)
         frequency = np.fft.rfftfreq(self._shape[1])
-        moved = self._spectra[key] * np.exp(-2j * np.pi * frequency * columns)
+        moved = (spectrum * np.exp(-2j * np.pi * frequency * columns)).astype(np.complex64)
         shifted: Array = fft.irfft(np.ascontiguousarray(moved), self._shape[1])[:height, :width]
         return shifted
+
+    def _spectrum(self, part: int) -> Array:
+        """Return the PSF's at this part of a plane: between two of them the light hardly changes."""
+        if part not in self._spectra:
+            padded = np.zeros(self._shape, np.float32)
+            padded[: self._light[0], : self._light[1]] = self._psf_at(self.depth_um(part / _PARTS))
+            self._spectra[part] = fft.rfft(padded)
+        return self._spectra[part]
