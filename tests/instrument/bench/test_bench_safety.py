@@ -214,6 +214,7 @@ def test_the_simulated_scene_is_switched_and_dark_after_closing() -> None:
 def test_an_operator_is_asked_once_for_each_change() -> None:
     asked: list[str] = []
     with open_bench(bench_with().config, ask=asked.append) as bench:
+        assert bench.can_switch_scene
         assert not bench.scene_lit
         bench.scene_on()
         bench.scene_on()
@@ -223,8 +224,17 @@ def test_an_operator_is_asked_once_for_each_change() -> None:
 
 
 def test_where_nobody_can_be_asked_that_is_an_error() -> None:
-    with bench_with().open() as bench, pytest.raises(OperatorNeededError, match="light the scene"):
-        bench.scene_on()
+    with bench_with().open() as bench:
+        assert not bench.can_switch_scene
+        with pytest.raises(OperatorNeededError, match="light the scene"):
+            bench.scene_on()
+
+
+def test_closing_a_device_has_twenty_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, waits_s = bench_with().open(), list[float]()
+    monkeypatch.setattr("instrument.bench.bench.within", lambda seconds, *_: waits_s.append(seconds))
+    bench.close()
+    assert waits_s == [20.0] * 4
 
 
 def test_the_bench_says_that_it_is_simulated() -> None:

@@ -87,7 +87,10 @@ def test_a_bench_that_was_closed_is_not_touched_again(tmp_path: Path, count: int
     assert "again" not in run.stdout
 
 
-def test_a_forked_child_which_has_no_closing_thread_closes_what_is_open() -> None:
+@pytest.mark.parametrize("has_thread", [True, False], ids=["program", "forked child"])
+def test_what_is_open_at_the_end_is_closed_and_nothing_is_said(
+    caplog: pytest.LogCaptureFixture, *, has_thread: bool
+) -> None:
     class Left:
         closed = False
 
@@ -95,6 +98,10 @@ def test_a_forked_child_which_has_no_closing_thread_closes_what_is_open() -> Non
             self.closed = True
 
     closing, bench = ClosingAtExit(), Left()
-    closing._open.add(bench)
+    if has_thread:
+        closing.watch(bench)
+    else:
+        closing._open.add(bench)
     closing._end()
     assert bench.closed
+    assert not caplog.text
