@@ -175,6 +175,7 @@ class RunsPanel(Panel):
     def _make_list(self) -> None:
         self.table = table(_COLUMNS, "Click a run or photograph to open it", wide=0, row_px=26)
         self.table.setSelectionMode(QTableWidget.SelectionMode.SingleSelection)
+        self.table.setWordWrap(False)  # it would leave out a word before it shows "…"
         self.table.verticalHeader().hide()
         self.table.currentCellChanged.connect(lambda row, *_: self._row_chosen(row))
         self.where = label(role="dim", yields=True)
@@ -219,6 +220,7 @@ class RunsPanel(Panel):
         said += f" and {count(photographs, 'photograph')}" if photographs else ""
         simulated = bool(summaries) and all(listed.is_simulated for listed in summaries)
         self.table.setColumnHidden(len(_COLUMNS) - 1, simulated)  # said once
+        self.table.setColumnHidden(_COLUMNS.index("kind"), not photographs)
         said += ", SIMULATED," if simulated else ""
         self.where.setText(f"{said} in {folder.name} of {folder.parent.name}")
         self.where.setToolTip(str(folder))
@@ -334,4 +336,4 @@ def _called(path: Path) -> str:
     if dated is None:
         return path.name
     day, hour, minute, second, name = dated.groups()
-    return f"{name.replace('_', ' ')} {day} {hour}:{minute}:{second}".strip()
+    return f"{day} {hour}:{minute}:{second} {name}".strip()

@@ -73,6 +73,7 @@ class LengthBar:
     """
 
     def __init__(self, view: ImageView) -> None:
+        self._words = ""
         self.bar: Any = pg.ScaleBar(1.0)
         self.bar.setParentItem(view.box)
         self.bar.anchor((1, 1), (1, 1), offset=(-14, -14))
@@ -84,10 +85,16 @@ class LengthBar:
         if pitch_um is not None:
             length = round_length(_BAR_SHARE * width * pitch_um)
             self.bar.size = length / pitch_um
-            self.bar.bar.setBrush(pg.mkBrush(colours().text))
-            self.bar.bar.setPen(pg.mkPen(colours().text))
-            self.bar.text.setText(quantity(length, "um"), color=colours().text)
+            self._words = quantity(length, "um")
+            self.restyle()
             self.bar.updateBar()
+
+    def restyle(self) -> None:
+        """Take over the theme's accent, which is seen on a black picture and beside it."""
+        now = colours().accent
+        self.bar.bar.setBrush(pg.mkBrush(now))
+        self.bar.bar.setPen(pg.mkPen(now))
+        self.bar.text.setText(self._words, color=now)
 
 
 class Measure(QObject):

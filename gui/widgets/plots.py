@@ -175,6 +175,7 @@ class LevelsBar(QWidget):
     def restyle(self) -> None:
         """Take over the colours and the colour map of the theme in use."""
         now = colours()
+        self.plot.setBackground(now.panel)
         self._curve.setBrush(now.line)
         for line in self.region.lines:
             line.setPen(now.accent)

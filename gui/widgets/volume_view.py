@@ -363,6 +363,7 @@ class VolumeView(QWidget):
         """Take over the colours of the theme in use."""
         self._along.setPen(curve_pen(0))
         self._here.setPen(colours().dim)
+        self.bar.restyle()
         self._show()
 
     # From any side, and measured -----------------------------------------------------------------
