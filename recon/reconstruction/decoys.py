@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from recon.analysis.resolution import lateral_resolution
 from recon.base.blocks import block_mean
-from recon.base.checks import saturated_share
+from recon.base.checks import SATURATED_LIGHT, saturated_light, saturated_share
 from recon.camera.camera_model import CAMERAS, ModelName
 from recon.camera.registration import likeness
 from recon.camera.transformed import Transformation, transformed
@@ -75,6 +75,12 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
     """
     if problem.patterned or problem.model in CAMERAS:
         return None
+    check = _checked(problem, on_stage)
+    light = max(saturated_light(psf) for depth in _given(problem).depths.central for psf in depth)
+    return check if check is None or light <= SATURATED_LIGHT else replace(check, clipped=light)
+
+
+def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | None:
     done = count(1)
 
     def compete(small: _Small, iterations: int, *, lit: bool) -> CalibrationCheck:

@@ -127,12 +127,15 @@ class CalibrationCheck:
         That they were taken on.
     better : Transformation or None
         The decoy that explains the photograph better, where one does.
+    clipped : float
+        Share of the PSFs' light that is at full scale, where the picture suffers of it.
     """
 
     fit: Fit
     scores: Mapping[Transformation, Score]
     pixels: int
     better: Transformation | None = None
+    clipped: float = 0.0
 
     @property
     def sure(self) -> bool:
@@ -149,6 +152,12 @@ class CalibrationCheck:
     @property
     def sentences(self) -> tuple[str, ...]:
         """What is wrong with it, and what to do; empty where it fits."""
+        if self.fit is Fit.OFF and self.clipped and self.better not in FAR:
+            return (
+                "the calibration does not fit this photograph: its PSF is saturated, "
+                f"{self.clipped:.0%} of its light is at full scale",
+                "Take the PSF again with a shorter exposure",
+            )
         if self.fit is Fit.OFF and self.better is not None:
             left = (self.scores[self.better].misfit / self.scores[GIVEN].misfit) ** 0.5
             why = (
@@ -183,6 +192,7 @@ class CalibrationCheck:
             "better": None if self.better is None else str(self.better),
             "scores": {str(t): [s.misfit, s.objective] for t, s in self.scores.items()},
             "pixels": self.pixels,
+            "clipped": self.clipped,
         }
 
 
