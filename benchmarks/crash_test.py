@@ -1,9 +1,10 @@
 """Kill the program with ``kill -9`` at random moments of its work, go on, and look for what was lost.
 
-    python benchmarks/crash_test.py                          50 kills of every kind of work
-    python benchmarks/crash_test.py run resume --kills 200   of some, more of each
-    TMPDIR=/dev/shm python benchmarks/crash_test.py          on a tmpfs; else on the disk of TMPDIR
-    python benchmarks/crash_test.py record --signal term     another signal, which it answers itself
+    python -m benchmarks.crash_test                          50 kills of every kind of work
+    python -m benchmarks.crash_test run resume --kills 200   of some, more of each
+    TMPDIR=/dev/shm python -m benchmarks.crash_test          on a tmpfs; else on the disk of TMPDIR
+    python -m benchmarks.crash_test record --signal term     another signal, which it answers itself
+    python -m benchmarks.crash_test run record --clock       and the clock jumps by hours all the while
 
 Each trial carries out one command of the terminal on the simulated bench in a process of its own and kills
 it: runs, sweeps, recordings and the window once the run's folder is there (at any time, or just after one of
@@ -15,7 +16,7 @@ open and verify; files must be those of an unharmed process; nothing else may li
 status 1 when any of it fails.
 
 ``kill -9`` ends the process, not the kernel: that everything is also synced in the right order, so that a
-power cut costs no more, is held by tests/instrument/runs/test_store_order.py.
+power cut costs no more, is held by tests/instrument/runs/test_store_order.py, tests/kernel_vm/power_cut.py.
 """
 
 from __future__ import annotations
@@ -30,101 +31,26 @@ import random
 import select
 import shutil
 import signal
-import struct
 import sys
 import tempfile
 import time
-import traceback
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from instrument.cli import main
+from benchmarks.crash_work import BENCH, FINISHING, KINDS, PLAN, PROMISE, Kind, in_folder, runs_in, tree, work
 from instrument.files.images import read_image, write_image
-from instrument.plan import Part, Plan
 from instrument.runs.inspection import verify
 from instrument.runs.log import read_lines
 from instrument.runs.run import Run, RunCondition
-from instrument.runs.writer import FrameToStore, RunWriter
 
-BENCH = """
-[bench]
-name = "crash test"
-[camera]
-driver = "simulated"
-roi = [0, 0, 64, 96]
-[stage]
-driver = "simulated"
-[led_array]
-driver = "simulated"
-[scene]
-control = "simulated"
-[simulated]
-preset = "tiny"
-time_scale = 0.05
-"""
-PLAN = Plan(
-    label="crash test",
-    parts=(
-        Part(label="dark", exposures_ms=(2.0,), repeats=5),
-        Part(label="psf", light=("source", "off"), exposures_ms=(1.0, 3.0), repeats=8),
-        Part(label="dark again", exposures_ms=(2.0,), average=2, repeats=5),
-    ),
-)
-RUN = "RUN"
-"""In a command: the run's folder."""
-PROMISE = struct.Struct("<HI")
-FINISHING = 0xFFFF
-"""In place of a promised frame's number: the run's end is being written."""
 IMPATIENT_S = 600.0
 FAMILIES = ("instrument.cli", "instrument.tasks", "instrument.reconstruction", "calibration_routines")
 """Imported before anything is forked, so that no process is killed while it imports them."""
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A kind of work: its command, the one that goes on with it, and what is there before."""
-
-    first: Sequence[str]
-    again: Sequence[str] = ("resume", RUN)
-    begins: str = "folder"
-    """From when on it is killed: ``start``, ``folder`` (a run's is there) or ``finishing``."""
-    given: Sequence[Sequence[str]] = ()
-    """Commands carried out once before, whole."""
-    cut_after: int | None = None
-    """A run of ``first`` is cut after so many frames before; what is killed is going on with it."""
-
-    @property
-    def makes_run(self) -> bool:
-        """Whether it ends in a run, not in files."""
-        return self.begins != "start"
-
-
-_RUN = ("run", "plan.json", "--out", "runs")
-_SOLVED = ("--psf", "psf.tif", "--model", "convolution", "--tau", "1e-3", "--bin", "1", "--solver", "admm")
-_PICTURE = ("reconstruct", "--image", "scene.tif", *_SOLVED, "-n", "150", "--checkpoint", "kept")
-_VIDEO = ("reconstruct", RUN, "--video", *_SOLVED, "-n", "10", "--out", "film.ome.zarr")
-_HOLOGRAM = ("hologram", "scene.tif", "--expansion", "1", "--iterations", "15", "--out", "slm.png")
-_RECORD = ("record", "--source", "--frames", "40", "--exposure-ms", "2", "--out", "runs")
-_SWEEP = ("calibrate", "axial", "--z-min", "20", "--average", "1", "--dark-frames", "1", "--out", "runs")
-KINDS = {
-    "run": Kind(_RUN),
-    "sweep": Kind(_SWEEP),
-    "record": Kind(_RECORD),
-    "resume": Kind(_RUN, cut_after=12),
-    "finishing": Kind(_RUN, begins="finishing"),
-    "reconstruct": Kind(
-        (*_PICTURE, "--out", "picture.tif"), (*_PICTURE, "--out", "picture.tif", "--force"), "start"
-    ),
-    "video": Kind(_VIDEO, _VIDEO, "start", given=(_RECORD,)),
-    "hologram": Kind(_HOLOGRAM, (*_HOLOGRAM, "--force"), "start"),
-    "window": Kind(("window",)),
-}
 
 
 @dataclass
@@ -160,8 +86,9 @@ class Attempt:
 class Work:
     """One kind of work in a folder, with what it is given."""
 
-    def __init__(self, kind: Kind, parent: Path, number: int) -> None:
+    def __init__(self, kind: Kind, parent: Path, number: int, *, clock_jumps: bool) -> None:
         self.kind, self._parent, self._number = kind, parent, number
+        self._clock_jumps = clock_jumps
         self.given = parent / "given"
         self.given.mkdir()
         (self.given / "bench.toml").write_text(BENCH + '[slm]\ndriver = "simulated"\nshape = [96, 128]\n')
@@ -199,7 +126,7 @@ class Work:
         process = os.fork()
         if process == 0:
             os.close(reading)
-            _work(folder, command, writing)
+            work(folder, command, writing, clock_jumps=self._clock_jumps)
         os.close(writing)
         began_s = time.monotonic()
         promised: dict[int, int] = {}
@@ -293,98 +220,6 @@ def _send(process: int, number: int) -> None:
             os.kill(process, signal.SIGCONT if number == signal.SIGSTOP else number)
 
 
-def _work(folder: Path, command: Sequence[str], promises: int) -> None:
-    """Carry out a command in this process, and end it."""
-    code = 70
-    try:
-        os.chdir(folder)
-        for handle, name in ((1, "out"), (2, "said")):
-            os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), handle)
-        (folder / "tmp").mkdir(exist_ok=True)
-        tempfile.tempdir = os.environ["TMPDIR"] = str(folder / "tmp")
-        promising(promises)
-        code = run_in_window() if command[0] == "window" else main(list(command))
-    except KeyboardInterrupt:  # of the window, or of the second one
-        code = 128 + signal.SIGINT
-    except BaseException:  # noqa: BLE001 - shown, and the process ends here whatever it was
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-
-
-def promising(promises: int) -> None:
-    """Have every stored frame told, and the beginning of a run's end; write checkpoints often."""
-    from instrument.reconstruction.checkpointing import CheckpointFolder
-
-    write, finish = RunWriter.write, RunWriter.finish
-
-    def writing(self: RunWriter, frames: Sequence[FrameToStore]) -> None:
-        write(self, frames)
-        kind = np.float32 if self._float or not frames else frames[0].image.dtype
-        sums = ((f.index, zlib.crc32(f.image.astype(kind).tobytes())) for f in frames)
-        os.write(promises, b"".join(PROMISE.pack(index, crc) for index, crc in sums))
-
-    def finishing(self: RunWriter, *args: Any, **named: Any) -> Any:
-        os.write(promises, PROMISE.pack(FINISHING, 0))
-        return finish(self, *args, **named)
-
-    RunWriter.write, RunWriter.finish = writing, finishing  # type: ignore[method-assign]
-    CheckpointFolder.__init__.__kwdefaults__["every_s"] = 0.02
-
-
-def run_in_window() -> int:
-    """Open the window on the bench of this folder, and carry the plan out from it."""
-    os.environ["QT_QPA_PLATFORM"] = "offscreen"
-    from PySide6.QtCore import QSettings
-    from PySide6.QtTest import QTest
-
-    from gui.app import application
-    from gui.main_window import MainWindow
-    from gui.session import BenchSession
-    from instrument.bench.config_file import load_config
-    from instrument.runs.acquire import prepare
-
-    application()
-    session = BenchSession(load_config(Path("bench.toml")))
-    window = MainWindow(session, QSettings("window.ini", QSettings.Format.IniFormat))
-    window.show()
-    opening = session.open()
-    while not opening.is_over:
-        QTest.qWait(5)
-    work = session.exclusive_job("A plan", lambda _: prepare(session.bench, PLAN, Path("runs")).execute())
-    while not work.is_over:
-        QTest.qWait(5)
-    session.close()
-    while not session.is_closed:
-        QTest.qWait(5)
-    return 0
-
-
-def in_folder(command: Sequence[str], folder: Path) -> list[str]:
-    """Return a command with the run's folder in it."""
-    runs = runs_in(folder / "runs")
-    return [str(runs[0].relative_to(folder)) if word == RUN else word for word in command]
-
-
-def runs_in(folder: Path) -> list[Path]:
-    """Return the run folders in a folder: the one, or none yet."""
-    if not folder.is_dir():
-        return []
-    return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-
-
-def tree(folder: Path) -> set[str]:
-    """Return the names of all that is in a folder, the run's date left out."""
-    runs = {run.name: "run" for run in runs_in(folder / "runs")}
-    found = set()
-    for path in folder.rglob("*"):
-        parts = path.relative_to(folder).parts
-        found.add("/".join(runs.get(part, part) for part in parts))
-    return found - {"out", "said", "tmp", "window.ini"}
-
-
 def look(runs: list[Path], promised: dict[int, int], kept: dict[int, bytes], tally: Tally) -> None:
     """After a kill: what was promised must be there, and what is there must stay."""
     if not runs:
@@ -436,16 +271,17 @@ def judge(runs: list[Path], promised: dict[int, int], kept: dict[int, bytes], ta
     tally.found("repeated", len(twice) + len(changed), f"{run.path}: twice {twice}, changed {changed}")
 
 
-def kill(name: str, kills: int, number: int) -> Tally:
+def kill(name: str, kills: int, number: int, *, clock_jumps: bool) -> Tally:
     """Kill one kind of work so often, and return what it came to."""
     tally = Tally()
     with tempfile.TemporaryDirectory(prefix="crash-test-") as folder:
         parent = Path(folder)
-        work = Work(KINDS[name], parent, number)
+        kind = KINDS[name]
+        job = Work(kind, parent, number, clock_jumps=clock_jumps)
         whole = parent / "whole"
-        shutil.copytree(work.given, whole)
-        command = in_folder(work.kind.first if work.kind.cut_after is None else work.kind.again, whole)
-        done = work.whole(whole, command)
+        shutil.copytree(job.given, whole)
+        command = in_folder(kind.first if kind.cut_after is None else kind.again, whole)
+        done = job.whole(whole, command)
         sums = list(done.promised.values())
         if len(sums) != len(set(sums)):
             raise SystemExit(f"{name}: frames are alike; a swap would not be seen.")
@@ -454,16 +290,16 @@ def kill(name: str, kills: int, number: int) -> Tally:
         def choose() -> tuple[int, float] | None:
             if tally.kills >= kills:
                 return None
-            if work.kind.begins == "finishing":  # most of what is left after it is the program's own end
+            if kind.begins == "finishing":  # most of what is left after it is the program's own end
                 return 0, random.uniform(0.0, 0.4 * done.lived_s)
-            if work.kind.begins == "start" or random.random() < 0.3:
+            if kind.begins == "start" or random.random() < 0.3:
                 return 0, random.uniform(0.0, 1.05 * done.lived_s)
             return random.randint(1, len(sums)), random.uniform(0.0, 0.03)
 
         fruitless = 0
         while tally.kills < kills and fruitless < 50:
             before = tally.kills
-            work.trial(tally, unharmed, choose)
+            job.trial(tally, unharmed, choose)
             fruitless = 0 if tally.kills > before else fruitless + 1
     return tally
 
@@ -477,6 +313,7 @@ def command_line() -> int:
     signals = {"kill": signal.SIGKILL, "term": signal.SIGTERM, "hup": signal.SIGHUP}
     signals |= {"int": signal.SIGINT, "stop": signal.SIGSTOP}
     parser.add_argument("--signal", choices=signals, default="kill", help="int: twice; stop: and go on")
+    parser.add_argument("--clock", action="store_true", help="the clock jumps by up to a day, at every look")
     options = parser.parse_args()
     random.seed(options.seed)
     for family in FAMILIES:
@@ -488,7 +325,7 @@ def command_line() -> int:
     wrong = 0
     for name in options.kind or KINDS:
         began_s = time.monotonic()
-        tally = kill(name, options.kills, signals[options.signal])
+        tally = kill(name, options.kills, signals[options.signal], clock_jumps=options.clock)
         stored = sorted(tally.stored_at_kill) or [0]
         print(
             f"{name}: {tally.kills} kills in {tally.trials} trials, {time.monotonic() - began_s:.0f} s; "

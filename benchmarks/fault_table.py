@@ -1,7 +1,7 @@
 """A fault at every call of every device, and what became of light, motion, run, exit code and words.
 
-    python benchmarks/fault_table.py                       every call, every fault, all work: hours
-    python benchmarks/fault_table.py --every 7 run snap    a sample
+    python -m benchmarks.fault_table                       every call, every fault, all work: hours
+    python -m benchmarks.fault_table --every 7 run snap    a sample
 
 Each trial is a process of its own that carries out a command of the terminal on the simulated bench, or a
 live session of eight pictures from Python. The device call with the trial's number (counted at the driver,
@@ -49,7 +49,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.crash_test import BENCH, PLAN, runs_in
+from benchmarks.crash_work import BENCH, PLAN, runs_in
 from drivers.camera import Camera
 from drivers.device import Device
 from drivers.errors import DeviceError, DeviceLostError
@@ -212,13 +212,14 @@ def changed(value: Any, number: float) -> Any:
 
 def soon() -> None:
     """Shorten the waits for a device that hangs."""
-    from drivers.common import stream
+    from drivers.common import checked, stream
     from instrument.bench import bench, photograph, safety
 
     for module in (stream, bench, safety):
         setattr(module, "STOP_ANSWER_S", SOON_S)  # noqa: B010 # its type is final
     for module in (stream, photograph):
         setattr(module, "CALL_MARGIN_S", SOON_S)  # noqa: B010
+    checked.call_limit_s = lambda *_: SOON_S
     SimulatedCamera.longest_silence_s = SOON_S
 
 

@@ -82,6 +82,7 @@ def _pictures(
         shots._prepare_camera(folder)
     else:
         (folder / "bench.toml").write_text(shots.CAMERA)
+    apply_theme(application(), themes[0])  # the state before ended with the last
     window = shots._open(folder, *size)
     if state == "failed":
         world = window.session.bench.shared["simulated"]

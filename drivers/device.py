@@ -149,6 +149,12 @@ class Device(ABC):
 
     Options: ClassVar[type[DriverOptions]] = DriverOptions
     Shared: ClassVar[type[SharedPart] | None] = None
+    longest_call_s: ClassVar[float] = 30.0
+    """A call that sets or asks something and has not come back by then hangs, and is given up.
+
+    Opening has four times as long; arming a sequence 20 times; homing and moves 20 times, or three times the
+    slowest axis' whole travel. A driver whose device takes longer says so.
+    """
 
     @abstractmethod
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None: ...

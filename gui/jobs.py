@@ -18,6 +18,7 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 from PySide6.QtCore import QObject, Qt, Signal
+from shiboken6 import isValid
 
 from drivers.errors import StoppedError
 from instrument.files.errors import BenchError, in_words
@@ -219,7 +220,8 @@ class JobRunner(QObject):
         """Have jobs end without a word from now on: whatever showed them is being deleted."""
         self._silent = True
         for job in self._jobs.values():
-            job.blockSignals(True)
+            if isValid(job):  # Qt may delete it before what showed it
+                job.blockSignals(True)
 
     # Starting ------------------------------------------------------------------------------------
     def device(

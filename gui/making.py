@@ -15,7 +15,7 @@ from gui.session import BenchSession
 from gui.theme import restyled
 from gui.widgets.building import PanelPlace, label, text_view
 
-_SLICE_S = 0.015
+_SLICE_S = 0.008
 """Of the window's thread at once; a part that takes longer is the only one of its slice."""
 REST_MS = 1
 """Between two slices: what was made is laid out and painted, and clicks are taken, in turns of their own."""

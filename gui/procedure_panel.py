@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from PySide6.QtCore import Qt
+from PySide6.QtCore import Qt, QTimer
 from PySide6.QtWidgets import QScrollArea, QStackedWidget, QWidget
 
 from calibration_routines.plan_procedures import ResumeProcedure, left_unfinished
@@ -15,6 +15,7 @@ from calibration_routines.procedure import Outcome, Outlook, Procedure, Routine
 from gui.background import NewestOnly
 from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobContext
+from gui.making import REST_MS, take_slice
 from gui.panel import Panel
 from gui.panels.unserved import why_not
 from gui.procedure_run import Ended, ProcedureRun, RunBar, Situation, script
@@ -32,25 +33,55 @@ _SLOW_MS = 700
 _FORM_WIDTH_PX = 400
 
 
-class _Forms(dict[str, OptionsForm]):
-    """The forms of routines by their names, each made when it is first asked for.
+class _Forms(QStackedWidget):
+    """The forms of routines, each on a page of its own: begun when it is chosen, whole when it is asked for.
 
-    Attributes
+    Parameters
     ----------
-    pages : dict
-        Where those that were shown stand.
+    routines : sequence of Routine
+    changed : callable
+        Called when something in a form was changed.
     """
 
     def __init__(self, routines: Sequence[Routine], changed: Callable[[], object]) -> None:
         super().__init__()
         self._routines = {routine.name: routine for routine in routines}
         self._changed = changed
-        self.pages: dict[str, QScrollArea] = {}
+        self._begun: dict[str, tuple[OptionsForm, QScrollArea]] = {}
+        self._parts: dict[str, Iterator[None]] = {}
 
-    def __missing__(self, name: str) -> OptionsForm:
-        self[name] = form = OptionsForm(self._routines[name].declared)
-        form.changed.connect(self._changed)
-        return form
+    def __getitem__(self, name: str) -> OptionsForm:
+        """Return a routine's form, made to its end now if it was not yet."""
+        for _ in self.parts(name):
+            pass
+        return self._begun[name][0]
+
+    def show_page(self, name: str) -> None:
+        """Show a routine's form, or the place that it is made in."""
+        self._begin(name)
+        self.setCurrentWidget(self._begun[name][1])
+
+    def is_whole(self, name: str) -> bool:
+        """Whether a form has all of its fields."""
+        return name in self._begun and name not in self._parts
+
+    def parts(self, name: str) -> Iterator[None]:
+        """Make what a form lacks, with a ``yield`` after each field."""
+        self._begin(name)
+        while name in self._parts:
+            try:
+                next(self._parts[name])
+            except StopIteration:
+                del self._parts[name]
+                self._begun[name][0].changed.connect(self._changed)
+            yield
+
+    def _begin(self, name: str) -> None:
+        if name not in self._begun:
+            form = OptionsForm(self._routines[name].declared, whole=False)
+            self._begun[name] = form, (page := scrolled(form))
+            self.addWidget(page)
+            self._parts[name] = form.parts()
 
 
 class ProcedurePanel(Panel):
@@ -84,10 +115,10 @@ class ProcedurePanel(Panel):
         session = self.session
         self.choice = choice([routine.title for routine in self.routines], "What to do")
         self.choice.setAccessibleName("Routine")
-        self.stack = QStackedWidget()
         for number, routine in enumerate(self.routines):
             self.choice.setItemData(number, routine.help, Qt.ItemDataRole.ToolTipRole)
         self.views = _Forms(self.routines, self._typed)
+        """Of the routines, by their names."""
         if len(self.routines) == 1:
             self.choice.hide()
         self.about = label(role="dim", wraps=True)
@@ -106,11 +137,16 @@ class ProcedurePanel(Panel):
         self._left = NewestOnly(self.jobs, "Looking for runs that did not end")
         self._result: Path | None = None
         yield
-        left = fill(
-            QWidget(),
+        left, self.right = QWidget(), QWidget()
+        """For the subclass."""
+        sizes = [_FORM_WIDTH_PX, 3 * _FORM_WIDTH_PX]
+        fill(self.body, split(left, self.right, sizes=sizes, stretch=1, firm=True))
+        yield
+        fill(
+            left,
             self.choice,
             self.about,
-            (self.stack, 1),
+            (self.views, 1),
             self.verdict,
             self.run_bar,
             self.use_button,
@@ -119,11 +155,8 @@ class ProcedurePanel(Panel):
             margins=(0, 0, 6, 0),
         )
         yield
-        self.right = QWidget()
-        """For the subclass."""
-        sizes = [_FORM_WIDTH_PX, 3 * _FORM_WIDTH_PX]
-        fill(self.body, split(left, self.right, sizes=sizes, stretch=1, firm=True))
-        yield
+        self.views.show_page(self.routine.name)
+        yield from self.views.parts(self.routine.name)
         self._started: set[str] = set()
         self._said_at_end = ""
         """How the last procedure ended, as long as that is shown."""
@@ -181,8 +214,8 @@ class ProcedurePanel(Panel):
 
     def check(self) -> None:
         """Check the form against the bench, in a job; the start button follows."""
-        if self.run.is_running:
-            return
+        if self.run.is_running or not self.views.is_whole(self.routine.name):
+            return  # what is being made is checked then
         if self._check_job is not None:
             self._again = True
             return
@@ -273,7 +306,7 @@ class ProcedurePanel(Panel):
         self._said_at_end = ""
         self._say(f"{title} goes on.", wrong=False)
         self.run_bar.set_running(True)
-        self.stack.setEnabled(False)
+        self.views.setEnabled(False)
         self.choice.setEnabled(False)
         self.began()
 
@@ -288,13 +321,18 @@ class ProcedurePanel(Panel):
 
     # Inside --------------------------------------------------------------------------------------
     def _chosen(self) -> None:
-        page = self.views.pages.get(self.routine.name)
-        if page is None:
-            page = self.views.pages[self.routine.name] = scrolled(self.view)
-            self.stack.addWidget(page)
-        self.stack.setCurrentWidget(page)
+        self.views.show_page(self.routine.name)
         self.about.setText(f"{self.routine.help.removesuffix('.')}.")
-        self._typed()
+        self.run_bar.set_startable("Its form is being made.")
+        self._make_form()
+
+    def _make_form(self) -> None:
+        """Make the form that is shown, a slice at a time, then have it checked."""
+        try:
+            take_slice(self.views.parts(self.routine.name))
+            QTimer.singleShot(REST_MS, self, self._make_form)
+        except StopIteration:
+            self._typed()
 
     @property
     def _with_files(self) -> bool:
@@ -399,7 +437,7 @@ class ProcedurePanel(Panel):
         words = self.run_bar.words.text()
         self.run_bar.set_running(False)
         self.run_bar.words.setText(words)
-        self.stack.setEnabled(True)
+        self.views.setEnabled(True)
         self.choice.setEnabled(True)
         self.check()  # what was possible before may not be any more
 

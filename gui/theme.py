@@ -328,6 +328,21 @@ QLabel#caption {{ background: {c.panel}; color: {c.text}; padding: 2px 8px; bord
 QFrame#jog-pad {{ background: {c.field}; border: 1px dashed {c.border}; border-radius: 5px; }}
 QFrame#jog-pad[active="true"] {{ border: 2px solid {c.accent}; }}
 QFrame#strip {{ background: {c.panel}; border-bottom: 1px solid {c.line}; }}
+QCheckBox::indicator {{ width: 14px; height: 14px; border: 1px solid {c.border}; border-radius: 3px;
+  background: {c.field}; }}
+QCheckBox::indicator:checked {{ background: {c.accent}; background-clip: content; padding: 3px;
+  width: 8px; height: 8px; }}
+QCheckBox::indicator:focus {{ border-color: {c.text}; }}
+QCheckBox::indicator:hover {{ border-color: {c.accent}; }}
+QCheckBox::indicator:disabled {{ border-color: {c.line}; }}
+QCheckBox::indicator:checked:disabled {{ background: {unused}; background-clip: content; }}
+QSlider::groove:horizontal {{ height: 4px; background: {c.line}; border-radius: 2px; }}
+QSlider::sub-page:horizontal {{ background: {c.accent}; border-radius: 2px; }}
+QSlider::handle:horizontal {{ width: 12px; margin: -5px 0; border-radius: 7px; background: {c.field};
+  border: 1px solid {c.accent}; }}
+QSlider::handle:horizontal:hover, QSlider::handle:horizontal:focus {{ background: {c.accent}; }}
+QSlider::sub-page:horizontal:disabled {{ background: {c.line}; }}
+QSlider::handle:horizontal:disabled {{ border-color: {c.line}; }}
 QGroupBox {{ border: 1px solid {c.line}; border-radius: 5px; margin-top: 10px; padding-top: 6px; }}
 QGroupBox::title {{ subcontrol-origin: margin; left: 8px; padding: 0 4px; color: {c.dim}; }}
 QTabBar {{ qproperty-drawBase: 0; }}

@@ -15,7 +15,7 @@ from drivers.common.framing import reply_line
 from drivers.common.port_stage import AxisState, PortOptions, PortStage, distinct
 from drivers.common.serial_transport import SerialTransport
 from drivers.common.stage_axes import UM_PER_MM, AxisMap, AxisName, AxisOptions
-from drivers.device import DriverOptions, SharedPart
+from drivers.device import DeviceIdentity, DriverOptions, SharedPart
 from drivers.errors import DeviceError
 from drivers.stage import StageAxis
 
@@ -62,7 +62,8 @@ class AsiStage(PortStage):
     """Axes of one ASI controller, moved together.
 
     The controller has no reference of its own: homing drives each axis to its HOME place and has it read
-    ``home_at_um`` there; soft limits are the controller's, seen from there.
+    ``home_at_um`` there. Its limits are places of the hardware, whose numbers change by that: they are asked
+    for again, and only then may ``lower_limit`` and ``upper_limit`` narrow them.
     """
 
     Options = AsiOptions
@@ -103,7 +104,8 @@ class AsiStage(PortStage):
 
     def _read_axis(self, name: str) -> tuple[AxisMap, StageAxis]:
         options, letter = self.axis_options[name], self._letter(name)
-        self._homed.discard(name)
+        if name not in self._homed:  # its numbers are those of wherever it was switched on
+            options = options.model_copy(update={"lower_limit": None, "upper_limit": None})
         tenth_um = UM_PER_MM / _TENTHS_PER_MM
         axis_map = AxisMap(name, f"axis {letter}", -tenth_um if options.reverse else tenth_um)
         return axis_map, axis_map.stage_axis(
@@ -118,14 +120,29 @@ class AsiStage(PortStage):
         letter = self._letter(name)
         moving = self._link.request(b"/\r", reply_line(rb":?[BN]\s*"))[-1].strip()[-1:] == b"B"
         if self._came_home(name, moving=moving):
-            options = self.axis_options[name]
-            assert isinstance(options, AsiAxis)
-            self._query(f"H {letter}={round(self._maps[name].to_controller(options.home_at_um))}")
-            self._homed.add(name)
+            self._call_home(name, letter)
         place = self._query(f"W {letter}", r"[-+.\d]+(?: [-+.\d]+)*")
         found = re.match(r"[-+.\d]+", place)
         assert found is not None, "the matcher lets nothing else through"
         return AxisState(float(found[0]), moving, name in self._homed)
+
+    def _call_home(self, name: str, letter: str) -> None:
+        """Have an axis that came home read what is configured, and ask for its limits as seen from there."""
+        options = self.axis_options[name]
+        assert isinstance(options, AsiAxis)
+        try:
+            self._query(f"H {letter}={round(self._maps[name].to_controller(options.home_at_um))}")
+            self._homed.add(name)
+            _, axis = self._read_axis(name)
+        except DeviceError:
+            self._homed.discard(name)
+            self._homing[name] = 0.0  # who waits for the homing is told, too, whoever asked
+            raise
+        self._axes = tuple(axis if old.name == name else old for old in self._axes)
+
+    def _connect(self) -> tuple[DeviceIdentity, tuple[StageAxis, ...]]:
+        self._homed.clear()
+        return super()._connect()
 
     def _send_move(self, name: str, place: float) -> None:
         self._query(f"M {self._letter(name)}={round(place)}")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 from typing import TypeVar
 
 from drivers.errors import DeviceTimeoutError
 
+_log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 STOP_ANSWER_S = 10.0
@@ -17,26 +19,72 @@ CALL_MARGIN_S = 20.0
 """Beyond what an exposure needs: connecting anew, a slow bus, a busy computer."""
 
 
-def within(seconds: float, device: str, what: str, call: Callable[[], T]) -> T:
+_here = threading.local()
+
+
+def is_bounded() -> bool:
+    """Return whether somebody waits for what this thread does no longer than a stated time."""
+    return getattr(_here, "bounded", False)
+
+
+def within(
+    seconds: float,
+    device: str,
+    what: str,
+    call: Callable[[], T],
+    *,
+    undo: Callable[[], object] | None = None,
+    left: list[threading.Thread] | None = None,
+) -> T:
     """Return what ``call`` returns, or raise what it raises, unless it takes longer than ``seconds``.
 
-    The call is made in a thread of its own, which is left to itself where it hangs: nothing can end it.
+    The call is made in a thread of its own, which is left to itself where it hangs: nothing can end it. When
+    it ends after all, or was interrupted by Ctrl-C, nobody wants what it did: ``undo`` is called after it.
+    Such a thread is put into ``left``.
 
     Raises DeviceTimeoutError, naming the device and what it was to do.
     """
     answer: list[T] = []
     errors: list[BaseException] = []
+    deciding, over = threading.Lock(), threading.Event()
+    given_up = False
 
     def run() -> None:
+        _here.bounded = True
         try:
             answer.append(call())
         except BaseException as error:  # noqa: BLE001 - raised in the caller's thread
             errors.append(error)
+        with deciding:
+            over.set()
+        if given_up:
+            undone()
+
+    def undone() -> None:
+        try:
+            if undo is not None:
+                undo()
+        except Exception as error:  # noqa: BLE001 - whoever gave the call up has said so
+            _log.error("%s: after %s, which was given up: %s", device, what, error)
+
+    def give_up() -> bool:
+        """Return whether the call has not ended."""
+        nonlocal given_up
+        with deciding:
+            given_up = not over.is_set()
+            if given_up and left is not None:
+                left.append(thread)
+        return given_up
 
     thread = threading.Thread(target=run, name=f"{device}: {what}", daemon=True)
-    thread.start()
-    thread.join(seconds)
-    if thread.is_alive():
+    try:
+        thread.start()
+        over.wait(seconds)
+    except BaseException:  # Ctrl-C
+        if not give_up():
+            undone()
+        raise
+    if not over.is_set() and give_up():
         raise DeviceTimeoutError(
             device,
             f"hangs: {what} has not ended for {seconds:g} s.",

@@ -13,7 +13,8 @@ binning, format, ...  none; a region lies within the one asked for
 pattern, SLM image    none
 ====================  ==============================================================================
 
-A value that is no finite number is never a report.
+A value that is no finite number is never a report. A call that sets, moves, opens or asks and does not come
+back is given up (``longest_call_s`` of the device), and its device is not used again before it does.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import functools
 import inspect
 import logging
 import math
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar, cast
 
@@ -29,9 +31,10 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.camera import Camera, Roi, TriggerEdge, TriggerMode
+from drivers.common.answers import STOP_ANSWER_S, is_bounded, within
 from drivers.common.pixels import Pixels
 from drivers.device import Device
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, DeviceTimeoutError
 from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import LedArray, LedPattern
 from drivers.sequence import PlaysSequences
@@ -42,6 +45,16 @@ _log = logging.getLogger(__name__)
 _D = TypeVar("_D", bound=type[Device])
 _T = TypeVar("_T")
 _TRAVELS = 100
+_SHORT = {"settings", "own_settings", "position", "display", "trigger", "off", "blank"}
+"""Calls that are waited for as long as their device says, as are all that set something."""
+_MOVES = {"home": 20, "move_to": 20, "move_by": 20, "wait": 20}
+_LONG = {"open": 4, "arm": 20, **_MOVES}
+"""Calls that have so many times as long; frames, stopping and closing are waited for where asked for."""
+_SAFE = {"off", "blank"}
+"""Tried, too, while another call hangs."""
+_UNDONE_BY = {"open": "close", "set_pattern": "off", **dict.fromkeys(_MOVES, "stop")}
+"""What is done after a call that ended when it had been given up: it may have lit or moved something."""
+_INTERRUPTED_S = 2.0
 _REMEDY = "Its readings cannot be trusted: check the device, its firmware and its driver."
 
 
@@ -73,7 +86,46 @@ def _guarded_call(made: type, name: str) -> Callable[..., Any]:
         except Exception as error:
             raise _driver_failed(self, name, error) from error
 
-    return call
+    if not (name in _SHORT or name in _LONG or name.startswith("set_")):
+        return call
+
+    def bounded(self: Device, *args: Any, **named: Any) -> Any:
+        if is_bounded():
+            return call(self, *args, **named)
+        return _in_time(self, name, lambda: call(self, *args, **named))
+
+    return bounded
+
+
+def call_limit_s(device: Device, name: str) -> float:
+    """Return after how many seconds a call of a driver's method is given up."""
+    limit_s = device.longest_call_s * _LONG.get(name, 1)
+    if isinstance(device, Stage) and name in _MOVES:
+        travels_s = ((axis.upper_limit - axis.lower_limit) / axis.speed_per_s for axis in device.axes)
+        limit_s = max(limit_s, 3 * max(travels_s, default=0.0))
+    return limit_s
+
+
+def _in_time(device: Device, name: str, call: Callable[[], _T]) -> _T:
+    """Return what a call of a driver returns; one that hangs is given up, and its device not used again."""
+    left: list[threading.Thread] = device.__dict__.setdefault("_left", [])
+    left[:] = [thread for thread in left if thread.is_alive()]
+    if left and name not in _SAFE:
+        problem = f"still hangs: {left[0].name.removeprefix(f'{device.name}: ')} has not ended."
+        raise DeviceTimeoutError(device.name, problem, "Unplug it or switch it off and on.")
+    undo = getattr(device, _UNDONE_BY[name]) if name in _UNDONE_BY else None
+    try:
+        return within(
+            call_limit_s(device, name), device.name, name.replace("_", " "), call, undo=undo, left=left
+        )
+    except Exception:
+        raise
+    except BaseException:  # Ctrl-C: nothing moves on, or is lit late, that nobody waits for
+        if name in _MOVES and undo is not None:
+            within(STOP_ANSWER_S, device.name, "stopping", undo)
+        for thread in left:
+            thread.join(_INTERRUPTED_S)
+        raise
 
 
 def _guarded_read(made: type, name: str) -> Callable[[Any], Any]:

@@ -40,9 +40,15 @@ class _Motion:
         self.target: dict[str, float] = {}
         self.ended = False
         self.stopped = False
+        self.failed: DeviceError | None = None
         self.interrupted = threading.Event()
         """STOP was called; whether it came in time is known once ``decided`` is set."""
         self.decided = threading.Event()
+
+    def fail(self, error: DeviceError) -> None:
+        """End it by an error, which all who wait for it are told."""
+        self.failed = error
+        self.ended = True
 
 
 class PolledStage(Stage):
@@ -56,7 +62,12 @@ class PolledStage(Stage):
     A subclass implements the methods that begin with an underscore. ``_state``, ``_start`` and
     ``_start_homing`` return at once. Faults that ``_state`` reports end moves and refuse new ones, but not
     the next homing; what lasts through it (some controllers keep faults until they move) is no fault then.
+    A fault that is seen while a motion runs is the motion's, whoever asked: it is told to who waits for the
+    motion, or refuses the next one.
     """
+
+    faults_last = True
+    """Whether the controller reports a fault as long as it lasts; False: once, to whoever asks first."""
 
     poll_s = 0.02
     """Between two questions whether a move has ended."""
@@ -79,6 +90,9 @@ class PolledStage(Stage):
         self._counting = threading.Lock()
         self._commanded: dict[str, float] = {}
         self._excused: frozenset[str] = frozenset()
+        self._noticed: dict[str, None] = {}
+        """Faults seen and not told: a motion's, or any of a controller that says them once."""
+        self._looking = threading.RLock()
 
     # The protocol ----------------------------------------------------------------------------------
     @abstractmethod
@@ -137,6 +151,7 @@ class PolledStage(Stage):
             if state.faults:
                 _log.warning("%s: %s", self.name, "; ".join(state.faults))
             self._commanded = dict(state.position)
+            self._noticed.clear()
         except BaseException:
             self._identity = None
             self._disconnect()
@@ -203,7 +218,9 @@ class PolledStage(Stage):
         self._require()
         stops = self._stops
         with self._commanding:
-            self._excused = frozenset(self._state().faults)
+            faults = self._look().faults
+            self._excused = frozenset(faults if self.faults_last else ())
+            self._noticed.clear()
             motion = self._motion = _Motion(homing=True)
             self._launch(motion, self._start_homing, stops)
         self._follow(motion, None)
@@ -213,7 +230,7 @@ class PolledStage(Stage):
         self._require()
         stops = self._stops
         with self._commanding:
-            state = self._state()
+            state = self._look()
             self._raise_faults(state)
             motion = self._motion
             homing = state.moving and motion is not None and motion.homing
@@ -254,12 +271,24 @@ class PolledStage(Stage):
 
     def _ask(self) -> StageState:
         self._require()
-        return self._state()
+        return self._look()
+
+    def _look(self) -> StageState:
+        """Ask for the state, and note its faults; an excused one that has gone is excused no more."""
+        with self._looking:
+            state = self._state()
+            self._excused &= frozenset(state.faults)
+            if not self.faults_last or (self._motion is not None and not self._motion.ended):
+                faults = (fault for fault in state.faults if fault not in self._excused)
+                self._noticed.update(dict.fromkeys(faults))
+            return state
 
     def _raise_faults(self, state: StageState) -> None:
-        """Raise the faults that are not excused; an excused one that has gone is excused no more."""
-        self._excused &= frozenset(state.faults)
-        faults = [fault for fault in state.faults if fault not in self._excused]
+        """Raise the faults that were noticed, and those of a state, but for the excused ones."""
+        with self._looking:
+            new = (fault for fault in state.faults if fault not in self._excused)
+            faults = list(dict.fromkeys([*self._noticed, *new]))
+            self._noticed.clear()
         if faults:
             raise DeviceError(self.name, f"{'; '.join(faults)}.", "Remove the cause, then home again.")
 
@@ -304,7 +333,7 @@ class PolledStage(Stage):
             except DeviceError as error:
                 if motion.interrupted.is_set():
                     continue
-                motion.ended = True
+                motion.fail(error)
                 self._halt_after(error)
                 raise
             now_s = time.monotonic()
@@ -327,6 +356,8 @@ class PolledStage(Stage):
             motion.interrupted.wait(self.poll_s)
         if motion.stopped:
             raise self._stopped(motion.homing)
+        if (failed := motion.failed) is not None:  # whoever else waited was told
+            raise DeviceError(failed.device, failed.problem, failed.remedy)
 
     def _arrived(self, motion: _Motion, state: StageState, seen_moving: bool) -> bool:
         if motion.homing:
@@ -344,19 +375,23 @@ class PolledStage(Stage):
 
     def _end(self, motion: _Motion, state: StageState) -> None:
         """Note that the axes rest, and raise if it is not where they should."""
-        motion.ended = True
+        wrong: DeviceError | None = None
         if motion.homing:
             self._commanded = dict(state.position)
             if not state.homed:
-                raise DeviceError(
+                wrong = DeviceError(
                     self.name, "ended its homing without a reference.", "Check its switches and home again."
                 )
         elif strays := self._strays(motion, state):
-            raise DeviceError(
+            wrong = DeviceError(
                 self.name,
                 f"came to rest elsewhere: {'; '.join(strays)}.",
                 "Is something in its way, or was it moved by hand (knob, joystick)? Check, then home again.",
             )
+        motion.ended = wrong is None
+        if wrong is not None:
+            motion.fail(wrong)
+            raise wrong
 
     def _decide(self, motions: set[_Motion | None]) -> None:
         """After STOP: wait until the axes rest, and settle which motions had arrived before."""
@@ -378,7 +413,7 @@ class PolledStage(Stage):
         deadline_s = told_s + self.stop_s
         while True:
             try:
-                state = self._state()
+                state = self._look()
                 if not state.moving:
                     return state
             except StoppedError:  # another STOP cancelled the question
@@ -416,12 +451,12 @@ class PolledStage(Stage):
             error.add_note(f"Nor could it be stopped: {another}")
 
     def _blocked(self, motion: _Motion) -> DeviceTimeoutError:
-        motion.ended = True
         error = DeviceTimeoutError(
             self.name,
             f"says that it moves, but has stayed where it is for {self.stuck_s:g} s.",
             "Free it and home again.",
         )
+        motion.fail(error)
         self._halt_after(error)
         return error
 

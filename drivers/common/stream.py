@@ -8,6 +8,7 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
@@ -133,21 +134,9 @@ class FrameStream:
         self._pool = BufferPool(self.n_buffers + 2, shape, dtype)
         self._scratch: Pixels = np.empty(shape, dtype)
         self._answer_limit_s = self.camera.longest_wait_s + STOP_ANSWER_S
-        given_up, begun = threading.Event(), threading.Event()
-
-        def begin() -> None:
-            self.camera.start_sequence(self.n_buffers)
-            begun.set()
-            if given_up.is_set():
-                self.camera.stop_sequence()
-
-        try:
-            within(CALL_MARGIN_S, self.camera.name, "starting its sequence", begin)
-        except BaseException:  # Ctrl-C, too: what is begun late, or just now, does not run on
-            given_up.set()
-            if begun.is_set():
-                self.camera.stop_sequence()
-            raise
+        start, stop = partial(self.camera.start_sequence, self.n_buffers), self.camera.stop_sequence
+        # Begun late, or when Ctrl-C came, it does not run on.
+        within(CALL_MARGIN_S, self.camera.name, "starting its sequence", start, undo=stop)
         self._running = True
         self._thread = threading.Thread(
             target=self._produce, name=f"stream of {self.camera.name}", daemon=True

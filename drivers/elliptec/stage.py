@@ -131,14 +131,11 @@ class ElliptecStage(PortStage):
 
     def _axis_state(self, name: str) -> AxisState:
         address = self._maps[name].label[-1]
-        status = int(self._query(address, "gs", "GS[0-9A-F]{2}")[2:], 16)
-        if moving := status == _BUSY:
-            self._faults.pop(name, None)
-        elif status:
-            self._faults[name] = _words(status)
+        moving = self._note(address, self._query(address, "gs", "GS[0-9A-F]{2}"))
         reply = self._query(address, "gp", "(PO[0-9A-F]{8}|GS[0-9A-F]{2})")
-        if reply.startswith("GS"):  # some firmware tells no place while it moves
-            return AxisState(self._last(name), True, name in self._homed)
+        if reply.startswith("GS"):  # some firmware tells no place while it moves; or a move failed just now
+            self._note(address, reply)
+            return AxisState(self._last(name), True, name in self._homed, self._faults.get(name, ""))
         if self._came_home(name, moving=moving) and name not in self._faults:
             self._homed.add(name)
         place = int(reply[2:], 16)
@@ -169,13 +166,14 @@ class ElliptecStage(PortStage):
 
     def _unasked(self, line: bytes) -> None:
         """Keep the failure that a move ended with."""
-        found = re.fullmatch(rb"([0-9A-F])GS([0-9A-F]{2})", line)
-        status = int(found[2], 16) if found else 0
-        if found and status not in (0, _BUSY):
+        if re.fullmatch(rb"[0-9A-F]GS[0-9A-F]{2}", line):
+            self._note(chr(line[0]), line[1:].decode())
+
+    def _note(self, address: str, reply: str) -> bool:
+        """Keep the failure that a status says, until the next move; returns whether the module is busy."""
+        status = int(reply[2:], 16)
+        if status not in (0, _BUSY):
             for name, axis_map in self._maps.items():
-                if axis_map.label[-1] == found[1].decode():
-                    self._faults[name] = _words(status)
-
-
-def _words(status: int) -> str:
-    return f"{_STATUS.get(status, 'unknown status')} (status {status})"
+                if axis_map.label[-1] == address:
+                    self._faults[name] = f"{_STATUS.get(status, 'unknown status')} (status {status})"
+        return status == _BUSY

@@ -69,6 +69,7 @@ class Esp301Stage(PortStage):
     Options = Esp301Options
     driver = "esp301"
     vendor = "Newport"
+    faults_last = False
     probed_axis = {"number": 1}  # noqa: RUF012
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:

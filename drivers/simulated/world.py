@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from matplotlib import cbook
 
 from drivers.device import DriverOptions
 from drivers.simulated.living import POWER, LivingLight
@@ -90,6 +89,8 @@ def _place(options: WorldOptions, preset: Preset, distance_um: float) -> tuple[f
 
 def sample_picture() -> npt.NDArray[np.float32]:
     """Load the photograph that ships with matplotlib, ``(600, 512, 3)`` float32 linear brightness, 0 to 1."""
+    from matplotlib import cbook  # a third of a second, for one scene
+
     path = cbook.get_sample_data("grace_hopper.jpg", asfileobj=False)
     bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if bgr is None:

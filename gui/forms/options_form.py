@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -50,6 +50,8 @@ class OptionsForm(QWidget):
         By name, what a field does besides what its declaration says.
     folded : collection of str
         Groups that are folded away.
+    whole : bool
+        Whether it has its fields at once; else ``parts`` makes them, where the form has its place by then.
     """
 
     changed = Signal()
@@ -62,39 +64,48 @@ class OptionsForm(QWidget):
         behaviour: Mapping[str, Behaviour] | None = None,
         *,
         folded: Collection[str] = FOLDED,
+        whole: bool = True,
         parent: QWidget | None = None,
     ) -> None:
         super().__init__(parent)
         options = [o for d in declared for o in ((d,) if isinstance(d, Option) else options_of(d))]
-        offered = [o for o in options if o.declaration.flags != ("",)]
-        given = behaviour or {}
-        self.fields: dict[str, OptionField] = {
-            o.name: field_for(o, given.get(o.name, Behaviour())) for o in offered
-        }
-        self.widgets: dict[str, QWidget] = {name: field.widget for name, field in self.fields.items()}
+        self._offered = [o for o in options if o.declaration.flags != ("",)]
+        self._given = behaviour or {}
+        self.fields: dict[str, OptionField] = {}
+        self.widgets: dict[str, QWidget] = {}
         self._folded = frozenset(folded)
         self._reasons: dict[str, QLabel] = {}
         self._headings: dict[str, QLabel] = {}
         self._rows: dict[str, QFormLayout] = {}
         self._hidden: set[str] = set()
         self._disabled: dict[str, str] = {}
-        usual, seldom = QWidget(), QWidget()
-        self._fill(usual, [f for f in self.fields.values() if not self._is_folded(f)])
-        self._fill(seldom, [f for f in self.fields.values() if self._is_folded(f)])
+        if whole:
+            for _ in self.parts():
+                pass
+
+    def parts(self) -> Iterator[None]:
+        """Make the fields, then their rows, with a ``yield`` after each."""
+        for option in self._offered:
+            field = field_for(option, self._given.get(option.name, Behaviour()))
+            field.show(field.default)
+            self.fields[option.name], self.widgets[option.name] = field, field.widget
+            yield
+        folded = [field for field in self.fields.values() if self._is_folded(field)]
+        usual, self._seldom = QWidget(), QWidget()
         self.more = QToolButton()
         self.more.setText(FOLDED[0])
         self.more.setCheckable(True)
         self.more.setAutoRaise(True)
         self.more.setArrowType(Qt.ArrowType.RightArrow)
         self.more.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextBesideIcon)
-        self.more.setToolTip(", ".join(f.bare_label for f in self.fields.values() if self._is_folded(f)))
-        self._seldom = seldom
+        self.more.setToolTip(", ".join(field.bare_label for field in folded))
         self.more.toggled.connect(self._fold)
-        seldom.hide()
-        fill(self, usual, in_row(self.more, None), seldom, None, margins=(2, 6, 8, 2))
-        self.more.setVisible(any(map(self._is_folded, self.fields.values())))  # once it has its place
+        self._seldom.hide()
+        fill(self, usual, in_row(self.more, None), self._seldom, None, margins=(2, 6, 8, 2))
+        self.more.setVisible(bool(folded))  # once it has its place
+        yield from self._fill(usual, [field for field in self.fields.values() if field not in folded])
+        yield from self._fill(self._seldom, folded)
         for name, field in self.fields.items():
-            field.show(field.default)
             field.edited.connect(self._edited)
             field.refused.connect(partial(self._refused_itself, name))
             field.settled.connect(partial(self.settled.emit, name))
@@ -260,7 +271,7 @@ class OptionsForm(QWidget):
         return self._reasons[name].text()
 
     # Inside --------------------------------------------------------------------------------------
-    def _fill(self, box: QWidget, fields: list[OptionField]) -> None:
+    def _fill(self, box: QWidget, fields: list[OptionField]) -> Iterator[None]:
         rows = QFormLayout(box)
         rows.setContentsMargins(0, 0, 0, 0)
         rows.setVerticalSpacing(4)
@@ -274,6 +285,7 @@ class OptionsForm(QWidget):
                 rows.addRow(heading)
             for field in (f for f in fields if self._group(f) == group):
                 self._add(rows, field)
+                yield
 
     def _add(self, rows: QFormLayout, field: OptionField) -> None:
         name = field.option.name

@@ -57,7 +57,9 @@ class _KindOptions:
 
 
 class ReconstructForm(QWidget):
-    """The options of a reconstruction, its progress, and the buttons that start and end it; made in parts.
+    """The options of a reconstruction, its progress, and the buttons that start and end it.
+
+    ``parts`` makes it, best where it has its place.
 
     Signals
     -------
@@ -103,8 +105,8 @@ class ReconstructForm(QWidget):
                 **dict.fromkeys(("iterations", "time_s", "tolerance", "stop_at_noise"), iterated),
             },
             folded=_FOLDED,
+            whole=False,
         )
-        yield
         self.widgets = self.options.widgets
         tip = "Reconstruct with these settings (Ctrl+Return)"
         self.start = button(
@@ -118,6 +120,8 @@ class ReconstructForm(QWidget):
         self.note = label(role="dim", wraps=True)
         buttons = in_row((self.start, 1), self.explain, self.stop)
         fill(self, (scrolled(self.options), 1), self.note, self.progress, buttons)
+        yield
+        yield from self.options.parts()
         self.options.refused.connect(self.refused)
         self.options.settled.connect(lambda name: self._show_kind() if name == "kind" else None)
         yield

@@ -33,12 +33,16 @@ class PanelEntry(NamedTuple):
     tried_on: str = ""
     """Of simulated benches the only one that serves it, of ``instrument.bench.config_file.TEMPLATES``."""
 
-    def load(self) -> type[Panel]:
-        """Return the panel's class, with all that it needs imported and compiled; for any thread."""
+    @property
+    def kind(self) -> type[Panel]:
+        """The panel's class, imported if it was not yet."""
         module, _, name = self.place.partition(":")
-        kind: type[Panel] = getattr(import_module(module), name)
-        kind.prepare()
-        return kind
+        found: type[Panel] = getattr(import_module(module), name)
+        return found
+
+    def load(self) -> None:
+        """Import and compile all that the panel needs; in any thread."""
+        self.kind.prepare()
 
     def slices(self, session: BenchSession) -> Generator[None, None, Panel]:
         """Make the panel, with a ``yield`` after each of its parts, and return it."""
@@ -46,7 +50,7 @@ class PanelEntry(NamedTuple):
         if why := why_not(session, self.title, self.needs, self.tried_on):
             panel = UnservedPanel(session, self.title, why, self.tried_on)
         else:
-            panel = self.load()(session)
+            panel = self.kind(session)
         panel.title = self.title
         dress(panel)
         try:

@@ -5,19 +5,20 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QSignalBlocker, Qt
-from PySide6.QtWidgets import QWidget
+from PySide6.QtWidgets import QStackedWidget, QWidget
 
 from gui.jobs import Job
 from gui.panel import Panel
 from gui.session import BenchSession
 from gui.theme import colours
-from gui.widgets.building import button, cell, choice, fill, in_row, label, offer, split, table, tabs
+from gui.widgets.building import Hint, button, cell, choice, fill, in_row, label, offer, split, table, tabs
 from gui.widgets.dialogues import choose_path
 from gui.widgets.plots import curve_colour, curve_pen, dots, plot_widget
 from gui.widgets.stability_view import StabilityView
@@ -28,7 +29,7 @@ from recon.base.declare import Imports, expression
 from recon.evaluation.scored import KINDS, Axis, Point, is_known, pareto
 from recon.verdict.cases import SHIPPED
 
-_NO_CHART = "No chart yet. Make one with diffuserbench chart, then open its chart.json."
+_NO_CHART = "No chart is open: one shows which settings are fast, and which are accurate, on your photograph."
 
 
 class ChartsPanel(Panel):
@@ -41,9 +42,11 @@ class ChartsPanel(Panel):
 
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
+        session = self.session
         self.stability = StabilityView()
         yield
-        self.chart = ChartView()
+        make = partial(session.handed_on.emit, "tasks", ("chart photograph", {}))
+        self.chart = ChartView(Hint(_NO_CHART, "Make one…", make, ("Open…", self._choose)))
         yield
         tip = "A stability.json or chart.json, made by the commands of those names"
         self.open_button = button("Open…", tip, self._choose)
@@ -51,7 +54,7 @@ class ChartsPanel(Panel):
         self.shipped_button = button("Shipped maps", tip, lambda: self.open(SHIPPED))
         self.heading = label()
         self.heading.setMinimumWidth(10)
-        self._headings = {self.stability: ("", ""), self.chart: (_NO_CHART, "")}
+        self._headings = {self.stability: ("", ""), self.chart: ("", "")}
         self.tabs = tabs({"Where methods fail": self.stability, "Speed against accuracy": self.chart})
         self.tabs.currentChanged.connect(lambda _: self._show_heading())
         top = in_row((self.heading, 1), self.open_button, self.shipped_button)
@@ -144,9 +147,15 @@ _SHORT = {"seconds": "seconds", "peak_mib": "MiB", "images": "photographs"}
 
 
 class ChartView(QWidget):
-    """A plot of scored points and a table of settings; pointing at either names the other."""
+    """A plot of scored points and a table of settings; pointing at either names the other.
 
-    def __init__(self, parent: QWidget | None = None) -> None:
+    Parameters
+    ----------
+    empty : QWidget
+        Stands here until there are points.
+    """
+
+    def __init__(self, empty: QWidget, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self._points: Sequence[Point] = ()
         self._kind = KINDS["reconstruction"]
@@ -164,11 +173,16 @@ class ChartView(QWidget):
         self.place = label(words, "dim", selectable=True)
         self.front: list[Point] = []
         chosen = in_row(label("Compare"), self.measure, label("against"), self.cost, self.group, None)
-        fill(self, chosen, (split(self.plot, self.table, sizes=[620, 330]), 1), self.place)
+        drawn = split(self.plot, self.table, sizes=[620, 330])
+        self.stack = QStackedWidget()
+        self.stack.addWidget(empty)
+        self.stack.addWidget(fill(QWidget(), chosen, (drawn, 1), self.place))
+        fill(self, (self.stack, 1))
 
     def show_points(self, points: Sequence[Point], kind: str = "reconstruction") -> None:
         """Show points of a chart of a kind (:data:`recon.evaluation.scored.KINDS`)."""
         self._points, self._kind = points, KINDS[kind]
+        self.stack.setCurrentIndex(1)
 
         def known(axes: Sequence[Axis]) -> list[tuple[str, str]]:
             return [(a.words, a.key) for a in axes if any(is_known(p, a.key) for p in points)]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
-from PySide6.QtWidgets import QWidget
+from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from calibration_routines.display.hologram_photograph import Photographed
 from gui.background import NewestOnly
@@ -26,7 +26,7 @@ from gui.hologram_work import (
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.session import BenchSession
-from gui.widgets.building import button, fill, in_row, scrolled, share_bar, split
+from gui.widgets.building import button, fill, in_column, in_row, scrolled, share_bar, split
 from gui.widgets.hologram_views import WEIGHTS_SHAPE, HologramViews, WeightsMode
 from instrument.display.hologram import depth_limit_mm, expansion_side, field_picture
 from instrument.files.errors import BenchError
@@ -80,7 +80,10 @@ class HologramsPanel(Panel):
         across = split(left := QWidget())
         fill(self.body, across)
         self.form = self._make_form()
+        place = scrolled(self.form)
+        fill(left, (place, 1))
         yield
+        yield from self.form.parts()
         self._names = SuggestedName(self.jobs, self.form, session.runs_folder / "holograms", ".png")
         self.views = HologramViews()
         yield
@@ -107,15 +110,16 @@ class HologramsPanel(Panel):
         self.capture_button = button("Show and photograph", tip, self.photograph)
         self.progress = share_bar()
         yield
-        fill(
-            left,
-            (scrolled(self.form), 1),
+        below = in_column(
             self.clear,
             self.views.plane,
             self.progress,
             in_row(self.preview_button, self.compute_button, self.stop_button),
             in_row(self.show_button, self.capture_button),
         )
+        column = left.layout()
+        assert isinstance(column, QVBoxLayout)
+        column.addLayout(below)
         across.setSizes([330, 850])
         yield
         self.form.refused.connect(self.refused)
@@ -149,6 +153,7 @@ class HologramsPanel(Panel):
                 "correction": Behaviour(filters="SLM calibrations (*.json)", must_exist=True),
                 "out": Behaviour(browse="save", filters="Patterns (*.png)"),
             },
+            whole=False,
         )
 
     # What is asked for ---------------------------------------------------------------------------

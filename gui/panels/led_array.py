@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ from PySide6.QtWidgets import QGridLayout, QPushButton, QSlider, QWidget
 from drivers.led_array import LedPattern, Rgb
 from gui.forms.fields import Behaviour, NumberField
 from gui.panel import DevicePanel, on_bench
-from gui.session import BenchSession
 from gui.theme import colours, luminance
 from gui.widgets.building import after_rest, button, choice, fill, in_row, label
 from gui.widgets.dialogues import elided
@@ -34,8 +34,14 @@ class LedPanel(DevicePanel):
     kind = "led_array"
     look_ms = 300
 
-    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
-        super().__init__(session, parent)
+    @classmethod
+    def prepare(cls) -> None:
+        """Look for patterns that installed packages add: each has a button."""
+        shape_buttons()
+
+    def parts(self) -> Iterator[None]:
+        """Make the widgets."""
+        session = self.session
         self.plot = plot_widget("x", "y", x_unit="mm", y_unit="mm", grid=False)
         self.plot.setAspectLocked(True)
         self.plot.hideButtons()
@@ -50,6 +56,7 @@ class LedPanel(DevicePanel):
         self._dimmed: tuple[LedPattern, LedPattern] | None = None
         """The pattern that was dimmed last, and the one whose hues it has: faint levels keep no hue."""
         self._positions: Any = None
+        yield
         self.now = label("–", selectable=True, wraps=True)
         self.colour = choice(_COLOURS, "Colour of the LEDs that are lit next")
         self.brightness = QSlider(Qt.Orientation.Horizontal)
@@ -76,6 +83,7 @@ class LedPanel(DevicePanel):
         tip = "Light or darken the LED of this number"
         self.toggle_button = button("Toggle LED", tip, self._toggle_typed)
         self.pattern_buttons: dict[str, QPushButton] = {}
+        yield
         grid = QGridLayout()
         grid.setSpacing(4)
         tips = {
@@ -87,13 +95,16 @@ class LedPanel(DevicePanel):
             made = button(words, tip, lambda _=False, words=words: self.show_pattern(words))
             self.pattern_buttons[words] = made
             grid.addWidget(made, number // 4, number % 4)
-        self._controls = fill(
-            QWidget(),
+        self._controls = QWidget()
+        fill(self.body, self.now, (self.plot, 1), self._controls)
+        yield
+        fill(
+            self._controls,
             in_row(self.colour, (self.brightness, 1), self.level, label(na.label), self.na),
             grid,
             in_row(label("LED"), self.index, self.toggle_button, None),
         )
-        fill(self.body, self.now, (self.plot, 1), self._controls)
+        yield
         self.watch_device(self.now)
 
     # Panel ---------------------------------------------------------------------------------------

@@ -70,10 +70,15 @@ class LivePanel(Panel):
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
         session = self.session
+        above, pictures, side = QWidget(), QWidget(), QWidget()
+        both = split(pictures, side, sizes=[900, 240], stretch=0)
         self.picture = LivePicture(session)
         yield
+        yield from self.picture.parts()
         self.picture.region_sent.connect(self.send_region)
+        yield
         self.form = CameraForm(self)
+        yield from self.form.parts()
         yield
         self.record_bar = RecordBar(self)
         self.status = label("Waiting for the first frame …", "dim", selectable=True, wraps=True, yields=True)
@@ -83,7 +88,21 @@ class LivePanel(Panel):
         """When the last frame came, or could have begun to."""
         self._shown_at: deque[float] = deque(maxlen=400)
         yield
-        self._lay_out()
+        fill(self.body, above, (both, 1), self.record_bar)
+        yield
+        self._make_buttons(above)
+        yield
+        fill(pictures, (self.picture, 1), in_row((self.status, 1), self.under_mouse))
+        yield
+        fill(
+            side,
+            label("CAMERA", "heading"),
+            self.form,
+            6,
+            label("HISTOGRAM, RAW DATA", "heading"),
+            (self.picture.histogram, 1),
+            margins=(8, 0, 0, 0),
+        )
         yield
         session.device_changed.connect(self._device_changed)
         self.offer_reconnect("camera")
@@ -91,7 +110,7 @@ class LivePanel(Panel):
         every(self, _STATISTICS_MS, self.count)
 
     # Layout --------------------------------------------------------------------------------------
-    def _lay_out(self) -> None:
+    def _make_buttons(self, row: QWidget) -> None:
         tip = "Run the camera, or hold the last frame (Ctrl+L)"
         self.live_button = button("▶ Live", tip, self.toggle_live, checkable=True)
         self.live_button.setChecked(self.session.live_wanted)
@@ -119,19 +138,8 @@ class LivePanel(Panel):
         tip = "Read the whole sensor again"
         self.whole_button = button("Whole sensor", tip, lambda: self.form.set_region(None))
         self.form.buttons.insertWidget(0, self.whole_button)
-        side = fill(
-            QWidget(),
-            label("CAMERA", "heading"),
-            self.form,
-            6,
-            label("HISTOGRAM, RAW DATA", "heading"),
-            (self.picture.histogram, 1),
-            margins=(8, 0, 0, 0),
-        )
-        pictures = fill(QWidget(), (self.picture, 1), in_row((self.status, 1), self.under_mouse))
         first = (self.live_button, self.snap_button, self.average, self.reconstruct_button)
-        both = split(pictures, side, sizes=[900, 240], stretch=0)
-        fill(self.body, in_row(*first, 10, light, None, spacing=6), (both, 1), self.record_bar)
+        fill(row, *first, 10, light, None, across=True, spacing=6)
 
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:

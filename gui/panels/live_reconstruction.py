@@ -87,11 +87,18 @@ class LiveReconstructionPanel(Panel):
         self._logged: tuple[str, ...] = ()
         """Warnings of the reconstructor in use that are in the log already."""
 
+    @classmethod
+    def prepare(cls) -> None:
+        """Look for methods that installed packages add: the form offers them."""
+        for offered in options_of(ReconstructionOptions):
+            _ = offered.words
+
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
         session = self.session
         self.view = ImageView()
         follow_orientation(session, "results", self.view.orient)
+        yield
         self.file, self.browse_button = path_field(
             "calibration folder",
             "A calibration, or a run that holds one",
@@ -115,13 +122,11 @@ class LiveReconstructionPanel(Panel):
         self.budget.refused.connect(lambda why: self.refused(None, why))
         declared = (*options_of(ReconstructionOptions), *options_of(LiveOptions))
         own = ("z_um", "budget_ms")
-        self.options = OptionsForm([o for o in declared if o.name not in own], folded=(*FOLDED, "Computing"))
-        yield
-        self.options.show_for("live picture")
-        self.options.settled.connect(lambda _: self._rebuild())
-        self.options.refused.connect(self.refused)
+        asked = [o for o in declared if o.name not in own]
+        self.options = OptionsForm(asked, folded=(*FOLDED, "Computing"), whole=False)
         folded = scrolled(self.options)
         folded.hide()
+        yield
         tip = "Prior, solver, camera model, background; how frames are binned"
         self.options_button = button("Options", tip, checkable=True)
         self.options_button.toggled.connect(folded.setVisible)
@@ -138,6 +143,11 @@ class LiveReconstructionPanel(Panel):
         switches = (self.run_button, self.refine_button, self.options_button)
         second = in_row(*switches, self.turn_button, None, label("within"), self.budget)
         fill(self.body, first, (self.view, 1), (self.hint, 1), self.status, second, (folded, 1))
+        yield
+        yield from self.options.parts()
+        self.options.show_for("live picture")
+        self.options.settled.connect(lambda _: self._rebuild())
+        self.options.refused.connect(self.refused)
         yield
         session.run_finished.connect(self._run_finished)
         self._timer = every(self, _LOOK_MS, self.look)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,23 +17,20 @@ from gui.forms.options_form import SuggestedName
 from gui.forms.reconstruct import CALIBRATION, PSF, ReconstructForm, SoFar, Written, reconstruct_job
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
+from gui.result_export import ResultExport
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
 from gui.theme import as_shown
 from gui.widgets.building import Hint, button, fill, in_row, label, split
-from gui.widgets.dialogues import Question, choose_path
+from gui.widgets.dialogues import choose_path
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
-from instrument.files.atomic import protecting
 from instrument.files.calibration_file import calibrated_depths_um, newest_calibration
 from instrument.files.errors import BenchError, FileError
-from instrument.files.images import write_image
-from instrument.files.volumes import uneven_steps
 from instrument.reconstruction.job import find_calibration
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.stored_result import (
     StoredResult,
-    export_result,
     find_results,
     open_result,
 )
@@ -44,8 +40,6 @@ from recon.reconstruction.options import ReconstructionOptions
 
 _REFINABLE = "--refine-psf fits"
 """In the verdict's sentence, where fitting the PSF to the photograph is what helps."""
-Views = dict[Path, npt.NDArray[np.uint8]]
-"""Files of an export with the colours that they show, (height, width, 3)."""
 
 
 class ReconstructionsPanel(Panel):
@@ -54,6 +48,7 @@ class ReconstructionsPanel(Panel):
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.result: StoredResult | None = None
+        self.export = ResultExport(self, lambda: self.result, self._shown, lambda: self.picture.orientation)
         self.job: Job | None = None
         self._explaining: Job | None = None
         self._opening: Job | None = None
@@ -88,7 +83,7 @@ class ReconstructionsPanel(Panel):
         self.open_button = button("Open…", tip, self._choose)
         self.refresh_button = button("Refresh", "Look into the data folder again", self.refresh)
         tip = "Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)"
-        self.export_button = button("Export…", tip, self._choose_export, enabled=False)
+        self.export_button = button("Export…", tip, lambda: self.export.choose(), enabled=False)
         buttons = in_row(self.open_button, self.refresh_button)
         self.tabs.addTab(fill(QWidget(), (self.list, 1), buttons, margins=(0, 6, 0, 0)), "Results")
         yield
@@ -99,13 +94,13 @@ class ReconstructionsPanel(Panel):
         self.keep_button = button("Keep the fitted PSF", tip, self.keep_fitted)
         self.keep_button.hide()
         self.form = ReconstructForm()
+        self.tabs.addTab(self.form, "Reconstruct")
+        yield
         yield from self.form.parts()
         self.form.asked.connect(self.reconstruct)
         self.form.questioned.connect(self.explain)
         self.form.stopped.connect(self._stop)
         self.form.refused.connect(self.refused)
-        yield
-        self.tabs.addTab(self.form, "Reconstruct")
         yield
         self.heading = label(selectable=True)
         self.place = label(role="dim")
@@ -218,92 +213,6 @@ class ReconstructionsPanel(Panel):
         self.export_button.setEnabled(False)
 
     # Export --------------------------------------------------------------------------------------
-    def _choose_export(self) -> None:
-        if self.result is None:
-            return
-        values = "*.tif *.npy" if self.result.volume is None else "*.tif *.ome.zarr *.npy"
-        filters = f"All values ({values});;What is shown (*.png)"
-        start = str(self.result.path.parent)
-        choose_path(self.viewers, "save", "Export", start, partial(self._export_chosen, self.result), filters)
-
-    def _export_chosen(self, result: StoredResult, target: Path) -> None:
-        """Export the result that the name was chosen for, after asking whether files may be replaced."""
-        if not self._still_shown(result):
-            return
-        views = self._views_for(target)  # what is asked about now is what is written after the answer
-
-        def answered(agreed: bool) -> None:
-            if agreed and self._still_shown(result):
-                self.export_to(target, overwrite=True, views=views)
-
-        def looked(present: list[str]) -> None:
-            if present:
-                text = f"{', '.join(present)}: exists already. Replace it?"
-                Question(self, "Replace?", text, ("Replace", "Keep"), answered).ask()
-            elif self._still_shown(result):
-                self.export_to(target, views=views)
-
-        files = list(views or (target,))
-        look = self.jobs.watch("Looking for files", lambda _: [file.name for file in files if file.exists()])
-        self.follow(look).succeeded.connect(looked)
-
-    def _still_shown(self, result: StoredResult) -> bool:
-        """Whether a result is still open; says so where another was opened while the operator was asked."""
-        if self.result is result:
-            return True
-        self.refused(None, f"{result.path.name} is not open any more: nothing was exported. Open it again.")
-        return False
-
-    def _views_for(self, target: Path) -> Views | None:
-        """Return the files of a ``.png`` export, each with what it shows now; None for all values."""
-        if target.suffix.lower() != ".png":
-            return None
-        shown = self._shown()
-        if len(shown) == 1:
-            return {target: next(iter(shown.values()))}
-        return {target.with_name(f"{target.stem}-{name}.png"): pixels for name, pixels in shown.items()}
-
-    def export_to(self, target: Path, *, overwrite: bool = False, views: Views | None = None) -> Job | None:
-        """Write what is shown (``.png``: one file for each view), or all values, as the name asks for.
-
-        ``views`` are the files of a ``.png`` as they were when the name was chosen; default: as they are now.
-        """
-        result = self.result
-        if result is None:
-            return None
-        views = self._views_for(target) if views is None else views
-        if views is not None and not views:
-            self.refused(None, "The volume's views are still being read. Export them when they are shown.")
-            return None
-        orientation = self.picture.orientation
-
-        def write(context: JobContext) -> list[Path]:
-            with protecting(result.inputs):
-                return write_views(context)
-
-        def write_views(context: JobContext) -> list[Path]:
-            if views is None:
-                advance = partial(_report_share, context)
-                export_result(result, target, orientation=orientation, overwrite=overwrite, advance=advance)
-                return [target]
-            for path, pixels in views.items():
-                if path.exists() and not overwrite:
-                    raise BenchError(f"{path}: exists already and was left as it is.")
-                write_image(path, pixels)
-            return list(views)
-
-        job = self.follow(self.jobs.compute(f"Exporting {target.name}", write))
-        planes_um = None if views is not None or target.suffix.lower() == ".npy" else result.planes_um
-        steps = "" if planes_um is None else uneven_steps(planes_um[0])
-
-        def written(files: list[Path]) -> None:
-            self.session.log("info", f"Wrote {', '.join(map(str, files))}")
-            if steps:
-                self.session.log("warning", f"{target.name}: {steps}")
-
-        job.succeeded.connect(written)
-        return job
-
     def _shown(self) -> dict[str, npt.NDArray[np.uint8]]:
         """Return the views in their colours, 8 bit."""
         view = self.picture if self.viewers.currentWidget() is self.picture else self.volume
@@ -529,10 +438,6 @@ class ReconstructionsPanel(Panel):
         self._depths.forget()
         self._newest.forget()
         self._close_result()
-
-
-def _report_share(context: JobContext, done: int, total: int) -> None:
-    context.report(done / total)
 
 
 def _age(record: Path) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 from PySide6.QtCore import QFileSystemWatcher, QSignalBlocker, Qt, QUrl
@@ -56,19 +58,28 @@ class RunsPanel(Panel):
         self._verifier = NewestOnly(session.jobs, "Verifying a run")
         self._lister = NewestOnly(session.jobs, "Reading the list of runs")
         self._wanted: Path | None = None
+
+    def parts(self) -> Iterator[None]:
+        """Make what holds the widgets, then those."""
+        session = self.session
+        left, top, below = QWidget(), QWidget(), QWidget()
+        right = split(top, below, sizes=[480, 260], down=True)
+        fill(self.body, split(left, right, sizes=[560, 640], firm=True))
         self._make_list()
+        fill(left, self.where, (self.table, 1), (self.hint, 1), margins=(0, 0, 6, 0))
+        yield
         self._make_details()
-        left = fill(QWidget(), self.where, (self.table, 1), (self.hint, 1), margins=(0, 0, 6, 0))
+        yield
+        fill(top, (self.view, 1), self.slider, self.frame_words, margins=(6, 0, 0, 0))
+        yield
         foot = in_row(
             (self.bar, 1),
             in_column(
                 self.use_button, self.play_button, self.export_button, self.verify_button, self.folder_button
             ),
         )
-        top = fill(QWidget(), (self.view, 1), self.slider, self.frame_words, margins=(6, 0, 0, 0))
-        below = fill(QWidget(), (self.about, 1), foot, margins=(6, 0, 0, 0))
-        right = split(top, below, sizes=[480, 260], down=True)
-        fill(self.body, split(left, right, sizes=[560, 640], firm=True))
+        fill(below, (self.about, 1), foot, margins=(6, 0, 0, 0))
+        yield
         self._rest = after_rest(self, _REST_MS, self.read_folder)
         self._watcher = QFileSystemWatcher(self)
         self._watcher.directoryChanged.connect(lambda _: self._rest.start())
@@ -164,11 +175,9 @@ class RunsPanel(Panel):
     def _make_list(self) -> None:
         self.table = table(_COLUMNS, "Click a run or photograph to open it", wide=0, row_px=26)
         self.table.setSelectionMode(QTableWidget.SelectionMode.SingleSelection)
-        # What distinguishes runs of a day stands at the end of their names.
-        self.table.setTextElideMode(Qt.TextElideMode.ElideMiddle)
         self.table.verticalHeader().hide()
         self.table.currentCellChanged.connect(lambda row, *_: self._row_chosen(row))
-        self.where = label(role="dim", selectable=True, yields=True)
+        self.where = label(role="dim", yields=True)
         self.hint = Hint(
             "No run yet: each calibration, plan, recording and photograph is listed here.",
             "Calibrate…",
@@ -221,7 +230,7 @@ class RunsPanel(Panel):
             self.table.setRowCount(len(summaries))
             for number, listed in enumerate(summaries):
                 texts = (
-                    listed.path.name,
+                    _called(listed.path),
                     listed.became,
                     f"{listed.stored}"
                     if listed.stored == listed.frames
@@ -232,7 +241,7 @@ class RunsPanel(Panel):
                 for place, text in enumerate(texts):
                     tip = listed.problem or (str(listed.path) if place == 0 else text)
                     warns = place == 1 and listed.became != RunCondition.COMPLETED
-                    self.table.setItem(number, place, cell(text, tip, warns=warns))
+                    self.table.setItem(number, place, cell(text, tip, number=place == 2, warns=warns))
             self.table.setCurrentCell(chosen, 0) if chosen >= 0 else self.table.clearSelection()
         if chosen >= 0 and self._wanted is not None:
             self._wanted = None
@@ -314,3 +323,15 @@ class RunsPanel(Panel):
         if self.opened is not None:
             self._wanted = self.opened.path
         self.read_folder()
+
+
+_DATED = re.compile(r"\d{4}-(\d\d-\d\d)_(\d\d)-(\d\d)-(\d\d)_?(.*)")
+
+
+def _called(path: Path) -> str:
+    """Return what a run or photograph is called in the list: what distinguishes it first."""
+    dated = _DATED.fullmatch(path.stem if path.suffix == ".tif" else path.name)
+    if dated is None:
+        return path.name
+    day, hour, minute, second, name = dated.groups()
+    return f"{name.replace('_', ' ')} {day} {hour}:{minute}:{second}".strip()

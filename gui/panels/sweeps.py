@@ -46,7 +46,7 @@ class _PlanOptions:
     text: str = option(
         (files("instrument.plan") / "example.toml").read_text(),
         label="Plan",
-        help="TOML; diffuserbench plan new writes the same example.",
+        help="A plan in TOML; the example shows all that can be said.",
         default_words="the example",
     )
 
@@ -91,11 +91,17 @@ class SweepsPanel(ProcedurePanel):
         self.psfs = PsfTable()
         self.picture = Picture()
         yield from super().parts()
-        shown = fill(QWidget(), (self.frame, 1), self.frame_words)
-        self.tabs = tabs({"Quality of PSFs": self.psfs, "Result": self.picture})
-        above = split(self.path, shown, sizes=[560, 420], firm=True)
-        yield
+        above, self.tabs = split(), tabs({})
         fill(self.right, split(above, self.tabs, sizes=[360, 400], down=True, firm=True))
+        yield
+        above.addWidget(self.path)
+        yield
+        above.addWidget(fill(QWidget(), (self.frame, 1), self.frame_words))
+        above.setChildrenCollapsible(False)
+        above.setSizes([560, 420])
+        yield
+        self.tabs.addTab(self.psfs, "Quality of PSFs")
+        self.tabs.addTab(self.picture, "Result")
         yield
         self._shown: Snapshot | None = None
         self._pictures = PsfPictures()

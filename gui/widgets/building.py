@@ -171,11 +171,50 @@ class Hint(QWidget):
         self.button.setVisible(not busy)
 
 
+class OneLine(QLabel):
+    """One line of words: as much of it as there is room for, with "…"; the tool tip has all of it.
+
+    It widens nothing: it takes what room it is given.
+    """
+
+    def __init__(self, words: str = "") -> None:
+        super().__init__()
+        self._words = ""
+        self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+        self.setText(words)
+
+    def text(self) -> str:
+        """Return all of the words."""
+        return self._words
+
+    def setText(self, words: str) -> None:  # noqa: N802 - Qt's name
+        """Show other words."""
+        if words != self._words:
+            self._words = words
+            self.setToolTip(words)
+            self.setAccessibleDescription(words)
+        self._fit()
+
+    def clear(self) -> None:
+        """Show nothing."""
+        self.setText("")
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
+        """Show what there is room for now."""
+        super().resizeEvent(event)
+        self._fit()
+
+    def _fit(self) -> None:
+        shown = self.fontMetrics().elidedText(self._words, Qt.TextElideMode.ElideRight, self.width())
+        if super().text() != shown:
+            super().setText(shown)
+
+
 def label(
     words: str = "", role: str = "", *, selectable: bool = False, wraps: bool = False, yields: bool = False
 ) -> QLabel:
     """Return a label. ``role``: dim, value, heading, title, hint; one that ``yields`` widens nothing."""
-    made = QLabel(words)
+    made = OneLine(words) if yields and not wraps else QLabel(words)
     made.setWordWrap(wraps)
     if role:
         made.setProperty("role", role)

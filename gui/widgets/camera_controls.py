@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -63,14 +64,19 @@ class CameraForm(QWidget):
         self._panel = panel
         self._session = panel.session
         self.state: CameraState | None = None
+
+    def parts(self) -> Iterator[None]:
+        """Make the fields and buttons."""
+        panel = self._panel
         tip = "Find the exposure that fills the sensor's range in the present light, nothing saturated"
         self.auto_button = button("Auto", tip, self.expose)
         behaviours = {
             name: Behaviour(offers=partial(self._offered, offered)) for name, offered in _OFFERED.items()
         }
         behaviours["exposure_ms"] = Behaviour(beside=lambda: self.auto_button)
-        self.form = OptionsForm([CameraOptions], behaviours)
+        self.form = OptionsForm([CameraOptions], behaviours, whole=False)
         self.widgets = self.form.widgets
+        yield from self.form.parts()
         self.form.hide_fields(_OF_HARDWARE)
         self.form.refused.connect(panel.refused)
         self.form.settled.connect(self._settled)
@@ -83,7 +89,9 @@ class CameraForm(QWidget):
         )
         self.presets = KeptBar(self._session, "camera", "Presets", self._preset, self._use_preset, "Use")
         self.buttons = in_row(self._temperature_name, (self.temperature, 1), self.all_button)
+        yield
         fill(self, self.form, self.presets, self.buttons)
+        yield
         self._session.device_changed.connect(self._device_changed)
         self._reads = every(self, _FIRST_READ_MS, self.read_back)
         self._device_changed("camera")

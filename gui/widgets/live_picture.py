@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import pyqtgraph as pg
@@ -215,19 +216,27 @@ class LivePicture(QWidget):
         self.frame: Frame | None = None
         self._measured: Frame | None = None
         self.levels = (0.0, 1.0)
+        self._session = session
+
+    def parts(self) -> Iterator[None]:
+        """Make the view and its tools."""
+        session = self._session
         self.view = ImageView()
         self.view.keys.moved.connect(lambda across, down: self._by_keys(across, down, alt=False))
         self.view.keys.resized.connect(lambda across, down: self._by_keys(across, down, alt=True))
         self.view.keys.acted.connect(lambda send: self.region_sent.emit() if send else None)
         self.histogram = HistogramPlot()
         self.histogram.levels_dragged.connect(self._levels_by_hand)
+        yield
         self.cross_hair = CrossHair(self.view)
         self.profile_line = ProfileLine(self.view)
         self.region_box = RegionBox(self.view)
+        yield
         self.profile_plot = plot_widget("along the line", "counts", x_unit="pixels")
         self._profile_curve = self.profile_plot.plot([], [], pen=curve_pen(1))
         self.profile_plot.setMaximumHeight(170)
         self.profile_plot.hide()
+        yield
         self.colour_map = choice(NAMES, "Colour map; saturated pixels have a colour of their own")
         self.colour_map.setCurrentText(self.view.colour_map)
         self.colour_map.currentTextChanged.connect(self.view.set_colour_map)
@@ -260,6 +269,7 @@ class LivePicture(QWidget):
             for switched in what:
                 switch.toggled.connect(switched)
             switch.toggled.connect(lambda _: self._arrows_for())
+        yield
         fit = button("Fit", "Show the whole image (wheel zooms, dragging moves)", self.view.whole)
         tip = "Turn and mirror what the camera sees, in every panel; files stay as the sensor has them."
         self.turn_button = OrientationButton(session, "frames", tip)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import Qt, QTimer, Signal
-from PySide6.QtGui import QResizeEvent
-from PySide6.QtWidgets import QFrame, QLabel, QSizePolicy, QWidget
+from PySide6.QtCore import Signal
+from PySide6.QtWidgets import QFrame, QSizePolicy, QWidget
 
 from gui.background import NewestOnly
 from gui.jobs import Job
@@ -14,7 +13,6 @@ from gui.theme import colours
 from gui.widgets.building import after_rest, button, every, fill, label
 
 _LOOK_MS = 500
-_AT_END = Qt.TextElideMode.ElideRight
 _REST_MS = 400
 """Rest after a job before the folder is read again."""
 
@@ -65,10 +63,12 @@ class StepStrip(QFrame):
         steps = steps_of(self._session.config, facts)
         step = next_of(steps)
         self.step = step or after_all(self._session.config, facts)
-        self._set(self.marks, "&nbsp;&nbsp; ".join(_mark(one, one is step) for one in steps))
+        marks = "&nbsp;&nbsp; ".join(_mark(one, one is step) for one in steps)
+        if self.marks.text() != marks:
+            self.marks.setText(marks)
         running = next((job.title for job in self._session.jobs.jobs if _is_run(job)), "")
         waits = self.step.panel == "reconnect" and not self.step.what
-        self._say(f"{running} is under way …" if running else self.step.words)
+        self.words.setText(f"{running} is under way …" if running else self.step.words)
         if self.button.text() != self.step.answer:
             self.button.setText(self.step.answer)
         self.button.setVisible(bool(self.step.answer) and not running and not waits)
@@ -76,26 +76,10 @@ class StepStrip(QFrame):
         assert layout is not None
         layout.activate()  # never a word cut off for a moment
 
-    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
-        """Show as much of the sentence as there is room for."""
-        super().resizeEvent(event)
-        QTimer.singleShot(0, self, lambda: self._say(self.words.toolTip()))
-
-    def _say(self, text: str) -> None:
-        """Show a sentence, its beginning where it is too long; all of it is the tool tip."""
-        self._set(self.words, self.words.fontMetrics().elidedText(text, _AT_END, self.words.width()))
-        if self.words.toolTip() != text:
-            self.words.setToolTip(text)
-            self.words.setAccessibleDescription(text)
-
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""
         self.marks.setText("")
         self.look()
-
-    def _set(self, part: QLabel, text: str) -> None:
-        if part.text() != text:
-            part.setText(text)
 
     def _go(self) -> None:
         if self.step is not None:

@@ -138,12 +138,12 @@ def _shown(name: str) -> tuple[str, str, float]:
 
 
 _COLUMNS = (
-    ("x (mm)", "Where the source stood"),
-    ("y (mm)", "Where the source stood"),
-    ("z (mm)", "Where the source stood"),
-    ("signal/noise", f"Mean signal inside the pattern over a pixel's noise; from {MIN_SNR:g} it is good"),
-    ("saturated", "Pixels at full scale"),
-    ("off (px)", "Distance from where the others, or the stage, say the pattern is"),
+    ("x\n(mm)", "Where the source stood"),
+    ("y\n(mm)", "Where the source stood"),
+    ("z\n(mm)", "Where the source stood"),
+    ("signal\n/noise", f"Mean signal inside the pattern over a pixel's noise; from {MIN_SNR:g} it is good"),
+    ("satu-\nrated", "Pixels at full scale"),
+    ("off\n(px)", "Distance from where the others, or the stage, say the pattern is"),
     ("verdict", "What is wrong; the whole text as tool tip"),
 )
 _VERDICT = len(_COLUMNS) - 1

@@ -25,6 +25,7 @@ from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.run_files import STATE
 from recon.base.checks import require_noise, select_psf
 from recon.camera.camera_model import ModelName, members_of_depths
+from recon.camera.grid import depth_in_words
 from recon.camera.refocus import at_depth
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.measurement import Measurement
@@ -221,8 +222,8 @@ def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOpt
 
 def require_distance(z_um: float) -> None:
     """Check a scene's distance, micrometres; BenchError says it in millimetres, as it was given."""
-    if not 0 < z_um < np.inf:
-        raise BenchError(f"The scene's distance must be above 0 mm and finite, not {z_um / 1e3:g} mm.")
+    if not z_um > 0:
+        raise BenchError(f"The scene's distance must be above 0 mm, not {z_um / 1e3:g} mm.")
 
 
 def refocused(job: Job, z_um: float) -> Job:
@@ -234,7 +235,7 @@ def refocused(job: Job, z_um: float) -> Job:
     Raises BenchError when ``z_um`` is no distance, or there is one PSF that nothing can bring there.
     """
     require_distance(z_um)
-    calibration, asked = job.calibration, f"{z_um / 1e3:g} mm"
+    calibration, asked = job.calibration, depth_in_words(z_um)
     z = calibration.source_positions_um[:, 2]
     as_it_is = "Leave the distance (--z-mm, z_um) out to take the PSF as it is, or give a calibration"
     if not bool((z > 0).all()):

@@ -166,6 +166,7 @@ def picture_grid(grid: Grid) -> dict[str, Any]:
         "centre": grid.centre,
         "sensor_pitch_um": grid.sensor_pitch_um,
         "object_pitch_um": known(grid.pitch_um[0]),
+        "pixel_mrad": known(grid.pixel_mrad),
         "z_um": known(grid.z_um[0]),
     }
 

@@ -238,7 +238,10 @@ class StoredResult:
         if self.volume is None:
             assert self.image is not None
             text = " x ".join(map(str, self.image.shape)) + " pixels"
-            return text if self.pitch_um is None else f"{text} of {_length(self.pitch_um)}"
+            angle = self._grid("pixel_mrad")
+            sizes = [] if self.pitch_um is None else [_length(self.pitch_um)]
+            sizes += [] if angle is None else [f"{angle:.3g} mrad"]
+            return f"{text} of {' or '.join(sizes)}" if sizes else text
         text = " x ".join(map(str, self.volume.shape)) + " voxels (planes, rows, columns)"
         if self.volume.n_channels > 1:
             text += f", {self.volume.n_channels} channels"

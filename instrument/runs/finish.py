@@ -13,6 +13,7 @@ from typing import Any
 from instrument.bench.bench import Bench
 from instrument.bench.safety import StepsFailedError, try_all
 from instrument.runs.run import FinishReason, Run
+from instrument.runs.run_files import LOG, RunError
 from instrument.runs.writer import RunWriter
 
 HELD_SIGNALS = 2
@@ -120,7 +121,7 @@ def end_run(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseEx
         try:
             held.answer()
         except BaseException as interruption:
-            interruption.add_note(f"What was acquired is in {writer.path}")
+            interruption.add_note(_where(writer))
             raise
     return run
 
@@ -140,11 +141,24 @@ def _end(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseExcep
         if error is None:
             for other in others:
                 first.add_note(str(other))
-            first.add_note(f"What was acquired is in {writer.path}")
+            first.add_note(_where(writer))
             raise first from None
         for problem in (first, *others):
             _log.error("%s", problem)
             error.add_note(str(problem))
     if error is not None:
-        error.add_note(f"What was acquired is in {writer.path}")
-    return ended[0] if ended else Run.open(writer.path)
+        error.add_note(_where(writer))
+    if ended:
+        return ended[0]
+    try:
+        return Run.open(writer.path)
+    except RunError:
+        if error is None:
+            raise
+        raise error from None  # nothing hides it
+
+
+def _where(writer: RunWriter) -> str:
+    if not (writer.path / LOG).exists():
+        return f"What was acquired was in {writer.path}, which is gone."
+    return f"What was acquired is in {writer.path}"

@@ -6,6 +6,7 @@ Lines without one are of runs made before there were any.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -165,6 +166,8 @@ class AppendOnlyLog:
     def append(self, records: Iterable[Json]) -> None:
         """Append records and wait until they are on the disk; all of them, or (raising) none."""
         data = b"".join(log_line(record) for record in records)
+        if not os.fstat(self._handle).st_nlink:  # what is written to it now nobody can read
+            raise FileNotFoundError(errno.ENOENT, "was deleted meanwhile", str(self.path))
         try:
             written = 0
             while written < len(data):

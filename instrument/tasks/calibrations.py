@@ -11,6 +11,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.tasks.task import Desk, Done, Given, saying_what_is_left, task
 from recon.analysis import AnalysisSettings, Noise
 from recon.base.declare import option
+from recon.camera.grid import FAR_UM, depth_in_words
 from recon.types import Calibration
 
 _PAGES = (".pdf", ".png", ".svg")
@@ -46,7 +47,12 @@ class RefocusOptions:
         help="A calibration, or a run with one.", metavar="CALIBRATION", positional=True
     )
     z_um: tuple[float, ...] = option(
-        help="Depth wanted; repeatable.", unit="um", shown_unit="mm", shown_factor=1000.0, above=0
+        help="Depth wanted; repeatable. inf: light that comes in parallel.",
+        unit="um",
+        shown_unit="mm",
+        shown_factor=1000.0,
+        above=0,
+        infinity=FAR_UM,
     )
     out: Path = option(help="The new calibration.", metavar="FOLDER", flags=("--out", "-o"))
     deflection_deg: float = option(
@@ -269,11 +275,11 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
         desk.say("SIMULATED: the calibration comes from the simulated bench")
     for one, field in zip(made, fields, strict=True):
         places = f" ({len(field.psfs)} places of the field)" if len(field.psfs) > 1 else ""
-        desk.say(f"{one.z_um / 1e3:g} mm{places}: {one}")
+        desk.say(f"{depth_in_words(one.z_um)}{places}: {one}")
         if one.extrapolated:
             near, far = (v / 1e3 for v in one.calibrated_um)
             desk.warn(
-                f"Warning: {one.z_um / 1e3:g} mm lies outside the calibrated "
+                f"Warning: {depth_in_words(one.z_um)} lies outside the calibrated "
                 f"{f'{near:.4g} to {far:.4g} mm' if far > near else f'depth, {near:.4g} mm'}: the pattern is "
                 "extrapolated, by scaling alone. Measure a PSF there where it matters."
             )

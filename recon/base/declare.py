@@ -44,6 +44,8 @@ class Declaration:
         Unit that people type and read, and how much of ``unit`` one of it is (1000 for mm of um).
     least, most, above, below : float
         Limits of a number: ``least <= x <= most`` and ``above < x < below``.
+    infinity : float, optional
+        What the word ``inf`` stands for, in ``unit``; None: it is no value.
     choices : callable or sequence of str
         Words it can be; a callable is asked each time, so that what is registered later appears.
     group : str
@@ -81,6 +83,7 @@ class Declaration:
     most: float = math.inf
     above: float = -math.inf
     below: float = math.inf
+    infinity: float | None = None
     choices: Callable[[], Sequence[str]] | Sequence[str] = ()
     group: str = ""
     flags: tuple[str, ...] = ()
@@ -199,6 +202,8 @@ class Option:
         said = self.declaration
         kind = Integral if self.is_whole else Real
         is_number = isinstance(value, kind) and not isinstance(value, bool)
+        if value == math.inf and said.infinity is not None:
+            return None
         # A NaN fails every comparison.
         if is_number and said.least <= value <= said.most and said.above < value < said.below:  # type: ignore[operator]
             return None
@@ -233,6 +238,7 @@ class Option:
         number = ", ".join(["a whole number" if self.is_whole else "a number", *self.limits(typed=typed)])
         unit = (said.shown_unit if typed else "") or said.unit
         number += f" ({unit})" if unit else ""
+        number += ", or inf" if said.infinity is not None else ""
         if Path in self.kinds:
             words.append("the name of a file")
         return f"{', '.join(words)} or {number}" if words else number

@@ -67,15 +67,12 @@ def _of_kind(o: Option, typed: str) -> Any:
 
 def _number(o: Option, typed: str) -> int | float | None:
     try:
-        return int(typed) if o.is_whole else _finite(float(typed)) * o.declaration.shown_factor
+        value = int(typed) if o.is_whole else float(typed)
     except ValueError:
         return None
-
-
-def _finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise ValueError(f"{value} is not finite")
-    return value
+    if value == math.inf and o.declaration.infinity is not None:
+        return o.declaration.infinity
+    return value if o.is_whole else value * o.declaration.shown_factor if math.isfinite(value) else None
 
 
 def size(typed: str) -> tuple[int, int]:
@@ -97,6 +94,8 @@ def shown(o: Option, value: Any) -> str:
     if isinstance(value, enum.Enum):
         return str(value.value)
     if isinstance(value, int | float) and not isinstance(value, bool):
+        if value == o.declaration.infinity:
+            return "inf"
         return f"{value / o.declaration.shown_factor:.6g}"
     if isinstance(value, tuple | list):
         return ("," if "," in o.declaration.metavar else " ").join(shown(o, one) for one in value)

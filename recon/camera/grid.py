@@ -23,8 +23,16 @@ if TYPE_CHECKING:
 Floats = npt.NDArray[np.float64]
 Plane = npt.NDArray[np.float32]
 
+FAR_UM = 1e9
+"""What stands for infinity, a kilometre: light from there is parallel to d / z, 1e-5 for a centimetre."""
+
 SAME = 1e-3
 """Sizes that differ by less than this part of the smallest are taken for equal."""
+
+
+def depth_in_words(z_um: float) -> str:
+    """Say a distance from the diffuser: in millimetres, or that it is infinity."""
+    return "infinity" if z_um >= FAR_UM else f"{z_um / 1e3:g} mm"
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +74,19 @@ class Grid:
             return np.full(len(self.z_um), np.nan)
         steps = np.abs(np.diff(self.z_um))
         return np.append(steps, steps[-1])
+
+    @property
+    def pixel_mrad(self) -> float:
+        """Angle between what neighbouring pixels near the axis look at, in every plane; NaN if not known."""
+        return float(1e3 * self.pitch_um[0] / self.z_um[0])
+
+    def direction_deg(self, row: float, column: float) -> tuple[float, float]:
+        """Return the angles ``(x, y)`` from the axis at which a pixel looks; NaN where they are not known.
+
+        A picture of what is far away has places on the sky: ``tan(angle) = offset * pitch / d``.
+        """
+        x, y, z = self.place_um(0, row, column)
+        return float(np.degrees(np.arctan2(x, z))), float(np.degrees(np.arctan2(y, z)))
 
     @property
     def is_metric(self) -> bool:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from recon.camera.camera_model import members_of_depths
 from recon.camera.field_registration import remembered_field
+from recon.camera.grid import FAR_UM
 from recon.camera.registration import displacement, moved, register, rescaled
 from recon.camera.transformed import geometric_centre, resampled
 from recon.camera.varying_psfs import interpolation_weights
@@ -123,13 +124,14 @@ def refocus(
     calibration : Calibration
         With depths, and ``geometry.diffuser_distance_mm``.
     z_um : float
+        Infinity is taken as :data:`~recon.camera.grid.FAR_UM`.
     deflection_deg : float
         Typical angle by which the diffuser bends light (its half width at half maximum), for the error.
 
     Raises InputError when depths or the distance from diffuser to sensor are unknown.
     """
     depths, psfs = central_psfs(calibration)
-    distance_um = _distance_um(calibration)
+    distance_um, z_um = _distance_um(calibration), min(z_um, FAR_UM)
     mixture = _mixture(depths, psfs, z_um, distance_um)
     members, weights = mixture.members, mixture.weights
     bend_um = np.deg2rad(deflection_deg) * distance_um
@@ -172,7 +174,7 @@ def refocus_field(calibration: Calibration, z_um: float) -> Calibration:
     Raises as :func:`refocus`, and InputError where the pixel pitch is not known.
     """
     depths, psfs = central_psfs(calibration)
-    distance_um = _distance_um(calibration)
+    distance_um, z_um = _distance_um(calibration), min(z_um, FAR_UM)
     pitch_um = calibration.geometry.pixel_pitch_um
     mixture = _mixture(depths, psfs, z_um, distance_um)
     groups = members_of_depths(calibration.source_positions_um)
@@ -278,7 +280,7 @@ def at_depth(calibration: Calibration, z_um: float) -> tuple[Calibration, Refocu
     Where the calibration has the depth (to :data:`SAME_DEPTH` of the pattern's scale), its PSFs are returned
     as they are. Raises as :func:`refocus`.
     """
-    distance_um = _distance_um(calibration)
+    distance_um, z_um = _distance_um(calibration), min(z_um, FAR_UM)
     z, _ = central_psfs(calibration)
     same = np.array([abs(paraxial_scale(v, z_um, distance_um) - 1) < SAME_DEPTH for v in z])
     if same.any():
@@ -356,7 +358,7 @@ class _Mixture:
 
 def _mixture(depths: npt.NDArray[np.float64], psfs: Floats, z_um: float, distance_um: float) -> _Mixture:
     """Return what PSFs at ``z_um`` are made of, by the central ones, (n_z, n_channels, height, width)."""
-    if not 0 < z_um < np.inf:
+    if not z_um > 0:
         raise InputError(f"The depth to refocus to is above 0, not {z_um:g} um.")
 
     def of(members: tuple[int, ...], weights: tuple[float, ...]) -> _Mixture:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from recon.base.declare import option
 from recon.base.namespace import DEVICES, Device
 from recon.camera.camera_model import ModelName, model_names
+from recon.camera.grid import FAR_UM
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior
 
@@ -156,11 +157,12 @@ class ReconstructionOptions:
     )
     z_um: float | None = option(
         None,
-        help="Distance of the scene; a PSF is refocused to it.",
+        help="Distance of the scene; a PSF is refocused to it. inf: light that comes in parallel.",
         unit="um",
         shown_unit="mm",
         shown_factor=1000.0,
         above=0,
+        infinity=FAR_UM,
         flags=("--z-mm",),
         label="Distance",
         group=_MAIN,

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 import time
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from drivers.common.answers import within
+from drivers.common.checked import call_limit_s
 from drivers.common.stream import FrameStream
-from drivers.errors import DeviceError, DeviceTimeoutError
+from drivers.device import Device
+from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import FrameMetadata
 from instrument.bench.bench import Bench
 from instrument.live.live import LiveView
@@ -25,6 +30,8 @@ from recon.streams.live import LiveReconstructor
 from recon.types import Calibration
 from tests.instrument.conftest import mock_drivers
 from tests.instrument.runs.test_recorder import bench_with
+from tests.instrument.runs.test_resume import calls, open_mock_bench
+from tests.mocks.devices import MockCamera, MockLedArray, MockSlm, MockStage
 from tests.mocks.free_running import FreeRunningCamera
 
 __all__ = ["mock_drivers"]
@@ -160,3 +167,75 @@ def test_a_stream_that_is_given_up_lets_go_of_its_readers_and_frames(monkeypatch
     let_go.set()
     monkeypatch.undo()
     camera.stop_sequence()
+
+
+HANGING: dict[Any, tuple[type[Device], str]] = {
+    "stage": (MockStage, "move_to"),
+    "led_array": (MockLedArray, "set_pattern"),
+    "slm": (MockSlm, "display"),
+    "camera": (MockCamera, "set_exposure_ms"),
+}
+
+
+@pytest.mark.usefixtures("mock_drivers", "soon")
+@pytest.mark.parametrize("kind", HANGING)
+def test_a_device_that_hangs_when_set_or_moved_is_given_up_named_and_undone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Any
+) -> None:
+    image = tmp_path / "image.png"
+    cv2.imwrite(str(image), np.full((4, 6), 40, np.uint8))
+    positions = {"kind": "points", "points_um": [(0, 0, 10.0), (0, 0, 20.0)]}
+    raw = {
+        "label": "a",
+        "light": "source",
+        "exposure_ms": 20,
+        "slm_image": str(image),
+        "positions": positions,
+    }
+    with open_mock_bench() as bench:
+        device = bench.devices[kind]
+        plain, name = HANGING[kind]
+        method, let_go = getattr(plain, name), threading.Event()
+        limits_s = [call_limit_s(device, what) for what in ("settings", "open", name)]
+        assert limits_s == [30, 120, 3000 if kind == "stage" else 30]  # three times 1 m at 1 mm/s
+        monkeypatch.setattr("drivers.common.checked.call_limit_s", lambda *_: 0.25)
+
+        def hangs(self: Device, *args: Any, **named: Any) -> Any:
+            let_go.wait(20)
+            return method(self, *args, **named)
+
+        monkeypatch.setattr(plain, name, hangs)
+        with pytest.raises(
+            DeviceTimeoutError, match=rf"^{kind} \(mock\): hangs: {name.replace('_', ' ')} has"
+        ):
+            acquire(bench, Plan(label="p", parts=(Part.model_validate(raw),)), tmp_path / "runs")
+        assert Run.open(run_paths(tmp_path / "runs")[0]).condition is RunCondition.FAILED
+        assert light_is_off(bench)
+        with pytest.raises(DeviceTimeoutError, match="still hangs"):
+            device.settings()
+        calls(bench).clear()
+        let_go.set()
+        for thread in vars(device)["_left"]:
+            thread.join(5)
+        undone = {"stage": ["stage.stop"], "led_array": ["led_array.off"]}.get(kind, [])
+        assert [call for call in calls(bench) if call in ("stage.stop", "led_array.off")] == undone
+        assert light_is_off(bench)
+        assert device.settings() is not None
+
+
+@pytest.mark.usefixtures("mock_drivers")
+def test_ctrl_c_during_a_move_stops_it_and_waits_for_its_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_mock_bench() as bench:
+        stage, stopped = bench.stage, threading.Event()
+        assert stage is not None
+
+        def moves(*_: Any, **__: Any) -> Any:
+            os.kill(os.getpid(), signal.SIGINT)  # as a terminal does: to the process
+            assert stopped.wait(20)
+            raise StoppedError(stage.name, "stopped.")
+
+        monkeypatch.setattr(MockStage, "move_to", moves)
+        monkeypatch.setattr(MockStage, "stop", lambda _: stopped.set())
+        with pytest.raises(KeyboardInterrupt):
+            stage.move_to({"x_um": 1.0})
+        assert not any(thread.is_alive() for thread in vars(stage)["_left"])

@@ -83,6 +83,9 @@ def test_steps_of_honest_cameras_are_no_lies() -> None:
 
 def test_settings_without_tolerance_and_frames() -> None:
     class Stubborn(MockCamera):
+        def set_gain(self, gain: float) -> float:
+            return super().set_gain(1.3 * gain)
+
         def set_binning(self, binning: int) -> int:
             return 1
 
@@ -101,6 +104,7 @@ def test_settings_without_tolerance_and_frames() -> None:
 
     camera: Camera = made(Stubborn)
     for call, said in (
+        (lambda: camera.set_gain(4.0), "a gain of 4 and says 5.2"),
         (lambda: camera.set_binning(2), "a binning of 2 and says 1"),
         (lambda: camera.set_pixel_format("Mono12"), "a pixel format of Mono12 and says Mono8"),
         (lambda: camera.set_trigger_mode("software"), "a trigger mode of software and says free_run"),
@@ -111,17 +115,28 @@ def test_settings_without_tolerance_and_frames() -> None:
             call()
 
 
-def test_a_frame_without_an_exposure_is_none() -> None:
+@pytest.mark.parametrize("said", [float("nan"), 0.0])
+def test_a_frame_without_an_exposure_is_none(said: float) -> None:
     class Unsure(MockCamera):
         def snap(self) -> Frame:
             frame = super().snap()
-            return Frame(frame.image, replace(frame.metadata, exposure_ms=float("nan")))
+            return Frame(frame.image, replace(frame.metadata, exposure_ms=said))
 
-    with pytest.raises(DeviceError, match=r"a frame with an exposure \(ms\) and says nan"):
+    with pytest.raises(DeviceError, match=rf"a frame with an exposure \(ms\) and says {said:g}"):
         made(Unsure).snap()
 
 
 # Stages ---
+class Coloured(MockCamera):
+    def snap(self) -> Frame:
+        frame = super().snap()
+        return Frame(np.repeat(frame.image[..., None], 3, axis=2), frame.metadata)
+
+
+def test_a_frame_in_colour_has_its_regions_shape() -> None:
+    assert made(Coloured).snap().image.ndim == 3
+
+
 class Stays(MockStage):
     def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
         return dict(target)
@@ -148,6 +163,8 @@ def test_a_stage_that_does_not_move_is_found_out() -> None:
         DeviceError, match=r"its place, which is within 0 to 1e\+06 and says z_um = 9\.9e\+09"
     ):
         stage.position()
+    stage._position = {"x_um": -9e3, "z_um": 3 * 0.1}  # type: ignore[attr-defined] # far out, and just there
+    stage.move_to({"z_um": 0.0})
     with pytest.raises(DeviceError, match="was asked for homing and says that it is not homed"):
         made(NeverHome).home()
 

@@ -35,6 +35,7 @@ class ScriptedStage(PolledStage):
         self.targets = dict(self.places)
         self.halts = 0
         self.fault: DeviceError | None = None
+        self.says: list[str] = []
         self.blocked = False
         self.forgets_home = False
         self.ignores_stop = False
@@ -72,7 +73,10 @@ class ScriptedStage(PolledStage):
             step = self.targets[name] - place
             if not self.blocked:
                 self.places[name] = place + max(-reach, min(reach, step))
-        return StageState(dict(self.places), self.places != self.targets, self.homed)
+        faults = tuple(self.says)
+        if not self.faults_last:
+            self.says.clear()
+        return StageState(dict(self.places), self.places != self.targets, self.homed, faults)
 
     def _start(self, target: Mapping[str, float]) -> None:
         self._state()
@@ -128,6 +132,33 @@ def test_a_fault_stops_the_other_axes(stage: ScriptedStage) -> None:
         stage.wait(10.0)
     assert stage.halts == 1
     stage.fault = None
+
+
+@pytest.mark.parametrize("told", ["by wait", "by the next move", "to all who wait"])
+def test_a_fault_that_only_a_poller_heard_is_told_to_the_mover(stage: ScriptedStage, told: str) -> None:
+    stage.faults_last = False
+    stage.move_to({"x_um": 20.0}, wait=False)
+    stage.says.append("x_um: following error")
+    stage.position()  # of a window, a log: the controller says it once
+    while stage.is_moving:
+        time.sleep(0.002)
+    with pytest.raises(DeviceError, match="following error"):
+        stage.move_to({"x_um": 10.0}) if told == "by the next move" else stage.wait(5.0)
+    if told == "to all who wait":
+        with pytest.raises(DeviceError, match="following error"):
+            stage.wait(5.0)
+    stage.move_to({"x_um": 10.0})  # it was told once
+    stage.says.append("x_um: following error")
+    stage.position()
+    stage.home()
+    stage.move_to({"x_um": 10.0})  # what was before the homing is over
+
+
+def test_a_lasting_fault_that_is_gone_between_moves_refuses_none(stage: ScriptedStage) -> None:
+    stage.says.append("x_um: too hot")
+    stage.position()
+    stage.says.clear()
+    stage.move_to({"x_um": 10.0})
 
 
 def test_a_move_that_was_refused_half_way_stops_what_had_begun(stage: ScriptedStage) -> None:

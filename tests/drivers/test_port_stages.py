@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from drivers.asi.stage import AsiOptions, AsiStage
 from drivers.elliptec.stage import ElliptecOptions, ElliptecStage
-from drivers.errors import DeviceError, StoppedError
+from drivers.errors import DeviceError, LimitError, StoppedError
 from drivers.esp301.stage import Esp301Options, Esp301Stage
 from drivers.smc100.stage import Smc100Options, Smc100Stage
 from drivers.testing.stage import StageContract
@@ -36,7 +36,8 @@ def esp301(controller: EspController) -> Esp301Stage:
 
 
 def asi(controller: AsiController) -> AsiStage:
-    axes = {"x_um": {"letter": "X", "home_at_um": 5000.0}, "z_um": {"letter": "Z", "home_at_um": 900.0}}
+    axes = {"x_um": {"letter": "X", "home_at_um": 50_000.0}, "z_um": {"letter": "Z", "home_at_um": 900.0}}
+    axes["x_um"] |= {"lower_limit": 41_000.0, "upper_limit": 50_000.0}  # as seen from home
     return AsiStage(AsiOptions.model_validate({"port": str(controller.link), "axes": axes}))
 
 
@@ -104,8 +105,8 @@ def test_elliptec_failures_are_said(tmp_path: Path) -> None:
     with elliptec(bus) as stage:
         stage.home()
         stage.move_to({"x_um": 30_000.0}, wait=False)
+        bus.status["0"] = 2  # said once: unasked, or to who asks just then
         bus.axes["0"].halt()
-        bus.status["0"] = 2
         with pytest.raises(DeviceError, match=r"x_um \(module 0\): it did not reach its place in time"):
             stage.wait(5.0)
     wrong = {"port": str(bus.link), "axes": {"x_um": {"address": "1"}}}
@@ -176,16 +177,64 @@ def test_asi_says_its_refusals_and_reads_what_is_configured_at_home(tmp_path: Pa
     controller = AsiController(tmp_path)
     with asi(controller) as stage:
         assert stage.identity.firmware == "USB-9.53"
+        assert stage.limits["x_um"] == (-5000.0, 5000.0)  # of wherever it was switched on
         stage.home()
-        assert stage.position() == {"x_um": 5000.0, "z_um": 900.0}
+        assert stage.position() == {"x_um": 50_000.0, "z_um": 900.0}
+        assert stage.limits == {"x_um": (41_000.0, 50_000.0), "z_um": (-900.0, 900.0)}
+        assert stage.move_to({"x_um": 41_000.0, "z_um": -899.0})["x_um"] == pytest.approx(41_000.0)
+        stage.home()
+        assert stage.limits == {"x_um": (41_000.0, 50_000.0), "z_um": (-900.0, 900.0)}
         with pytest.raises(DeviceError, match=r"refuses 'Q X': it does not know the command \(error 1\)"):
             stage._query("Q X")
+    axes = {"x_um": {"letter": "X", "home_at_um": 5000.0, "upper_limit": 5001.0}}
+    with AsiStage(AsiOptions.model_validate({"port": str(controller.link), "axes": axes})) as stage:
+        for _ in range(2):
+            with pytest.raises(LimitError, match="-5000 to 5001 reach beyond the controller's own"):
+                stage.home()
+        assert not stage.is_homed
     found = AsiStage.probe(str(controller.link))
     assert found is not None
     assert found.driver == "asi"
     controller.port.unplug()
     with pytest.raises(DeviceError, match="no port"):
         asi(controller).open()
+
+
+def test_elliptec_modules_answer_somebody_elses_client_as_they_answer_ours(tmp_path: Path) -> None:
+    peer = pytest.importorskip("thorlabs_elliptec", reason="thorlabs-elliptec is not installed (dev extra)")
+    bus = ElliptecBus(tmp_path)
+    module = peer.ELLx(str(bus.link), x=20)
+    try:
+        assert (module.travel, module.serial_number, module.units) == (60, "1140TEST", "mm")
+        module.home(blocking=True)
+        module.move_absolute(1.5, blocking=True)
+        assert module.get_position() == pytest.approx(1.5, abs=1e-3)
+        with pytest.raises(peer.ELLError) as caught:
+            module.move_absolute(61.0, blocking=True)
+        assert caught.value.status.value == 12
+    finally:
+        module.close()
+        time.sleep(0.3)  # its thread ends its port
+    bus.port.unplug()
+
+
+def test_an_asi_controller_answers_somebody_elses_client_as_it_answers_ours(tmp_path: Path) -> None:
+    peer = pytest.importorskip("asitiger.tigercontroller", reason="asitiger is not installed (dev extra)")
+    controller = AsiController(tmp_path)
+    tiger = peer.TigerController.from_serial_port(str(controller.link))
+    assert float(tiger.speed({"X": "?"})["X"]) == pytest.approx(6.0)
+    tiger.move({"X": 20_000})
+    tiger.wait_until_idle()
+    assert tiger.where(["X"]) == {"X": 20_000}
+    tiger.home(["X"])
+    with pytest.raises(Exception, match="N-21"):
+        tiger.halt()
+    tiger.home(["X"])
+    tiger.wait_until_idle()
+    tiger.here({"X": 1000})
+    assert tiger.where(["X"]) == {"X": 1000}
+    tiger.connection.disconnect()
+    controller.port.unplug()
 
 
 def test_a_wrong_port_is_no_such_stage(tmp_path: Path) -> None:

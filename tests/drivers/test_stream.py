@@ -87,8 +87,8 @@ def test_a_frame_that_is_held_never_changes_and_starves_only_the_stream() -> Non
     stream = FrameStream(camera, 4)
     reader = stream.reader()
     with stream:
-        while (frame := reader.next_frame(0.5)) is not None:
-            held.append(frame)
+        while reader.status.acquired < 40 or reader.status.waiting:
+            held += [frame for frame in (reader.next_frame(0.5),) if frame is not None]
         status = reader.status
     numbers = [number_of(frame) for frame in held]
     assert len(held) == len(set(numbers)) < 40

@@ -172,3 +172,12 @@ def test_only_what_applies_is_shown(form: OptionsForm) -> None:
     form.show_for("picture", "volume")
     assert form.widgets["at_once"].isVisible()
     assert form.make(Wanted).at_once is True
+
+
+def test_a_form_is_made_a_field_at_a_time(qtbot: QtBot) -> None:
+    form = OptionsForm([Wanted], whole=False)
+    qtbot.addWidget(form)
+    made = [len(form.fields) for _ in form.parts()]
+    assert made[0] == 1
+    assert len(made) >= 2 * len(form.fields), "each field, then each row"
+    assert form.values() == OptionsForm([Wanted]).values()

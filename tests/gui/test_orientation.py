@@ -9,6 +9,7 @@ import pytest
 from PySide6.QtCore import QPoint, Qt
 from pytestqt.qtbot import QtBot
 
+from gui.panel import whole
 from gui.session import BenchSession
 from gui.widgets.image_view import ImageView
 from gui.widgets.live_picture import LivePicture
@@ -71,7 +72,7 @@ def test_a_click_means_the_pixel_that_is_seen_there(qtbot: QtBot, orientation: O
 
 
 def test_it_is_kept_with_the_bench_and_all_views_follow(qtbot: QtBot, session: BenchSession) -> None:
-    pictures = [LivePicture(session), LivePicture(session)]
+    pictures = [whole(LivePicture(session)), whole(LivePicture(session))]
     for picture in pictures:
         qtbot.addWidget(picture)
     pictures[0].turn_button.menu().actions()[1].trigger()

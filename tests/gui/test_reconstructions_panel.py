@@ -334,7 +334,7 @@ def test_export_writes_values_and_views(qtbot: QtBot, panel: ReconstructionsPane
     np.save(tmp_path / "v.npy", voxels)
 
     def export(name: str) -> None:
-        job = panel.export_to(tmp_path / name)
+        job = panel.export.to(tmp_path / name)
         with qtbot.waitSignal(job.succeeded, timeout=WAIT_MS):
             pass
 
@@ -357,7 +357,7 @@ def test_export_writes_values_and_views(qtbot: QtBot, panel: ReconstructionsPane
     export("view.png")
     names = sorted(p.name for p in tmp_path.glob("view-*.png"))
     assert names == ["view-depth.png", "view-front.png", "view-side.png", "view-top.png"]
-    job = panel.export_to(tmp_path / "out.tif")
+    job = panel.export.to(tmp_path / "out.tif")
     with qtbot.waitSignal(job.failed, timeout=WAIT_MS):
         pass
     assert "exists already" in panel._note.toolTip()

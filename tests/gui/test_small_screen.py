@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 from PySide6.QtCore import QPoint, QRect, QSettings, QSize, Qt
-from PySide6.QtWidgets import QLineEdit, QPushButton, QScrollArea, QWidget
+from PySide6.QtWidgets import QLabel, QLineEdit, QPushButton, QScrollArea, QWidget
 from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
@@ -90,3 +90,15 @@ def _scroll_of(panel: QWidget) -> QScrollArea:
         assert around is not None
         around = around.parent()
     return around
+
+
+def test_a_line_that_is_too_long_says_that_it_goes_on(qtbot: QtBot) -> None:
+    words = "Last frame: 14:05:13, 4.715 ms, light: scene, SIMULATED"
+    line = label(words, yields=True)
+    qtbot.addWidget(line)
+    line.resize(120, 20)
+    line.show()
+    assert QLabel.text(line).endswith("…")
+    assert line.text() == line.toolTip() == words, "all of it, for who asks or points at it"
+    line.resize(900, 20)
+    assert QLabel.text(line) == words

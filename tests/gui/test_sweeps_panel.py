@@ -400,3 +400,13 @@ def test_a_folder_in_which_nothing_can_be_kept_is_told_before_anything_moves(
     folder.unlink()
     enter(qtbot, panel, planes="3")
     assert panel.run_bar.start_button.isEnabled()
+
+
+def test_another_routines_form_is_made_while_the_window_answers(qtbot: QtBot, panel: SweepsPanel) -> None:
+    panel.choice.setCurrentIndex(panel.choice.findText("Angular response"))
+    assert not panel.views.is_whole("angular"), "made in one go"
+    assert not panel.run_bar.start_button.isEnabled()
+    qtbot.waitUntil(lambda: panel.views.is_whole("angular"), timeout=WAIT_MS)
+    qtbot.waitUntil(panel.run_bar.start_button.isEnabled, timeout=WAIT_MS)
+    panel.choice.setCurrentIndex(panel.choice.findText("Bead slides"))
+    assert panel.view.values() is not None, "whole for who asks"

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import threading
+import time
 from pathlib import Path
 
 from tests.mocks.moving_axis import MovingAxis
@@ -19,13 +22,14 @@ def commands_of(received: bytes, known: str) -> tuple[list[bytes], bytes]:
 
 
 class ElliptecBus:
-    """Modules by address. ``mute_when_busy``: they tell no place during a move."""
+    """Modules by address, which tell unasked how moves end. ``mute_when_busy``: no place during one."""
 
     def __init__(self, folder: Path, *, mute_when_busy: bool = False) -> None:
         self.axes = {"0": MovingAxis(0, 60 * 1024, 40_000, 700), "1": MovingAxis(0, 143_360, 90_000, 500)}
         self.about = {"0": (20, 60, 1024), "1": (14, 360, 143_360)}
         self.mute_when_busy = mute_when_busy
         self.status: dict[str, int] = {}
+        self.moves = dict.fromkeys(self.axes, 0)
         self.port = PtyDevice(
             folder,
             self.answer,
@@ -39,21 +43,29 @@ class ElliptecBus:
         axis = self.axes.get(address)
         if axis is None:
             return []
-        return (
-            [f"{address}{self.say(address, axis, words, text[3:])}\r\n".encode()]
-            if words
-            not in (
-                "ma",
-                "ho",
-            )
-            else self.go(axis, words, text[3:])
-        )
+        if words in ("ma", "ho"):
+            return self.go(address, axis, words, text[3:])
+        return [f"{address}{self.say(address, axis, words)}\r\n".encode()]
 
-    def go(self, axis: MovingAxis, words: str, value: str) -> list[Answer]:
+    def go(self, address: str, axis: MovingAxis, words: str, value: str) -> list[Answer]:
+        if words == "ma" and int(value, 16) > axis.highest:
+            return [f"{address}GS0C\r\n".encode()]
         axis.home(0) if words == "ho" else axis.go(int(value, 16))
+        self.moves[address] += 1
+        end = threading.Thread(target=self.end, args=(address, axis, self.moves[address]), daemon=True)
+        end.start()
         return []
 
-    def say(self, address: str, axis: MovingAxis, words: str, _value: str) -> str:
+    def end(self, address: str, axis: MovingAxis, move: int) -> None:
+        while axis.moving and self.moves[address] == move:
+            time.sleep(0.001)
+        if self.moves[address] == move:
+            failure = self.status.pop(address, 0)
+            said = f"GS{failure:02X}" if failure else f"PO{axis.place & 0xFFFFFFFF:08X}"
+            with contextlib.suppress(OSError):  # unplugged meanwhile
+                self.port.send(f"{address}{said}\r\n".encode())
+
+    def say(self, address: str, axis: MovingAxis, words: str) -> str:
         moving = axis.moving
         if words == "in":
             kind, travel, pulses = self.about[address]
@@ -216,10 +228,12 @@ class AsiController:
         match words:
             case "W":
                 return f":A {axis.place} "
-            case "M":
-                axis.go(int(value[1:]))
-            case "H":
+            case "M":  # beyond a limit it ends there, without a word
+                axis.go(max(axis.lowest, min(axis.highest, int(value[1:]))))
+            case "H":  # limits are places of the hardware: their numbers change with the place's
+                by = int(value[1:]) - axis.place
                 axis.set_place(int(value[1:]))
+                axis.lowest, axis.highest = axis.lowest + by, axis.highest + by
             case "!":
                 axis.go(axis.highest)
             case _:

@@ -47,7 +47,12 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "instrument/runs/acquire.py",
             "instrument/runs/timed.py",
         ),
-        (*_RUNS, "tests/drivers/test_answers.py"),
+        (
+            *_RUNS,
+            "tests/drivers/test_answers.py",
+            "tests/calibration_routines/test_procedures.py",
+            "tests/instrument/test_cli_acquisition.py",
+        ),
     ),
     "store": (
         (
@@ -62,7 +67,12 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "instrument/files/atomic.py",
             "instrument/files/record.py",
         ),
-        (*_RUNS, "tests/instrument/files/test_atomic.py", "tests/instrument/files/test_record.py"),
+        (
+            *_RUNS,
+            "tests/instrument/files/test_atomic.py",
+            "tests/instrument/files/test_record.py",
+            "tests/instrument/test_cli_acquisition.py",
+        ),
     ),
     "drops": (("drivers/common/drops.py",), ("tests/drivers/test_drops.py",)),
     "streams": (

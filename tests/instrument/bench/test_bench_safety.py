@@ -214,8 +214,10 @@ def test_the_simulated_scene_is_switched_and_dark_after_closing() -> None:
 def test_an_operator_is_asked_once_for_each_change() -> None:
     asked: list[str] = []
     with open_bench(bench_with().config, ask=asked.append) as bench:
+        assert not bench.scene_lit
         bench.scene_on()
         bench.scene_on()
+        assert bench.scene_lit
         bench.scene_off()
     assert asked == ["Please light the scene.", "Please darken the scene."]
 

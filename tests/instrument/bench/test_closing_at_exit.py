@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from instrument.bench.safety import ClosingAtExit
+
 BENCH = """
 [bench]
 name = "left open"
@@ -83,3 +85,16 @@ def test_a_bench_that_was_closed_is_not_touched_again(tmp_path: Path, count: int
     )
     assert run.returncode == 0, run.stderr
     assert "again" not in run.stdout
+
+
+def test_a_forked_child_which_has_no_closing_thread_closes_what_is_open() -> None:
+    class Left:
+        closed = False
+
+        def close(self) -> None:
+            self.closed = True
+
+    closing, bench = ClosingAtExit(), Left()
+    closing._open.add(bench)
+    closing._end()
+    assert bench.closed

@@ -42,9 +42,12 @@ def test_what_a_killed_program_left_goes_and_what_is_being_written_stays(tmp_pat
 def test_a_folder_that_is_replaced_is_never_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def write(text: str) -> None:
         with whole_folder(tmp_path / "c") as draft:
-            (draft / "a").write_text(text)
+            write_text(draft / "a", text)
 
+    open_files = len(list(Path("/proc/self/fd").iterdir()))
     write("old")
+    assert len(list(Path("/proc/self/fd").iterdir())) == open_files
+    assert not (tmp_path / "c" / "a").stat().st_mode & 0o111
     (tmp_path / "d").mkdir()
     if not atomic._exchanged(tmp_path / "c", tmp_path / "d"):
         pytest.skip("this system or disk cannot exchange two names")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from instrument.runs.acquire import prepare, prepare_resume
 from instrument.runs.inspection import verify
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_files import RunError
+from instrument.runs.runner import RunStatus
 from tests.mocks.devices import MockDevice, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")
@@ -204,9 +206,27 @@ def test_a_stage_that_fails_mid_run_loses_nothing(tmp_path: Path) -> None:
                     stall("stage (mock)")
 
         patch.setattr(MockDevice, "_call", call)
-        with pytest.raises(DeviceError, match=r"stalled.*Free its way"):
+        with pytest.raises(DeviceError, match=r"stalled.*Free its way") as caught:
             runner.execute()
+    assert f"5 of {len(PLAN)} frames are kept. For the others: diffuserbench resume" in "".join(
+        caught.value.__notes__
+    )
     run = Run.open(runner.path)
     assert sorted(run.records) == [0, 1, 2, 3, 4]
     assert "stalled" in run.error
     assert np.all(run.frame(4) > 0)
+
+
+@pytest.mark.parametrize("deleted", [".", ".."])
+def test_a_run_whose_folder_is_deleted_meanwhile_ends_dark_and_says_so(tmp_path: Path, deleted: str) -> None:
+    def delete(status: RunStatus) -> None:
+        if status.done == 3:
+            shutil.rmtree((runner.path / deleted).resolve(), ignore_errors=True)
+
+    with open_mock_bench() as bench:
+        runner = prepare(bench, PLAN, tmp_path / "runs", on_progress=delete)
+        with pytest.raises(RunError) as caught:
+            runner.execute()
+        assert_safe(bench)
+    assert "which is gone" in "".join(caught.value.__notes__)
+    assert "no run folder" not in str(caught.value)

@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,9 +16,10 @@ from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.bench.safety import StepsFailedError
 from instrument.plan import SOURCE, Part, Plan, PlanError, SourcePoints
-from instrument.runs.acquire import acquire, prepare
+from instrument.runs.acquire import abilities_of, acquire, prepare
 from instrument.runs.run import FinishReason, Run, RunCondition
-from instrument.runs.runner import Runner, RunState, RunStatus
+from instrument.runs.run_control import RunControl
+from instrument.runs.runner import Runner, RunState, RunStatus, StepSettings
 from instrument.runs.writer import RunWriter
 from tests.mocks.devices import MockDevice, MockWorld
 
@@ -369,3 +371,26 @@ def test_a_runner_executes_once(tmp_path: Path) -> None:
         runner.execute()
         with pytest.raises(RuntimeError, match="once"):
             runner.execute()
+
+
+@pytest.mark.parametrize("asked", ["pause", "abort", "stop", ""])
+def test_what_was_asked_of_a_control_before_a_run_holds_for_it(asked: str) -> None:
+    control, runner = RunControl(), Mock()
+    getattr(control, asked, bool)()
+    control.follow(runner)
+    assert [name for name in ("pause", "abort", "stop") if getattr(runner, name).called] == [asked] * bool(
+        asked
+    )
+
+
+def test_a_bench_of_a_camera_has_nothing_else() -> None:
+    with open_mock_bench(["camera"]) as bench:
+        able = abilities_of(bench)
+        assert (able.n_leds, able.slm_shape, able.stage_axes, able.slm_settle_ms) == (0, None, (), 0.0)
+
+
+def test_darkening_leaves_alone_what_no_step_has_lit() -> None:
+    with open_mock_bench() as bench:
+        before = list(calls(bench))
+        StepSettings(bench).darken()
+        assert calls(bench) == before

@@ -112,6 +112,7 @@ def test_faults_are_named_and_the_sequence_is_taken_again(
             "the camera's pulses come on Line1, rising edge."
         )
     assert notes(run, "sequence taken again") == ["no frame came of pattern 5"]
+    assert [event["first"] for event in run.events if "first" in event] == [0]
     assert attempts == [2 + 2 + 6] * 2
     assert brightness(run)[2] / brightness(run)[-1] == pytest.approx(0.5, abs=0.02)
 

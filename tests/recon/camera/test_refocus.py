@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.correlation import across_field, similarity
+from recon.camera.grid import FAR_UM
 from recon.camera.refocus import at_depth, central_psfs, paraxial_scale, refocus, refocus_psf
 from recon.camera.registration import register, rescaled
 from recon.errors import InputError
+from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration, Geometry
 
 WORLD = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
@@ -144,3 +148,20 @@ def test_what_is_not_known_is_refused_in_words() -> None:
     bare = Calibration(calibration.psfs, calibration.source_positions_um, geometry=Geometry(6.5))
     with pytest.raises(InputError, match="diffuser_distance_mm"):
         refocus(bare, 50e3)
+
+
+def test_infinity_is_where_light_comes_in_parallel() -> None:
+    """Judged by light from a kilometre; a picture's pixels have angles, as the camera divides directions."""
+    calibration = calibrated([60e3, 100e3, 300e3])
+    made, how = at_depth(calibration, math.inf)
+    assert how is not None
+    assert similarity(made.psfs[0, 0], true_psf(FAR_UM)) > 0.98
+    psf = made.psfs[0, 0] / made.psfs.max()
+    photo = psf + np.roll(psf, (7, -20), (0, 1))
+    picture = reconstruct(photo, made, z_um=math.inf, iterations=2, judged=False)
+    pitch_um = WORLD.geometry.pixel_pitch_um
+    assert picture.grid.pixel_mrad == pytest.approx(1e3 * pitch_um / WORLD.distance_um)
+    row, column = picture.grid.centre
+    x_deg, y_deg = picture.grid.direction_deg(row, column - 10)
+    assert x_deg == pytest.approx(np.degrees(np.arctan(10 * pitch_um / WORLD.distance_um)), abs=1e-3)
+    assert y_deg == pytest.approx(0, abs=1e-3)
