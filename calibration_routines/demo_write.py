@@ -80,7 +80,7 @@ def _figure(done: DemoResult, viewer: Viewer, picture: Float, truth: Float) -> F
     pictures = outer[0].subgridspec(1, 4, wspace=0.06)
     for column, panel in enumerate(_pictures(done, viewer, picture, truth)):
         draw_panel(figure.add_subplot(pictures[0, column]), panel)
-    depths = outer[1].subgridspec(1, 5, wspace=0.08, width_ratios=[0.92, 1.1, 1.1, 0.08, 1.0])
+    depths = outer[1].subgridspec(1, 5, wspace=0.08, width_ratios=[0.92, 1.1, 1.1, 0.14, 0.96])
     for column, panel in enumerate(_lights(done)):
         draw_panel(figure.add_subplot(depths[0, column]), panel)
     _draw_from_above(figure.add_subplot(depths[0, 4]), done)

@@ -79,6 +79,18 @@ class Calibration:
                 f"not {self.background.shape}."
             )
 
+    def __repr__(self) -> str:
+        """Say in a line how many PSFs there are, how large, and how far away."""
+        count, channels, height, width = self.psfs.shape
+        z_mm = self.source_positions_um[:, 2] / 1e3
+        depths = f"{len(np.unique(z_mm))} depths, {z_mm.min():.4g} to {z_mm.max():.4g} mm"
+        if not np.isfinite(z_mm).all():
+            depths = "depth not known"
+        elif np.ptp(z_mm) == 0:
+            depths = f"{z_mm[0]:.4g} mm"
+        colour = "grey" if channels == 1 else f"{channels} channels"
+        return f"<Calibration: {count} PSF{'s' * (count > 1)} {height} x {width} {colour}, {depths}>"
+
     def part(self, members: Any) -> Calibration:
         """Return the calibration with some of its PSFs: a slice, a mask, or their numbers."""
         positions_um = self.source_positions_um[members]

@@ -74,7 +74,9 @@ def test_a_result_shows_draws_and_saves_itself(scene: tuple[np.ndarray, np.ndarr
     with pytest.raises(db.BenchError, match="a multiple of 90"):
         found.save(tmp_path / "c.npy", rotate_deg=45)
     assert not (tmp_path / "c.npy").exists()
-    assert db.open_result(tmp_path / "b.tif").facts()
+    opened = db.open_result(tmp_path / "b.tif")
+    assert opened.facts()
+    assert repr(opened).startswith(f"<{tmp_path / 'b.tif'}: 48 x 48 pixels")
 
 
 def test_options_are_completed_and_nothing_is_ignored(scene: tuple[np.ndarray, np.ndarray]) -> None:
@@ -85,9 +87,39 @@ def test_options_are_completed_and_nothing_is_ignored(scene: tuple[np.ndarray, n
         ({"z_um": 100.0}, "a bare PSF image has none"),
         ({"dark": 30}, "arrays are taken as they are"),
         ({"iteration": 3}, "Did you mean 'iterations'"),
+        ({"bin": 2}, "It is called 'binning'"),
     ):
         with pytest.raises((ValueError, db.BenchError), match=said):
             db.reconstruct(photo, psf, **given)
+
+
+def test_a_files_image_is_no_array_and_says_where_its_array_is(
+    scene: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    db.write_image(tmp_path / "photo.tif", scene[0])
+    photo = db.read(tmp_path / "photo.tif")
+    np.testing.assert_array_equal(np.asarray(photo), scene[0])
+    for used, said in (
+        (lambda: photo.astype(float), "take .pixels.astype"),
+        (lambda: photo[:10], ".pixels is its array"),
+        (lambda: db.reconstruct(photo, None), "not NoneType"),
+    ):
+        with pytest.raises((AttributeError, TypeError, db.BenchError), match=said):
+            used()
+
+
+def test_what_a_notebook_shows_is_short() -> None:
+    made = make_scene("beads", size=32)
+    operator = db.Convolution(made.calibration.psfs[:1, 0], (32, 32))
+    outcome = db.Fista(operator, np.ones((1, 32, 32), np.float32), db.L1(1)).run(db.StoppingRules(1))
+    for shown, said in (
+        (made.calibration, "<Calibration: 8 PSFs 32 x 32 grey, 8 depths, 2.304 to 6.912 mm>"),
+        (db.Measurement(made.measurement, noise=2.0), "Measurement(image=<float32 32 x 32>, noise=2.0)"),
+        (db.PRIORS, "<priors: tv, tv-isotropic, tv-haar, l1, nonnegative, none"),
+        (outcome, "Outcome(solution=<float32 1 x 63 x 64>, history="),
+    ):
+        assert repr(shown).startswith(said)
+        assert len(repr(shown)) < 200
 
 
 def test_nan_pixels_are_erased_and_said(scene: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:

@@ -208,7 +208,8 @@ def _in_colour(bench: Bench, place: Alignment, settings: DisplayDemoSettings) ->
     options = HologramOptions(iterations=settings.iterations, srgb=True)
     size = require_slm(bench).shape, require_slm(bench).pixel_pitch_um
     lights, patterns = [], []
-    for name, nm, share in zip(CHANNELS, LASERS_NM, colour_shares(LASERS_NM), strict=True):
+    plain = [display_of_pattern(bench.config, size, {"wavelength_nm": nm}) for nm in LASERS_NM]
+    for name, nm, share in zip(CHANNELS, LASERS_NM, colour_shares(plain), strict=True):
         facts = {"wavelength_nm": nm, "colour": name, "field_share": share, "options": {"srgb": True}}
         display = display_of_pattern(bench.config, size, facts, place)
         model = HologramModel(display, [target_of_pattern(picture, display, facts)], options)

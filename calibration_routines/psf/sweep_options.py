@@ -183,6 +183,7 @@ class _Depths:
     planes: int | None = option(
         None,
         least=1,
+        most=10_000,
         help="Number of planes, evenly spaced in 1/z.",
         default_words="as many as the optics need",
     )
@@ -226,7 +227,7 @@ class _Depths:
         if needed.value > MOST_PLANES:
             words = (
                 f"from {self.z_min_um / 1e3:g} to {self.far_um / 1e3:g} mm these optics need "
-                f"{needed.value:.0f} planes, more than {MOST_PLANES}: narrow the range, or say how many"
+                f"{needed.value:.6g} planes, more than {MOST_PLANES}: narrow the range, or say how many"
             )
             raise SettingsError([("planes", words)])
         return int(needed.value), (f"{needed.reason}. Another number of planes can be chosen.",)

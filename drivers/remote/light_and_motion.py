@@ -15,6 +15,9 @@ from drivers.sequence import SequenceLimits
 from drivers.slm import Slm, read_only
 from drivers.stage import Stage
 
+_HEADER_BYTES = 1 << 10
+"""What an array's file begins with is shorter."""
+
 
 @filled_in
 class RemoteStage(RemoteDevice, Stage):
@@ -72,15 +75,15 @@ class RemoteSlm(RemoteDevice, Slm):
 
     @property
     def sequence_limits(self) -> SequenceLimits | None:
-        """What sequences the SLM plays, and of these what one request can hold."""
+        """What sequences the SLM plays, and of these what a server keeps for one."""
         limits: SequenceLimits | None = self._ask("sequence_limits")
         if limits is None:
             return None
-        fits = int(0.7 * LONGEST_ARRAYS) // int(np.prod(self.shape))  # three bytes are sent as four
+        fits = (LONGEST_ARRAYS - _HEADER_BYTES) // int(np.prod(self.shape))
         return replace(limits, most=min(limits.most, fits))
 
     def arm(self, patterns: Sequence[npt.NDArray[np.uint8]], period_ms: float, output: int = 0) -> float:
-        """Have the server arm a sequence; LimitError when it is too long for one request, too."""
+        """Have the server arm a sequence; LimitError when it is longer than a server keeps, too."""
         self._check_sequence(len(patterns), period_ms, output)
         for levels in patterns:
             self._check(levels)

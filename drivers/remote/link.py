@@ -22,6 +22,7 @@ from drivers.remote.options import RemoteOptions, token_place
 from drivers.remote.wire import (
     NUMBER_HEADER,
     OPERATOR_HEADER,
+    PIECE_BYTES,
     PROTOCOL,
     Call,
     Kind,
@@ -233,16 +234,33 @@ class Link:
         return call.gives.load(json.loads(data)["value"])
 
     async def _request(self, call: Call, arguments: Mapping[str, Any]) -> bytes:
+        number = next(self._numbers)  # of the whole: a stop during its arrays overtakes it
+        said = {
+            name: {"upload": await self._upload(value)} if isinstance(value, memoryview) else value
+            for name, value in arguments.items()
+        }
+        return await self._exchange(call.verb, call.name, number, data=json.dumps(said) if said else None)
+
+    async def _upload(self, file: memoryview) -> str:
+        """Send an array ahead, a piece after the other, and return the word for it."""
+        word = str(next(self._numbers))
+        for place in range(0, len(file), PIECE_BYTES):
+            query, piece = {"size": len(file), "place": place}, bytes(file[place : place + PIECE_BYTES])
+            await self._exchange("POST", f"upload/{word}", int(word), params=query, data=piece)
+        return word
+
+    async def _exchange(self, verb: str, name: str, number: int, **named: Any) -> bytes:
+        """Return the reply to one request; errors as ``call``."""
         import aiohttp
 
         if self._session is None:
             raise DeviceNotOpenError(self._name)
         try:
             async with self._session.request(
-                call.verb,
-                f"/api/devices/{self._kind}/{call.name}",
-                data=json.dumps(arguments) if arguments else None,
-                headers={NUMBER_HEADER: str(next(self._numbers))},
+                verb,
+                f"/api/devices/{self._kind}/{name}",
+                headers={NUMBER_HEADER: str(number)},
+                **named,
             ) as reply:
                 data = await reply.read()
                 if reply.status == 200:
@@ -251,7 +269,8 @@ class Link:
                     raise self._refused(reply.status, data[:100].decode(errors="replace"))
                 raise load_error(self._name, json.loads(data)["error"])
         except (aiohttp.ClientError, OSError) as error:
-            raise await self.broke(call.name, str(error) or type(error).__name__) from error
+            during = name.partition("/")[0]
+            raise await self.broke(during, str(error) or type(error).__name__) from error
 
     async def frames(self, n_buffers: int, window: int) -> aiohttp.ClientWebSocketResponse:
         """Start a sequence; returns the connection that its frames come over.

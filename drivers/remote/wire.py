@@ -7,6 +7,8 @@ declares is served and called without being declared again. A call is one HTTP r
 ``GET /api/devices/KIND/NAME``               a property, or what only looks
 ``POST /api/devices/KIND/NAME``              a command; its arguments by name, a JSON object
 ``PUT /api/devices/KIND/NAME``               what overtakes: ``stop``, ``off``, ``stop_sequence``
+``POST /api/devices/KIND/upload/WORD``       a piece of an array (a file of NumPy's of ``size`` bytes) from
+                                             ``place`` on; a command takes it whole as ``{"upload": WORD}``
 ``GET /api/devices/KIND/hold`` (WebSocket)   opens the device and keeps it for one operator, until it ends
 ``GET /api/devices/camera/frames``           (WebSocket) a running sequence
 ===========================================  ====================================================
@@ -58,12 +60,13 @@ NUMBER_HEADER = "Diffuserbench-Number"
 PROTOCOL = "diffuserbench"
 """WebSocket subprotocol; a browser, which can send no header, gives the token as a second one."""
 
-LONGEST_ARRAYS, LONGEST_REQUEST = 256 << 20, 16 << 20
-"""Bytes of the longest request that holds arrays, and of any other."""
+LONGEST_ARRAYS, LONGEST_REQUEST, PIECE_BYTES = 1 << 30, 16 << 20, 1 << 19
+"""Bytes of all arrays that a server keeps for a call, of the longest request, of an array's piece."""
 
 _AT_HOME = {"open", "close", "is_open", "name", "stream", "start_sequence", "next_frame", "next_frame_into"}
 _AT_HOME |= {"is_streaming", "frame_dtype", "single"}
 """What the computer that asks answers itself."""
+_HEADER_BYTES = 1 << 17
 _OVERTAKING = frozenset(("stop", "off", "stop_sequence"))
 
 
@@ -81,38 +84,44 @@ class Values:
     def dump(self, value: Any) -> Any:
         """Return a value as ``json.dumps`` takes it, with :func:`plain`."""
         if self.is_array:
-            file = io.BytesIO()
-            np.save(file, np.ascontiguousarray(value), allow_pickle=False)
-            return base64.b64encode(file.getvalue()).decode()
+            return base64.b64encode(self.file(value)).decode()
         return self._adapter.dump_python(value, mode="json", warnings=False)
 
+    @staticmethod
+    def file(value: Any) -> memoryview:
+        """Return an array, or a list of such of one shape, as a file of NumPy's."""
+        file = io.BytesIO()
+        np.save(file, np.ascontiguousarray(value), allow_pickle=False)
+        return file.getbuffer()
+
     def load(self, value: Any) -> Any:
-        """Return a value from what ``json.loads`` gave.
+        """Return a value from what ``json.loads`` gave, an array also from its file's bytes.
 
         Raises ValueError when it is none of this type.
         """
         if not self.is_array:
             return self._adapter.validate_python(value)
-        array = _array(base64.b64decode(value, validate=True))
+        is_file = isinstance(value, memoryview)
+        array = _array(value if is_file else memoryview(base64.b64decode(value, validate=True)))
         array.flags.writeable = False
         return list(array) if self._is_list else array
 
 
-def _array(data: bytes) -> Any:
-    """Return an array from a file of NumPy's; ValueError where it is none, or of another size."""
-    file = io.BytesIO(data)
+def _array(data: memoryview) -> Any:
+    """Return an array over a file of NumPy's; ValueError where it is none, or of another size."""
+    file = io.BytesIO(data[:_HEADER_BYTES])
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(file)
     if version not in read:
         raise ValueError(f"an array's file has version {version}")
     try:  # NumPy reads it as Python
-        shape, _, dtype = read[version](file)
+        shape, by_columns, dtype = read[version](file)
     except (tokenize.TokenError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
         raise ValueError(f"an array's file does not begin as one: {error}") from error
     said, there = math.prod(shape) * dtype.itemsize, len(data) - file.tell()
     if said != there:
         raise ValueError(f"an array of {shape} {dtype} has {said} bytes, and {there} came")
-    return np.load(io.BytesIO(data), allow_pickle=False)
+    return np.frombuffer(data, dtype, offset=file.tell()).reshape(shape, order="F" if by_columns else "C")
 
 
 def plain(value: Any) -> Any:
@@ -147,17 +156,16 @@ class Call:
     gives: Values
     function: FunctionType
 
-    @property
-    def longest_request(self) -> int:
-        """Bytes of the longest request that it takes."""
-        return LONGEST_ARRAYS if any(values.is_array for values in self.takes.values()) else LONGEST_REQUEST
-
     def named(self, device: Device, args: tuple[Any, ...], named: Mapping[str, Any]) -> dict[str, Any]:
-        """Return arguments by name, as JSON has them."""
+        """Return arguments by name, as JSON has them; arrays, which are sent ahead, as their files' bytes."""
         if self.signature is None:
             return {}
         bound = self.signature.bind(device, *args, **named).arguments
-        return {name: self.takes[name].dump(value) for name, value in bound.items() if name in self.takes}
+        return {
+            name: values.file(bound[name]) if values.is_array else values.dump(bound[name])
+            for name, values in self.takes.items()
+            if name in bound
+        }
 
     def make(self, device: Device, arguments: Mapping[str, Any]) -> Any:
         """Call a device, with arguments from JSON.

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
 from instrument.cli.app import App, examples
+from instrument.files.errors import BenchError
 
 app = App()
+
+SHELLS = ("bash", "zsh")
 
 _SCRIPT = """\
 # Completions of diffuserbench for bash and zsh.
@@ -41,8 +44,14 @@ complete -o filenames -F _diffuserbench diffuserbench
         'eval "$(diffuserbench completion)"          for this shell',
     )
 )
-def completion() -> None:
+def completion(
+    shell: Annotated[
+        str, typer.Argument(help="bash or zsh: both take the same lines.", show_default=False)
+    ] = "",
+) -> None:
     """Print completions of commands, options and their words for bash and zsh, plug-ins' among them."""
+    if shell not in ("", *SHELLS):
+        raise BenchError(f"There are no completions for {shell}; there are for {' and '.join(SHELLS)}.")
     typer.echo(script(), nl=False)
 
 

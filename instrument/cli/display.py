@@ -26,7 +26,7 @@ from instrument.display.hologram import (
 from instrument.display.hologram_files import HologramFiles, light_words
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image, read_stack
-from instrument.tasks.spots import HologramInputs, make_spots, tell_limit
+from instrument.tasks.spots import HologramInputs, make_spots, say_distance, tell_limit
 from instrument.tasks.task import Given, saying_what_is_left
 from recon.holography import (
     Display,
@@ -91,13 +91,8 @@ def hologram(
     ]
     for display in displays:
         for z in depths:
-            display.defocus(z)  # refuses what is too far or too near before anything is said or made
-    if options.distance_mm is not None:
-        typer.echo(
-            f"Without a lens: the picture's field is {min(d.field_mm for d in displays):.4g} mm wide, "
-            f"{options.distance_mm:g} mm behind the mask.",
-            err=True,
-        )
+            display.require_plane(z)  # before anything is said or made
+    say_distance(Terminal(), displays, options)
     if inputs.alignment is not None:
         found = load_alignment(inputs.alignment)
         displays = [found.of(display) for display in displays]

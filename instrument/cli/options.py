@@ -39,7 +39,12 @@ class GroupedCommand(TyperCommand):
     """A command whose help shows the options under their groups' headings, what is rare last."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Remember the flags as they were typed: of several names of an option messages say that one."""
+        """Remember the flags as they were typed: of several names of an option messages say that one.
+
+        ``help`` as the only word asks for help, as it does before a command, unless a file has that name.
+        """
+        if args == ["help"] and not Path("help").exists():
+            args = ["--help"]
         ctx.meta[_WORDS] = {word.partition("=")[0] for word in args}
         typed = list(args)
         try:

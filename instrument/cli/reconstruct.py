@@ -10,6 +10,7 @@ import typer
 
 from instrument.cli.app import App, examples
 from instrument.cli.tasks import Terminal, finish
+from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import BenchError
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.request import VolumeRequest, request_of
@@ -76,9 +77,11 @@ def reconstruct(
         _video(asked, run)
     elif run is not None:
         photograph = run.is_file() and "image" not in given
+        calibration = is_calibration(run) and "calibration" not in given
         raise BenchError(
             f"{run}: no option says what it is for. With --video it is a video's run; else leave it out."
             + (f" A photograph is given by --image {run}, its PSF by --psf FILE." if photograph else "")
+            + (f" A calibration is given by --calibration {run}." if calibration else "")
         )
     else:
         _photograph(asked)

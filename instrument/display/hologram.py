@@ -37,7 +37,7 @@ from recon.holography.judge import compare
 from recon.holography.learned import Learned
 from recon.holography.options import Fit
 from recon.holography.pose import NODES, Pose
-from recon.holography.target import EVERYWHERE, FIRST_ORDER, Window, make_band
+from recon.holography.target import EVERYWHERE, FIRST_ORDER, Window, band_of, near_window
 
 if TYPE_CHECKING:
     from drivers.slm import Slm
@@ -158,9 +158,11 @@ def prepare_target(
     options = options or HologramOptions()
     image = options.lift + (1 - options.lift) * field_picture(pixels, fit=options.fit, srgb=options.srgb)
     window = None if options.mirrors is None else FIRST_ORDER
+    if display.near:
+        window = near_window(display)
     if window is not None:
         image = _placed(image, window)
-    small = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
+    small = band_of(display).seen_shape
     if image.shape[0] < small[0] or image.shape[1] < small[1]:
         wide, high = max(small[1], image.shape[1]), max(small[0], image.shape[0])
         image = cv2.resize(image, (wide, high), interpolation=cv2.INTER_CUBIC).clip(0, 1)
@@ -185,12 +187,23 @@ def _placed(image: Image, window: Window) -> Image:
     return field
 
 
-def colour_shares(wavelengths_nm: Sequence[float]) -> list[float]:
+def colour_shares(displays: Sequence[Display]) -> list[float]:
     """Return which part of its field each colour's picture fills so that all are of one size.
 
-    The field of view is as wide as the wavelength is long, so that of the shortest is what all have.
+    Far away the field of view is as wide as the wavelength is long, so that of the shortest is what all have;
+    near, all have the mask's size.
+
+    Raises BenchError where a picture is near in one colour and not in another.
     """
-    return [min(wavelengths_nm) / nm for nm in wavelengths_nm]
+    near = {display.near for display in displays}
+    if len(near) > 1:
+        raise BenchError(
+            f"A picture {displays[0].distance_mm:g} mm away is near for some of the colours only: give a "
+            f"distance below {min(d.nearest_mm for d in displays):.4g} mm or from "
+            f"{max(d.nearest_mm for d in displays):.4g} mm on."
+        )
+    least = min(display.wavelength_nm for display in displays)
+    return [1.0 if display.near else least / display.wavelength_nm for display in displays]
 
 
 def field_picture(

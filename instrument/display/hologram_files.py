@@ -100,7 +100,7 @@ class HologramFiles:
     @property
     def shares(self) -> list[float]:
         """Which part of its field each colour's picture fills."""
-        return colour_shares([display.wavelength_nm for display in self.displays])
+        return colour_shares(self.displays)
 
     def display_facts(self, channel: int) -> dict[str, Any]:
         """Return what a pattern was computed for, JSON-compatible."""

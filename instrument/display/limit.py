@@ -12,7 +12,7 @@ from instrument.display.hologram import prepare_target
 from instrument.files.images import Pixels
 from recon.holography import Display, HologramOptions, HologramRecord, HologramStop, Limit, hologram_limit
 from recon.holography.limit import BANDS
-from recon.holography.target import make_band
+from recon.holography.target import band_of
 
 LIFTS = (0.1, 0.3)
 """How far black is lifted to see what would help."""
@@ -59,7 +59,7 @@ def limit_lines(found: Sequence[Limit], display: Display, options: HologramOptio
         f"limit: no number of frames shows this picture better than {_decibels(here.bound_db)} through this "
         f"mask (a bound; {here.reached_db:.2f} dB is reached by what need not be frames of phases)"
     ]
-    least = display.factor / make_band(display.slm_shape, display.factor, "alias-free").cutoff
+    least = display.factor / band_of(display).cutoff
     for (low, high), wanted, reached in zip(pairwise(BANDS), here.wanted, here.reached, strict=True):
         why = ""
         if reached < 0.7 and low < least:

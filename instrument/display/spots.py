@@ -18,7 +18,15 @@ from instrument.files.record import plain, value_of
 from instrument.files.slm_image import phase_levels, write_slm_image
 from recon.base.declare import record
 from recon.errors import InputError
-from recon.holography import Display, Hologram, SpotList, SpotScores, spot_array
+from recon.holography import (
+    Display,
+    Hologram,
+    HologramModel,
+    SpotList,
+    SpotScores,
+    Target,
+    spot_array,
+)
 
 _COLUMNS = {"y": None, "x": None, "intensity": 1.0, "z_mm": 0.0}
 """Of a list of spots, with what is taken where a column is missing."""
@@ -108,12 +116,18 @@ class SpotFiles:
 
 def _draw(path: Path, spots: SpotList, display: Display, hologram: Hologram, scores: SpotScores) -> None:
     from recon.holography.judge import intensity
+    from recon.holography.target import near_window
 
     phase = np.mod(np.angle(hologram.slm[0]), 2 * np.pi)
     first = float(spots.z_mm[0])
     padding = 2 if display.mask.levels.size < 2e6 else 1
     straight = replace(display, displacement=None)
-    seen = np.fft.fftshift(intensity(hologram.slm, straight, z_mm=first, padding=padding))
+    if display.near:
+        model = HologramModel(straight, [Target(np.ones((8, 8)), first)], frames=len(hologram.slm))
+        seen = model.intensity(hologram.slm)
+        seen = seen[near_window(display).part(seen.shape)]
+    else:
+        seen = np.fft.fftshift(intensity(hologram.slm, straight, z_mm=first, padding=padding))
     side = 480
     blocks = [np.linspace(0, n, side + 1).astype(int)[:-1] for n in seen.shape]
     seen = np.maximum.reduceat(np.maximum.reduceat(seen, blocks[0], axis=0), blocks[1], axis=1)

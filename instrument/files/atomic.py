@@ -243,6 +243,16 @@ def make_folder(path: Path) -> None:
     sync_folder(path.parent)
 
 
+def output_folder(folder: Path) -> None:
+    """Make a folder for results, and those above it, where it is not there.
+
+    Raises FileError when a file has its name.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise FileError(folder, "is a file; a folder is expected.", "Name another with --out.")
+    folder.mkdir(parents=True, exist_ok=True)
+
+
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Write a mapping as a JSON file, atomically."""
     write_bytes(path, json_text(data).encode())

@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -26,6 +26,9 @@ from instrument.files.named_arrays import is_zarr, read_zarr
 from instrument.files.seen import as_seen, levels_of, png_bytes
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
+
+MOST_LIGHT = 1e15
+"""No light has more counts; their squares are summed."""
 
 WRITABLE = (".tif", ".tiff", ".png", ".npy")
 
@@ -65,6 +68,15 @@ class ImageFile:
     def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
         """Return the pixels."""
         return np.array(self.pixels, dtype, copy=copy)
+
+    if not TYPE_CHECKING:  # for who takes it for an array
+
+        def __getattr__(self, name: str) -> Any:
+            hint = f": take .pixels.{name}" if hasattr(np.ndarray, name) and name[:2] != "__" else ""
+            raise AttributeError(f"An image of a file has no {name!r}{hint}.", name=name, obj=self)
+
+        def __getitem__(self, _place: Any) -> Any:
+            raise TypeError("An image of a file is cut by the option crop; .pixels is its array.")
 
     def __repr__(self) -> str:
         """Say in a line what it is."""
@@ -284,6 +296,10 @@ def _standard_dtype(
     with np.errstate(over="ignore"):
         pixels = np.ascontiguousarray(native, np.float32)
     _refuse_non_finite(path, pixels, holes=holes)
+    if (largest := float(np.nanmax(np.abs(pixels), initial=0))) > MOST_LIGHT:
+        raise FileError(
+            path, f"holds values up to {largest:.3g}; no light has more than {MOST_LIGHT:g} counts."
+        )
     return pixels, () if native.dtype == np.float32 else (f"{native.dtype} taken as float32",)
 
 

@@ -14,7 +14,7 @@ from instrument.evaluation.chart_problems import problem_of_job, problem_of_scen
 from instrument.evaluation.figures import write_charts
 from instrument.files.atomic import write_json
 from instrument.files.errors import BenchError
-from instrument.notebook.result import Result, show_figure
+from instrument.notebook.result import Result, figure_png, show_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,6 +34,9 @@ class Chart(ChartData):
     def figure(self) -> Figure:
         """Return the chart as a figure."""
         return chart_figure(self)
+
+    def _repr_png_(self) -> bytes:
+        return figure_png(self.figure())
 
     def show(self) -> None:
         """Show it: below the cell of a notebook, else in a window."""

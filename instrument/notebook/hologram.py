@@ -26,7 +26,7 @@ from instrument.display.hologram_files import HologramFiles, hologram_figure
 from instrument.files.images import ImageFile, read_image
 from instrument.files.sample_images import SAMPLES
 from instrument.notebook.reconstruct import bench_config
-from instrument.notebook.result import show_figure
+from instrument.notebook.result import figure_png, show_figure
 from recon.base.declare import with_overrides
 from recon.holography import HologramOptions, HologramRecord
 
@@ -66,6 +66,9 @@ class HologramShown(HologramResult):
         """Return a page: wanted and seen picture, raw light, the SLM's phase, how it was optimised."""
         lines = [(name, str(value)) for name, value in self.files.display_facts(0).items()]
         return hologram_figure(self, title="Hologram", facts=lines)
+
+    def _repr_png_(self) -> bytes:
+        return figure_png(self.figure())
 
     def show(self) -> None:
         """Show the page: below the cell of a notebook, else in a window."""

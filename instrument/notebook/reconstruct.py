@@ -27,7 +27,7 @@ from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import refocused, volume_job
 from instrument.runs.run import Run, is_run
 from recon.base.checks import as_channels
-from recon.base.declare import options_of, require, with_overrides
+from recon.base.declare import options_of, require, require_known, with_overrides
 from recon.reconstruction import reconstruct as one_door
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
@@ -121,6 +121,7 @@ def reconstruct(
     Raises InputError, BenchError or FileError: what was found, what was expected, what to do.
     """
     image, psf = getattr(image, "measurement", image), getattr(psf, "calibration", psf)
+    require_known(overrides, ReconstructionOptions, InputOptions)
     told = on_stage or _Told()
     further: dict[str, Any] = {"warm": warm, "on_progress": on_progress, "cancel": cancel, "on_stage": told}
     try:
@@ -157,6 +158,11 @@ def _opened(given: Any, name: str) -> ImageFile:
             "A Measurement goes with a Calibration or an array, not with a file: db.read(...).pixels is one."
         )
     pixels = np.asarray(given)
+    if pixels.dtype.kind not in "uifb" or pixels.ndim < 2:
+        raise BenchError(
+            f"The {name} is a file, an image of db.read, or an array (height, width) of real numbers, "
+            f"not {type(given).__name__}{f' {pixels.dtype} {pixels.shape}' if pixels.ndim else ''}."
+        )
     if pixels.dtype not in (np.uint8, np.uint16):
         pixels = pixels.astype(np.float32)
     return ImageFile(Path(f"the {name}, an array"), pixels)

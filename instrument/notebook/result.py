@@ -9,6 +9,7 @@ from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from importlib import import_module
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,7 @@ from instrument.reconstruction.result_file import (
     write_volume,
 )
 from recon.reconstruction.result import Reconstruction
+from recon.types import Calibration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -178,7 +180,7 @@ def _title(shown: object) -> str:
 
 
 def show(*pictures: Any, **titled: Any) -> None:
-    """Show pictures beside one another: results, images, arrays; those with a name under it.
+    """Show pictures beside one another: results, images, arrays, calibrations (the PSF nearest to the axis).
 
     Below the cell of a notebook, else in a window: ``db.show(photo, tv=first, l1=second)``.
 
@@ -207,6 +209,8 @@ def _pixels(picture: Any) -> Shown:
         return picture.seen()
     if isinstance(picture, Reconstruction):
         picture = picture.image
+    if isinstance(picture, Calibration):
+        picture = np.moveaxis(picture.psfs[picture.nearest_to_axis()], 0, -1).squeeze()
     array = np.asarray(picture)
     if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
         raise BenchError(
@@ -216,16 +220,19 @@ def _pixels(picture: Any) -> Shown:
     return as_seen(array, raw=array.dtype.kind == "u")
 
 
+def figure_png(figure: Figure) -> bytes:
+    """Return a figure as PNG: what a notebook shows."""
+    png = BytesIO()
+    figure.savefig(png, format="png")
+    return png.getvalue()
+
+
 def show_figure(figure: Figure) -> None:
     """Show a figure where there is a place for it; say where there is none."""
     ipython = sys.modules.get("IPython")
     if ipython is not None and ipython.get_ipython() is not None:
-        from io import BytesIO
-
         shown: Any = import_module("IPython.display")  # installed or not, typed or not
-        png = BytesIO()
-        figure.savefig(png, format="png")
-        shown.display(shown.Image(png.getvalue()))
+        shown.display(shown.Image(figure_png(figure)))
         return
     import matplotlib
     from matplotlib.backends.registry import BackendFilter, backend_registry

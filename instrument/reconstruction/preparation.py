@@ -206,6 +206,12 @@ def dark_from_file(dark: ImageFile, image: ImageFile) -> Dark:
             f"{8 * depths[1].itemsize} bit: their counts are not the same.",
             "Use the raw file of the dark frame.",
         )
+    if np.array_equal(dark.pixels, image.pixels):
+        raise FileError(
+            dark.path,
+            f"the dark frame is the photograph {image.path} itself: nothing would be left of it.",
+            "Give a frame taken in the dark (diffuserbench snap --dark), or leave --dark out.",
+        )
     frame = dark.pixels.astype(np.float32)
     return Dark(frame, frame, f"the frame {dark.path} (mean {float(frame.mean()):.1f} counts)")
 

@@ -54,6 +54,10 @@ class StoredResult:
     residual: npt.NDArray[np.float32] | None = None
     """What is left of the data, in units of their noise; None where a verdict says what it is worth."""
 
+    def __repr__(self) -> str:
+        """Say in a line what it is."""
+        return f"<{self.path}: {self._size()}{'; ' * bool(self.verdict)}{' '.join(self.verdict[:1])}>"
+
     @property
     def inputs(self) -> list[Path]:
         """The files that it was made of, as far as they are known, and its own."""
@@ -242,9 +246,8 @@ class StoredResult:
             sizes = [] if self.pitch_um is None else [_length(self.pitch_um)]
             sizes += [] if angle is None else [f"{angle:.3g} mrad"]
             return f"{text} of {' or '.join(sizes)}" if sizes else text
-        text = " x ".join(map(str, self.volume.shape)) + " voxels (planes, rows, columns)"
-        if self.volume.n_channels > 1:
-            text += f", {self.volume.n_channels} channels"
+        colours = f", {n} channels" if (n := self.volume.n_channels) > 1 else ""
+        text = " x ".join(map(str, self.volume.shape)) + f" voxels (planes, rows, columns){colours}"
         if (planes := self.planes_um) is not None:
             z_um = planes[0]
             text += f"; {_length(z_um[0])} to {_length(z_um[-1])} from the diffuser"

@@ -24,11 +24,12 @@ from drivers.frame import Frame
 from drivers.remote.device import said_facts
 from drivers.remote.wire import (
     INTERFACES,
-    LONGEST_ARRAYS,
+    LONGEST_REQUEST,
     NUMBER_HEADER,
     OPERATOR_HEADER,
     PORT,
     PROTOCOL,
+    Call,
     Kind,
     calls,
     dump_error,
@@ -39,6 +40,7 @@ from drivers.remote.wire import (
 from instrument.bench.config import BenchConfig
 from instrument.files.errors import BenchError
 from instrument.serve.operation import WATCHER, Operation, Operator
+from instrument.serve.uploads import Uploads
 from instrument.serve.watching import Watcher, picture
 
 _log = logging.getLogger(__name__)
@@ -94,6 +96,7 @@ class BenchServer:
         self._pool = ThreadPoolExecutor(64, "call")
         self._overtaking = ThreadPoolExecutor(16, "stop")
         self._watcher = Watcher(self.operation)
+        self._uploads = Uploads()
         self._runner: web.AppRunner | None = None
         self._links: weakref.WeakSet[web.WebSocketResponse] = weakref.WeakSet()
         self._frames: asyncio.Task[Any] | None = None
@@ -121,7 +124,7 @@ class BenchServer:
         return self
 
     async def _begin(self) -> None:
-        app = web.Application(client_max_size=LONGEST_ARRAYS, middlewares=[self._guard])
+        app = web.Application(client_max_size=LONGEST_REQUEST, middlewares=[self._guard])
         app.add_routes(
             [
                 web.get("/", self._page),
@@ -129,6 +132,7 @@ class BenchServer:
                 web.post("/api/stop", self._stop),
                 web.get("/api/live", self._live),
                 web.get("/api/devices/{kind}/hold", self._hold),
+                web.post("/api/devices/{kind}/upload/{word}", self._upload),
                 web.get("/api/devices/camera/frames", self._sequence),
                 *(
                     web.route(verb, "/api/devices/{kind}/{name}", self._call)
@@ -198,9 +202,9 @@ class BenchServer:
             return _error(401, DeviceError("server", "needs its token.", "See where serve has put it."))
         try:
             return await handler(request)
-        except LimitError as error:
-            too_long = isinstance(error.__cause__, web.HTTPRequestEntityTooLarge)
-            return _error(413 if too_long else 409, error)
+        except web.HTTPRequestEntityTooLarge:
+            problem = f"takes requests of at most {LONGEST_REQUEST >> 20} MB over the network."
+            return _error(413, LimitError("server", problem, "Send less at a time."))
         except DeviceError as error:
             return _error(409, error)
         except BenchError as error:
@@ -232,10 +236,10 @@ class BenchServer:
         if call is None or call.verb != request.method:
             problem = f"takes no {request.method} {name}."
             return _error(404, DeviceError(kind, problem, "Both ends need the same version of the program."))
-        arguments = await self._arguments(request, kind, call.longest_request)
+        key = self._operator(request).key
+        arguments = await self._arguments(request, call, f"{key} {kind}")
         number = int(request.headers.get(NUMBER_HEADER, "0"))
         pool = self._overtaking if call.verb == "PUT" else self._pool
-        key = self._operator(request).key
         self._overtakers += call.verb == "PUT"
         try:
             made = await self._loop.run_in_executor(
@@ -248,26 +252,23 @@ class BenchServer:
         said = await self._in_thread(lambda: _dumps({"value": call.gives.dump(made)}))
         return web.json_response(text=said)
 
-    async def _arguments(self, request: web.Request, kind: Kind, longest: int) -> dict[str, Any]:
-        """Return what a request says, decoded in another thread, so that no STOP waits for it.
+    async def _upload(self, request: web.Request) -> web.StreamResponse:
+        """Keep a piece of an array for the call that takes it."""
+        kind, key, query = _kind(request), self._operator(request).key, request.query
+        self.operation.device(kind, key)
+        word, size, place = request.match_info["word"], int(query["size"]), int(query["place"])
+        self._uploads.add(f"{key} {kind}", word, size, place, await request.read())
+        return web.json_response({"value": None})
 
-        Raises ValueError when it is no JSON object; LimitError when it is too long.
-        """
-        try:
-            if (request.content_length or 0) > longest:
-                raise web.HTTPRequestEntityTooLarge(longest, request.content_length or 0)
-            data = await request.read() if request.can_read_body else b"{}"
-        except web.HTTPRequestEntityTooLarge as error:
-            problem = f"takes requests of at most {longest >> 20} MB over the network."
-            raise LimitError(
-                kind, problem, "Send less at a time: shorter sequences, smaller patterns."
-            ) from error
+    async def _arguments(self, request: web.Request, call: Call, sender: str) -> dict[str, Any]:
+        """Return what a request says, decoded in another thread, so that no STOP waits for it."""
+        data = await request.read() if request.can_read_body else b"{}"
         # A STOP's few bytes do not wait for the threads that it is to overtake.
         short = len(data) <= _SHORT_BYTES
         arguments = _decoded(data) if short else await self._in_thread(_decoded, data)
         if not isinstance(arguments, dict):
             raise ValueError("arguments come by name, in a JSON object")
-        return arguments
+        return self._uploads.filled_in(sender, call, arguments)
 
     async def _stop(self, request: web.Request) -> web.StreamResponse:
         who = f"somebody at {request.remote}"
@@ -319,6 +320,7 @@ class BenchServer:
         finally:
             if kind == "camera" and self._frames is not None:
                 self._frames.cancel()
+            self._uploads.forget(f"{operator.key} {kind}")
             await asyncio.shield(self._after(kind, operator, link if let_go else None))
         return link
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from instrument.files.atomic import output_folder
 from instrument.files.errors import BenchError
 from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.tasks.task import BenchFile, Desk, Done, Given, Only, bench_of, saying_what_is_left, task
@@ -253,9 +254,9 @@ def _charted(
     from instrument.evaluation.figures import write_charts
 
     out = files.out
+    output_folder(out)
     if about.get("simulated"):
         desk.say("SIMULATED   what is charted, or its input, comes from a simulation")
-    out.mkdir(parents=True, exist_ok=True)
     record = out / "chart.json"
     data = _made(desk, problem, about, record, max(files.budget_s - spent_s, _LEAST_S))
     if not data.points:
@@ -272,7 +273,7 @@ def _simulated(desk: Desk, size: int, out: Path, budget_s: float) -> tuple[Subje
     from instrument.evaluation.bench_photographs import OutOfTimeError, photographs
     from recon.evaluation.chart_calibration import CalibrationProblem
 
-    out.mkdir(parents=True, exist_ok=True)
+    output_folder(out)
     path = out / "photographs.npz"
     counted = ""
 

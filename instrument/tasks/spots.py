@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -140,6 +141,18 @@ def tell_limit(desk: Desk, picture: Pixels, display: Display, options: HologramO
     return Done()
 
 
+def say_distance(desk: Desk, displays: Sequence[Display], options: HologramOptions) -> None:
+    """Say how wide a picture without a lens is, and how it is computed."""
+    if options.distance_mm is None:
+        return
+    how = ", as the mask is (near: by its angular spectrum)" if displays[0].near else ""
+    width_mm = min(display.picture_mm for display in displays)
+    desk.warn(
+        f"Without a lens: the picture's field is {width_mm:.4g} mm wide{how}, {options.distance_mm:g} mm "
+        "behind the mask."
+    )
+
+
 def make_spots(
     desk: Desk,
     inputs: HologramInputs,
@@ -155,6 +168,7 @@ def make_spots(
     config, size = bench
     wanted = spots_of(inputs.spots)
     display = options.display_of(bench_display(config, size, expansion=options.expansion))
+    say_distance(desk, [display], options)
     if inputs.alignment is not None:
         display = load_alignment(inputs.alignment).of(display)
     writer = HologramFiles(inputs.out, config.display.slm_binning, options, [display])

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from instrument.files.atomic import output_folder
 from instrument.files.errors import BenchError, FileError
 from instrument.tasks.task import Desk, Done, command_line, saying_what_is_left, task
 from recon.base.declare import option
@@ -77,7 +78,7 @@ def stability(desk: Desk, options: StabilityOptions) -> Done:
         known = sorted({m for s in (map_named(n) for n in wanted) for m in s.methods})
         raise BenchError(f"No map has the method {', '.join(options.method)}. Methods: {'; '.join(known)}.")
     out, size = options.out, options.size
-    _make(out)
+    output_folder(out)
     from instrument.files.stability_file import RESULT, CellLog, map_record, write_stability
 
     log = CellLog(out)
@@ -108,12 +109,6 @@ def _methods(offered: tuple[str, ...], asked: tuple[str, ...]) -> list[str]:
     return list(offered) if not asked else [m for m in offered if m in asked]
 
 
-def _make(folder: Path) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise FileError(folder, "is a file; a folder is expected.", "Name another with --out.")
-    folder.mkdir(parents=True, exist_ok=True)
-
-
 def _draw(record: dict[str, object], picture: Path) -> None:
     from instrument.evaluation.figures import map_figure
     from instrument.files.figures import save_figure
@@ -130,7 +125,7 @@ def _redraw(desk: Desk, options: StabilityOptions, names: list[str] | None) -> D
     if missing := [n for n in names or () if n not in maps]:
         raise BenchError(f"Not made yet: {', '.join(missing)}. Leave --redraw out to make them.")
     verdict = None if options.case is None else _verdict_of(options.case)
-    _make(out)
+    output_folder(out)
     for name in names or maps:
         if verdict is not None:
             desk.fact(name, _mark(maps[name], verdict))

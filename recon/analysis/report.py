@@ -39,6 +39,7 @@ from recon.analysis.resolution import (
     support_extent_px,
     voxel_grid,
 )
+from recon.base.brief import brief
 from recon.base.declare import option
 from recon.camera.camera_model import choose_model, sort_by_depth
 from recon.camera.refocus import central_psfs
@@ -173,6 +174,8 @@ class Analysis:
     model_reason: str
     settings: AnalysisSettings
     notes: tuple[str, ...]
+
+    __repr__ = brief
 
     def figures(self) -> dict[str, Any]:
         """Return every figure by name; images are left out."""

@@ -13,7 +13,7 @@ import enum
 import functools
 import math
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from pathlib import Path, PurePath
@@ -312,16 +312,21 @@ def with_overrides(options: _T, overrides: Mapping[str, Any]) -> _T:
 
     Raises InputError for a name that is no option, with the nearest one that is.
     """
-    known = [field.name for field in dataclasses.fields(options)]  # type: ignore[arg-type]
-    for name in overrides:
+    require_known(overrides, type(options))
+    return dataclasses.replace(options, **overrides) if overrides else options  # type: ignore[type-var]
+
+
+def require_known(names: Iterable[str], *classes: type) -> None:
+    """Raise InputError for a name that is no option of these classes, with the one that may be meant."""
+    known = [field.name for cls in classes for field in dataclasses.fields(cls)]
+    for name in names:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1)
             hint = f" Did you mean {near[0]!r}?" if near else f" There are {', '.join(known)}."
             flag = f"--{name.replace('_', '-')}"  # an old name goes on working on the command line
-            if new := next((o.name for o in options_of(options) if flag in o.flags), ""):
+            if new := next((o.name for cls in classes for o in options_of(cls) if flag in o.flags), ""):
                 hint = f" It is called {new!r}."
-            raise InputError(f"{type(options).__name__} has no option {name!r}.{hint}")
-    return dataclasses.replace(options, **overrides) if overrides else options  # type: ignore[type-var]
+            raise InputError(f"{classes[0].__name__} has no option {name!r}.{hint}")
 
 
 def settled(options: _T, **values: Any) -> _T:

@@ -54,6 +54,10 @@ class Registry(Mapping[str, T], Generic[T]):
         self._loading = threading.RLock()  # a plug-in may register itself while it is loaded
         self._loaded = False
 
+    def __repr__(self) -> str:
+        """Say which there are."""
+        return f"<{self.what}s: {', '.join(self)}>"
+
     def register(self, registered: T) -> T:
         """Offer an object under its name, for the rest of the program.
 

@@ -49,6 +49,34 @@ def gather(
                 out[j, i] += total * weight
 
 
+@njit(nogil=True, cache=True, fastmath=True)
+def spread(spectrum: Any, field: Any, passed: Any, wy: Any, wx: Any, start: int, stop: int) -> None:
+    """Repeat a periodic spectrum over a wider band, the axis in the middle, and weigh it.
+
+    ``passed`` holds the weights of one quadrant, ``wy`` and ``wx`` those of all rows and columns.
+    """
+    period, band = len(spectrum), len(wy)
+    half = band // 2
+    for i in range(start, stop):
+        row, down = (i - half) % period, abs(i - half)
+        for j in range(band):
+            field[i, j] = spectrum[row, (j - half) % period] * (passed[down, abs(j - half)] * (wy[i] * wx[j]))
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def collect(spectrum: Any, field: Any, passed: Any, wy: Any, wx: Any, start: int, stop: int) -> None:
+    """Adjoint of :func:`spread`, rows ``start`` to ``stop`` of the periodic spectrum."""
+    period, band = len(spectrum), len(wy)
+    half = band // 2
+    spectrum[start:stop] = 0
+    for row in range(start, stop):
+        for i in range((row + half) % period, band, period):
+            down = abs(i - half)
+            for j in range(band):
+                weight = passed[down, abs(j - half)] * (wy[i] * wx[j])
+                spectrum[row, (j - half) % period] += field[i, j] * np.conj(weight)
+
+
 @njit(nogil=True, cache=True)
 def _cell(position: float, k: int) -> tuple[int, float]:
     """SLM pixel in which a mask cell at ``position`` (mask pixels) begins, and the part of it in there."""

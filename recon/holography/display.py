@@ -8,6 +8,7 @@ from math import asin, atan, ceil, degrees, pi, radians, sin, sqrt, tan
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.fft import fast_length
 from recon.errors import InputError
 from recon.holography.learned import Learned
 
@@ -123,8 +124,9 @@ class Display:
     learned : Learned or None
         What photographs taught of it; ``dc`` is part of that then.
     distance_mm : float or None
-        Without a Fourier lens: where the picture is behind the mask, and ``wavelength_nm distance_mm /
-        mask_pitch_um`` wide (Fresnel diffraction). ``focal_mm`` does not count then.
+        Without a Fourier lens: where the picture is behind the mask. ``focal_mm`` does not count then. The
+        picture is ``wavelength_nm distance_mm / mask_pitch_um`` wide (Fresnel diffraction), or where that is
+        too :attr:`near`, as the mask's shorter side (angular spectrum).
     """
 
     slm_shape: tuple[int, int]
@@ -179,28 +181,28 @@ class Display:
     def defocus(self, z_mm: float) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.complex128]]:
         """Return the Fresnel factor of a plane as a product of a column and a row (Eqs. 7.21, 7.22).
 
-        ``z_mm`` is the plane's distance from the Fourier lens' focal plane. With ``u = X / (lambda f1)`` the
-        phase is ``pi z X^2 / (lambda f1^2)``; without a lens, ``d`` in front of the picture, it is
-        ``pi X^2 / (lambda (d + z))``. The constant phase is left out.
+        ``z_mm`` is the plane's distance from the Fourier lens' focal plane, away from the lens. With
+        ``u = X / (lambda f1)`` the phase is ``-pi z X^2 / (lambda f1^2)``; without a lens, ``d`` in front of
+        the picture, it is ``pi X^2 / (lambda (d + z))``. The constant phase is left out.
 
-        Which way ``z`` counts depends on the SLM. Where a larger phase is a longer way, the picture without a
-        lens is real, ``d + z`` behind the mask, and with one ``z > 0`` lies towards the lens. Where it is a
-        shorter way, ``z > 0`` lies away from the lens, and the picture without one is virtual.
+        Both hold for an SLM whose larger phase is a longer way. Where it is a shorter way, ``z > 0`` lies
+        towards the lens, and the picture without one is virtual.
 
         Raises InputError when the factor turns by more than pi between mask pixels at the aperture's edge,
-        where the plane would be aliased; without a lens, nearer than :attr:`nearest_mm`.
+        where the plane would be aliased; without a lens, nearer than :attr:`nearest_mm`, where light is
+        propagated otherwise (:mod:`recon.holography.near`).
         """
         wavelength_mm = self.wavelength_nm * 1e-6
         if self.distance_mm is None:
             shape, pitch_um = self.mask.shape, self.mask_pitch_um
             require_defocus(z_mm, greatest_defocus_mm(shape, pitch_um, self.wavelength_nm, self.focal_mm))
-            curvature = np.pi * z_mm / (wavelength_mm * self.focal_mm**2)
+            curvature = -np.pi * z_mm / (wavelength_mm * self.focal_mm**2)
         else:
             away_mm, least_mm = self.distance_mm + z_mm, self.nearest_mm
             if away_mm < least_mm:
                 raise InputError(
-                    f"Without a lens a picture {away_mm:g} mm away is too near for this display: it is shown "
-                    f"rightly from {least_mm:.4g} mm on."
+                    f"Without a lens a plane {away_mm:g} mm away is too near for a picture "
+                    f"{self.distance_mm:g} mm away: give all of them nearer than {least_mm:.4g} mm, or none."
                 )
             curvature = np.pi / (wavelength_mm * away_mm)
         factors = []
@@ -209,26 +211,58 @@ class Display:
             factors.append(np.exp(1j * curvature * x_mm**2))
         return factors[0], factors[1]
 
+    def require_plane(self, z_mm: float) -> None:
+        """Raise InputError for a plane that this display cannot show."""
+        if not self.near:
+            self.defocus(z_mm)
+        elif self.distance_mm is not None and self.distance_mm + z_mm <= 0:
+            raise InputError(
+                f"A plane {self.distance_mm + z_mm:g} mm behind the mask is none: its distance is above 0."
+            )
+
     @property
     def nearest_mm(self) -> float:
-        """Distance without a lens from which on pictures are as computed.
+        """Distance without a lens from which on pictures are computed by Fresnel diffraction.
 
         Twice that at which the Fresnel factor turns by pi between mask pixels. Nearer, that the envelope of
-        a pixel is centred before the pixel and not on the axis changes the picture: against light propagated
-        by itself its correlation is 0.93 at 1.1 times, 0.975 at 1.8, 0.994 at 3.5, 0.999 at 7.
+        a pixel is centred before the pixel and not on the axis would change the picture: against light
+        propagated by itself its correlation is 0.93 at 1.1 times, 0.975 at 1.8, 0.994 at 3.5, 0.999 at 7.
         """
         extent_mm = (max(self.mask.shape) - 1) * self.mask_pitch_um * 1e-3
         return 2 * extent_mm * self.mask_pitch_um * 1e-3 / (self.wavelength_nm * 1e-6)
 
     @property
+    def near(self) -> bool:
+        """Whether light is propagated by its angular spectrum: a picture nearer than :attr:`nearest_mm`."""
+        return self.distance_mm is not None and self.distance_mm < self.nearest_mm
+
+    @property
+    def period(self) -> int:
+        """Width of the field of a :attr:`near` picture in mask pixels: the mask, and what light spreads."""
+        side = max(self.mask.shape)
+        spread = self.wavelength_nm * (self.distance_mm or 0.0) / self.mask_pitch_um**2
+        return fast_length(side + ceil(min(side, 16 + 1.25 * spread)))
+
+    @property
+    def picture_mm(self) -> float:
+        """Width of what is asked for: the field, or the mask's shorter side under a :attr:`near` picture."""
+        return min(self.mask.shape) * self.mask_pitch_um * 1e-3 if self.near else self.field_mm
+
+    @property
     def field_mm(self) -> float:
         """Width of the field in the focal plane, or ``distance_mm`` away."""
+        if self.near:
+            return self.period * self.mask_pitch_um * 1e-3
         away_mm = self.focal_mm if self.distance_mm is None else self.distance_mm
         return self.wavelength_nm * 1e-3 * away_mm / self.mask_pitch_um
 
     def envelope(self, shape: tuple[int, int]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return the mask pixels' intensity envelope over the field, in FFT order, as two factors."""
-        y, x = (np.sinc(self.mask_fill * np.fft.fftfreq(n)) ** 2 for n in shape)
+        """Return the mask pixels' intensity envelope over the field, in FFT order, as two factors.
+
+        All even where a picture is :attr:`near`: there it is part of the propagation.
+        """
+        fill = 0.0 if self.near else self.mask_fill
+        y, x = (np.sinc(fill * np.fft.fftfreq(n)) ** 2 for n in shape)
         return y, x
 
     def taught(self, learned: Learned) -> Display:

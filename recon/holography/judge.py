@@ -51,6 +51,8 @@ def intensity(slm: Array, display: Display, *, z_mm: float = 0.0, padding: int =
     """
     if display.displacement is not None:
         raise InputError("The plain judge knows no displacement; give the display without it.")
+    if display.near:
+        raise InputError("The plain judge knows far fields only, and this picture is near.")
     k = display.factor
     hy, hx = display.defocus(z_mm)
     mask = display.mask.field(display.wavelength_nm) * hy[:, None] * hx

@@ -94,7 +94,7 @@ def hologram_limit(
             "The limit is known for a display as it is described, and this one was learned from photographs. "
             "Give the alignment from align mask, without what was learned, or none."
         )
-    if options.complex_slm or options.loss != "frequency":
+    if options.complex_slm or options.mirrors is not None or options.loss != "frequency":
         raise InputError("The limit is known for a phase SLM and the loss 'frequency'.")
     model = HologramModel(display, [target], options, frames=COLUMNS)
     variable = _Rows(model)
@@ -105,7 +105,7 @@ def hologram_limit(
     slm = variable.field(search.x)
     found = model.evaluate(slm)
     gap = _gap(model, slm, found.gradient)
-    peak = model.peaks[0] ** 2
+    peak = model.peaks[0] ** 2 * model.counted
     least = max(2 * found.loss - gap, 0.0) ** 2 / (2 * found.loss)
     wanted, reached = _bands(model, slm)
     return Limit(
@@ -150,13 +150,22 @@ def _bands(model: HologramModel, slm: Array) -> tuple[Array, Array]:
     """Return the contrast wanted in each band, and the part of it that is reached."""
     wanted, seen = model.lags(), model.lags(slm)
     y, x = model.band.lags()
-    radius = np.hypot(y[:, None], x) / model.band.cutoff
+    cutoff = model.band.cutoff
+    if model.window is not None:  # only what is inside it is the picture
+        part = model.window.part(model.band.seen_shape)
+        inside = model.wanted()[part], model.seen(slm)[part]
+        height = len(inside[0])
+        wanted, seen = (np.fft.rfft2(image) / image.size for image in inside)
+        y = np.asarray(np.fft.fftfreq(height) * height, np.float64)
+        x = np.arange(wanted.shape[1], dtype=np.float64)
+        cutoff *= height / model.band.seen_shape[0]
+    radius = np.hypot(y[:, None], x) / cutoff
     weight = np.where(x == 0, 1.0, 2.0) / (1 + radius ** (2 * ORDER)) ** 2
     found = []
     for low, high in pairwise(BANDS):
-        inside = (radius > low) & (radius <= high)
-        power = float(np.sum((weight * np.abs(wanted) ** 2)[inside]))
-        missed = float(np.sum((weight * np.abs(seen - wanted) ** 2)[inside]))
+        here = (radius > low) & (radius <= high)
+        power = float(np.sum((weight * np.abs(wanted) ** 2)[here]))
+        missed = float(np.sum((weight * np.abs(seen - wanted) ** 2)[here]))
         contrast = np.sqrt(power) / abs(wanted[0, 0])
         found.append((contrast, max(0.0, 1 - np.sqrt(missed / power)) if power else 1.0))
     contrasts, parts = np.array(found).T

@@ -29,8 +29,9 @@ from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.learned import Panel
 from recon.holography.losses import loss_of
+from recon.holography.near import NearField
 from recon.holography.options import HologramOptions
-from recon.holography.target import BESIDE, Target, Window, make_band, weights_on
+from recon.holography.target import BESIDE, Target, Window, band_of, weights_on
 
 ComplexArray = npt.NDArray[Any]
 
@@ -93,6 +94,8 @@ class HologramModel:
         options = with_overrides(options or HologramOptions(), overrides)
         if display.learned is not None and (options.complex_slm or options.mirrors is not None):
             raise InputError("What was learned of the display is of a phase SLM; leave it out for others.")
+        if display.near and options.mirrors is not None:
+            raise InputError("Mirrors show far pictures: behind a lens, or farther away without one.")
         self.display = display
         self.targets = tuple(targets)
         self.options = options
@@ -109,7 +112,7 @@ class HologramModel:
         self.dtype: np.dtype[Any] = np.dtype(dtype)
         self._real: np.dtype[Any] = np.empty(0, self.dtype).real.dtype
         unfiltered = not self.loss.low_passed
-        self.band = make_band(display.slm_shape, display.factor, options.grid, unfiltered=unfiltered)
+        self.band = band_of(display, options.grid, unfiltered=unfiltered)
         # What needs room to be computed comes before the large arrays, one after the other.
         spectra = [self._spectrum_of(target) for target in self.targets]
         self._wanted = [spectrum for spectrum, _ in spectra]
@@ -135,7 +138,12 @@ class HologramModel:
                 self._wanted_images = [self._image_of(s, self._cutoff) for s in self._wanted]
         self._field = np.zeros((self.frames, *self.band.shape), self.dtype)
         self._spectrum = np.empty((self.band.shape[0], self.band.kept[1]), self.dtype)
-        self._defocus = [tuple(h.astype(self.dtype) for h in display.defocus(t.z_mm)) for t in self.targets]
+        depths = [target.z_mm for target in self.targets]
+        self._near = NearField(display, depths, self.band.aperture[0], self.dtype) if display.near else None
+        flat = tuple(np.ones(n, self.dtype) for n in display.mask.shape)
+        self._defocus = [
+            flat if display.near else tuple(h.astype(self.dtype) for h in display.defocus(z)) for z in depths
+        ]
         self._nodes: npt.NDArray[Any] | None = None
         self._mean_light = 1.0
         self.take(display)
@@ -173,13 +181,18 @@ class HologramModel:
         self._ey, self._ex = ey.astype(self._real), ex.astype(self._real)
 
     @property
+    def counted(self) -> float:
+        """Part of the field that the target counts in."""
+        return 1.0 if self.window is None else float(self._inside.mean())
+
+    @property
     def nbytes(self) -> int:
         """Bytes in the work arrays, without the mask itself and the optimiser's vectors."""
         arrays = [self._field, self._spectrum, *self._wanted]
         if not self.loss.mean_square:
             optional = [self._weights, *self._wanted_images]
             arrays += [self._small, self._seen, *(a for a in optional if a is not None)]
-        return sum(a.nbytes for a in arrays)
+        return sum(a.nbytes for a in arrays) + (0 if self._near is None else self._near.nbytes)
 
     def evaluate(self, slm: ComplexArray) -> Evaluation:
         """Return loss, gradient and PSNR for SLM patterns, complex (n_frames, height, width)."""
@@ -238,7 +251,8 @@ class HologramModel:
     def efficiency(self, slm: ComplexArray, plane: int = 0) -> float:
         """Return the part of the light on the SLM that reaches the field, DC term and envelope included."""
         self._intensity_spectrum(self._check(slm), plane)
-        return float(self._spectrum[0, 0].real) * self._mean_light
+        passed = 1.0 if self._near is None else self._near.passed
+        return float(self._spectrum[0, 0].real) * self._mean_light * passed
 
     def slope(self) -> ComplexArray:
         """Return the row spectra of ``dL/dI`` of the pattern that was evaluated last, for :meth:`weighed`."""
@@ -289,6 +303,8 @@ class HologramModel:
     def _spectrum_of(self, target: Target) -> tuple[ComplexArray, float]:
         spectrum, peak = target.spectrum(self.display, self.band)
         share = self.options.share
+        if self.display.near:  # the light beside its square goes nowhere else
+            share *= min(self.display.mask.shape) / max(self.display.mask.shape)
         spectrum *= share
         return spectrum.astype(self.dtype), peak * share
 
@@ -327,24 +343,29 @@ class HologramModel:
         height, width = mask.shape
         hy, hx = self._defocus[plane]
         self._spectrum[:] = 0
+        filled = self.band.aperture[1]
         for field, pattern in zip(self._field, patterns, strict=True):
-            field[height:, :width] = 0
+            behind = field if self._near is None else self._near.canvas
+            behind[height:, :width] = 0
+            behind[:, width:filled] = 0
 
-            def fill(start: int, stop: int, field: Any = field, pattern: Any = pattern) -> None:
+            def fill(start: int, stop: int, behind: Any = behind, pattern: Any = pattern) -> None:
                 if self._nodes is None:
-                    self._kernels.fill(field, pattern, mask, self._table, hy, hx, k, start, stop)
+                    self._kernels.fill(behind, pattern, mask, self._table, hy, hx, k, start, stop)
                 else:
                     self._kernels.fill_displaced(
-                        field, pattern, mask, self._table, hy, hx, self._nodes, k, start, stop
+                        behind, pattern, mask, self._table, hy, hx, self._nodes, k, start, stop
                     )
 
             in_blocks(fill, height, grain=64)
-            self._kernels.columns(field[:, :width], True, get_threads())
+            if self._near is not None:
+                self._near.forward(field, plane)
+            self._kernels.columns(field[:, :filled], True, get_threads())
             scale = 1.0 / np.prod(self.band.shape)
 
             def rows(start: int, stop: int, field: Any = field, scale: float = scale) -> None:
                 self._kernels.rows_to_spectrum(
-                    field, self._spectrum, self._ey, self._ex, width, scale, start, stop
+                    field, self._spectrum, self._ey, self._ex, filled, scale, start, stop
                 )
 
             in_blocks(rows, self.band.shape[0], grain=64)
@@ -399,10 +420,13 @@ class HologramModel:
 
     def _columns_and_gather(self, frame: int, plane: int, out: ComplexArray) -> None:
         mask, k, nodes = self.display.mask.levels, self._factor, self._nodes
-        height, width = mask.shape
+        height = mask.shape[0]
         hy, hx = self._defocus[plane]
         field = self._field[frame]
-        self._kernels.columns(field[:, :width], False, get_threads())
+        self._kernels.columns(field[:, : self.band.aperture[1]], False, get_threads())
+        if self._near is not None:
+            self._near.back(field, plane)
+            field = self._near.canvas
         if nodes is None:
 
             def gather(start: int, stop: int) -> None:

@@ -127,15 +127,15 @@ class HologramOptions:
     )
     distance_mm: float | None = option(
         None,
-        help="Without a Fourier lens: the picture is so far behind the mask, or the SLM where there is none "
-        "(Fresnel diffraction); planes are counted from there.",
+        help="Without a Fourier lens: the picture is so far behind the mask, or the SLM where there is none; "
+        "planes are counted from there.",
         default_words="behind the bench's Fourier lens",
         unit="mm",
         above=0,
         metavar="MM",
         label="Distance",
         group=_SLM,
-        applies=_OF_PICTURES,
+        applies=("picture", "limit", "spots"),
     )
     frames: int = option(
         1,

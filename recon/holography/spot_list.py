@@ -38,8 +38,8 @@ class SpotList:
     Attributes
     ----------
     places : ndarray, float64, (n, 2)
-        ``(y, x)`` in fractions of the field, (0, 0) its top left corner; 0.5, 0.5 is the axis, where light is
-        that the SLM does not modulate.
+        ``(y, x)`` in fractions of the field (of what a near picture fills), (0, 0) its top left corner;
+        0.5, 0.5 is the axis, where light is that the SLM does not modulate.
     intensity : ndarray, float64, (n,)
         As it is seen, any scale, above 0.
     z_mm : ndarray, float64, (n,)
@@ -129,15 +129,41 @@ class SpotField:
         for z_mm in np.unique(spots.z_mm):
             here = np.flatnonzero(spots.z_mm == z_mm)
             rows, row_of = np.unique(nu[here, 0], return_inverse=True)
-            down = _wave(rows, display.mask.shape[0])
+            down = self._waves(rows, 0, float(z_mm))
             groups = [here[row_of == n] for n in range(len(rows))]
-            across = [_wave(nu[group, 1], display.mask.shape[1]) for group in groups]
-            hy, hx = (h.astype(np.complex64) for h in display.defocus(float(z_mm)))
-            self._planes.append(((hy, hx), down, groups, across))
-        self.envelope = np.prod(np.sinc(display.mask_fill * nu) ** 2, axis=1)
+            across = [self._waves(nu[group, 1], 1, float(z_mm)) for group in groups]
+            self._planes.append((self._defocus(float(z_mm)), down, groups, across))
+        fill = 0.0 if display.near else display.mask_fill
+        self.envelope = np.prod(np.sinc(fill * nu) ** 2, axis=1)
         """Intensity of the mask pixels' diffraction and the vignetting at each spot, (n,)."""
         if learned is not None:
             self.envelope *= np.prod(learned.shading_at(nu[:, 0], nu[:, 1]), axis=0)
+
+    def _defocus(self, z_mm: float) -> tuple[Array, Array]:
+        """Return what a plane out of focus adds behind the mask; near, every spot's wave has its own."""
+        if self.display.near:
+            height, width = self.display.mask.shape
+            return np.ones(height, np.complex64), np.ones(width, np.complex64)
+        hy, hx = self.display.defocus(z_mm)
+        return hy.astype(np.complex64), hx.astype(np.complex64)
+
+    def _waves(self, nu: Array, axis: int, z_mm: float) -> npt.NDArray[np.complex64]:
+        """Return what of the mask's rows or columns arrives at places in the field, (places, cells)."""
+        display, cells = self.display, self.display.mask.shape[axis]
+        if not display.near:
+            return _wave(nu, cells)
+        assert display.distance_mm is not None
+        display.require_plane(z_mm)
+        away_mm = display.distance_mm + z_mm
+        pitch_mm, wavelength_mm = display.mask_pitch_um * 1e-3, display.wavelength_nm * 1e-6
+        aside = nu[:, None] * display.picture_mm - (np.arange(cells) - (cells - 1) / 2) * pitch_mm
+        way = np.hypot(aside, away_mm) - away_mm
+        order = pitch_mm * aside / (wavelength_mm * np.hypot(aside, away_mm))
+        shape = np.sinc(display.mask_fill * order) if display.mask_fill else abs(order) <= 0.5
+        wave = np.exp(2j * np.pi / wavelength_mm * way) * shape
+        # So that a spot's brightness is the light in it, however few pixels reach it.
+        wave /= np.sqrt(np.mean(abs(order) < 1, axis=1, keepdims=True))
+        return np.asarray(wave, np.complex64)
 
     def at_spots(self, slm: Array) -> npt.NDArray[np.complex64]:
         """Return the field at each spot, complex64 (n,), of an SLM field (height, width); 1 for all light."""

@@ -108,6 +108,26 @@ def make_band(slm_shape: tuple[int, int], factor: int, grid: Grid, *, unfiltered
     return Band(aperture, shape, (reach[0], reach[1]), cutoff)
 
 
+def band_of(display: Display, grid: Grid = "alias-free", *, unfiltered: bool = False) -> Band:
+    """Choose the grid for a display, as :func:`make_band` does.
+
+    Of a near picture the field's spectrum is what is transformed: twice as wide as the mask pixels' own band,
+    the mask pixels' first orders with it. The eye resolves an SLM pixel there.
+
+    Raises InputError for the dissertation's grid and a near picture.
+    """
+    if not display.near:
+        return make_band(display.slm_shape, display.factor, grid, unfiltered=unfiltered)
+    if grid == "dissertation":
+        raise InputError("The dissertation's grid is for displays with a Fourier lens.")
+    side = display.period * (2 if display.mask_fill else 1)
+    cutoff = display.period / display.factor / sqrt(pi)
+    reach = min(ceil(CUT * cutoff), side - 1)
+    whole = fast_length(side + reach, real=True)
+    radius = whole // 2 if unfiltered else reach
+    return Band((side, side), (whole, whole), (radius, radius), cutoff)
+
+
 @dataclass(frozen=True, slots=True)
 class Window:
     """A rectangle of the field, in fractions of it from the top left."""
@@ -134,6 +154,12 @@ def _between(first: float, last: float, n: int) -> slice:
 
 EVERYWHERE = Window(0.0, 0.0, 1.0, 1.0)
 
+
+def near_window(display: Display) -> Window:
+    """Return where in its field a near picture stands: over the mask, a square of its shorter side."""
+    return EVERYWHERE.shrunk(display.picture_mm / display.field_mm)
+
+
 FIRST_ORDER = Window(0.05, 0.55, 0.45, 0.95)
 """Where mirrors show a picture: away from the twin (opposite), and from the light that no mirror deflects, in
 the middle and on the axes through it."""
@@ -151,7 +177,7 @@ class Target:
     image : ndarray, real, (height, width)
         Linear intensity, non-negative, any size and scale; row 0 is the field's top.
     z_mm : float
-        Distance of the plane from the Fourier lens' focal plane.
+        Distance of the plane from the Fourier lens' focal plane, away from the lens.
     white : float or None
         The value that PSNR counts as peak; the image's maximum by default.
     window : Window or None

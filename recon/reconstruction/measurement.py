@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.brief import brief
 from recon.base.checks import as_channels, require_finite, require_noise, saturated_share, select_psf
 from recon.base.noise import NoiseModel, estimate_deviation
 from recon.camera.camera_model import Depths, members_of_depths, one_depth, sort_by_depth
@@ -48,6 +49,8 @@ class Measurement:
     background: npt.ArrayLike | None = None
     erasures: npt.ArrayLike | None = None
     patterns: npt.ArrayLike | None = None
+
+    __repr__ = brief
 
     @property
     def flat(self) -> bool:

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.brief import brief
 from recon.base.namespace import Namespace, to_host
 from recon.base.threads import linear_algebra_on_one_thread
 from recon.priors.base import Prior
@@ -136,6 +137,8 @@ class Outcome:
     seconds: float
     tau: float | None = None
     """The regularisation that a solver settled for itself."""
+
+    __repr__ = brief
 
 
 class Keeper(Protocol):

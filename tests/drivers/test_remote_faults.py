@@ -26,7 +26,7 @@ from drivers.remote import link
 from drivers.remote.camera import RemoteCamera
 from drivers.remote.light_and_motion import RemoteLedArray, RemoteSlm, RemoteStage
 from drivers.remote.options import RemoteOptions
-from drivers.remote.wire import OPERATOR_HEADER, Values
+from drivers.remote.wire import LONGEST_REQUEST, OPERATOR_HEADER, Values
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.files.errors import BenchError
@@ -278,17 +278,15 @@ def test_there_is_one_operator_at_a_time_until_somebody_presses_stop(
     leds.close()
 
 
-def _said_to_be_vast() -> str:
-    """Return an array's file that says to be of terabytes."""
+def _said_to_be(descr: str, *shape: int) -> str:
+    """Return an array's file that says to be so, and has eight bytes."""
     file = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        file, {"descr": "|u1", "fortran_order": False, "shape": (1 << 21, 1 << 21)}
-    )
+    np.lib.format.write_array_header_1_0(file, {"descr": descr, "fortran_order": False, "shape": shape})
     return base64.b64encode(file.getvalue() + bytes(8)).decode()
 
 
 def test_without_the_token_nothing_is_answered(
-    server: BenchServer, options: RemoteOptions, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+    server: BenchServer, options: RemoteOptions, tmp_path: Any
 ) -> None:
     async def ask(verb: str, path: str, **named: Any) -> tuple[int, str]:
         async with (
@@ -332,15 +330,16 @@ def test_without_the_token_nothing_is_answered(
                 ask("POST", "/api/devices/led_array/set_pattern", headers=headers, data=data)
             )
             assert (status, "does not understand" in text) == (400, True), text
-        monkeypatch.setattr("drivers.remote.wire.LONGEST_REQUEST", 200_000)
         for path, data, status, words in (
-            ("led_array/set_pattern", b" " * 300_000, 413, "over the network"),
+            ("led_array/set_pattern", io.BytesIO(b" " * (LONGEST_REQUEST + 1)), 413, "over the network"),
             ("led_array/set_pattern", b"[" * 100_000, 400, "nested too deep"),
         ):
             found = asyncio.run(ask("POST", f"/api/devices/{path}", headers=headers, data=data))
             assert (found[0], words in found[1]) == (status, True), found
     with pytest.raises(ValueError, match="bytes, and 8 came"):
-        Values(npt.NDArray[np.uint8]).load(_said_to_be_vast())
+        Values(npt.NDArray[np.uint8]).load(_said_to_be("|u1", 1 << 21, 1 << 21))
+    with pytest.raises(ValueError, match="OBJECT"):
+        Values(npt.NDArray[np.uint8]).load(_said_to_be("|O", 1))
     for broken in (b"{(", b"'''", b"{[]: 1}", b"-" * 9000):  # NumPy reads them as Python
         file = b"\x93NUMPY\x01\x00" + len(broken).to_bytes(2, "little") + broken
         with pytest.raises(ValueError, match="does not begin as one"):

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.common.stream import BufferPool, FrameStream
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
-from drivers.frame import Frame
+from drivers.frame import Frame, FrameMetadata
 from tests.mocks.free_running import FreeRunningCamera
 
 
@@ -32,12 +32,29 @@ def positions(frames: list[Frame]) -> list[int]:
     return list(np.cumsum([1 + frame.metadata.dropped_before for frame in frames]) - 1)
 
 
+class _Paced(FreeRunningCamera):
+    """Exposes at most 16 frames ahead of its reader, who keeps up then, however slow he is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.n_frames = self.deep_ring = 60
+        self.ahead = threading.Semaphore(16)
+
+    def snap_metadata(self, number: int) -> FrameMetadata:
+        assert self.ahead.acquire(timeout=60)
+        return super().snap_metadata(number)
+
+
 def test_a_reader_that_keeps_up_gets_every_frame_once() -> None:
-    camera = finite(60)
+    camera = _Paced()
     stream = FrameStream(camera, 32)
     reader = stream.reader()
+    frames = []
     with stream:
-        frames = [number_of(frame) for frame in iter(lambda: reader.next_frame(1.0), None)]
+        while len(frames) < 60 and (frame := reader.next_frame(60.0)) is not None:
+            frames.append(number_of(frame))
+            camera.ahead.release()
+        assert reader.next_frame(0.01) is None
         status = reader.status
     assert frames == list(range(60))
     assert (status.acquired, status.delivered, status.overwritten, status.waiting) == (60, 60, 0, 0)

@@ -65,7 +65,7 @@ def test_alone_it_says_what_one_can_do(capsys: pytest.CaptureFixture[str]) -> No
     assert capsys.readouterr().out == shown
     assert main(["help", "check"]) == 0
     assert "Usage: diffuserbench check" in capsys.readouterr().out
-    for words in (["help", "plan", "show"], ["plan", "help", "show"]):
+    for words in (["help", "plan", "show"], ["plan", "help", "show"], ["plan", "show", "help"]):
         assert main(words) == 0
         assert "diffuserbench plan show" in capsys.readouterr().out
 

@@ -65,6 +65,12 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["compare", "cal", "plain"], "--volume FOLDER"),
     (["refocus", "psf.tif", "--z-mm", "20", "--out", "near"], "--psf FILE"),
     (["chart", "photograph", "--calibration", "plain", "--image", "photo.tif"], "--volume FOLDER"),
+    ([*PAIR, "--dark", "photo.tif"], "nothing would be left of it"),
+    ([*RECONSTRUCT, "--psf", "psf.tif", "--image", "huge.tif"], "no light has more"),
+    (["calibrate", "axial", "--z-min", "100", "--z-max", "200", "--planes", "100000000"], "10000 or less"),
+    (["completion", "fish"], "there are for bash and zsh"),
+    (["chart", "calibrations", "--out", "photo.tif"], "a folder is expected"),
+    (["reconstruct", "cal"], "by --calibration cal"),
     (["show", "plain"], "plain"),
     (["verify", "cal"], "is no run folder"),
 ]
@@ -85,6 +91,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "colour": np.stack([psf] * 3, axis=-1),
         "eight": (psf >> 8).astype(np.uint8),
         "black": np.zeros_like(psf),
+        "huge": (psf * 1e33).astype(np.float32),
         "holes": np.where(psf == psf.max(), np.nan, psf).astype(np.float32),
     }
     for name, image in images.items():
