@@ -2,7 +2,7 @@
 
     python benchmarks/growth.py [--most 1.0] [--out growth] [--iterations 30]
     python benchmarks/growth.py --told            # what reconstructions say early, and what they took
-    python benchmarks/growth.py --before          # memory that volumes say before they are solved
+    python benchmarks/growth.py --before          # memory that is said before it is taken
 
 Cases run in processes of their own on points seen through random lenslets (SIMULATED): first the
 forecast that ``reconstruct --explain`` gives, from six iterations, then the whole of it. Written are
@@ -15,18 +15,23 @@ from __future__ import annotations
 
 import argparse
 import csv
+import ctypes
+import gc
 import multiprocessing
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from instrument.files import kept_times
 from instrument.files.figures import ACCENT, INK, SECOND, save_figure, style
-from instrument.reconstruction.forecast import Foretold, forecast
+from instrument.reconstruction.forecast import Foretold, Like, forecast
 from recon import Calibration, Geometry, reconstruct
 from recon.base.threads import set_threads
 from recon.evaluation.scene import make_scene
@@ -126,32 +131,49 @@ def in_process(work: Callable[..., None], *arguments: object) -> tuple[float, fl
 
 
 def tell_default(size: int) -> None:
-    """Print what reconstructions by default options say they will take, and what they took."""
-    for name in ("dense-picture", "sparse-picture", "beads", "dense-volume"):
-        made = make_scene(name, size=size)
-        reconstruct(made.measurement, made.calibration, iterations=2)  # kernels are compiled
-        foretold, meter, began = Foretold(lambda _: None), MemoryMeter(), time.perf_counter()
-        found = reconstruct(
-            made.measurement, made.calibration, on_progress=foretold.watch, on_stage=foretold.stage
-        )
-        took_s, took_bytes = time.perf_counter() - began, meter.peak_mib() * 2**20
-        print(
-            f"{name:<16}{len(found.history):4} iterations, "
-            f"{took_s:6.2f} s (told {foretold.seconds / took_s - 1:+.0%}), "
-            f"{took_bytes / 2**20:6.1f} MiB (told {foretold.memory_bytes / max(took_bytes, 1) - 1:+.0%})",
-            flush=True,
-        )
+    """Print what reconstructions by default options say they will take, and what they took; each twice.
+
+    The second is told before it begins, by the first.
+    """
+    kept_times.in_a_window()
+    with TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = folder
+        for name in ("dense-picture", "sparse-picture", "beads", "dense-volume"):
+            made = make_scene(name, size=size)
+            reconstruct(made.measurement, made.calibration, iterations=2)  # kernels are compiled
+            for _ in range(2):
+                foretold = Foretold(lambda _: None, Like(name, size))
+                meter, began = MemoryMeter(), time.perf_counter()
+                found = reconstruct(
+                    made.measurement, made.calibration, on_progress=foretold.watch, on_stage=foretold.stage
+                )
+                took_s, took_bytes = time.perf_counter() - began, meter.peak_mib() * 2**20
+                foretold.ended(found.stop_reasons)
+                before_s, before_bytes = foretold.before or (np.nan, np.nan)
+                print(
+                    f"{name:<16}{len(found.history):4} iterations, {took_s:6.2f} s "
+                    f"(before {before_s / took_s - 1:+.0%}, early {foretold.seconds / took_s - 1:+.0%}), "
+                    f"{took_bytes / 2**20:6.1f} MiB (before {before_bytes / max(took_bytes, 1) - 1:+.0%}, "
+                    f"early {foretold.memory_bytes / max(took_bytes, 1) - 1:+.0%})",
+                    flush=True,
+                )
 
 
-def take_volume(case: Case, prior: str, answer: Any) -> None:
-    """Reconstruct a volume; sends what was said of memory before the first iteration, and its bytes."""
+def take(case: Case, prior: str, answer: Any) -> None:
+    """Reconstruct; sends what was said of memory before the first iteration, and the bytes that it took."""
     set_threads(case.threads)
     options = ReconstructionOptions(
-        model="convolution", prior=prior, iterations=14, tolerance=0.0, judged=False
+        model="local" if case.psfs > 1 else "convolution",
+        prior=prior,
+        iterations=14,
+        tolerance=0.0,
+        judged=False,
     )
-    small = scene(Case(side=48, planes=case.planes))
+    small = scene(Case(side=48, planes=case.planes, psfs=case.psfs))
     reconstruct(small[0][0], small[1], options, iterations=2)  # kernels are compiled
     (photograph,), calibration = scene(case)
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)  # what was freed is not there for the taking
     said: list[str] = []
     meter = MemoryMeter()
     reconstruct(photograph, calibration, options, on_stage=lambda _, what: said.append(what))
@@ -160,21 +182,27 @@ def take_volume(case: Case, prior: str, answer: Any) -> None:
 
 
 def tell_before() -> None:
-    """Print what volumes say they take before they are solved, and what they took; a process each."""
-    for planes, side, threads in (
-        (4, 192, 1),
-        (8, 128, 1),
-        (8, 192, 2),
-        (16, 192, 1),
-        (16, 192, 2),
-        (32, 128, 2),
-    ):
+    """Print what is said of memory before the first iteration, and what was taken; a process each."""
+    volumes = [
+        Case(side=side, planes=planes, threads=threads)
+        for planes, side, threads in (
+            (4, 192, 1),
+            (8, 128, 1),
+            (8, 192, 2),
+            (16, 192, 1),
+            (16, 192, 2),
+            (32, 128, 2),
+        )
+    ]
+    pictures = [Case(side=side, threads=2) for side in (192, 384, 640)]
+    varying = [Case(side=side, psfs=psfs, threads=2) for side, psfs in ((128, 3), (256, 3), (192, 4))]
+    varying.append(Case(side=128, planes=4, psfs=2, threads=2))
+    for case in (*pictures, *varying, *volumes):
         for prior in ("tv", "l1"):
-            case = Case(side=side, planes=planes, threads=threads)
-            told, took = in_process(take_volume, case, prior)
+            told, took = in_process(take, case, prior)
             print(
-                f"{prior:<3}{planes:4} planes of {side} x {side}, {threads} threads: "
-                f"{took / 2**20:6.1f} MiB (told {told / took - 1:+.0%})",
+                f"{prior:<3}{case.planes:4} planes of {case.side} x {case.side}, {case.psfs**2} PSFs, "
+                f"{case.threads} threads: {took / 2**20:6.1f} MiB (told {told / took - 1:+.0%})",
                 flush=True,
             )
 

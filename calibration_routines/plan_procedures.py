@@ -6,6 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from calibration_routines.display.kept_frames import kept_by
 from calibration_routines.procedure import (
     Listener,
     Outcome,
@@ -103,7 +104,12 @@ def settled(
     run = Run.open(path)
     if run.plan is None:
         words = f"a recording, {found.condition}; there is nothing to go on with."
-        if done:
+        if command := kept_by(run):
+            words = (
+                f"{len(run.records)} frames of {command}: diffuserbench {command} --again {path} sees them "
+                "again, and takes what they lack."
+            )
+        elif done:
             words = f"a recording, {run.condition}, with {len(run.records)} of {run.n_frames} frames."
     else:
         words = f"complete already, {run.n_frames} frames read back, all as they were written."

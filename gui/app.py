@@ -20,6 +20,7 @@ from gui.theme import apply_theme
 from gui.widgets.dialogues import TextWindow
 from instrument.bench.config import BenchConfig
 from instrument.bench.config_file import no_bench
+from instrument.files import kept_times
 from instrument.files.errors import BenchError, in_words
 
 _FRAME = QSize(16, 40)
@@ -35,6 +36,7 @@ def run(config: BenchConfig | None) -> int:
     Returns the exit status. None: no bench; the start page leads to one.
     """
     require_screen()
+    kept_times.in_a_window()
     app = application()
     settings = QSettings("diffuserbench", "diffuserbench")
     status = 0

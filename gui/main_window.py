@@ -48,6 +48,8 @@ _SIZE = QSize(1600, 980)
 _ROOMY = QSize(1500, 860)
 """From here on the log and the panels at the right stand side by side with the live view."""
 
+_PREPARE_MS = 3000
+"""Rest after the bench was opened, for the first frame, before panels are prepared that nobody asked for."""
 _COMPACT_PX = 480
 """Width of the panels at the right of a small screen."""
 _BY_HAND, _BREAKS_OFF = QMessageBox.Icon.Information, QMessageBox.Icon.Warning
@@ -102,6 +104,7 @@ class MainWindow(QMainWindow):
         session.handed_on.connect(self._hand_on)
         session.bench_wanted.connect(self.change_bench)
         session.closed.connect(self._close_now)
+        session.opened.connect(lambda: QTimer.singleShot(_PREPARE_MS, self, self.maker.prepare))
         session.jobs.job_started.connect(self._job_started)
         session.jobs.job_ended.connect(self._job_ended)
         self.resize(size)

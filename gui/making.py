@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from functools import partial
 
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
 
-from gui.jobs import words_for
+from gui.jobs import JobContext, words_for
 from gui.panel import Panel
 from gui.panels import PANELS
 from gui.session import BenchSession
@@ -89,6 +90,18 @@ class PanelMaker(QObject):
         job = self._session.jobs.watch(f"Opening {PANELS[name].title}", lambda _: PANELS[name].load())
         job.succeeded.connect(lambda _: self._begin(name))
         job.failed.connect(lambda why: self._failed(name, why))
+
+    def prepare(self) -> None:
+        """Import and compile in a job what the panels need, before they are asked for."""
+
+        def work(context: JobContext) -> None:
+            for entry in PANELS.values():
+                context.check()
+                with contextlib.suppress(Exception):  # the panel says so when it is asked for
+                    entry.load()
+
+        if not self._session.is_closing:
+            self._session.jobs.watch("Preparing panels", work)
 
     def shutdown(self) -> None:
         """Make none further; the timers of those that are half made end."""

@@ -84,9 +84,9 @@ class Calibration:
         count, channels, height, width = self.psfs.shape
         z_mm = self.source_positions_um[:, 2] / 1e3
         depths = f"{len(np.unique(z_mm))} depths, {z_mm.min():.4g} to {z_mm.max():.4g} mm"
-        if not np.isfinite(z_mm).all():
+        if np.isnan(z_mm).any():
             depths = "depth not known"
-        elif np.ptp(z_mm) == 0:
+        elif z_mm.min() == z_mm.max():
             depths = f"{z_mm[0]:.4g} mm"
         colour = "grey" if channels == 1 else f"{channels} channels"
         return f"<Calibration: {count} PSF{'s' * (count > 1)} {height} x {width} {colour}, {depths}>"

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration_routines.display.kept_frames import KeptFrames, question
 from drivers.led_array import LedPattern
 from drivers.slm import Slm
 from drivers.stage import Stage
@@ -49,6 +50,8 @@ class DisplayBench:
     wavelength_nm : float, optional
         Of the light. Unless it is that of ``[display]``, whose laser is the scene's light, the LED array's
         colour of that wavelength shines, and the SLM's phases are taken for those of the same optical path.
+    kept : KeptFrames, optional
+        Keeps the frames, and gives those that it has instead of new ones.
 
     Raises BenchError when the bench has no light of that wavelength.
     """
@@ -63,6 +66,7 @@ class DisplayBench:
         check: Callable[[], object] = lambda: None,
         on_frame: Callable[[int], object] = lambda _: None,
         wavelength_nm: float | None = None,
+        kept: KeptFrames | None = None,
     ) -> None:
         self.bench = bench
         self.slm = require_slm(bench)
@@ -77,6 +81,7 @@ class DisplayBench:
         self._check, self._on_frame = check, on_frame
         self.frames = 0
         self._dark: tuple[tuple[float, ...], Array | float] | None = None
+        self._kept, self._lit = kept, False
 
     def show(self, field: Array) -> None:
         """Show an SLM field, complex (height, width) in binned pixels: its phase, or what mirrors send."""
@@ -115,8 +120,8 @@ class DisplayBench:
         frames: list[Array] = []
         for first in range(0, len(images), most):
             self._check()
-            for frame in take_sequence(wire, images[first : first + most]).frames:
-                frames.append(self._signal(self._counted(frame.image)) / exposure)
+            part = images[first : first + most]
+            frames += [self._signal(image) / exposure for image in self._played(wire, part)]
         return frames
 
     def _expose(self, exposure_ms: float) -> float:
@@ -139,7 +144,7 @@ class DisplayBench:
 
     def light(self, *, on: bool) -> None:
         """Switch the laser; another than the bench's own shines alone."""
-        bench = self.bench
+        bench, self._lit = self.bench, on
         if self._laser is None:
             bench.scene_on() if on else bench.scene_off()
             return
@@ -178,7 +183,26 @@ class DisplayBench:
         return display.wavelength_nm * display.focal_mm / display.mask_pitch_um / pitch_um
 
     def _snap(self) -> Array:
-        return self._counted(self.bench.snap().image)
+        if self._kept is None:
+            return self._counted(self.bench.snap().image)
+        asked = self._question(self.slm.displayed)
+        (image,) = self._kept.answers([asked], lambda _: [self.bench.snap()])
+        return self._counted(image)
+
+    def _played(self, wire: Wire, images: Sequence[npt.NDArray[np.uint8]]) -> list[Array]:
+        """Return the frames of grey levels that hardware times."""
+        if self._kept is None:
+            taken = [frame.image for frame in take_sequence(wire, images).frames]
+        else:
+            asked = [self._question(levels) for levels in images]
+            taken = self._kept.answers(asked, lambda first: take_sequence(wire, images[first:]).frames)
+        return [self._counted(image) for image in taken]
+
+    def _question(self, shown: Array) -> str:
+        stage = self.bench.stage
+        place = stage.commanded_position() if stage is not None and stage.is_homed else {}
+        places = [(name, round(value, 3)) for name, value in sorted(place.items())]
+        return question(shown, self._lit, f"{self.bench.camera.exposure_ms:.6g}", *self._key, *places)
 
     def _counted(self, image: Array) -> Array:
         self.frames += 1
@@ -269,10 +293,12 @@ def laser_of(bench: Bench, wavelength_nm: float) -> LedPattern:
 
 
 # Files ------------------------------------------------------------------------------------------------
-def require_slm(bench: Bench) -> Slm:
-    """Return the bench's SLM; BenchError where it has none."""
+def require_slm(bench: Bench, only_phases: str = "") -> Slm:
+    """Return the bench's SLM; BenchError where it has none, or mirrors where ``only_phases`` says why not."""
     if bench.slm is None:
         raise BenchError(f"{bench.label} has no [slm].")
+    if only_phases and bench.slm.mirrors:
+        raise BenchError(f"{bench.slm.name} has mirrors that send light or not: {only_phases}.")
     return bench.slm
 
 

@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, bring_mask, require_slm, writable
 from calibration_routines.display.hologram_photograph import HologramCamera
+from calibration_routines.display.kept_frames import KeptFrames, SeenAgain, kept_words
 from calibration_routines.procedure import Checked, Listener, Outcome, Outlook, Procedure, Routine
 from instrument.bench.bench import Bench
 from instrument.display.hologram import Alignment, bench_display, load_alignment, save_alignment
 from instrument.files.atomic import require_new
-from instrument.files.errors import BenchError
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
 from recon.base.declare import option
@@ -44,7 +44,7 @@ def photograph_looks(seen: HologramCamera, count: int, *, seed: int = 0) -> list
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearningProcedure(Checked, Procedure):
+class LearningProcedure(SeenAgain, Checked, Procedure):
     """Photograph random phases, fit the display's model to them, judge it by others."""
 
     alignment: Path | None = option(
@@ -80,9 +80,7 @@ class LearningProcedure(Checked, Procedure):
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse a bench without SLM or with mirrors, files that cannot be read or do not fit or exist."""
-        slm = require_slm(bench)
-        if slm.mirrors:
-            raise BenchError(f"{slm.name} has mirrors that send light or not: only phases can be learned.")
+        slm = require_slm(bench, "only phases can be learned")
         if self.out is not None:
             require_new(self.out, overwrite=self.overwrite)
         if self.slm_calibration is not None:
@@ -94,7 +92,10 @@ class LearningProcedure(Checked, Procedure):
             place.require_correction(self.slm_calibration is not None)
         height, width = display.slm_shape
         return Outlook(
-            (f"{self.patterns} random patterns of {height} x {width} pixels, {self.frames} frames",)
+            (
+                f"{self.patterns} random patterns of {height} x {width} pixels, {self.frames} frames",
+                kept_words(bench, self.frames, self.again),
+            )
         )
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
@@ -102,21 +103,23 @@ class LearningProcedure(Checked, Procedure):
         slm, out = require_slm(bench), writable(bench, folder, self.out, "display")
         place = load_alignment(self.alignment) if self.alignment is not None else None
         nominal = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
-        io = DisplayBench(
-            bench,
-            bench.config.display.slm_binning,
-            load_slm_correction(self.slm_calibration) if self.slm_calibration else None,
-            check=control.check,
-            on_frame=lambda frames: listener.share(frames, self.frames),
-        )
-        if place is not None:
-            bring_mask(bench, place.stage_position)
-        else:
-            place = _in_place(nominal, bench)
-        listener.step("photographing random patterns")
-        seen = HologramCamera.registered(io, place.of(nominal))
-        looks = photograph_looks(seen, self.patterns)
-        bench.stop()
+        with KeptFrames(bench, folder, "calibrate display", self.again) as kept:
+            io = DisplayBench(
+                bench,
+                bench.config.display.slm_binning,
+                load_slm_correction(self.slm_calibration) if self.slm_calibration else None,
+                check=control.check,
+                on_frame=lambda frames: listener.share(frames, self.frames),
+                kept=kept,
+            )
+            if place is not None:
+                bring_mask(bench, place.stage_position)
+            else:
+                place = _in_place(nominal, bench)
+            listener.step("photographing random patterns")
+            seen = HologramCamera.registered(io, place.of(nominal))
+            looks = photograph_looks(seen, self.patterns)
+            bench.stop()
         listener.step("learning")
 
         def progress(share: float, _words: str) -> None:
@@ -135,6 +138,7 @@ class LearningProcedure(Checked, Procedure):
         return Outcome(
             verdict=tuple(learning_lines(lesson, io.frames, simulated=found.simulated)),
             good=True,
+            runs=kept.paths,
             calibration=out,
             result=lesson,
         )

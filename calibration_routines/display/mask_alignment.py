@@ -30,6 +30,7 @@ from calibration_routines.display.display_io import (
     require_slm,
     writable,
 )
+from calibration_routines.display.kept_frames import KeptFrames, kept_words
 from calibration_routines.display.mask_search import (
     ALIGNMENT_FILE,
     AlignmentFailedError,
@@ -256,8 +257,8 @@ class AlignmentProcedure(Procedure):
     settings: AlignmentSettings = field(default_factory=AlignmentSettings)
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
-        """Refuse a bench without SLM, a display that does not fit, files that exist or cannot be read."""
-        slm = require_slm(bench)
+        """Refuse a bench without phase SLM, a display that does not fit, files that exist or are wrong."""
+        slm = require_slm(bench, "a mask is aligned by the spots of a phase SLM in their place")
         if (out := self.settings.out) is not None:
             for file in (out, out.with_suffix(".png")):
                 require_new(file, overwrite=self.settings.overwrite)
@@ -271,6 +272,7 @@ class AlignmentProcedure(Procedure):
                 f"±{self.settings.reach:g} of its pixels and ±{self.settings.depth_um:g} µm",
                 f"{self.settings.max_frames} frames at most; "
                 + (f"the stage moves {moves} times at most" if moves and bench.stage else "nothing moves"),
+                kept_words(bench, self.settings.max_frames, self.settings.again),
             )
         )
 
@@ -280,17 +282,19 @@ class AlignmentProcedure(Procedure):
         out = writable(bench, folder, settings.out, "alignment")
         correction = load_slm_correction(settings.slm_calibration) if settings.slm_calibration else None
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
-        io = DisplayBench(
-            bench,
-            bench.config.display.slm_binning,
-            correction,
-            check=control.check,
-            on_frame=lambda frames: listener.share(frames, settings.max_frames, at_most=True),
-        )
-        if settings.moves:
-            home_if_needed(bench, listener)
-        listener.step("aligning the mask")
-        report = MaskAlignment(io, display, settings, listener).run()
+        with KeptFrames(bench, folder, "align mask", settings.again) as kept:
+            io = DisplayBench(
+                bench,
+                bench.config.display.slm_binning,
+                correction,
+                check=control.check,
+                on_frame=lambda frames: listener.share(frames, settings.max_frames, at_most=True),
+                kept=kept,
+            )
+            if settings.moves:
+                home_if_needed(bench, listener)
+            listener.step("aligning the mask")
+            report = MaskAlignment(io, display, settings, listener).run()
         alignment = alignment_of(report, bench, display.mask.shape)
         bench.stop()
         doubted = bool(report.findings)
@@ -313,6 +317,7 @@ class AlignmentProcedure(Procedure):
         return Outcome(
             verdict=tuple(alignment_lines(report, simulated=alignment.simulated)),
             good=not doubted,
+            runs=kept.paths,
             calibration=out,
             files=(figure,),
             result=report,

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench
+from calibration_routines.display.kept_frames import SeenAgain
 from calibration_routines.display.spot_camera import SpotCamera
 from calibration_routines.procedure import Checked, Listener, Size
 from calibration_routines.scatter import Scatter, scatter_of
@@ -41,7 +42,7 @@ class AlignmentFailedError(BenchError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlignmentSettings(Checked):
+class AlignmentSettings(SeenAgain, Checked):
     """How far and how carefully to search."""
 
     reach: float = option(72.0, unit="mask px", above=0, help="Largest shift to look for, mask pixels.")

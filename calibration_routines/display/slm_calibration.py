@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, bring_mask, require_slm, writable
+from calibration_routines.display.kept_frames import KeptFrames, SeenAgain, kept_words
 from calibration_routines.display.spot_camera import SpotCamera
 from calibration_routines.procedure import (
     CalibrationError,
@@ -199,7 +200,7 @@ def _exposure_ms(io: DisplayBench) -> float:
 
 # Procedure -------------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
-class SlmProcedure(Checked, Procedure):
+class SlmProcedure(SeenAgain, Checked, Procedure):
     """Measure the SLM's phase against its grey levels and, with an alignment, its flatness."""
 
     levels: int = option(33, least=8, most=256, label="Grey levels", help="Grey levels to measure.")
@@ -226,37 +227,41 @@ class SlmProcedure(Checked, Procedure):
         return self.levels + references + 2 + (_FLATNESS_FRAMES if self.alignment is not None else 0)
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
-        """Refuse a bench without SLM, an alignment that cannot be read, a file that exists."""
-        require_slm(bench)
+        """Refuse a bench without phase SLM, an alignment that cannot be read, a file that exists."""
+        require_slm(bench, "they have no phase that their levels could be measured by")
         if self.out is not None:
             require_new(self.out, overwrite=self.overwrite)
         if self.alignment is not None:
             load_alignment(self.alignment)
-        return Outlook((f"{self.levels} grey levels, {self.frames} frames at most",))
+        words = f"{self.levels} grey levels, {self.frames} frames at most"
+        return Outlook((words, kept_words(bench, self.frames, self.again)))
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Measure, and save what ``align mask`` and ``show`` take."""
         slm, out = require_slm(bench), writable(bench, folder, self.out, "slm calibration")
         place = load_alignment(self.alignment) if self.alignment is not None else None
-        io = DisplayBench(
-            bench,
-            bench.config.display.slm_binning,
-            check=control.check,
-            on_frame=lambda frames: listener.share(frames, self.frames),
-        )
-        listener.step("measuring the look-up table")
-        found = measure_look_up_table(io, n_levels=self.levels)
-        if place is not None:
-            listener.step("measuring flatness")
-            bring_mask(bench, place.stage_position)
-            display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
-            found = measure_flatness(io, display, place.pose, found, rest=place.rest)
-        bench.stop()
+        with KeptFrames(bench, folder, "calibrate slm", self.again) as kept:
+            io = DisplayBench(
+                bench,
+                bench.config.display.slm_binning,
+                check=control.check,
+                on_frame=lambda frames: listener.share(frames, self.frames),
+                kept=kept,
+            )
+            listener.step("measuring the look-up table")
+            found = measure_look_up_table(io, n_levels=self.levels)
+            if place is not None:
+                listener.step("measuring flatness")
+                bring_mask(bench, place.stage_position)
+                display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
+                found = measure_flatness(io, display, place.pose, found, rest=place.rest)
+            bench.stop()
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "frames": found.frames}
         found.correction.save(out, facts)
         return Outcome(
             verdict=tuple(slm_lines(found, simulated=bool(bench.simulated_kinds))),
             good=True,
+            runs=kept.paths,
             files=(out,),
             result=found,
         )

@@ -24,6 +24,7 @@ _LEAST_ERROR = 0.002  # of a plane's brightness: what dark frames and the sensor
 _SURE = 5.0  # standard deviations
 _TOLERATED = 0.01  # of the nearest distance
 _BESIDE_PX = 2.0  # of the centroid's way over the sweep
+_OFF_MIDDLE = 0.03  # of a pattern's radius: its light need not be even
 _UNEVEN = 0.02  # of a plane's brightness: a step away from the law
 
 
@@ -120,3 +121,32 @@ def _beside(
     error = spread * float(np.sqrt(np.linalg.inv(design.T @ design)[1, 1]))
     y_um, x_um = (float(v) for v in solution[1])
     return (x_um, y_um), error, float(np.hypot(x_um, y_um) * np.ptp(px_per_um))
+
+
+def off_middle(planes: Sequence[PsfQuality], geometry: Geometry) -> str:
+    """Return words where the central patterns lie beside the sensor's middle at every depth; else nothing.
+
+    A rail that leans by an angle moves them as a diffuser does that stands ``d`` times the angle beside the
+    sensor's middle: which of them it is no sweep tells.
+    """
+    d_mm, pitch_um = geometry.diffuser_distance_mm, geometry.pixel_pitch_um
+    kept = [p for p in planes if p.radius_px > 0 and p.clipped <= MAX_CLIPPED]
+    if d_mm is None or pitch_um is None or not kept:
+        return ""
+    z = np.array([p.z_um for p in kept])
+    recorded = np.array([(p.y_um, p.x_um) for p in kept])
+    off = np.array([p.centroid_px for p in kept]) + recorded * (1e3 * d_mm / z / pitch_um)[:, None]
+    one_depth = len(np.unique(z)) < 2
+    if not one_depth:  # what goes with 1/z is the source's place
+        off = np.linalg.lstsq(np.stack([np.ones_like(z), 1 / z], axis=1), off, rcond=None)[0]
+    row, column = (float(v) for v in off[0])
+    if np.hypot(row, column) <= max(_BESIDE_PX, _OFF_MIDDLE * kept[0].radius_px):
+        return ""
+    off_um = float(np.hypot(row, column)) * pitch_um
+    lean_mrad = off_um / d_mm
+    who = "the diffuser or the source stands" if one_depth else "the diffuser stands"
+    return (
+        f"Middle: the pattern's light lies {column:+.1f}, {row:+.1f} pixels (x, y) beside the sensor's "
+        f"middle: {who} beside it, by {off_um / 1e3:.2f} mm on the sensor, or the rail leans by "
+        f"{lean_mrad:.1f} mrad; the sweep cannot tell which. PSFs are right where they were taken."
+    )

@@ -218,20 +218,28 @@ def judge_next(
     if not plane.radius_px > 0:
         return plane
     if len({one.z_um for one in before}) >= 3:
-        plane = _with_step(plane, _centroid_steps(before, [plane])[0])
+        unsure = _unsureness([one.z_um for one in before], plane.z_um)
+        plane = _with_step(plane, _centroid_steps(before, [plane])[0], MAX_STEP_PX * unsure)
     if len(before) >= 2:
         plane = _with_scale_error(plane, _scale_errors([*before, plane], diffuser_distance_um)[-1])
     return plane
 
 
-def _with_step(plane: PsfQuality, step_px: float) -> PsfQuality:
+def _unsureness(depths_um: Sequence[float], z_um: float) -> float:
+    """Return how much less sure a line through depths is of a depth than each of them is of its own place."""
+    inverse = 1 / np.array(depths_um)
+    apart = float(((1 / z_um - inverse.mean()) ** 2) / ((inverse - inverse.mean()) ** 2).sum())
+    return float(np.sqrt(1 + 1 / len(inverse) + apart))
+
+
+def _with_step(plane: PsfQuality, step_px: float, most_px: float = MAX_STEP_PX) -> PsfQuality:
     plane = replace(plane, step_px=step_px)
-    if step_px <= MAX_STEP_PX:
+    if step_px <= most_px:
         return plane
     return with_finding(
         plane,
         f"the pattern lies {step_px:.1f} pixels beside the line through the other planes (up to "
-        f"{MAX_STEP_PX:g} expected): the stage or the source slipped. Take the plane again.",
+        f"{most_px:.2g} expected): the stage or the source slipped. Take the plane again.",
         retake=True,
     )
 

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine, outlook_of
+from calibration_routines.psf.mount_fit import off_middle
 from calibration_routines.psf.psf_quality import place_of
 from calibration_routines.psf.sampling import reachable_depths_um
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep, finish_sweep, watch_sweep
@@ -140,6 +141,9 @@ def quality_lines(done: SweepCalibration) -> list[str]:
             f"Frames: brightness steady within {done.scatter.flicker:.1%}, place within "
             f"{done.scatter.motion_px:.2f} pixels from frame to frame, noise taken off."
         )
+    central = [q for q in done.quality if q.similarity is None]
+    if words := off_middle(central, done.calibration.geometry):
+        lines.append(words)
     if done.late_hot:
         lines.append(
             f"Sensor: {count(done.late_hot, 'pixel')} turned hot during the sweep (replaced by the "

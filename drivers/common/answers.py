@@ -84,7 +84,7 @@ def within(
         if not give_up():
             undone()
         raise
-    if not over.is_set() and give_up():
+    if give_up():
         raise DeviceTimeoutError(
             device,
             f"hangs: {what} has not ended for {seconds:g} s.",

@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.camera import Camera, Roi, TriggerEdge, TriggerMode
-from drivers.common.answers import STOP_ANSWER_S, is_bounded, within
+from drivers.common.answers import CALL_MARGIN_S, STOP_ANSWER_S, is_bounded, within
 from drivers.common.pixels import Pixels
 from drivers.device import Device
 from drivers.errors import DeviceError, DeviceTimeoutError
@@ -45,14 +45,15 @@ _log = logging.getLogger(__name__)
 _D = TypeVar("_D", bound=type[Device])
 _T = TypeVar("_T")
 _TRAVELS = 100
-_SHORT = {"settings", "own_settings", "position", "display", "trigger", "off", "blank"}
+_SHORT = {"settings", "own_settings", "position", "display", "snap", "trigger", "off", "blank"}
 """Calls that are waited for as long as their device says, as are all that set something."""
 _MOVES = {"home": 20, "move_to": 20, "move_by": 20, "wait": 20}
 _LONG = {"open": 4, "arm": 20, **_MOVES}
-"""Calls that have so many times as long; frames, stopping and closing are waited for where asked for."""
+"""Calls that have so many times as long; streams, stopping and closing have limits of their own."""
 _SAFE = {"off", "blank"}
 """Tried, too, while another call hangs."""
-_UNDONE_BY = {"open": "close", "set_pattern": "off", **dict.fromkeys(_MOVES, "stop")}
+_ENDED_BY = {"snap": "stop_sequence", **dict.fromkeys(_MOVES, "stop")}
+_UNDONE_BY = {"open": "close", "set_pattern": "off", **_ENDED_BY}
 """What is done after a call that ended when it had been given up: it may have lit or moved something."""
 _INTERRUPTED_S = 2.0
 _REMEDY = "Its readings cannot be trusted: check the device, its firmware and its driver."
@@ -99,6 +100,8 @@ def _guarded_call(made: type, name: str) -> Callable[..., Any]:
 
 def call_limit_s(device: Device, name: str) -> float:
     """Return after how many seconds a call of a driver's method is given up."""
+    if name == "snap":
+        return cast(Camera, device).longest_wait_s + CALL_MARGIN_S
     limit_s = device.longest_call_s * _LONG.get(name, 1)
     if isinstance(device, Stage) and name in _MOVES:
         travels_s = ((axis.upper_limit - axis.lower_limit) / axis.speed_per_s for axis in device.axes)
@@ -121,8 +124,8 @@ def _in_time(device: Device, name: str, call: Callable[[], _T]) -> _T:
     except Exception:
         raise
     except BaseException:  # Ctrl-C: nothing moves on, or is lit late, that nobody waits for
-        if name in _MOVES and undo is not None:
-            within(STOP_ANSWER_S, device.name, "stopping", undo)
+        if name in _ENDED_BY:
+            within(STOP_ANSWER_S, device.name, "stopping", getattr(device, _ENDED_BY[name]))
         for thread in left:
             thread.join(_INTERRUPTED_S)
         raise

@@ -108,6 +108,8 @@ class SerialTransport:
         self._probe = probe
         self._on_message = on_message
         self._timeout_s = timeout_s
+        self.probe_s = timeout_s
+        """For the probe's reply: a silent port is given up after three of them."""
         self._settle_s = settle_s
         self._serial: Any = None
         self._reader: threading.Thread | None = None
@@ -316,9 +318,9 @@ class SerialTransport:
         """Return how many attempts were not answered in time before one was."""
         for unanswered in range(_PROBES - 1):
             with contextlib.suppress(DeviceTimeoutError):
-                self._exchange(command, matcher, self._timeout_s, ticket)
+                self._exchange(command, matcher, self.probe_s, ticket)
                 return unanswered
-        self._exchange(command, matcher, self._timeout_s, ticket)
+        self._exchange(command, matcher, self.probe_s, ticket)
         return _PROBES - 1
 
     # The reading thread ----------------------------------------------------------------------------

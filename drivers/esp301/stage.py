@@ -39,6 +39,8 @@ _UNITS = {
 }
 """What the answer to ``SN?`` stands for: the bench's unit, and how many of it one is; 0 and 1 are counts."""
 _SETTLING = {"um": 1.0, "mrad": 0.05}
+_PROBE_S = 0.5
+"""For the version: a port without a controller is given up within 2 s."""
 _QUEUE = 12
 """The controller keeps ten errors."""
 
@@ -81,6 +83,7 @@ class Esp301Stage(PortStage):
         """Held from a command until its refusal was asked for: no other thread's question takes it."""
         name = f"stage (esp301, {options.port})"
         link = SerialTransport(options.port, name, baud_rate=options.baud_rate, probe=_VERSION)
+        link.probe_s = _PROBE_S
         super().__init__(options, link)
 
     def _number(self, name: str) -> int:

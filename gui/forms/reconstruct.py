@@ -18,7 +18,7 @@ from gui.jobs import JobContext
 from gui.widgets.building import button, fill, in_row, label, scrolled, share_bar
 from instrument.files.errors import BenchError
 from instrument.reconstruction.checkpointing import checkpoint_for, require_kept, settle_checkpoint
-from instrument.reconstruction.forecast import Foretold
+from instrument.reconstruction.forecast import Foretold, Like
 from instrument.reconstruction.job import Job as Prepared
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
 from instrument.reconstruction.request import (
@@ -309,7 +309,7 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
         nonlocal expected
         expected = f"; {words}"
 
-    foretold = Foretold(told)
+    foretold = Foretold(told, Like.of(prepared, request.options))
 
     def watch(record: IterationRecord, present: Callable[[], npt.NDArray[np.float32]]) -> None:
         history.append(record)
@@ -325,10 +325,12 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
 
     if isinstance(request, VolumeRequest):
         volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_stage=stage)
+        foretold.ended(volume.stop_reasons)
         write_volume(outputs, volume, prepared)
         settled = settle_checkpoint(keeper, volume.stop_reasons)
     else:
         picture = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_stage=stage)
+        foretold.ended([picture.stop_reason])
         write_reconstruction(outputs, picture, prepared, rotate_deg=work.rotate_deg)
         settled = settle_checkpoint(keeper, [picture.stop_reason])
     return Written(outputs.image, settled)

@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Literal, NamedTuple
 
 from PySide6.QtWidgets import QWidget
+from shiboken6 import isValid
 
 from gui.panel import Panel
 from gui.panels.unserved import UnservedPanel, why_not
@@ -63,7 +64,8 @@ class PanelEntry(NamedTuple):
             for part in reversed(parts):  # layouts have measured fields that had not their looks yet
                 part.updateGeometry()
         except BaseException:  # or not wanted any more
-            Panel.shutdown(panel)  # its timers: a subclass may lack yet what it would end
+            if isValid(panel):  # its window may be gone
+                Panel.shutdown(panel)  # its timers: a subclass may lack yet what it would end
             raise
         return panel
 

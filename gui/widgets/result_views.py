@@ -222,7 +222,8 @@ class ViewGrid(QWidget):
         super().__init__(parent)
         self._cells: list[QWidget] = []
         for title, view in views:
-            heading = label(title, "heading")
+            heading = label(title, "heading", yields=True)
+            heading.setContentsMargins(_SPACING_PX, 0, 2 * _SPACING_PX, 0)
             heading.setFixedHeight(_HEADING_PX)
             self._cells.append(fill(QWidget(), heading, (view, 1), spacing=0))
         self._layout = QGridLayout(self)

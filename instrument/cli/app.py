@@ -18,8 +18,8 @@ from zlib import crc32
 import typer
 
 from drivers.errors import DeviceError, LimitError
-from instrument.cli import kept_times
 from instrument.cli.options import USAGE_ERROR, GroupedCommand, flat
+from instrument.files import kept_times
 from instrument.files.errors import BenchError, OperatorNeededError, in_words
 from recon.base.declare import option
 

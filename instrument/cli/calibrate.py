@@ -42,9 +42,9 @@ from calibration_routines.psf.sweep_watch import SweepEvent
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import other_bench_for
 from instrument.bench.safety import StepsFailedError
-from instrument.cli import kept_times
 from instrument.cli.app import App, BenchOption, examples, load_and_say, open_and_say
 from instrument.cli.progress import keys, progress_bar
+from instrument.files import kept_times
 from instrument.files.errors import BenchError, duration, size
 from instrument.files.images import read_image
 from instrument.runs.acquire import free_bytes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
@@ -26,11 +27,17 @@ from instrument.cli.app import (
     open_and_say,
 )
 from instrument.cli.progress import keys, one_task
+from instrument.files.atomic import require_new
 from instrument.files.errors import duration, size
+from instrument.files.figures import Panel, check_figure, pictures_figure, save_figure
+from instrument.files.seen import as_seen
 from instrument.runs.recorder import RecordingOptions, RecordingStatus, prepare_recording
 from instrument.runs.run import Run
 from instrument.tasks.task import saying_what_is_left
 from recon.base.declare import option
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 snap_app, record_app = App(), App()
 
@@ -109,7 +116,8 @@ class SnapOptions(CaptureOptions):
         flags=("--out", "-o"),
         group=_FILES,
     )
-    force: bool = option(False, help="Overwrite the file if it exists.", group=_FILES)
+    figure: Path | None = option(None, help="Also a page to look at (.png, .pdf, .svg).", group=_FILES)
+    force: bool = option(False, help="Overwrite files that exist.", group=_FILES)
 
 
 @snap_app.command(
@@ -131,6 +139,9 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
     light = options.light()
     target = options.out or Path(photograph_name())
     check_photograph_file(target, options.average, force=options.force)
+    if options.figure is not None:
+        check_figure(options.figure)
+        require_new(options.figure, overwrite=options.force)
     with saying_what_is_left(target), naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
         options.set_camera(opened)
         switch_light(opened, light)
@@ -139,7 +150,10 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
         with one_task("Frames", options.average if options.average > 1 else None) as advance:
             taken = opened.snap(options.average, on_progress=advance)
         write_snapshot(opened, target, taken, light, operator_asked=not options.as_is)
+        simulated = bool(opened.simulated_kinds)
     _report(target, taken, light)
+    if options.figure is not None:
+        typer.echo(f"Wrote {save_figure(_page(target, taken, light, simulated=simulated), options.figure)}")
 
 
 def _expose(bench: Bench, light: LightState) -> None:
@@ -170,6 +184,20 @@ def _expose(bench: Bench, light: LightState) -> None:
     with one_task("Finding the exposure"):
         found = auto_expose(bench.camera, hot=hot)
     typer.echo(found.message)
+
+
+def _page(target: Path, taken: Snapshot, light: LightState, *, simulated: bool) -> Figure:
+    metadata, image = taken.metadata, taken.image
+    facts = [
+        ("light", light.value),
+        ("exposure", f"{metadata.exposure_ms:.4g} ms, gain {metadata.gain:g}"),
+        ("frames", f"{taken.average}"),
+        ("counts", f"{float(image.min()):g} to {float(image.max()):g} of {taken.full_scale}"),
+        ("saturated", f"{metadata.saturated_fraction:.3%} of the pixels"),
+    ]
+    size = f"{image.shape[0]} x {image.shape[1]} {image.dtype}, as it is seen: sRGB, contrast by percentiles"
+    panel = Panel("", as_seen(image, raw=True) / 255, size, white=1.0)
+    return pictures_figure(target.name, [panel], facts, simulated=simulated)
 
 
 def _report(target: Path, taken: Snapshot, light: LightState) -> None:

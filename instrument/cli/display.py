@@ -72,9 +72,10 @@ def hologram(
     if (inputs.spots is None) == (not target):
         raise BenchError("Give a TARGET picture, or --spots.")
     config = load_and_say(bench)
-    size = slm_size(config, phases=options.mirrors is None)
     if inputs.spots is not None:
         given.refuse("--spots", "spots")
+    size = slm_size(config, phases=options.mirrors is None, spots=inputs.spots is not None)
+    if inputs.spots is not None:
         finish(make_spots(Terminal(), inputs, options, (config, size)))
         return
     assert target is not None

@@ -1,6 +1,6 @@
 """Long commands: a progress bar on stderr with the time left (none where it is no terminal), Ctrl-C, keys.
 
-A step that cannot say how far it is goes by what it took last time (:mod:`instrument.cli.kept_times`).
+A step that cannot say how far it is goes by what it took last time (:mod:`instrument.files.kept_times`).
 What is compiled is said beside the bar.
 """
 
@@ -32,7 +32,7 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
-from instrument.cli import kept_times
+from instrument.files import kept_times
 from instrument.files.errors import duration
 from instrument.tasks.task import Advance
 

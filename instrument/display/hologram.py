@@ -256,10 +256,12 @@ def read_weights(path: Path) -> npt.NDArray[np.float64]:
     return np.asarray(pixels, np.float64)
 
 
-def slm_size(config: BenchConfig, *, phases: bool = True) -> tuple[tuple[int, int], float]:
+def slm_size(
+    config: BenchConfig, *, phases: bool = True, spots: bool = False
+) -> tuple[tuple[int, int], float]:
     """Ask the bench's SLM for its shape and pixel pitch in micrometres; opens and closes it.
 
-    ``phases``: it is to show phases.
+    ``phases``: it is to show phases; ``spots``: those of spots.
 
     Raises BenchError when the bench has no SLM, or phases are asked of mirrors; DeviceError when it does not
     answer.
@@ -271,7 +273,7 @@ def slm_size(config: BenchConfig, *, phases: bool = True) -> tuple[tuple[int, in
     bench = Bench(config)
     try:
         slm: Slm = bench.open_device("slm")  # type: ignore[assignment]
-        if phases and (words := mismatch(slm, mirrors=False)):
+        if phases and (words := mismatch(slm, mirrors=False, spots=spots)):
             raise BenchError(words)
         return slm.shape, slm.pixel_pitch_um
     finally:

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.atomic import whole_file
+from instrument.files.errors import FileError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -101,6 +102,38 @@ def summary_figure(summary: Summary) -> Figure:
     figure.text(0.035, 0.955, summary.title, fontsize=17, color=INK, weight="bold", va="center")
     if summary.simulated:
         mark_simulated(figure, 0.955)
+    return figure
+
+
+def check_figure(path: Path) -> None:
+    """Refuse a name that no figure is written under.
+
+    Raises FileError.
+    """
+    if path.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise FileError(path, "a figure is written as .png, .pdf or .svg.")
+
+
+def pictures_figure(
+    title: str, panels: Sequence[Panel], lines: Sequence[tuple[str, str]] = (), *, simulated: bool = False
+) -> Figure:
+    """Draw pictures side by side, facts beside them."""
+    from matplotlib.figure import Figure
+
+    height, width = panels[0].image.shape[:2]
+    wide = max(2.5, 4.2 * width / height)
+    columns = [wide] * len(panels) + [4.5] * bool(lines)
+    figure = Figure(figsize=(sum(columns) + 0.6, 5.6), dpi=100, facecolor="white")
+    grid = figure.add_gridspec(
+        1, len(columns), width_ratios=columns, wspace=0.08, left=0.035, right=0.985, top=0.82, bottom=0.09
+    )
+    for column, panel in enumerate(panels):
+        draw_panel(figure.add_subplot(grid[0, column]), panel)
+    if lines:
+        draw_facts(figure.add_subplot(grid[0, -1]), lines)
+    figure.text(0.035, 0.94, title, fontsize=17, color=INK, weight="bold", va="center")
+    if simulated:
+        mark_simulated(figure, 0.94)
     return figure
 
 

@@ -134,9 +134,14 @@ def levels_field(levels: npt.NDArray[np.uint8], binning: int, *, mirrors: bool) 
     return np.asarray(np.exp(1j * levels_phase(levels, binning)))
 
 
-def mismatch(slm: Slm, *, mirrors: bool) -> str:
-    """Say why an SLM cannot show a pattern of mirrors, or of phases; empty where it can."""
+def mismatch(slm: Slm, *, mirrors: bool, spots: bool = False) -> str:
+    """Say why an SLM cannot show a pattern of mirrors, or of phases (of spots); empty where it can."""
     if slm.mirrors and not mirrors:
+        if spots:
+            return (
+                f"{slm.name} has mirrors that send light or not, and spots are made by phases: give a "
+                "picture of them instead, with --mirrors optimised."
+            )
         return (
             f"{slm.name} has mirrors that send light or not, and this pattern is of phases: compute it with "
             "--mirrors optimised (without a mask also lee or off-axis)."

@@ -12,7 +12,7 @@ import numpy as np
 
 from instrument.files.atomic import check_writable, write_json, write_text
 from instrument.files.errors import FileError
-from instrument.files.figures import save_figure
+from instrument.files.figures import check_figure, save_figure
 from instrument.files.images import write_image
 from instrument.files.record import plain
 from instrument.files.seen import as_seen, levels_of
@@ -55,8 +55,8 @@ class Outputs:
 
         With ``uncertainty`` a picture's standard deviations and points are among them. Raises FileError.
         """
-        if figure is not None and figure.suffix.lower() not in (".png", ".pdf", ".svg"):
-            raise FileError(figure, "a figure is written as .png, .pdf or .svg.")
+        if figure is not None:
+            check_figure(figure)
         if volume and is_zarr_name(out):
             if not (stem := stem_of(out)):
                 raise FileError(out, "has no name before its suffix.", "Call it volume.ome.zarr, say.")

@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError, FileError
+from instrument.files.figures import check_figure
 from instrument.tasks.task import Desk, Done, Given, saying_what_is_left, task
 from recon.analysis import AnalysisSettings, Noise
 from recon.base.declare import option
 from recon.camera.grid import FAR_UM, depth_in_words
 from recon.types import Calibration
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _PAGES = (".pdf", ".png", ".svg")
 
@@ -63,7 +68,8 @@ class RefocusOptions:
         help="Make PSFs over the field of the one on the axis: angular_response.json of calibrate angular.",
     )
     points: int = option(3, help="Places a side, with --response.", least=1)
-    force: bool = option(False, help="Replace a calibration that exists.", label="Overwrite")
+    figure: Path | None = option(None, help="Also a page: PSFs before and after (.png, .pdf, .svg).")
+    force: bool = option(False, help="Replace what exists.", label="Overwrite")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,6 +244,9 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
         raise BenchError("--z-mm: a depth is asked for twice.")
     if "points" in given and options.response is None:
         raise BenchError("--points is how many places --response makes: give --response too.")
+    if options.figure is not None:
+        check_figure(options.figure)
+        require_new(options.figure, overwrite=options.force)
     folder = find_calibration(options.calibration)
     with desk.step("reading"):
         measured = load_calibration(folder)
@@ -283,4 +292,23 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
                 f"{f'{near:.4g} to {far:.4g} mm' if far > near else f'depth, {near:.4g} mm'}: the pattern is "
                 "extrapolated, by scaling alone. Measure a PSF there where it matters."
             )
-    return Done((path,))
+    if options.figure is None:
+        return Done((path,))
+    from instrument.files.figures import save_figure
+
+    return Done((path, save_figure(_refocused_page(measured, new), options.figure)))
+
+
+def _refocused_page(measured: Calibration, new: Calibration) -> Figure:
+    from instrument.files.figures import Panel, pictures_figure
+    from instrument.files.seen import as_seen
+
+    panels = []
+    for called, calibration, at_most in (("measured", measured, 2), ("refocused", new, 3)):
+        depths_um = sorted(set(calibration.source_positions_um[:, 2].tolist()))
+        for z_um in depths_um[:: max(1, -(-len(depths_um) // at_most))]:
+            members = (calibration.source_positions_um[:, 2] == z_um).nonzero()[0]
+            psf = calibration.psfs[members[calibration.part(members).nearest_to_axis()]].mean(axis=0)
+            panels.append(Panel(called, as_seen(psf) / 255, depth_in_words(z_um), white=1.0))
+    simulated = bool(new.provenance.get("simulated"))
+    return pictures_figure("PSFs brought to another depth", panels, simulated=simulated)

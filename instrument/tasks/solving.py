@@ -9,7 +9,7 @@ from typing import Annotated
 from instrument.files.errors import BenchError
 from instrument.files.volumes import uneven_steps
 from instrument.reconstruction.checkpointing import checkpoint_for, settle_checkpoint
-from instrument.reconstruction.forecast import Foretold
+from instrument.reconstruction.forecast import Foretold, Like
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned, solve_patterned
@@ -53,13 +53,15 @@ def reconstruct_photograph(
         keeper = checkpoint_for(output.checkpoint, job, request)
         what = "volume" if is_volume else "picture"
         with desk.interruptible() as cancel, desk.step(what, 100) as advance:
-            foretold = Foretold(lambda words: desk.fact("Will take", words))
+            like = Like.of(job, request.options)
+            foretold = Foretold(lambda words: desk.fact("Will take", words), like)
 
             def stage(share: float, what: str) -> None:
                 advance(round(100 * share), note=what)
                 foretold.stage(share, what)
 
             result = request.solve(job, watch=foretold.watch, cancel=cancel, keeper=keeper, on_stage=stage)
+            foretold.ended(result.stop_reasons)
         _tell(desk, result)
         with desk.step("writing"):
             if is_volume:

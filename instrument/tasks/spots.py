@@ -119,7 +119,7 @@ def spots(
 ) -> Done:
     """Compute the SLM phase that makes spots as bright as asked for, at any places and depths."""
     config = bench_of(desk, bench)
-    return make_spots(desk, inputs, options, (config, slm_size(config)))
+    return make_spots(desk, inputs, options, (config, slm_size(config, spots=True)))
 
 
 def tell_limit(desk: Desk, picture: Pixels, display: Display, options: HologramOptions, z_mm: float) -> Done:

@@ -7,7 +7,7 @@ by least squares. What is left then is a change of the pattern itself.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.correlation import correlate, cut_to_light, lit_extent, similarity, spot_px
+from recon.base.blocks import block_mean
 from recon.camera.refocus import central_psfs, psf_at
 from recon.camera.registration import register
 from recon.camera.transformed import geometric_centre, resampled
@@ -92,16 +93,43 @@ def _size(calibration: Calibration) -> str:
     return f"{pixels}, {channels} colour{'s' if channels > 1 else ''}"
 
 
-def _refuse_other_cameras(old: Calibration, new: Calibration) -> None:
-    """Refuse what cannot be laid on one another: other pixels are another camera, binning or region."""
-    pitches = [c.geometry.pixel_pitch_um for c in (old, new)]
-    known = [pitch for pitch in pitches if pitch is not None]
-    same_pitch = len(known) < 2 or math.isclose(known[0], known[1], rel_tol=_SAME_PITCH)
-    if old.psfs.shape[1:] == new.psfs.shape[1:] and same_pitch:
-        return
-    raise InputError(
-        f"The cameras or their settings differ: the old PSFs have {_size(old)}, the new ones {_size(new)}. "
-        "Only calibrations of one camera with the same region of interest and binning compare."
+def _binned_alike(old: Calibration, new: Calibration) -> tuple[Calibration, Calibration, float]:
+    """Return both on the coarser one's pixels, and the side of the new one's pixels over the old one's.
+
+    Raises InputError where they cannot be laid on one another: another camera, or another region of interest.
+    """
+    before_um, after_um = (c.geometry.pixel_pitch_um for c in (old, new))
+    ratio = old.psfs.shape[-1] / new.psfs.shape[-1]
+    if before_um is not None and after_um is not None:
+        ratio = after_um / before_um
+    known = None not in (before_um, after_um)
+    factor = round(max(ratio, 1 / ratio))
+    fine, coarse = (old, new) if ratio > 1 else (new, old)
+    same_pitch = not known or math.isclose(max(ratio, 1 / ratio), factor, rel_tol=_SAME_PITCH)
+    shape = fine.psfs.shape[1], *(n // factor for n in fine.psfs.shape[2:])
+    if shape != coarse.psfs.shape[1:] or not same_pitch:
+        raise InputError(
+            f"The cameras or their settings differ: the old PSFs have {_size(old)}, the new ones "
+            f"{_size(new)}. Only calibrations of one camera with the same region of interest compare."
+        )
+    if factor == 1:
+        return old, new, 1.0
+    psfs = block_mean(fine.psfs, factor)
+    fine = replace(fine, psfs=psfs, background=None, geometry=coarse.geometry)
+    return (fine, new, float(factor)) if ratio > 1 else (old, fine, 1 / factor)
+
+
+def _of_binned(changes: list[Change], ratio: float) -> tuple[list[Change], tuple[str, ...]]:
+    """Return changes of brightness as a camera has them that adds binned pixels where that is more likely."""
+    if ratio == 1:
+        return changes, ()
+    brightness, added = float(np.median([c.brightness for c in changes])), ratio**2
+    if brightness > 0 and abs(math.log(brightness / added)) < abs(math.log(brightness)):
+        changes = [replace(c, brightness=c.brightness / added) for c in changes]
+    coarser, times = ("new", ratio) if ratio > 1 else ("old", 1 / ratio)
+    return changes, (
+        f"Another binning: pixels of the {coarser} PSFs are {times:.0f} times as large; both were compared "
+        "with those. A photograph goes with PSFs that are binned as it is.",
     )
 
 
@@ -109,11 +137,12 @@ def compare(old: Calibration, new: Calibration) -> Comparison:
     """Compare a calibration with an older one of the same camera.
 
     Depths that the old one does not have are refocused. Shift alone moves pictures without blurring them; it
-    counts when it differs between depths, or for the position in space.
+    counts when it differs between depths, or for the position in space. Of another binning the finer one is
+    binned, and that is said.
 
-    Raises InputError when the PSFs differ in size, or depths are not known.
+    Raises InputError when the PSFs are of other regions or cameras, or depths are not known.
     """
-    _refuse_other_cameras(old, new)
+    old, new, ratio = _binned_alike(old, new)
     depths, planes = central_psfs(new)
     chosen = sorted({0, len(depths) // 2, len(depths) - 1})
     exposure = _exposure_ratio(old, new)
@@ -121,9 +150,10 @@ def compare(old: Calibration, new: Calibration) -> Comparison:
     for k in chosen:
         reference = _at(old, float(depths[k]))
         changes.append(compare_psfs(planes[k].mean(axis=0), reference, float(depths[k]), exposure))
+    changes, binning = _of_binned(changes, ratio)
     distance_mm = new.geometry.diffuser_distance_mm
     due, reasons = _verdict(changes, None if distance_mm is None else 1e3 * distance_mm)
-    return Comparison(tuple(changes), due, reasons)
+    return Comparison(tuple(changes), due, (*binning, *reasons))
 
 
 def compare_psfs(new: Array, old: Array, z_um: float = float("nan"), exposure: float = 1.0) -> Change:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import minimize
 
 from recon.analysis.gram import WindowProblem
 from recon.base import fft
@@ -25,6 +26,12 @@ DIP = 0.2
 """Dip between two points that counts as resolved (the Rayleigh criterion's)."""
 TRIALS = 3
 """Noise draws and sub-pixel positions that all must be resolved."""
+TOLD = 0.95
+"""Share of pairs, at all places between pixels, that the curve tells apart at the stated distance: nine in
+ten are promised."""
+ROUNDS, DRAWS = 3, 8
+"""Rounds of two points, later ones about what earlier ones found; pairs of other distances in each."""
+SIXTEEN_DRAWS = 10
 
 PointImage = Callable[[float, float], Array]
 """Image (height, width) of one point ``columns`` sensor pixels off the axis at a place ``s`` on the depth
@@ -33,9 +40,10 @@ PLANES = 17
 """Planes of the window in depth, half an axial step (inner product 0.8) apart: the spacing of Sec. 4.4."""
 HALF_WINDOW = (4, 24)
 """Rows and columns that the window reaches from the axis, voxels."""
-LATERAL_PX = tuple(float(v) for v in np.arange(1.5, 12.1, 0.5))
-AXIAL_PLANES = tuple(float(v) for v in np.arange(1.5, 12.1, 0.5))
+FARTHEST = 12.0
+"""Pixels, or planes, between two points at most."""
 FACTORS = (1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.4, 2.8, 3.4)
+"""By which both distances of two points are multiplied for sixteen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +106,7 @@ class PointTrial:
     separation_planes: float
     """``separation_px`` and ``separation_planes``: between neighbours."""
     dip: float
-    """The smallest dip between any two neighbours, of all draws."""
+    """The smallest dip between any two neighbours, of all draws but the worst tenth."""
     map: Floats
     """(n_z, width): the reconstruction of the last draw, summed over rows."""
 
@@ -127,10 +135,10 @@ def try_points(
     seed: int = 0,
     trials: int = TRIALS,
 ) -> PointTrial:
-    """Reconstruct a grid of points; see :class:`PointTrial`."""
+    """Reconstruct a grid of points; see :class:`PointTrial`. Draws end where too many are not resolved."""
     rng = np.random.default_rng(seed)
-    worst, seen = np.inf, np.empty(0)
-    for _ in range(trials):
+    dips: list[float] = []
+    while len(dips) < trials and sum(dip < DIP for dip in dips) <= trials // 10:
         # Where the grid's points lie between voxels differs from draw to draw.
         phase_x, phase_z = rng.uniform(-0.5, 0.5, 2)
         x = (np.arange(grid.columns) - (grid.columns - 1) / 2) * grid.separation_px + phase_x
@@ -144,8 +152,9 @@ def try_points(
         light = np.sum([image(float(c), float(s)) for s in z for c in x], axis=0)
         seen = problem.solve(noise.expose(light, rng)).sum(axis=1)
         places = np.stack(np.meshgrid(z, x + problem.half[1], indexing="ij"), axis=-1)
-        worst = min(worst, smallest_dip(seen, places))
-    return PointTrial(grid.separation_px, grid.separation_planes, float(worst), seen)
+        dips.append(smallest_dip(seen, places))
+    told = sorted(dips)[min(trials // 10, len(dips) - 1)]
+    return PointTrial(grid.separation_px, grid.separation_planes, float(told), seen)
 
 
 def smallest_dip(seen: Floats, places: Floats) -> float:
@@ -176,24 +185,60 @@ def smallest_dip(seen: Floats, places: Floats) -> float:
     )
 
 
-def smallest_resolved(
-    try_one: Callable[[float], PointTrial], values: Sequence[float]
-) -> tuple[list[PointTrial], PointTrial | None]:
-    """Try growing separations; stop at the first that is resolved with the next one resolved as well.
+def smallest_told(
+    try_one: Callable[[float, int], PointTrial], least: float
+) -> tuple[list[PointTrial], float | None]:
+    """Try pairs at growing separations, each with a seed of its own.
 
     Returns
     -------
     list of PointTrial
-        All that were made, in order.
-    PointTrial or None
-        The smallest resolved one.
+        All that were made, the last one at the separation found.
+    float or None
+        The separation at which :data:`TOLD` of the pairs are resolved.
     """
     trials: list[PointTrial] = []
-    for value in values:
-        trials.append(try_one(value))
-        if len(trials) > 1 and trials[-1].resolved and trials[-2].resolved:
-            return trials, trials[-2]
-    return trials, trials[-1] if trials and trials[-1].resolved else None
+    tried: list[TriedPair] = []
+    about, wide, found = least * np.sqrt(3.0), np.sqrt(3.0), None
+    rng = np.random.default_rng(0)
+    for _ in range(ROUNDS):
+        for share in (np.arange(DRAWS) + rng.uniform(0, 1, DRAWS)) / DRAWS:
+            apart = min(float(about * wide ** (2 * share - 1)), FARTHEST)
+            trials.append(try_one(apart, len(tried)))
+            tried.append(TriedPair(apart, 0, trials[-1].resolved))
+        found, _ = stated_px(tried)
+        about, wide = (found, 1.3) if found is not None else (1.5 * about, wide)
+    if found is not None:
+        trials.append(try_one(found, 0))
+    return trials, found
+
+
+def stated_px(tried: Sequence[TriedPair]) -> tuple[float | None, float | None]:
+    """Return where a logistic curve in the logarithm of the distance reaches :data:`TOLD`, along y and x.
+
+    Both axes share its slope. Never below the smallest distance tried; None where no pair of an axis was told
+    apart, or none beyond.
+    """
+    logs = np.log([one.px for one in tried])
+    axes = np.array([one.axis for one in tried])
+    told = np.array([one.told for one in tried])
+    if not told.any():
+        return None, None
+    centre = float(logs.mean())
+
+    def misfit(p: Floats) -> float:
+        z = np.exp(p[0]) * (logs - centre - p[1 + axes])
+        # A slope of ten to forty in log distance is usual; pairs told apart by luck do not flatten it.
+        return float(
+            np.logaddexp(0.0, np.where(told, -z, z)).sum() + 0.5 * ((p[0] - np.log(20.0)) / 0.5) ** 2
+        )
+
+    slope, *middles = minimize(misfit, np.array([np.log(20.0), 0.0, 0.0]), method="Nelder-Mead").x
+    beyond = np.log(TOLD / (1 - TOLD)) / np.exp(slope)
+    stated = [float(np.exp(centre + middle + beyond)) for middle in middles]
+    least, most = min(one.px for one in tried), max(one.px for one in tried)
+    y, x = (max(px, least) if px <= most and axis in axes else None for axis, px in enumerate(stated))
+    return y, x
 
 
 def _peak(seen: Floats, place: Floats, reach_z: float, reach_x: float) -> tuple[int, int]:
@@ -290,36 +335,37 @@ def point_tests(
     def in_plane(columns: float, _s: float) -> Array:
         return point(columns, middle)
 
-    lateral, found = smallest_resolved(
-        lambda px: try_points(across, in_plane, PointGrid(2, separation_px=px), noise),
-        [v for v in LATERAL_PX if v >= 0.7 * lateral_px],
+    lateral, px = smallest_told(
+        lambda apart, seed: try_points(
+            across, in_plane, PointGrid(2, separation_px=apart), noise, seed=seed, trials=1
+        ),
+        max(0.7 * lateral_px, 1.2),
     )
-    if found is None:
+    if px is None:
         notes.append("No two points across the axis were resolved at any separation tried.")
     on_progress(0.3)
-    resolved_px = None if found is None else found.separation_px
     if not with_depth:
-        return PointTests(resolved_px, None, None, tuple(lateral), (), (), tuple(notes))
+        return PointTests(px, None, None, tuple(lateral), (), (), tuple(notes))
     along = WindowProblem(planes, (4, 4))
-    axial, found_z = smallest_resolved(
-        lambda s: try_points(along, point, PointGrid(1, 2, separation_planes=s), noise),
-        AXIAL_PLANES,
+    axial, apart_planes = smallest_told(
+        lambda apart, seed: try_points(
+            along, point, PointGrid(1, 2, separation_planes=apart), noise, seed=seed, trials=1
+        ),
+        1.2,
     )
-    if found_z is None:
+    if apart_planes is None:
         notes.append("No two points along the axis were resolved at any separation tried.")
     on_progress(0.5)
     sixteen: list[PointTrial] = []
     factor = None
-    if found is not None and found_z is not None:
+    if px is not None and apart_planes is not None:
         problem = WindowProblem(planes, HALF_WINDOW)
-        sixteen, factor = _sixteen(
-            problem, point, found.separation_px, found_z.separation_planes, noise, on_progress
-        )
+        sixteen, factor = _sixteen(problem, point, px, apart_planes, noise, on_progress)
         if factor is None:
             notes.append("16 points were not resolved at any separation that fits the window.")
     return PointTests(
-        resolved_px,
-        None if found_z is None else found_z.separation_planes * step_per_um / 2,
+        px,
+        None if apart_planes is None else apart_planes * step_per_um / 2,
         factor,
         tuple(lateral),
         tuple(axial),
@@ -341,9 +387,8 @@ def _sixteen(
     factors = [f for f in FACTORS if f <= room]
     trials: list[PointTrial] = []
     for number, factor in enumerate(factors):
-        trials.append(
-            try_points(problem, point, PointGrid(4, 4, factor * px, factor * planes), noise, trials=1)
-        )
+        grid = PointGrid(4, 4, factor * px, factor * planes)
+        trials.append(try_points(problem, point, grid, noise, trials=SIXTEEN_DRAWS))
         on_progress(0.5 + 0.5 * (number + 1) / len(factors))
         if trials[-1].resolved:
             return trials, factor

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -136,7 +137,7 @@ class PlacedStrip:
         self.n_tiles, self.tile = _tiling(self.axis.length // 2 + 1)
         parts: list[tuple[int, ...]] = []
         members: list[tuple[int, ...]] = []
-        weights, spectra = [np.empty(0, dtype)], []
+        weights = [np.empty(0, dtype)]
         at = n_weights = 0
         for part, axis in placed:
             parts.append(
@@ -155,22 +156,31 @@ class PlacedStrip:
                 weights.append(weight.astype(dtype))
                 n_weights += len(weight)
                 at += axis.length
-            spectra.append(self._spectra(part.psfs, axis.length, dtype))
         self.parts = np.array(parts, np.int64).reshape(-1, 7)
         self.members = np.array(members, np.int64).reshape(-1, 4)
         self.weights = np.concatenate(weights)
-        self.spectra = np.concatenate(spectra, axis=2) if spectra else np.empty((1, 0, 0, 0))
+        self._psfs = [(part.psfs, axis.length) for part, axis in placed]
+        channels = max((psfs.shape[0] for psfs, _ in self._psfs), default=1)
+        self._shape, self._dtype = (channels, self.n_tiles, at, self.tile), fft.complex_dtype(dtype)
+        held = int(np.prod(self._shape)) * self._dtype.itemsize
+        self.nbytes = held + self.masks.nbytes + self.weights.nbytes
 
-    def _spectra(self, psfs: Array, length: int, dtype: npt.DTypeLike) -> Array:
-        """Return a part's transfer functions, tile by tile."""
-        channels, n, height, width = psfs.shape
-        padded = np.zeros((channels, n, length, self.axis.length), dtype)
-        padded[..., :height, :width] = psfs
+    @cached_property
+    def spectra(self) -> Array:
+        """The transfer functions; made when they are asked for first: their memory is known before."""
+        spectra, at = np.zeros(self._shape, self._dtype), 0
         half = self.axis.length // 2 + 1
-        spectra = np.zeros((channels, n * length, self.n_tiles * self.tile), fft.complex_dtype(dtype))
-        spectra[..., :half] = fft.rfft(padded).reshape(channels, n * length, half)
-        tiles = spectra.reshape(channels, n * length, self.n_tiles, self.tile)
-        return np.ascontiguousarray(tiles.transpose(0, 2, 1, 3))
+        for psfs, length in self._psfs:
+            channels, n, height, width = psfs.shape
+            padded = np.zeros((channels, n, length, self.axis.length), self.masks.dtype)
+            padded[..., :height, :width] = psfs
+            rows = fft.rfft(padded).reshape(channels, n * length, half)
+            for tile in range(self.n_tiles):
+                columns = rows[..., tile * self.tile : (tile + 1) * self.tile]
+                spectra[:, tile, at : at + n * length, : columns.shape[2]] = columns
+            at += n * length
+        self._psfs = []
+        return spectra
 
     def of(self, channel: int) -> Array:
         """Return the transfer functions that serve a channel."""
@@ -194,7 +204,7 @@ class PlacedStrip:
 
     def columns(self) -> tuple[Array, Array]:
         """Return two tiles of scratch."""
-        first, second = np.empty((2, int(self.parts[:, 1].max()), self.tile), self.spectra.dtype)
+        first, second = np.empty((2, int(self.parts[:, 1].max()), self.tile), self._dtype)
         return first, second
 
 
@@ -264,9 +274,7 @@ class SpatiallyVarying(LinearOperator):
     @property
     def nbytes(self) -> int:
         """Memory that transfer functions, weights and work arrays take."""
-        held = sum(
-            s.masks.nbytes + s.weights.nbytes + s.spectra.nbytes for strips in self._depths for s in strips
-        )
+        held = sum(s.nbytes for strips in self._depths for s in strips)
         return held + self._object_work.nbytes + self._sensor_work.nbytes
 
     @property
@@ -369,7 +377,9 @@ class SpatiallyVarying(LinearOperator):
         in_blocks(add, len(out), grain=RUN)
 
     def _work(self, strips: list[PlacedStrip]) -> tuple[list[Array], list[Array]]:
-        """Cut the work arrays for one depth."""
+        """Cut the work arrays for one depth, whose transfer functions are there then."""
+        for s in strips:
+            s.spectra  # noqa: B018 - made before workers share it
         return (
             _cut(self._object_work, [s.object_shape for s in strips]),
             _cut(self._sensor_work, [s.sensor_shape for s in strips]),

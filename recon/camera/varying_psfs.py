@@ -86,20 +86,29 @@ def hats(nodes: Floats, positions: Floats) -> Floats:
     return np.stack([np.interp(positions, nodes, unit) for unit in np.eye(len(nodes))], axis=1)
 
 
+_BLOCK_VALUES = 2**17
+"""Values that are interpolated at once: scipy needs several times the memory of what it returns."""
+
+
 def _scattered(points: Floats, values: Floats, y: Floats, x: Floats) -> Floats:
     from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
     from scipy.spatial import QhullError
 
-    where: Any = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1)
     nearest = NearestNDInterpolator(points, values)
     try:
-        result = LinearNDInterpolator(points, values)(where)
+        linear: Any = LinearNDInterpolator(points, values)
     except QhullError:  # fewer than three points, or all on a line: nothing to span
-        result = nearest(where)
-    outside = np.isnan(result[..., 0])
-    if outside.any():
-        result[outside] = nearest(where[outside])
-    return np.moveaxis(result, -1, 0)
+        linear = nearest
+    result = np.empty((values.shape[1], len(y), len(x)))
+    rows = max(1, _BLOCK_VALUES // (len(x) * values.shape[1]))
+    for first in range(0, len(y), rows):
+        where: Any = np.stack(np.meshgrid(y[first : first + rows], x, indexing="ij"), axis=-1)
+        block = linear(where)
+        outside = np.isnan(block[..., 0])
+        if outside.any():
+            block[outside] = nearest(where[outside])
+        result[:, first : first + rows] = np.moveaxis(block, -1, 0)
+    return result
 
 
 class FieldOfPsfs:
@@ -267,7 +276,8 @@ def _span(weights: Array) -> slice:
 def _scattered_strips(
     z: int, psfs: Array, points: Array, rows: Array, columns: Array, needed: Mask, offset: tuple[int, int]
 ) -> Iterator[Strip]:
-    weights = interpolation_weights(points, np.eye(len(points)), rows, columns) * needed
+    weights = interpolation_weights(points, np.eye(len(points)), rows, columns)
+    weights *= needed
     for i, weight in enumerate(weights):
         if weight.any():
             window = bounding_window(weight != 0)

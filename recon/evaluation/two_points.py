@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
 
 from recon.analysis.correlation import lit_extent
 from recon.analysis.middle import Middle
-from recon.analysis.points import DIP, Noise, Reached, TriedPair, smallest_dip
+from recon.analysis.points import DIP, Noise, Reached, TriedPair, smallest_dip, stated_px
 from recon.base import fft
 from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration
@@ -28,9 +27,6 @@ from recon.types import Calibration
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
 
-TOLD = 0.95
-"""Share of pairs, at all places between pixels, that the curve tells apart at the stated distance: nine in
-ten are promised."""
 PICTURES, PAIRS = 4, 16
 """Pictures that are reconstructed, and pairs in each, half of them along each axis.
 
@@ -157,34 +153,6 @@ def reached(
     known = [px for px in across if px is not None]
     focus = _focus_um(tests, _WIDER * max(known), step_per_um, middle.spread) if len(known) == 2 else None
     return Reached(across, focus, tuple(tried), tests.method, middle.part)
-
-
-def stated_px(tried: Sequence[TriedPair]) -> tuple[float | None, float | None]:
-    """Return where a logistic curve in the logarithm of the distance reaches :data:`TOLD`, along y and x.
-
-    Both axes share its slope. Never below the smallest distance tried; None where no pair of an axis was told
-    apart, or none beyond.
-    """
-    logs = np.log([one.px for one in tried])
-    axes = np.array([one.axis for one in tried])
-    told = np.array([one.told for one in tried])
-    if not told.any():
-        return None, None
-    centre = float(logs.mean())
-
-    def misfit(p: Floats) -> float:
-        z = np.exp(p[0]) * (logs - centre - p[1 + axes])
-        # A slope of ten to forty in log distance is usual; pairs told apart by luck do not flatten it.
-        return float(
-            np.logaddexp(0.0, np.where(told, -z, z)).sum() + 0.5 * ((p[0] - np.log(20.0)) / 0.5) ** 2
-        )
-
-    slope, *middles = minimize(misfit, np.array([np.log(20.0), 0.0, 0.0]), method="Nelder-Mead").x
-    beyond = np.log(TOLD / (1 - TOLD)) / np.exp(slope)
-    stated = [float(np.exp(centre + middle + beyond)) for middle in middles]
-    least, most = min(one.px for one in tried), max(one.px for one in tried)
-    y, x = (max(px, least) if px <= most and axis in axes else None for axis, px in enumerate(stated))
-    return y, x
 
 
 def _focus_um(

@@ -8,8 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from recon.camera.camera_model import CAMERAS
 from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.part import volume_plan
+from recon.reconstruction.part import Part, parts_of, picture_bytes, volume_plan
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.solve import ITERATIONS, Progress
 from recon.reconstruction.uncertainty import REPEATS
@@ -21,7 +22,9 @@ TOLD_AT = 12
 """Iterations from which on the share is that of the time: how long one takes, and how fast they settle, shows
 then. Of 8 runs by default options the iterations foretold by these were within 25 % in 5, and within 45 %."""
 FORESEEN = ("tv", "tv-isotropic", "l1")
-"""Priors by which a volume's memory is foreseen."""
+"""Priors by which memory is foreseen."""
+KEPT = 8
+"""Copies of the data that a picture's problem keeps, about."""
 _UNCOUNTED = 2
 _SETTLING, _EVERY = 30, 10
 """Up to so many iterations their number is foretold after each, then after every so many."""
@@ -73,13 +76,16 @@ class Course:
     def iterations(self, on_progress: Progress | None, runs: int, problem: Problem) -> Progress | None:
         """Return what the solver tells: of each run, one after the other.
 
-        Before the first iteration, and until its end is foretold, the memory is said that a volume takes.
+        Before the first iteration, and until its end is foretold, the memory is said that solving takes.
         """
         if self._tell is None:
             return on_progress
         tell, run, records, count = self.stage("solve"), -1, list[IterationRecord](), 0
         tolerance, expected = problem.stop_tolerance, expected_bytes(problem)
-        expected += resident_bytes() - self._resident
+        if problem.n_planes == 1:  # of choosing much is free again: what is kept is counted
+            expected += KEPT * problem.data.nbytes + problem.calibration.psfs.nbytes
+        else:
+            expected += resident_bytes() - self._resident
         takes = "" if np.isnan(expected) else f"takes about {in_words(expected)} of memory"
         if takes:
             tell(0.0, f"solving: {takes}")
@@ -116,10 +122,20 @@ class Course:
 
 
 def expected_bytes(problem: Problem) -> float:
-    """Return what a volume by total variation or l1 takes beside what it is made of; NaN where unknown."""
-    known = isinstance(problem.prior, str) and problem.prior in FORESEEN and problem.solver.name == "admm"
-    if not known or problem.varies or problem.n_planes == 1 or problem.options.device != "cpu":
+    """Return what solving takes beside what the problem is made of; NaN where that is not known.
+
+    Raises NoMemoryError where a camera whose PSFs vary does not fit, before it is made.
+    """
+    known = isinstance(problem.prior, str) and problem.prior in FORESEEN and problem.options.device == "cpu"
+    if not known or problem.patterned or problem.model in CAMERAS:
         return float("nan")
+    if problem.varies:
+        part = Part(problem, parts_of(problem)[0])
+        part.close()
+        return float("nan") if part.plan is None else float(part.plan.total)
+    if problem.n_planes == 1:
+        looks = problem.options.tau is None or problem.solver.name == "admm-sensor"
+        return float(picture_bytes(problem)) if looks else float("nan")
     plan = volume_plan(problem)
     return float(plan.total) if plan.fits else float("nan")  # else some of it lies on a disk
 

@@ -14,7 +14,7 @@ from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR
 from recon.camera.convolution import Convolution, field_of
 from recon.camera.factors import BackgroundRemoval, Erasures, PatternedCamera
 from recon.camera.spatially_varying import SpatiallyVarying
-from recon.camera.varying_psfs import FieldOfPsfs, local_convolution, low_rank
+from recon.camera.varying_psfs import FieldOfPsfs, grid_axes, local_convolution, low_rank
 from recon.errors import NoMemoryError
 from recon.priors import Prior, TotalVariation
 from recon.reconstruction.problem import Problem
@@ -166,8 +166,7 @@ class Part:
         """Refuse a picture that a given limit has no room for."""
         if self._limit is None:
             return
-        size = self.dtype.itemsize * int(np.prod(plane.domain_shape))
-        self.plan = memory.MemoryPlan(0, 12 * size, self._limit)
+        self.plan = memory.MemoryPlan(0, picture_bytes(self.problem), self._limit)
         if not self.plan.fits:
             raise NoMemoryError(f"This picture needs {self.plan}. Bin the images, or allow more.")
 
@@ -200,10 +199,12 @@ class Part:
                 fields, shape, error=LOW_RANK_ERROR, support=support, grid_shape=grid, dtype=self.dtype
             )
         )
-        volumes = 12 if kind_of(problem.prior_name) == "tv" else 6
-        size = self.dtype.itemsize * int(np.prod(camera.domain_shape))
+        plane = self.dtype.itemsize * int(np.prod(camera.domain_shape[2:]))
         available = memory.available_bytes() if self._limit is None else self._limit
-        self.plan = memory.MemoryPlan(0, volumes * size + camera.nbytes, available)
+        scattered = max((len(f.points) for f in fields if grid_axes(f.points) is None), default=0)
+        kind = kind_of(problem.prior_name)
+        needed = memory.varying_bytes(kind, len(fields), plane, camera.nbytes, scattered)
+        self.plan = memory.MemoryPlan(0, needed, available)  # before its transfer functions are made
         if not self.plan.fits:
             raise NoMemoryError(
                 f"The {problem.model} model needs {self.plan}. Bin the images or take fewer depths."
@@ -380,6 +381,15 @@ def volume_plan(problem: Problem) -> memory.MemoryPlan:
         itemsize=np.dtype(problem.precision).itemsize,
         available=None if limit is None else int(limit * memory.GIB),
     )
+
+
+def picture_bytes(problem: Problem) -> int:
+    """Return the memory that a picture takes through one PSF, all channels together or its only one."""
+    itemsize = np.dtype(problem.precision).itemsize
+    field, _ = field_of(problem.sensor_shape, problem.depths.central.shape[2:])
+    channels = problem.n_channels if problem.together else 1
+    grid, sensor = (itemsize * int(np.prod(n)) for n in (fft.fast_shape(field), problem.sensor_shape))
+    return memory.picture_bytes(channels, grid, sensor)
 
 
 def parts_of(problem: Problem) -> list[slice]:

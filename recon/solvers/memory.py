@@ -119,6 +119,34 @@ def plan(
     return MemoryPlan(volumes, work, available_bytes() if available is None else available, traffic)
 
 
+_VARYING = {"tv": (33.0, 6.5), "l1": (9.0, 6.4)}
+"""Volumes, and planes beside them, that splitting through varying PSFs takes at its peak, as NumPy
+counts it at one and four planes."""
+_SCATTERED = 2.6
+"""Planes for every PSF whose weights are interpolated between scattered places, while its camera is made."""
+
+
+def varying_bytes(kind: str, n_z: int, plane: int, camera: int, scattered: int) -> int:
+    """Return what solving through varying PSFs takes.
+
+    ``plane`` bytes a plane, ``camera`` its operator's; ``scattered`` PSFs at most of a depth lie on no grid.
+    """
+    volumes, planes = _VARYING["tv" if kind == "tv" else "l1"]
+    return int(max((volumes * n_z + planes) * plane + camera, _SCATTERED * scattered * plane))
+
+
+_PICTURE = (13.0, 2.3, 12.8)
+"""Grids a channel, grids beside them, and sensors a channel that a picture's splitting takes at its peak."""
+_SMALL = 5.5 * 2**20
+"""What it takes beside them: the matrices of the preconditioner's lowest modes."""
+
+
+def picture_bytes(channels: int, grid: int, sensor: int) -> int:
+    """Return what a picture through one PSF takes, its first look included; bytes a grid and a sensor."""
+    per_channel, beside, per_sensor = _PICTURE
+    return int((per_channel * channels + beside) * grid + per_sensor * channels * sensor + _SMALL)
+
+
 def available_bytes() -> int:
     """Memory that this process may still take: what is free, within its control group's limit."""
     free = []

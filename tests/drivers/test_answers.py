@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -61,6 +62,29 @@ def test_what_a_call_returns_and_raises_comes_through_and_a_hang_is_named() -> N
     with pytest.raises(DeviceTimeoutError, match="camera: hangs: an answer has not ended"):
         within(0.05, "camera", "an answer", lambda: ended.wait(20))
     ended.set()
+
+
+@pytest.mark.parametrize("has_ended", [True, False])
+def test_an_interrupted_call_is_undone_once_and_after_it(
+    monkeypatch: pytest.MonkeyPatch, *, has_ended: bool
+) -> None:
+    class Interrupted(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            if has_ended:
+                super().wait(20)
+            raise KeyboardInterrupt
+
+    let_go, undone, left = threading.Event(), [], list[threading.Thread]()
+    patched = SimpleNamespace(Lock=threading.Lock, Event=Interrupted, Thread=threading.Thread)
+    monkeypatch.setattr("drivers.common.answers.threading", patched)
+    with pytest.raises(KeyboardInterrupt):
+        within(9, "a", "b", lambda: has_ended or let_go.wait(20), undo=lambda: undone.append(1), left=left)
+    assert (len(undone), len(left)) == (has_ended, not has_ended)
+    let_go.set()
+    for thread in left:
+        assert thread.daemon
+        thread.join(5)
+    assert undone == [1]
 
 
 class HangingCamera(FreeRunningCamera):

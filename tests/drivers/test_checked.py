@@ -13,13 +13,13 @@ import numpy.typing as npt
 import pytest
 
 from drivers.camera import Camera, Roi
-from drivers.common.checked import checked
+from drivers.common.checked import call_limit_s, checked
 from drivers.device import Device
 from drivers.errors import DeviceError, LimitError
 from drivers.frame import Frame
 from drivers.led_array import OFF, LedArray, LedPattern
 from drivers.slm import Slm
-from drivers.stage import Stage
+from drivers.stage import Stage, StageAxis
 from tests.mocks.devices import (
     MockCamera,
     MockLedArray,
@@ -46,7 +46,28 @@ def test_an_exposure_that_is_none_or_another_is_refused(said: float) -> None:
         made(Lying).set_exposure_ms(20.0)
 
 
-@pytest.mark.parametrize(("said", "is_refused"), [(9.9, True), (10.0, False), (17.0, False), (17.1, True)])
+@pytest.mark.parametrize(
+    ("what", "asked", "said", "is_refused"),
+    [
+        ("exposure_ms", 0.1, 0.0, True),
+        ("exposure_ms", 1.0, 1.3, True),
+        ("gain", 4.0, 5.0, False),
+        ("gain", 1.0, 1.75, True),
+    ],
+)
+def test_how_far_a_setting_may_be_off(what: str, asked: float, said: float, *, is_refused: bool) -> None:
+    class Other(MockCamera):
+        pass
+
+    setattr(Other, f"set_{what}", lambda *_: said)
+    setattr(Other, what, said)
+    with pytest.raises(DeviceError, match="was asked for") if is_refused else nullcontext():
+        assert getattr(made(Other), f"set_{what}")(asked) == said
+
+
+@pytest.mark.parametrize(
+    ("said", "is_refused"), [(9.9, True), (9.999985, True), (10.0, False), (17.0, False), (17.1, True)]
+)
 def test_a_sequence_is_no_faster_than_asked_nor_far_slower(said: float, *, is_refused: bool) -> None:
     class Playing(MockLedArray):
         def arm(self, patterns: Any, period_ms: float, output: int = 0) -> float:
@@ -75,6 +96,7 @@ def test_steps_of_honest_cameras_are_no_lies() -> None:
             return super().set_gain(10 ** (round(20 * np.log10(gain) / 2) * 2 / 20))
 
     camera = made(Stepping)
+    assert camera.set_roi(None) == camera.roi
     for exposure_ms in np.geomspace(0.1, 900, 60):
         camera.set_exposure_ms(float(exposure_ms))
     for gain in np.geomspace(1, 16, 60):
@@ -133,8 +155,47 @@ class Coloured(MockCamera):
         return Frame(np.repeat(frame.image[..., None], 3, axis=2), frame.metadata)
 
 
-def test_a_frame_in_colour_has_its_regions_shape() -> None:
+def test_a_frame_in_colour_or_of_an_odd_region_has_its_shape() -> None:
     assert made(Coloured).snap().image.ndim == 3
+
+    class Odd(MockCamera):
+        def snap(self) -> Frame:
+            frame = super().snap()
+            return Frame(frame.image[:12, :16], replace(frame.metadata, roi=(0, 0, 25, 33), binning=2))
+
+        next_frame = lambda self, timeout_s: self.snap()  # noqa: E731
+
+    assert made(Odd).next_frame(1.0).image.shape == (12, 16)
+    for call in (
+        made(Short).next_frame,
+        lambda _: made(Short).next_frame_into(np.empty((24, 16), np.uint8), 1),
+    ):
+        with pytest.raises(DeviceError, match="a frame of"):
+            call(1.0)
+
+
+class Short(MockCamera):
+    def next_frame(self, timeout_s: float) -> Frame:
+        frame = super().snap()
+        return Frame(frame.image[:, ::2].astype(np.uint8), frame.metadata)
+
+
+class Misses(MockStage):
+    def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
+        return {name: place + 50.0 for name, place in super().move_to(target).items()}
+
+
+class Afar(MockStage):
+    axes = (StageAxis("x_um", -2e6, -1e6, 1000.0, 0.1), StageAxis("y_um", 0.0, 1.0, 1000.0, 0.1))
+
+
+def test_a_call_has_the_time_that_its_device_needs() -> None:
+    stage, leds = made(Afar), made(MockLedArray)
+    times_s = [call_limit_s(stage, name) for name in ("settings", "open", "move_to", "home")]
+    assert times_s == [30, 120, 3000, 3000]  # three times 1 m at 1 mm/s
+    assert [call_limit_s(leds, name) for name in ("set_pattern", "open", "arm")] == [30, 120, 600]
+    assert call_limit_s(made(MockCamera), "snap") == pytest.approx(2 + 3 * 0.01 + 20)
+    assert call_limit_s(made(type("Bare", (MockStage,), {"axes": ()})), "wait") == 600
 
 
 class Stays(MockStage):
@@ -155,6 +216,9 @@ def test_a_stage_that_does_not_move_is_found_out() -> None:
     stage: Stage = made(Stays)
     with pytest.raises(DeviceError, match="x_um = 50 and says x_um = 0"):
         stage.move_to({"x_um": 50.0})
+    stage.move_to({"x_um": 50.0}, wait=False)  # it has not arrived
+    with pytest.raises(DeviceError, match="x_um = 20 and says x_um = 70"):
+        made(Misses).move_to({"x_um": 20.0})
     stage.move_to({"x_um": 0.2})  # within three times its resolution of where it stands
     with pytest.raises(DeviceError, match="no number, for x_um, z_um"):
         made(Lost).position()
@@ -167,6 +231,12 @@ def test_a_stage_that_does_not_move_is_found_out() -> None:
     stage.move_to({"z_um": 0.0})
     with pytest.raises(DeviceError, match="was asked for homing and says that it is not homed"):
         made(NeverHome).home()
+    lost = made(NeverHome)
+    assert "stage.home" not in lost.world.calls
+    lost._position["z_um"] = 9.9e9
+    assert lost.position()["z_um"] == 9.9e9
+    (homed := made(MockStage)).home()
+    assert homed.world.calls == ["stage.home"]
 
 
 # Light, SLM ---
@@ -194,6 +264,12 @@ def test_light_that_is_not_shown_or_not_put_out_is_found_out() -> None:
     leds.set_pattern(leds.single(2))
     with pytest.raises(DeviceError, match="was asked for darkness"):
         leds.off()
+    for shown in (OFF, leds.single(2)):
+        named = {"pattern": shown, "play": lambda self: self.world.calls.append("play")}
+        playing = made(type("Playing", (MockLedArray,), named))
+        with nullcontext() if shown is OFF else pytest.raises(DeviceError, match="darkness after a sequence"):
+            playing.play()
+        assert playing.world.calls == ["play"]
     slm: Slm = made(Frozen)
     with pytest.raises(DeviceError, match="was asked for an image"):
         slm.display(np.full(slm.shape, 3, np.uint8))

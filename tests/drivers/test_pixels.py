@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from drivers.common.camera_settings import GainScale
 from drivers.common.pixels import Packing, PixelFormat, genicam_format, unpack
 
 
@@ -134,3 +135,16 @@ def test_genicam_names_are_understood(name: str, bits: int, packing: str, channe
 @pytest.mark.parametrize("name", ["YUV422_8", "Mono14p", "Mono16p", "BayerXX8", "Mono8s", ""])
 def test_formats_that_cannot_be_unpacked_are_not_offered(name: str) -> None:
     assert genicam_format(name) is None
+
+
+@pytest.mark.parametrize(
+    ("scale", "number", "factor"),
+    [
+        (GainScale("dB", 0.1, 0), 60, 10**0.3),
+        (GainScale("factor", 0.01, 1), 250, 2.5),
+        (GainScale("steps", 0.1, 10), 15, 1.5),
+    ],
+)
+def test_a_cameras_number_of_gain_is_a_factor(scale: GainScale, number: float, factor: float) -> None:
+    assert scale.factor(number) == pytest.approx(factor)
+    assert scale.number(factor) == pytest.approx(number)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -85,7 +86,8 @@ def test_elliptec_is_not_homed_when_its_homing_was_stopped(tmp_path: Path) -> No
     with elliptec(bus) as stage:
         assert [axis.speed_per_s for axis in stage.axes] == pytest.approx([60_000.0, 5_000.0])
         stage.home()
-        stage.move_to({"x_um": 20_000.0})
+        stage.move_to({"x_um": 20_000.0, "roll_mrad": -500 * math.pi})
+        assert [axis.place for axis in bus.axes.values()] == [20 * 1024, 143_360 // 4]
         bus.axes["0"].set_place(bus.axes["0"].target)
         bus.axes["0"].speed_per_s = 2000  # homing would take 10 s, however late STOP comes
         with ThreadPoolExecutor(1) as other:

@@ -240,6 +240,12 @@ def test_checksums_are_put_back(chain: ZaberChain) -> None:
         assert chain.devices[1].settings["comm.checksum"] == "1"
     assert chain.devices[1].settings["comm.checksum"] == "0"
     assert chain.devices[2].settings["comm.checksum"] == "1"
+    with (stage := stage_on(chain)):
+        pass
+    chain.devices[1].settings["comm.checksum"] = "1"  # as somebody else wants it since
+    with stage:
+        pass
+    assert chain.devices[1].settings["comm.checksum"] == "1"
 
 
 def test_checksums_are_put_back_after_a_reconnection_too(chain: ZaberChain) -> None:

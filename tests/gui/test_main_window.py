@@ -16,7 +16,7 @@ from pytestqt.qtbot import QtBot
 from calibration_routines.procedure import Outlook, Procedure
 from gui.jobs import JobContext, JobState
 from gui.main_window import MainWindow
-from gui.panels import PANELS
+from gui.panels import PANELS, PanelEntry
 from gui.procedure_panel import ProcedurePanel
 from gui.session import BenchSession
 from gui.theme import THEMES
@@ -350,3 +350,19 @@ def test_what_drivers_and_instrument_tell_is_in_the_log(qtbot: QtBot, session: B
     for room in ("drivers.stage", "instrument.bench.bench", "calibration_routines.psf.sweep"):
         logging.getLogger(room).info("told by %s", room)
     qtbot.waitUntil(lambda: sum("told by" in text for _, text in lines) == 3, timeout=WAIT_MS)
+
+
+def test_panels_are_prepared_before_they_are_asked_for(
+    qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded: list[str] = []
+
+    def load(entry: PanelEntry) -> None:
+        loaded.append(entry.title)
+        if entry.title == "Films":
+            raise ImportError("it lacks something")
+
+    monkeypatch.setattr(PanelEntry, "load", load)
+    window.maker.prepare()
+    qtbot.waitUntil(lambda: len(loaded) == len(PANELS), timeout=WAIT_MS)
+    assert "lacks" not in window.job_label.text(), "it is told where the panel is opened"

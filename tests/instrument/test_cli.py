@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -239,8 +240,12 @@ time_scale = 0
 
 def test_snap_exposes_by_itself_unless_it_is_told_how(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (here / "bench.toml").write_text(TINY)
-    assert main(["snap", "--out", "found.tif"]) == 0
+    assert main(["snap", "--out", "found.tif", "--figure", "found.png"]) == 0
     assert "Auto-exposure" in capsys.readouterr().out
+    assert cv2.imread(str(here / "found.png")).std() > 10
+    assert main(["snap", "--out", "other.tif", "--figure", "found.png"]) == 2
+    assert "found.png: exists already" in capsys.readouterr().err
+    assert not (here / "other.tif").exists()
     assert main(["snap", "--dark", "--out", "dark.tif"]) == 0
     assert "no exposure is given" in capsys.readouterr().err
     (here / "bench.toml").write_text(TINY.replace("[stage]", "exposure_ms = 2\n[stage]", 1))

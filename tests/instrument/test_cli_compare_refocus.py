@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -47,8 +48,10 @@ def test_a_psf_at_another_depth_is_a_calibration(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "at75"
-    words = ["refocus", str(folder / "calibration"), "--z-mm", "75", "--out", str(out)]
+    page = tmp_path / "at75.png"
+    words = ["refocus", str(folder / "calibration"), "--z-mm", "75", "--out", str(out), "--figure", str(page)]
     assert main(words) == 0
+    assert cv2.imread(str(page)).std() > 10
     said = capsys.readouterr().out
     assert "60 and 100 mm" in said
     assert "SIMULATED" in said

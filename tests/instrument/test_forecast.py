@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import sys
+import time
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from instrument.reconstruction.forecast import TRIED, Forecast, Foretold, forecast
+from instrument.files import kept_times
+from instrument.reconstruction.forecast import TRIED, Forecast, Foretold, Like, forecast
+from instrument.reconstruction.job import Job
 from recon import Calibration, reconstruct
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
+from recon.solvers.base import StopReason
 
 
 @pytest.fixture(scope="module")
@@ -48,3 +55,43 @@ def test_a_reconstruction_says_once_what_it_will_take(scene: tuple[Measurement, 
     assert len(said) == 1
     assert said[0].startswith("about ")
     assert foretold.seconds > 0
+
+
+def test_the_next_like_it_is_told_before_it_begins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    like, said = Like("reconstruction of a hand", 1000), list[str]()
+    first = Foretold(said.append, like)
+    assert not said
+    time.sleep(0.05)
+    first.ended(["settled"])
+    second = Foretold(said.append, like)
+    assert said[0].endswith(", by the last like it")
+    assert second.before is not None
+    assert second.before[0] >= 0.05
+    like.keep(2.0, 3e6)
+    assert Like(like.key, 4000).took() == (8.0, 12e6), "it grows with the pixels"
+    assert Like(like.key, 10_000).took() is None, "too far from what was seen"
+    assert Like("another", 1000).took() is None
+    said.clear()
+    Foretold(said.append, like).ended([StopReason.CANCELLED])
+    assert said == ["about 2.0 s in all; 2.9 MiB of memory, by the last like it"]
+    assert like.took() == (2.0, 3e6), "what was cancelled is not kept"
+    compiling = Foretold(said.append, like)
+    compiling._compiled(1.0)
+    compiling.ended(["settled"])
+    assert like.took() == (2.0, 3e6), "nor what compilers took"
+    kept_times.place().write_text('{"reconstruction of a hand": [[1]]}')
+    assert like.took() is None
+
+
+def test_like_ones_have_the_same_options_and_psfs(scene: tuple[Measurement, Calibration]) -> None:
+    measurement, calibration = scene
+
+    def key(psfs: Calibration = calibration, **options: object) -> str:
+        job = Job(np.asarray(measurement.image, np.float32), psfs, {})
+        return Like.of(job, ReconstructionOptions(**options)).key  # type: ignore[arg-type]
+
+    two = Calibration(np.repeat(calibration.psfs, 2, 0), np.zeros((2, 3)))
+    assert key() == key(z_um=100.0)
+    assert len({key(), key(prior="l1"), key(iterations=30), key(two)}) == 4

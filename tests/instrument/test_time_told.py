@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from rich.progress import Progress
 
-from instrument.cli import kept_times
 from instrument.cli.progress import _Left, _Note
+from instrument.files import kept_times
 
 
 @pytest.fixture(autouse=True)

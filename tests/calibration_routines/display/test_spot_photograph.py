@@ -55,10 +55,17 @@ def test_a_picture_by_mirrors_is_photographed_as_it_was_computed(
     write_bench(**masked | {"masked": "true\nmirrors = true"})
     assert main(["hologram", "picture.png", "--out", "p.png"]) == 2
     assert "--mirrors optimised" in capsys.readouterr().err
+    assert main(["hologram", "--spots", "3x3", "--out", "p.png"]) == 2
+    assert "give a picture of them instead, with --mirrors optimised" in capsys.readouterr().err
     assert main(["show", "phases.png", *shown]) == 2
     assert "this pattern is of phases" in capsys.readouterr().err
-    assert main(["calibrate", "display", "--dry-run"]) == 2
-    assert "only phases can be learned" in capsys.readouterr().err
+    for command, words in (
+        (["calibrate", "display"], "only phases can be learned"),
+        (["calibrate", "slm"], "they have no phase that their levels could be measured by"),
+        (["align", "mask"], "a mask is aligned by the spots of a phase SLM in their place"),
+    ):
+        assert main([*command, "--dry-run"]) == 2
+        assert f"has mirrors that send light or not: {words}." in capsys.readouterr().err
     assert set(np.unique(read_slm_image("slm.png")[0])) == {0, 255}
     computed = json.loads(Path("slm.json").read_text())
     assert 0.03 < computed["efficiency"] < 0.1

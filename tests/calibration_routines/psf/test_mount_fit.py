@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from calibration_routines.psf.mount_fit import fit_mount
+from calibration_routines.psf.mount_fit import fit_mount, off_middle
 from calibration_routines.psf.psf_quality import PsfQuality
 from calibration_routines.psf.sweep_plan import size_findings
 from recon.types import Geometry
@@ -58,3 +60,19 @@ def test_a_pinhole_wider_than_the_resolution_is_said() -> None:
     (words,) = size_findings(1500.0, GEOMETRY, 60e3)
     assert "17.1 pixels" in words
     assert size_findings(150.0, GEOMETRY, 60e3) == size_findings(None, GEOMETRY, 60e3) == ()
+
+
+def test_a_rail_that_leans_or_a_diffuser_beside_the_middle_is_said() -> None:
+    def moved_by(columns: float, x_um: float = 0.0) -> list[PsfQuality]:
+        made = planes(x_um)
+        return [replace(q, centroid_px=(q.centroid_px[0], q.centroid_px[1] + columns)) for q in made]
+
+    assert off_middle(moved_by(-3.0), GEOMETRY) == off_middle(moved_by(-3.0, 400.0), GEOMETRY) == ""
+    moved = moved_by(-3.0 - 10.0 * 8.9 / 13.0, 400.0)  # 10 mrad
+    words = off_middle(moved, GEOMETRY)
+    assert "lies -6." in words
+    assert 9 < float(words.split("leans by ")[1].split()[0]) < 11
+    # One depth does not tell a source's place from that; where it is recorded to stand off the axis is known.
+    assert "or the source stands" in off_middle(moved[:1], GEOMETRY)
+    assert off_middle([replace(moved_by(-3.0, 5e3)[0], x_um=5e3)], GEOMETRY) == ""
+    assert off_middle(moved, replace(GEOMETRY, pixel_pitch_um=None)) == ""

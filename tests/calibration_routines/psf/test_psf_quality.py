@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration_routines.psf.psf_quality import judge_sweep, measure_psf, temporal_noise
+from calibration_routines.psf.psf_quality import judge_next, judge_sweep, measure_psf, temporal_noise
 
 D_UM = 8_900.0
 SHAPE = (256, 320)
@@ -104,3 +104,13 @@ def test_temporal_noise_is_that_of_the_average() -> None:
     assert temporal_noise(frames) == pytest.approx(30.0 / np.sqrt(8), rel=0.05)
     with pytest.raises(ValueError, match="at least two"):
         temporal_noise(frames[:1])
+
+
+def test_the_next_plane_may_lie_as_far_off_as_the_line_through_the_others_is_unsure() -> None:
+    z_um = (60e3, 75e3, 100e3, 150e3)  # the last one far beyond the others in 1/z
+    three = [measure_psf(pattern(z), z_um=z, noise=1.0) for z in z_um[:3]]
+    for shift_px, slipped in ((2.5, False), (6.0, True)):
+        last = measure_psf(pattern(z_um[3], shift_px=(shift_px, 0.0)), z_um=z_um[3], noise=1.0)
+        assert bool(judge_next(three, last, D_UM).findings) == slipped
+    inside = measure_psf(pattern(67e3, shift_px=(2.8, 0.0)), z_um=67e3, noise=1.0)
+    assert judge_next(three, inside, D_UM).findings

@@ -15,7 +15,8 @@ from drivers.errors import DeviceError, DeviceLostError
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.bench.safety import StepsFailedError
-from instrument.plan import SOURCE, Part, Plan, PlanError, SourcePoints
+from instrument.files.errors import BenchError
+from instrument.plan import SOURCE, Light, Part, Plan, PlanError, SourcePoints
 from instrument.runs.acquire import abilities_of, acquire, prepare
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_control import RunControl
@@ -287,6 +288,10 @@ def test_pause_darkens_and_resume_goes_on_where_it_was(tmp_path: Path) -> None:
         assert not thread.is_alive()
     assert runner.status.reason is FinishReason.COMPLETED
     assert runner.status.done == 5
+    assert [e["kind"] for e in Run.open(runner.path).events if e["kind"] in ("paused", "resumed")] == [
+        "paused",
+        "resumed",
+    ]
 
 
 def test_stop_during_an_exposure_keeps_no_frame_of_it(
@@ -394,3 +399,30 @@ def test_darkening_leaves_alone_what_no_step_has_lit() -> None:
         before = list(calls(bench))
         StepSettings(bench).darken()
         assert calls(bench) == before
+
+
+def test_progress_is_counted_and_a_runner_carries_out_once(tmp_path: Path) -> None:
+    told: list[RunStatus] = []
+    with open_mock_bench() as bench:
+        runner = prepare(bench, plan(), tmp_path, on_progress=told.append)
+        runner.execute()
+        with pytest.raises(RuntimeError, match="once"):
+            runner.execute()
+    stored = {status.done: status for status in told if status.done and status.step is not None}
+    assert [(s.done_here, s.total, s.dropped) for s in stored.values()] == [
+        (n, 5, n + 1) for n in range(1, 6)
+    ]
+    assert [s.seconds_left == pytest.approx(s.seconds / n * (5 - n)) for n, s in stored.items()] == [True] * 5
+    assert 0 < stored[1].seconds < 60
+
+
+def test_what_a_bench_lacks_is_said_when_a_step_needs_it() -> None:
+    with open_mock_bench(["camera"]) as bench:
+        settings, red = StepSettings(bench), Light(kind="pattern", leds=((0, 255, 0, 0),))
+        for call, lacking in (
+            (lambda: settings._move_stage({"x_um": 1.0}), "no stage"),
+            (lambda: settings._display(Path("a.png")), "no SLM"),
+            (lambda: settings._set_light(red), "no LED array"),
+        ):
+            with pytest.raises(BenchError, match=lacking):
+                call()

@@ -11,6 +11,7 @@ from scipy import ndimage
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.compare import compare, compare_psfs
+from recon.base.blocks import block_mean
 from recon.errors import InputError
 from recon.types import Calibration
 
@@ -131,6 +132,20 @@ def test_sizes_must_agree() -> None:
     small = Calibration(old.psfs[..., :100, :100].copy(), old.source_positions_um, geometry=old.geometry)
     with pytest.raises(InputError, match="region of interest"):
         compare(old, small)
+
+
+@pytest.mark.parametrize(("adds", "pitch_known"), [(1.0, True), (9.0, False)])
+def test_another_binning_is_told_and_the_rest_compared(adds: float, pitch_known: bool) -> None:
+    old, new = calibration(world()), calibration(world(diffuser_distance_mm=9.05), seed=1)
+    geometry = replace(new.geometry, pixel_pitch_um=3 * 13.0 if pitch_known else None)
+    binned = replace(new, psfs=block_mean(new.psfs, 3) * np.float32(adds), geometry=geometry)
+    unbinned = compare(old, new)
+    assert "Another binning" not in " ".join(unbinned.reasons)
+    for found, sign in ((compare(old, binned), 1), (compare(binned, old), -1)):
+        assert "Another binning" in found.reasons[0]
+        assert "3 times" in found.reasons[0]
+        assert found.changes[0].brightness == pytest.approx(unbinned.changes[0].brightness ** sign, rel=0.02)
+        assert found.changes[0].scale == pytest.approx(unbinned.changes[0].scale ** sign, abs=1e-3)
 
 
 def test_another_camera_of_as_many_pixels_is_named() -> None:

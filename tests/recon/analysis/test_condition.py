@@ -82,7 +82,7 @@ def test_a_window_is_reconstructed_as_by_a_dense_solver() -> None:
     truth = np.maximum(rng.normal(0, 1, len(voxels)), 0)
     data = dense @ truth + rng.normal(0, 0.05, dense.shape[0])
     expected, _ = nnls(dense, data)
-    solution = WindowProblem(stack, half).solve(data.reshape(30, 40), iterations=20_000, tolerance=1e-9)
+    solution = WindowProblem(stack, half).solve(data.reshape(30, 40))
     assert solution.ravel() == pytest.approx(expected, abs=1e-4)
 
 

@@ -1,0 +1,204 @@
+"""Frames of routines whose next picture depends on the last one: kept as they come, and seen again.
+
+A plan cannot tell such frames beforehand. They go into a run of their own, a recording whose log says of each
+what it was asked for: what the SLM showed, exposure, light, place of the stage. A routine that is carried out
+again with such a run asks the same questions and gets the frames that answered them; the first question
+beyond them goes to the camera. So a routine that ended early goes on, and one that ended well is analysed
+again. Meanwhile SLM and stage go where they went: what follows finds them as they were.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.errors import StoppedError
+from drivers.frame import FrameMetadata
+from instrument.bench.bench import Bench
+from instrument.files.errors import BenchError, size
+from instrument.runs.acquire import record_of
+from instrument.runs.run import FinishReason, Run
+from instrument.runs.run_control import EndedEarlyError
+from instrument.runs.writer import FrameToStore, RunWriter
+from recon.base.declare import RARE, option
+
+Array = npt.NDArray[Any]
+
+_ASKED = "asked"
+
+
+class Taken(Protocol):
+    """A frame, or a photograph."""
+
+    @property
+    def image(self) -> Array:
+        """Its counts."""
+
+    @property
+    def metadata(self) -> FrameMetadata:
+        """How it came about."""
+
+
+class KeptFrames:
+    """Keeps the frames of one routine on its bench; a context, which ends their run.
+
+    Parameters
+    ----------
+    bench : Bench
+        Open.
+    folder : Path or None
+        Where the run's folder goes; None: the bench's data folder.
+    command : str
+        That carries the routine out, ``"calibrate slm"``.
+    again : Path, optional
+        A run of the same whose frames are seen again; new ones are added to it.
+
+    Raises BenchError when ``again`` holds no frames of this routine; RunError when it is no run.
+    """
+
+    def __init__(self, bench: Bench, folder: Path | None, command: str, again: Path | None = None) -> None:
+        self._bench, self._folder, self._command = bench, folder, command
+        self._run = None if again is None else Run.open(again)
+        self._questions: list[str] = []
+        self._writer: RunWriter | None = None
+        self._next = 0
+        if self._run is not None:
+            if (made := kept_by(self._run)) != command:
+                what = f"is of {made}" if made else "holds no frames of such a routine"
+                raise BenchError(f"{again} {what}; --again takes a run of {command}.")
+            self._questions = _answered(self._run)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        if error is not None and self.path is not None:
+            error.add_note(
+                f"{self._next} frames are kept: diffuserbench {self._command} --again {self.path}, other "
+                "options as they were, goes on with them."
+            )
+        if self._writer is not None:
+            reason = FinishReason.COMPLETED
+            if isinstance(error, EndedEarlyError):
+                reason = error.reason
+            elif isinstance(error, StoppedError):
+                reason = FinishReason.STOPPED
+            elif error is not None:
+                reason = FinishReason.FAILED if isinstance(error, Exception) else FinishReason.ABORTED
+            self._writer.finish(reason, "" if error is None else str(error) or type(error).__name__)
+
+    @property
+    def path(self) -> Path | None:
+        """The run's folder; None before the first frame."""
+        if self._writer is not None:
+            return self._writer.path
+        return None if self._run is None else self._run.path
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The same, as an outcome's runs."""
+        return () if self.path is None else (self.path,)
+
+    def answers(self, questions: Sequence[str], take: Callable[[int], Sequence[Taken]]) -> list[Array]:
+        """Return the images that answer questions, one after the other.
+
+        Parameters
+        ----------
+        questions : sequence of str
+            What distinguishes each picture from others (:func:`question`).
+        take : callable
+            Takes the frames from the question of this number on, one or more, where they are not kept yet.
+
+        Raises BenchError when a kept frame is of another question; RunError when the disk fails.
+        """
+        images: list[Array] = []
+        while len(images) < len(questions):
+            asked = questions[len(images)]
+            if self._next < len(self._questions):
+                images.append(self._again(asked))
+                continue
+            taken = take(len(images))
+            self._keep(taken, questions[len(images) :])
+            images += [frame.image for frame in taken]
+        return images
+
+    def _again(self, asked: str) -> Array:
+        assert self._run is not None
+        if self._questions[self._next] != asked:
+            raise BenchError(
+                f"{self._run.path}: its frame {self._next} is of another picture, exposure or place than is "
+                "asked for now: other options, another bench, or another version of this program. Take new "
+                "frames, without --again."
+            )
+        self._next += 1
+        return np.asarray(self._run.frame(self._next - 1))
+
+    def _keep(self, taken: Sequence[Taken], questions: Sequence[str]) -> None:
+        if self._writer is None:
+            if self._run is not None:
+                self._writer = RunWriter.reopen(self._run.path)
+            else:
+                folder = self._folder or self._bench.config.data_folder
+                label = self._command.split()[-1]
+                self._writer = RunWriter.create(folder, label=label, bench=record_of(self._bench))
+            self._writer.start(routine=self._command)
+        frames = []
+        for frame, asked in zip(taken, questions, strict=False):
+            self._writer.note(_ASKED, index=self._next, question=asked)
+            frames.append(FrameToStore(self._next, frame.image, frame.metadata))
+            self._next += 1
+        self._writer.write(frames)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenAgain:
+    """Options of a routine whose frames can be seen again."""
+
+    again: Path | None = option(
+        None,
+        metavar="RUN",
+        label="Frames of run",
+        help="A run of the same: its frames are seen again, and further ones taken where they end.",
+        default_words="new frames",
+        group=RARE,
+    )
+
+
+def kept_words(bench: Bench, frames: int, again: Path | None) -> str:
+    """Return where frames go that are kept, and how large so many are at most."""
+    camera = bench.camera
+    each = math.prod(camera.frame_shape) * camera.frame_dtype.itemsize
+    words = f"frames are kept, {size(frames * each)} at most"
+    return words if again is None else f"{words}; those of {again} are seen again"
+
+
+def question(shown: Array | None, *settings: Any) -> str:
+    """Return what distinguishes a picture: a digest of what the SLM shows, and what else was set."""
+    told = hashlib.blake2b(repr(settings).encode(), digest_size=16)
+    if shown is not None:
+        told.update(repr(shown.shape).encode() + np.ascontiguousarray(shown).tobytes())
+    return told.hexdigest()
+
+
+def kept_by(run: Run) -> str:
+    """Return the command whose routine kept a run's frames so; empty for every other run."""
+    return next((str(event["routine"]) for event in run.events if "routine" in event), "")
+
+
+def _answered(run: Run) -> list[str]:
+    """Return the questions of the frames that are there, up to the first that is not as it was written."""
+    asked = {event["index"]: str(event["question"]) for event in run.events if event.get("kind") == _ASKED}
+    questions: list[str] = []
+    while (index := len(questions)) in asked and index in run.records and run.verify(index) is None:
+        questions.append(asked[index])
+    return questions

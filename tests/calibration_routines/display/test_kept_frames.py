@@ -1,0 +1,81 @@
+"""Frames of the display's routines are kept: a routine goes on with them, or sees all of them again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration_routines.display.slm_calibration import SlmProcedure
+from calibration_routines.plan_procedures import ResumeProcedure
+from calibration_routines.procedure import Listener, Outcome
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import parse_config
+from instrument.files.errors import BenchError
+from instrument.files.slm_image import load_slm_correction
+from instrument.runs.run import Run, RunCondition
+from instrument.runs.run_control import EndedEarlyError, RunControl
+from tests.calibration_routines.display.test_mask_alignment import BENT, small
+
+TEXT = small(shape="[120, 160]").replace("settle_ms = 30.0", BENT)
+ENDS_AT = 2
+"""Before the levels, which one sequence of the hardware takes."""
+
+
+class Ends(Listener):
+    """Asks a routine to end after some frames."""
+
+    def __init__(self, control: RunControl) -> None:
+        self.control = control
+
+    def share(self, done: float, total: float, *, at_most: bool = False) -> None:
+        if done >= ENDS_AT:
+            self.control.abort()
+
+
+def measured(
+    folder: Path, out: str, control: RunControl | None = None, again: Path | None = None, levels: int = 9
+) -> Outcome:
+    control = control or RunControl()
+    with Bench(parse_config(TEXT, None)).open() as bench:
+        procedure = SlmProcedure(levels=levels, out=folder / out, again=again)
+        listener = Ends(control) if again is None and out == "first.json" else Listener()
+        return procedure.carry_out(bench, folder, control=control, listener=listener)
+
+
+def test_a_table_that_ended_early_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(EndedEarlyError) as ended:
+        measured(tmp_path, "first.json")
+    (path,) = (p for p in tmp_path.iterdir() if p.is_dir())
+    assert f"calibrate slm --again {path}" in ended.value.__notes__[0]
+    run = Run.open(path)
+    assert (run.condition, len(run.records)) == (RunCondition.ABORTED, ENDS_AT)
+    with Bench(parse_config(TEXT, None)).open() as bench:
+        words = ResumeProcedure(path).carry_out(bench, tmp_path).verdict
+    assert "calibrate slm --again" in " ".join(words)
+
+    began = run.metadata(1).host_time_ns
+    gone_on = measured(tmp_path, "on.json", again=path)
+    run = Run.open(path)
+    assert gone_on.runs == (path,)
+    assert (run.condition, run.plan) == (RunCondition.COMPLETED, None)
+    assert run.metadata(1).host_time_ns == began  # seen again, not taken again
+    assert not run.missing()
+
+    monkeypatch.setattr(Bench, "snap", lambda *_: pytest.fail("a frame was taken"))
+    measured(tmp_path, "anew.json", again=path)
+    tables = [load_slm_correction(tmp_path / name).phase_of_level_rad for name in ("on.json", "anew.json")]
+    np.testing.assert_array_equal(*tables)
+    assert len(Run.open(path).records) == len(run.records)
+    with pytest.raises(BenchError, match="of another picture"):
+        measured(tmp_path, "other.json", again=path, levels=17)
+
+
+def test_a_run_of_something_else_is_refused(tmp_path: Path) -> None:
+    from instrument.runs.recorder import record
+
+    with Bench(parse_config(TEXT, None)).open() as bench:
+        run = record(bench, tmp_path, n_frames=1)
+    with pytest.raises(BenchError, match="no frames of such a routine"):
+        measured(tmp_path, "no.json", again=run.path)
