@@ -155,8 +155,9 @@ class _Small:
         """Return the share of the photograph's contrast beyond noise that its calibration leaves."""
         problem = self._problem(self.calibration, background=background)
         left, valid = pilot(problem, THOROUGH[1], weight=WEIGHT).left[0], problem.valid[0]
-        beyond = float(np.mean(left[valid].astype(np.float64) ** 2)) - 1
-        return max(beyond, 0.0) ** 0.5 / max(float(np.std(problem.data[0][valid], dtype=np.float64)), 1e-30)
+        beyond = max(float(np.mean(left[valid].astype(np.float64) ** 2)) - 1, 0.0)
+        contrast = float(np.std(problem.data[0][valid], dtype=np.float64))
+        return float(np.sqrt(beyond)) / max(contrast, 1e-30)
 
     def decoys(self) -> tuple[Transformation, ...]:
         """Return those that differ from the PSFs: near ones unless one of many serves, then far ones."""
