@@ -347,7 +347,7 @@ def _converted(psf: ImageFile, image: ImageFile) -> tuple[str, ...]:
 
 
 def _saturation(image: ImageFile, erased: Erased) -> tuple[str, ...]:
-    count = saturated_pixels(image.pixels)
+    count = np.count_nonzero(saturated_pixels(image.pixels))
     if not count or erased.valid is not None:
         return ()
     share = f"{count / image.pixels.size:.2%}"

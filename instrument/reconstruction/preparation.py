@@ -16,6 +16,7 @@ import numpy.typing as npt
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, read_image
 from recon.base.blocks import block_mean
+from recon.base.checks import saturated_share
 from recon.errors import InputError
 from recon.types import Calibration
 
@@ -140,13 +141,14 @@ def check_psf(psf: ImageFile, *, allow_saturated: bool = False) -> tuple[str, ..
     if lowest == highest:
         what = "empty (all zero)" if highest == 0 else f"constant (every pixel is {highest:g})"
         raise FileError(psf.path, f"the PSF is {what}.", "Was the point source on?")
-    count = saturated_pixels(pixels)
-    if not count:
+    saturated = saturated_pixels(pixels)
+    if not saturated.any():
         return ()
     total = float(pixels.sum(dtype=np.float64)) - lowest * pixels.size
-    share = count * (highest - lowest) / total
+    count = np.count_nonzero(saturated)
+    share = float(np.sum(pixels[saturated] - lowest, dtype=np.float64)) / total
     found = f"{count} pixels of the PSF are saturated (at {highest:g}) and hold {share:.1%} of its light"
-    if share > SATURATED_LIGHT_LIMIT and not allow_saturated:
+    if share > SATURATED_LIGHT_LIMIT and is_full_scale(pixels) and not allow_saturated:
         raise FileError(
             psf.path,
             f"{found}; up to {SATURATED_LIGHT_LIMIT:.0%} is allowed.",
@@ -155,16 +157,28 @@ def check_psf(psf: ImageFile, *, allow_saturated: bool = False) -> tuple[str, ..
     return (f"{found}.",)
 
 
-def saturated_pixels(pixels: npt.NDArray[Any]) -> int:
-    """Return how many pixels are at the sensor's full scale, as far as an integer image can tell.
+def saturated_pixels(pixels: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """Return which pixels are at full scale, in their shape, as far as an image can tell; channels apart.
 
-    Counted are pixels at the image's maximum when that is the full scale of an 8, 10, 12, 14 or 16 bit
-    sensor (also left-aligned in 16 bit) and is reached more than once.
+    They are at their channel's maximum, where that is a full scale and is reached more than once, or where
+    suspiciously many are there: cameras may clip below, and a dark frame taken off or a change of scale moves
+    the maximum.
     """
-    if pixels.dtype.kind != "u" or int(pixels.max()) not in _FULL_SCALES:
-        return 0
-    count = int(np.count_nonzero(pixels == pixels.max()))
-    return count if count > 1 else 0
+    channels = pixels[..., None] if pixels.ndim == 2 else pixels
+    saturated = np.zeros(channels.shape, bool)
+    for c in range(channels.shape[2]):
+        known = channels[..., c][np.isfinite(channels[..., c])]  # holes are NaN
+        if not known.size:
+            continue
+        at_top = channels[..., c] == known.max()
+        if np.count_nonzero(at_top) > 1 if is_full_scale(known) else saturated_share(known):
+            saturated[..., c] = at_top
+    return saturated.reshape(pixels.shape)
+
+
+def is_full_scale(pixels: npt.NDArray[Any]) -> bool:
+    """Tell whether the maximum is that of an 8, 10, 12, 14 or 16 bit sensor, left-aligned in 16 bit too."""
+    return pixels.dtype.kind == "u" and int(pixels.max()) in _FULL_SCALES
 
 
 # Dark ----------------------------------------------------------------------------------------------
@@ -359,13 +373,14 @@ def reduce_valid(valid: npt.NDArray[np.bool_], crop: Crop | None, binning: int) 
 
 
 def _saturated(image: ImageFile) -> Erased:
-    count = saturated_pixels(image.pixels)
+    saturated = saturated_pixels(image.pixels)
+    count = np.count_nonzero(saturated)
     if not count:
         return Erased(None, "none (no pixel is saturated)")
-    full_scale = int(image.pixels.max())
+    tops = ", ".join(f"{top:g}" for top in np.unique(image.pixels[saturated]))
     share = f"{count / image.pixels.size:.2%}"
-    reason = f"{count} saturated pixels ({share}, at {full_scale}); --erasures none uses them"
-    return Erased(np.asarray(image.pixels) != full_scale, reason)
+    reason = f"{count} saturated pixels ({share}, at {tops}); --erasures none uses them"
+    return Erased(~saturated, reason)
 
 
 def _from_mask(path: Path, image: ImageFile) -> Erased:

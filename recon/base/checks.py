@@ -92,12 +92,11 @@ def check_psf(psfs: npt.NDArray[np.float32]) -> tuple[str, ...]:
                 f"{where} sums to a negative number: too much background was subtracted. "
                 "Check the dark frame."
             )
-        share = saturated_share(psf)
-        light = share * psf.size * high / total
+        light = saturated_light(psf)
         if light > SATURATED_LIGHT:
             warnings.append(
-                f"{where} looks saturated: {share:.2%} of its pixels, with {light:.0%} of its light, are at "
-                f"exactly its maximum {high:g}. "
+                f"{where} looks saturated: {saturated_share(psf):.2%} of its pixels, with {light:.0%} of its "
+                f"light, are at exactly its maximum {high:g}. "
                 "The picture will be blurred; calibrate again with a shorter exposure."
             )
         below = float(np.sum(psf[psf < 0], dtype=np.float64)) if low < 0 else 0.0
@@ -185,6 +184,12 @@ def saturated_share(image: npt.NDArray[Any]) -> float:
         return 0.0
     below = image[image < top]
     return share if not below.size or at_top > np.count_nonzero(below == below.max()) else 0.0
+
+
+def saturated_light(psf: npt.NDArray[Any]) -> float:
+    """Return the share of a PSF's light in pixels at exactly the maximum when it is suspicious, else 0."""
+    total = float(np.sum(psf, dtype=np.float64))
+    return saturated_share(psf) * psf.size * float(psf.max()) / total if total > 0 else 0.0
 
 
 def select_psf(calibration: Calibration, z_um: float | None) -> tuple[npt.NDArray[np.float32], float | None]:

@@ -197,7 +197,8 @@ def reduced(choice: Choice, problem: Problem) -> Problem:
         made,
         reason=next(d.why for d in choice.decisions if d.name == "model"),
         tolerance=choice.tolerance,
-        warnings=tuple(dict.fromkeys((*warnings, *made.warnings))),
+        # PSFs and photograph are those that were looked at, on fewer pixels.
+        warnings=tuple(dict.fromkeys((*warnings, *made.depths.warnings))),
         choice=choice,
         reduction=Reduction(problem, choice, tint),
     )

@@ -127,12 +127,15 @@ class CalibrationCheck:
         That they were taken on.
     better : Transformation or None
         The decoy that explains the photograph better, where one does.
+    cause : (str, str) or None
+        What is known to keep it from fitting, in words, and what to do.
     """
 
     fit: Fit
     scores: Mapping[Transformation, Score]
     pixels: int
     better: Transformation | None = None
+    cause: tuple[str, str] | None = None
 
     @property
     def sure(self) -> bool:
@@ -149,6 +152,9 @@ class CalibrationCheck:
     @property
     def sentences(self) -> tuple[str, ...]:
         """What is wrong with it, and what to do; empty where it fits."""
+        if self.wrong and self.cause is not None:
+            found, help_ = self.cause
+            return (f"the calibration does not fit this photograph: {found}", help_)
         if self.fit is Fit.OFF and self.better is not None:
             left = (self.scores[self.better].misfit / self.scores[GIVEN].misfit) ** 0.5
             why = (
@@ -183,6 +189,7 @@ class CalibrationCheck:
             "better": None if self.better is None else str(self.better),
             "scores": {str(t): [s.misfit, s.objective] for t, s in self.scores.items()},
             "pixels": self.pixels,
+            "cause": None if self.cause is None else list(self.cause),
         }
 
 

@@ -164,7 +164,7 @@ def test_a_few_saturated_pixels_are_a_warning_and_a_single_bright_one_is_none() 
     (warning,) = check_psf(file(psf))
     assert warning.startswith("2 pixels")
     psf[20, 31] = 0
-    assert saturated_pixels(psf) == 0
+    assert not saturated_pixels(psf).any()
 
 
 def test_job_from_files_says_what_was_chosen(tmp_path: Path) -> None:
@@ -232,6 +232,21 @@ def test_saturated_pixels_are_erased_when_asked_and_counted() -> None:
     assert erased.reason.startswith("3 saturated pixels")
     assert erasures_of("none", file(image)).valid is None
     assert erasures_of("saturated", file(psf_pixels())).valid is None
+
+
+def test_pixels_clipped_below_full_scale_are_erased_too_each_channel_at_its_own_maximum() -> None:
+    rng = np.random.default_rng(3)
+    scene = rng.integers(100, 900, (60, 80)).astype(np.uint16)
+    clipped = np.minimum(scene, 800)
+    for image in (clipped, clipped.astype(np.float32) - 34.5):
+        erased = erasures_of("saturated", file(image))
+        np.testing.assert_array_equal(erased.valid, scene < 800)
+    colour = np.stack([clipped, clipped // 2, scene], axis=-1)
+    valid = erasures_of("saturated", file(colour)).valid
+    assert valid is not None
+    np.testing.assert_array_equal(valid[..., 1], clipped // 2 < 400)
+    assert valid[..., 2].all()
+    assert check_psf(file(clipped))[0].startswith(f"{np.count_nonzero(scene >= 800)} pixels")  # not certain
 
 
 def test_a_share_is_erased_at_random_and_the_same_every_time() -> None:

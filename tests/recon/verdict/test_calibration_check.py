@@ -118,6 +118,34 @@ def test_what_contradicts_itself_is_not_told(
     assert fit(*seen) == (Fit.UNTOLD, "None")
 
 
+def test_a_saturated_psf_is_named_as_what_does_not_fit(
+    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unsure = dict.fromkeys((GIVEN, *NEAR, *FAR), GOOD[GIVEN])
+    clipped = np.minimum(seen[1], np.percentile(seen[1], 95))
+    for better, named in ((NEAR[0], "PSF is saturated"), (FAR[0], "mirrored")):
+        off = CalibrationCheck(Fit.OFF, unsure, 9000, better)
+        monkeypatch.setattr(decoys, "_competition", lambda *_, off=off: off)
+        check = check_calibration(Problem.of(seen[0], clipped))
+        assert check is not None
+        assert named in check.sentences[0]
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_files_that_are_not_in_proportion_to_the_light_are_named(
+    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, both: bool
+) -> None:
+    unsure = dict.fromkeys((GIVEN, *NEAR, *FAR), GOOD[GIVEN])
+    monkeypatch.setattr(decoys, "_competition", lambda *_: CalibrationCheck(Fit.OFF, unsure, 9000, NEAR[0]))
+    photograph, psf = (255 * (image / image.max()) ** (1 / 2.2) for image in seen)
+    coded = check_calibration(Problem.of(photograph, psf if both else seen[1]))
+    turned = check_calibration(Problem.of(seen[0], transformed(seen[1], Transformation(rotation_deg=1))))
+    assert coded is not None
+    assert turned is not None
+    assert ("both are" if both else "the photograph is") + " gamma-coded" in coded.sentences[0]
+    assert turned.cause is None
+
+
 def test_noise_thought_to_be_less_than_it_is_makes_nobody_foreign() -> None:
     noisy = {how: score(1.22, 1.33, 0.001) for how in (GIVEN, *NEAR, *FAR)}
     assert check_of(noisy, 9000, structure=0.35).fit is Fit.UNTOLD  # of which any PSF explains 0.13
