@@ -1,10 +1,10 @@
 """Kill the program with ``kill -9`` at random moments of its work, go on, and look for what was lost.
 
-    python -m benchmarks.crash_test                          50 kills of every kind of work
-    python -m benchmarks.crash_test run resume --kills 200   of some, more of each
-    TMPDIR=/dev/shm python -m benchmarks.crash_test          on a tmpfs; else on the disk of TMPDIR
-    python -m benchmarks.crash_test record --signal term     another signal, which it answers itself
-    python -m benchmarks.crash_test run record --clock       and the clock jumps by hours all the while
+    python benchmarks/crash_test.py                          50 kills of every kind of work
+    python benchmarks/crash_test.py run resume --kills 200   of some, more of each
+    TMPDIR=/dev/shm python benchmarks/crash_test.py          on a tmpfs; else on the disk of TMPDIR
+    python benchmarks/crash_test.py record --signal term     another signal, which it answers itself
+    python benchmarks/crash_test.py run record --clock       and the clock jumps by hours all the while
 
 Each trial carries out one command of the terminal on the simulated bench in a process of its own and kills
 it: runs, sweeps, recordings and the window once the run's folder is there (at any time, or just after one of
@@ -41,6 +41,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.crash_work import BENCH, FINISHING, KINDS, PLAN, PROMISE, Kind, in_folder, runs_in, tree, work
 from instrument.files.images import read_image, write_image

@@ -1,7 +1,7 @@
 """A fault at every call of every device, and what became of light, motion, run, exit code and words.
 
-    python -m benchmarks.fault_table                       every call, every fault, all work: hours
-    python -m benchmarks.fault_table --every 7 run snap    a sample
+    python benchmarks/fault_table.py                       every call, every fault, all work: hours
+    python benchmarks/fault_table.py --every 7 run snap    a sample
 
 Each trial is a process of its own that carries out a command of the terminal on the simulated bench, or a
 live session of eight pictures from Python. The device call with the trial's number (counted at the driver,
@@ -48,6 +48,8 @@ from types import FunctionType
 from typing import Any
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.crash_work import BENCH, PLAN, runs_in
 from drivers.camera import Camera

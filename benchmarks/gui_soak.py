@@ -7,8 +7,8 @@ memory grows by more than 20 MB after the first ten minutes, a turn of the windo
 250 ms of its own processor time, an LED shines after a run or STOP, a file, thread or piece of shared memory
 is left, a warning or an error is logged, or the frame rate does not hold.
 
-    python -m benchmarks.gui_soak --minutes 120
-    python -m benchmarks.gui_soak --minutes 2 --figure /tmp/soak.png
+    python benchmarks/gui_soak.py --minutes 120
+    python benchmarks/gui_soak.py --minutes 2 --figure /tmp/soak.png
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 import numpy as np
 from PySide6.QtCore import QSettings, Qt
 from PySide6.QtTest import QTest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.gui_stalls import Turns
 from drivers.simulated.led_array import SimulatedLedArray
