@@ -215,9 +215,14 @@ class Display:
         """Raise InputError for a plane that this display cannot show."""
         if not self.near:
             self.defocus(z_mm)
-        elif self.distance_mm is not None and self.distance_mm + z_mm <= 0:
+            return
+        away_mm, side = (self.distance_mm or 0.0) + z_mm, max(self.mask.shape)
+        if away_mm <= 0:
+            raise InputError(f"A plane {away_mm:g} mm behind the mask is none: its distance is above 0.")
+        if min(side, self._spread_px(away_mm)) > self.period - side:
             raise InputError(
-                f"A plane {self.distance_mm + z_mm:g} mm behind the mask is none: its distance is above 0."
+                f"A plane {away_mm:g} mm behind the mask is too far for a picture {self.distance_mm:g} mm "
+                "away: give the farthest plane's distance, and count the others from there, below 0."
             )
 
     @property
@@ -240,8 +245,11 @@ class Display:
     def period(self) -> int:
         """Width of the field of a :attr:`near` picture in mask pixels: the mask, and what light spreads."""
         side = max(self.mask.shape)
-        spread = self.wavelength_nm * (self.distance_mm or 0.0) / self.mask_pitch_um**2
-        return fast_length(side + ceil(min(side, 16 + 1.25 * spread)))
+        return fast_length(side + ceil(min(side, 16 + 1.25 * self._spread_px(self.distance_mm or 0.0))))
+
+    def _spread_px(self, away_mm: float) -> float:
+        """Return how far aside a mask pixel's first order is, mask pixels."""
+        return self.wavelength_nm * away_mm / self.mask_pitch_um**2
 
     @property
     def picture_mm(self) -> float:
