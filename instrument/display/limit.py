@@ -59,11 +59,15 @@ def limit_lines(found: Sequence[Limit], display: Display, options: HologramOptio
         f"limit: no number of frames shows this picture better than {_decibels(here.bound_db)} through this "
         f"mask (a bound; {here.reached_db:.2f} dB is reached by what need not be frames of phases)"
     ]
-    least = display.factor / band_of(display).cutoff
+    cutoff = band_of(display).cutoff
+    least, coarse = display.factor / cutoff, "set by the mask within an SLM pixel, not by the SLM"
+    if display.near:  # a period is farther than a mask pixel's first order goes aside
+        aside_mm = display.wavelength_nm * (display.distance_mm or 0.0) / display.mask_pitch_um * 1e-3
+        least, coarse = display.field_mm / aside_mm / cutoff, "light does not go so far aside this near"
     for (low, high), wanted, reached in zip(pairwise(BANDS), here.wanted, here.reached, strict=True):
         why = ""
         if reached < 0.7 and low < least:
-            why = "   set by the mask within an SLM pixel, not by the SLM"
+            why = f"   {coarse}"
         elif reached < 0.7:
             why = "   more contrast than so many SLM pixels can make"
         lines.append(

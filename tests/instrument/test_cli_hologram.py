@@ -14,11 +14,13 @@ from calibration_routines.display.hologram_photograph import display_of_pattern,
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
 from instrument.display.hologram import Alignment, bench_display, prepare_target
+from instrument.display.limit import limit_lines
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image, write_image
 from instrument.files.sample_images import SAMPLES, load_sample
 from instrument.files.slm_image import levels_phase, phase_levels, read_slm_image
-from recon.holography import HologramModel, HologramOptions, spot_array
+from recon.holography import Display, HologramModel, HologramOptions, HologramStop, Limit, spot_array
+from recon.holography.display import no_mask
 from recon.holography.judge import compare
 from recon.holography.learned import Learned
 from recon.holography.pose import Pose
@@ -218,6 +220,16 @@ def test_the_limit_is_said_before_anything_is_computed(capsys):
     assert main(["hologram", "picture.png", "--limit", "--color"]) == 2
     lifted = HologramOptions(lift=0.2, envelope="correct")
     assert prepare_target(read_image("picture.png").pixels, bench(), lifted).image.min() >= 0.2
+
+
+def test_the_limit_says_why_coarse_contrast_is_not_reached_behind_a_lens_and_near():
+    mask = no_mask((96, 96), design_wavelength_nm=532.0)
+    lens = Display((96, 96), mask, slm_pitch_um=16.0, wavelength_nm=532.0)
+    found = Limit(20.0, 19.0, np.full(4, 0.5), np.array([0.3, 0.3, 0.9, 0.3]), HologramStop.CONVERGED, 1.0)
+    near = limit_lines([found], replace(lens, distance_mm=4.0), HologramOptions())
+    assert "light does not go so far aside" in near[1]
+    assert "more contrast than so many SLM pixels can make" in near[4]
+    assert "within an SLM pixel" in limit_lines([found], lens, HologramOptions())[1]
 
 
 @pytest.mark.usefixtures("here")
