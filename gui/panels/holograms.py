@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
-from PySide6.QtWidgets import QVBoxLayout, QWidget
+from PySide6.QtWidgets import QStackedWidget, QVBoxLayout, QWidget
 
 from calibration_routines.display.hologram_photograph import Photographed
 from gui.background import NewestOnly
@@ -25,9 +25,12 @@ from gui.hologram_work import (
 )
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
+from gui.panels.unserved import why_not
 from gui.session import BenchSession
-from gui.widgets.building import button, fill, in_column, in_row, scrolled, share_bar, split
+from gui.widgets.building import Hint, button, fill, in_column, in_row, scrolled, share_bar, split
+from gui.widgets.dialogues import choose_path
 from gui.widgets.hologram_views import WEIGHTS_SHAPE, HologramViews, WeightsMode
+from instrument.bench.config_file import TEMPLATES
 from instrument.display.hologram import depth_limit_mm, expansion_side, field_picture
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
@@ -87,7 +90,10 @@ class HologramsPanel(Panel):
         self._names = SuggestedName(self.jobs, self.form, session.runs_folder / "holograms", ".png")
         self.views = HologramViews()
         yield
-        across.addWidget(self.views)
+        self.empty, self.shown = self._hint(), QStackedWidget()
+        self.shown.addWidget(self.empty)
+        self.shown.addWidget(self.views)
+        across.addWidget(self.shown)
         across.setStretchFactor(1, 1)
         yield
         self.target = self.views.target
@@ -126,6 +132,20 @@ class HologramsPanel(Panel):
         self.form.settled.connect(self._settled)
         self._show_mode()
         self._set_running(False)
+
+    def _hint(self) -> Hint:
+        """Return what stands in the views' place until a picture is there."""
+        if why := why_not(self.session, "Computing a hologram", ("slm",), ""):
+            tried_on = f"Open the simulated {TEMPLATES['display'][0]}"
+            return Hint(why, tried_on, lambda: self.session.handed_on.emit("start", "display"))
+        words = "No hologram yet: choose the picture that the display is to show, then preview or compute it."
+        return Hint(words, "Choose a picture…", self._choose_picture)
+
+    def _choose_picture(self) -> None:
+        def chosen(path: Path) -> None:
+            self.form.set_values({"picture": path})
+
+        choose_path(self, "open", "Choose a picture", "", chosen, _IMAGES)
 
     def _make_form(self) -> OptionsForm:
         own, order = ({o.name: o for o in options_of(cls)} for cls in (_PanelOptions, HologramOrder))
@@ -238,6 +258,7 @@ class HologramsPanel(Panel):
             return compute(order, config, size, context, write=not preview)
 
         job = self._started(self.follow(self.jobs.compute(title, work)))
+        self.shown.setCurrentWidget(self.views)
         self.views.begin()
         for early in (job.failed, job.cancelled):
             early.connect(lambda _: self.views.go_back())
@@ -339,6 +360,7 @@ class HologramsPanel(Panel):
         elif read is not None:
             self._target_shown, target = read
             self.target.show_target(target)
+            self.shown.setCurrentWidget(self.views)
 
     def _suggest_out(self) -> None:
         self._names.suggest(Path(str(self.form.fields["picture"].raw())).stem or "slm")

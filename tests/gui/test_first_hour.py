@@ -16,6 +16,7 @@ from drivers.registry.registry import Listing
 from gui.help import KEYS
 from gui.main_window import MainWindow
 from gui.panels import PANELS
+from gui.panels.holograms import HologramsPanel
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.panels.start import StartPanel
 from gui.panels.unserved import UnservedPanel, why_not
@@ -119,6 +120,10 @@ def test_panels_say_why_and_what_would_serve(qtbot: QtBot, bare: MainWindow, win
     for name, entry in PANELS.items():
         panel = bare.show_panel(name)
         assert isinstance(panel, UnservedPanel) == bool(entry.needs), name
+        if isinstance(panel, HologramsPanel):
+            assert panel.shown.currentWidget() is panel.empty
+            assert "needs a bench with an SLM; no bench is open" in panel.empty.words.text()
+            assert panel.empty.button.text() == "Open the simulated holographic display"
     alignment = window.show_panel("alignment")
     assert isinstance(alignment, UnservedPanel)
     wanted: list[object] = []

@@ -76,6 +76,8 @@ def panel(qtbot: QtBot, make_session: Callable[[], BenchSession], tmp_path: Path
     panel.resize(1000, 700)
     qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
     panel.show()
+    assert panel.empty.words.text().startswith("No hologram yet")
+    assert panel.empty.isVisible()
     panel.form.widgets["picture"].setText(str(tmp_path / "picture.png"))
     qtbot.keyClick(panel.form.widgets["picture"], Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: panel.target.image is not None, timeout=WAIT_MS)
