@@ -215,12 +215,11 @@ def changed(value: Any, number: float) -> Any:
 def soon() -> None:
     """Shorten the waits for a device that hangs."""
     from drivers.common import checked, stream
-    from instrument.bench import bench, photograph, safety
+    from instrument.bench import bench, safety
 
     for module in (stream, bench, safety):
         setattr(module, "STOP_ANSWER_S", SOON_S)  # noqa: B010 # its type is final
-    for module in (stream, photograph):
-        setattr(module, "CALL_MARGIN_S", SOON_S)  # noqa: B010
+    setattr(stream, "CALL_MARGIN_S", SOON_S)  # noqa: B010
     checked.call_limit_s = lambda *_: SOON_S
     SimulatedCamera.longest_silence_s = SOON_S
 
@@ -261,21 +260,21 @@ def trial(work: str, number: int, fault: str, folder: Path, longer_s: float) -> 
     prepare(folder)
     process = os.fork()
     if process == 0:
-        code = 70
+        code, faulty = 70, Faulty(number, fault)
         signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
         try:
             os.chdir(folder)
             for handle, name in ((1, "out"), (2, "err")):
                 os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT), handle)
-            faulty = Faulty(number, fault)
             faulty.install()
             if fault == "hang":
                 soon()
             code = live() if work == "live" else main(WORK[work])
-            (folder / "state").write_bytes(pickle.dumps((faulty.calls, faulty.lit(), faulty.moving())))
         except BaseException:  # noqa: BLE001 - shown, and the process ends here whatever it was
             traceback.print_exc()
         finally:
+            with contextlib.suppress(BaseException):
+                (folder / "state").write_bytes(pickle.dumps((faulty.calls, faulty.lit(), faulty.moving())))
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(code)

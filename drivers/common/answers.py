@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import threading
+import time
+import weakref
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -19,6 +22,10 @@ CALL_MARGIN_S = 20.0
 """Beyond what an exposure needs: connecting anew, a slow bus, a busy computer."""
 
 
+EXIT_WAIT_S = 3.0
+"""For calls that were given up, when the program ends."""
+
+_given_up: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
 _here = threading.local()
 
 
@@ -72,6 +79,8 @@ def within(
         nonlocal given_up
         with deciding:
             given_up = not over.is_set()
+            if given_up:
+                _given_up.add(thread)
             if given_up and left is not None:
                 left.append(thread)
         return given_up
@@ -96,3 +105,12 @@ def within(
         finally:
             errors.clear()  # an error that its own traceback holds is never let go of
     return answer[0]
+
+
+@atexit.register
+def _wait_for_given_up() -> None:
+    """Wait a little: foreign code that comes back while Python ends has the process end by an abort."""
+    until_s = time.monotonic() + EXIT_WAIT_S
+    for thread in list(_given_up):
+        if thread.is_alive():
+            thread.join(max(0.0, until_s - time.monotonic()))

@@ -52,6 +52,8 @@ _LONG = {"open": 4, "arm": 20, **_MOVES}
 """Calls that have so many times as long; streams, stopping and closing have limits of their own."""
 _SAFE = {"off", "blank"}
 """Tried, too, while another call hangs."""
+_BEGIN = {"start_sequence", "play"}
+"""Bounded by who makes them, and refused, too, while another call hangs: what undoes that would end them."""
 _ENDED_BY = {"snap": "stop_sequence", **dict.fromkeys(_MOVES, "stop")}
 _UNDONE_BY = {"open": "close", "set_pattern": "off", **_ENDED_BY}
 """What is done after a call that ended when it had been given up: it may have lit or moved something."""
@@ -87,8 +89,12 @@ def _guarded_call(made: type, name: str) -> Callable[..., Any]:
         except Exception as error:
             raise _driver_failed(self, name, error) from error
 
+    def begins(self: Device, *args: Any, **named: Any) -> Any:
+        _require_ended(self)
+        return call(self, *args, **named)
+
     if not (name in _SHORT or name in _LONG or name.startswith("set_")):
-        return call
+        return begins if name in _BEGIN else call
 
     def bounded(self: Device, *args: Any, **named: Any) -> Any:
         if is_bounded():
@@ -112,10 +118,8 @@ def call_limit_s(device: Device, name: str) -> float:
 def _in_time(device: Device, name: str, call: Callable[[], _T]) -> _T:
     """Return what a call of a driver returns; one that hangs is given up, and its device not used again."""
     left: list[threading.Thread] = device.__dict__.setdefault("_left", [])
-    left[:] = [thread for thread in left if thread.is_alive()]
-    if left and name not in _SAFE:
-        problem = f"still hangs: {left[0].name.removeprefix(f'{device.name}: ')} has not ended."
-        raise DeviceTimeoutError(device.name, problem, "Unplug it or switch it off and on.")
+    if name not in _SAFE:
+        _require_ended(device)
     undo = getattr(device, _UNDONE_BY[name]) if name in _UNDONE_BY else None
     try:
         return within(
@@ -123,12 +127,23 @@ def _in_time(device: Device, name: str, call: Callable[[], _T]) -> _T:
         )
     except Exception:
         raise
-    except BaseException:  # Ctrl-C: nothing moves on, or is lit late, that nobody waits for
-        if name in _ENDED_BY:
-            within(STOP_ANSWER_S, device.name, "stopping", getattr(device, _ENDED_BY[name]))
+    except BaseException as interruption:  # Ctrl-C: nothing moves on, or is lit late, that nobody waits for
+        try:
+            if name in _ENDED_BY:
+                within(STOP_ANSWER_S, device.name, "stopping", getattr(device, _ENDED_BY[name]))
+        except Exception as error:  # noqa: BLE001 - Ctrl-C is not taken for a failure
+            interruption.add_note(str(error))
         for thread in left:
             thread.join(_INTERRUPTED_S)
         raise
+
+
+def _require_ended(device: Device) -> None:
+    """Refuse to go on while a call that was given up, or what undoes it, has not ended."""
+    for thread in tuple(device.__dict__.get("_left", ())):
+        if thread.is_alive():
+            problem = f"still hangs: {thread.name.removeprefix(f'{device.name}: ')} has not ended."
+            raise DeviceTimeoutError(device.name, problem, "Unplug it or switch it off and on.")
 
 
 def _guarded_read(made: type, name: str) -> Callable[[Any], Any]:

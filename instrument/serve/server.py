@@ -255,9 +255,10 @@ class BenchServer:
     async def _upload(self, request: web.Request) -> web.StreamResponse:
         """Keep a piece of an array for the call that takes it."""
         kind, key, query = _kind(request), self._operator(request).key, request.query
-        self.operation.device(kind, key)
         word, size, place = request.match_info["word"], int(query["size"]), int(query["place"])
-        self._uploads.add(f"{key} {kind}", word, size, place, await request.read())
+        piece = await request.read()
+        self.operation.device(kind, key)  # who has left meanwhile leaves nothing here
+        self._uploads.add(f"{key} {kind}", word, size, place, piece)
         return web.json_response({"value": None})
 
     async def _arguments(self, request: web.Request, call: Call, sender: str) -> dict[str, Any]:
@@ -320,7 +321,6 @@ class BenchServer:
         finally:
             if kind == "camera" and self._frames is not None:
                 self._frames.cancel()
-            self._uploads.forget(f"{operator.key} {kind}")
             await asyncio.shield(self._after(kind, operator, link if let_go else None))
         return link
 
@@ -333,6 +333,8 @@ class BenchServer:
                 await self._loop.run_in_executor(self._overtaking, self.operation.drop, operator, lost)
             except BenchError as error:
                 _log.error("%s", error)
+            finally:
+                self._uploads.forget(f"{operator.key} {kind}")
             return
         answer: dict[str, Any] = {"closed": True}
         try:
@@ -340,6 +342,7 @@ class BenchServer:
         except (DeviceError, BenchError) as error:
             told = error if isinstance(error, DeviceError) else DeviceError(kind, str(error))
             answer = {"error": dump_error(told)}
+        self._uploads.forget(f"{operator.key} {kind}")
         await link.send_json(answer)
         await link.close()
 

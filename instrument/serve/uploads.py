@@ -34,8 +34,8 @@ class Uploads:
         if upload is None:
             while self._waiting and size + self._kept > LONGEST_ARRAYS:
                 del self._waiting[next(iter(self._waiting))]
-            # Memory that was not written to yet takes none.
-            upload = self._waiting[operator, name] = _Upload(np.empty(size, np.uint8).data, size)
+            # Memory that was not written to yet takes none, and says nothing of what was there before.
+            upload = self._waiting[operator, name] = _Upload(np.zeros(size, np.uint8).data, size)
         if len(upload.bytes_) != size or not 0 <= place <= size - len(piece):
             raise ValueError(f"{len(piece)} bytes from {place} on are no piece of an array of {size} bytes")
         upload.bytes_[place : place + len(piece)] = piece

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -15,12 +17,13 @@ import numpy as np
 import pytest
 
 from drivers.common.answers import within
-from drivers.common.checked import call_limit_s
+from drivers.common.checked import call_limit_s, checked
 from drivers.common.stream import FrameStream
 from drivers.device import Device
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import FrameMetadata
 from instrument.bench.bench import Bench
+from instrument.bench.photograph import photograph
 from instrument.live.live import LiveView
 from instrument.plan import Part, Plan
 from instrument.runs.acquire import acquire
@@ -43,7 +46,7 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let what takes ten seconds take a quarter of one."""
     for place in ("drivers.common.stream", "instrument.bench.safety", "instrument.bench.bench"):
         monkeypatch.setattr(f"{place}.STOP_ANSWER_S", 0.25)
-    for place in ("drivers.common.stream", "instrument.bench.photograph"):
+    for place in ("drivers.common.stream", "drivers.common.checked"):
         monkeypatch.setattr(f"{place}.CALL_MARGIN_S", 0.25)
     monkeypatch.setattr(FreeRunningCamera, "longest_silence_s", 0.1)
 
@@ -163,12 +166,12 @@ def test_a_camera_that_hangs_ends_a_live_view_and_every_reader_that_waits(
 def test_a_camera_that_hangs_ends_a_run_and_the_other_devices_are_made_safe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    camera, let_go = FreeRunningCamera(), threading.Event()
-    bench = bench_with(camera)
+    let_go = threading.Event()
+    bench = bench_with(checked(FreeRunningCamera)())  # type: ignore[call-arg]
     for call in ("snap", "stop_sequence"):
-        monkeypatch.setattr(camera, call, lambda: let_go.wait(30))
+        monkeypatch.setattr(FreeRunningCamera, call, lambda _: let_go.wait(30))
     lit = Part.model_validate({"label": "a", "light": "source"})
-    with pytest.raises(DeviceTimeoutError, match="hangs: an exposure") as failure:
+    with pytest.raises(DeviceTimeoutError, match="hangs: snap") as failure:
         acquire(bench, Plan(label="p", parts=(lit,)), tmp_path)
     assert "exposure ended" in "".join(failure.value.__notes__)
     assert Run.open(run_paths(tmp_path)[0]).condition is RunCondition.FAILED
@@ -263,3 +266,64 @@ def test_ctrl_c_during_a_move_stops_it_and_waits_for_its_call(monkeypatch: pytes
         with pytest.raises(KeyboardInterrupt):
             stage.move_to({"x_um": 1.0})
         assert not any(thread.is_alive() for thread in vars(stage)["_left"])
+
+
+@pytest.mark.usefixtures("mock_drivers")
+@pytest.mark.parametrize("stops", [True, False])
+def test_ctrl_c_stays_ctrl_c_where_the_stop_fails(monkeypatch: pytest.MonkeyPatch, *, stops: bool) -> None:
+    """Of a photograph, too: its exposure is ended, and does not go on while the bench is closed."""
+    with open_mock_bench() as bench:
+        camera, stopped = bench.camera, threading.Event()
+
+        def snap(_: Any) -> Any:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert stopped.wait(20)
+            raise StoppedError(camera.name, "stopped.")
+
+        def stop(_: Any) -> None:
+            stopped.set()
+            if not stops:
+                raise DeviceError(camera.name, "does not stop.")
+
+        monkeypatch.setattr(MockCamera, "snap", snap)
+        with monkeypatch.context() as patched:
+            patched.setattr(MockCamera, "stop_sequence", stop)
+            with pytest.raises(KeyboardInterrupt) as caught:
+                photograph(camera)
+            assert stopped.is_set()
+            assert not any(thread.is_alive() for thread in vars(camera)["_left"])
+        notes = getattr(caught.value, "__notes__", [])
+        assert [note for note in notes if "does not stop" in note] == notes
+        assert len(notes) == (not stops)
+
+
+def test_nothing_begins_that_the_end_of_a_call_that_hangs_would_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    let_go = threading.Event()
+    monkeypatch.setattr("drivers.common.checked.call_limit_s", lambda *_: 0.05)
+    monkeypatch.setattr(FreeRunningCamera, "snap", lambda _: let_go.wait(20))
+    camera = checked(FreeRunningCamera)()  # type: ignore[call-arg]
+    with pytest.raises(DeviceTimeoutError, match="hangs: snap"):
+        camera.snap()
+    with pytest.raises(DeviceTimeoutError, match="still hangs: snap has not ended"):
+        camera.stream().start()
+    let_go.set()
+    for thread in vars(camera)["_left"]:
+        thread.join(5)
+    camera.stream().start().close()
+
+
+def test_a_call_that_was_given_up_may_end_before_the_program_does() -> None:
+    program = (
+        "import threading\n"
+        "from drivers.common.answers import within\n"
+        "def late():\n"
+        "    while threading.main_thread().is_alive():\n"  # it ends when the interpreter begins to
+        "        pass\n"
+        "    print('ended')\n"
+        "try:\n"
+        "    within(0.01, 'camera', 'an answer', late)\n"
+        "except Exception as error:\n"
+        "    print(error)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert ended.stdout.splitlines()[-1] == "ended"

@@ -278,6 +278,27 @@ def test_there_is_one_operator_at_a_time_until_somebody_presses_stop(
     leds.close()
 
 
+@pytest.mark.parametrize("how", ["let_go", "drop"])
+def test_pieces_that_come_while_their_sender_leaves_are_not_kept(
+    how: str, server: BenchServer, options: RemoteOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leaves = getattr(server.operation, how)
+
+    def late(*args: Any) -> None:
+        operator = server.operation.operator
+        assert operator is not None
+        server._uploads.add(f"{operator.key} led_array", "7", 5, 0, b"ab")
+        leaves(*args)
+
+    monkeypatch.setattr(server.operation, how, late)
+    leds = RemoteLedArray(options)
+    leds.open()
+    if how == "drop":
+        server.operation.stop("a test")
+    leds.close()
+    until(lambda: not server._uploads._waiting)
+
+
 def _said_to_be(descr: str, *shape: int) -> str:
     """Return an array's file that says to be so, and has eight bytes."""
     file = io.BytesIO()
