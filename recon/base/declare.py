@@ -202,7 +202,7 @@ class Option:
         said = self.declaration
         kind = Integral if self.is_whole else Real
         is_number = isinstance(value, kind) and not isinstance(value, bool)
-        if value == math.inf and said.infinity is not None:
+        if is_number and said.infinity is not None and value == math.inf:
             return None
         # A NaN fails every comparison.
         if is_number and said.least <= value <= said.most and said.above < value < said.below:  # type: ignore[operator]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -332,6 +333,8 @@ class ReconstructionOptions:
 
         require_solver(self.solver)
         require(self)
+        if self.z_um == math.inf:  # as the command line has it: records hold no infinities
+            object.__setattr__(self, "z_um", FAR_UM)
 
 
 Options = ReconstructionOptions

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 
 from recon.base.declare import changed, expression, mistakes, option, options_of, record, with_overrides
+from recon.camera.grid import FAR_UM
 from recon.errors import InputError
+from recon.reconstruction.options import ReconstructionOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +30,15 @@ def test_all_mistakes_are_named_at_once() -> None:
     ]
     assert mistakes(Some(count=2, kind="fancy", z_um=1)) == []
     assert mistakes(Some(count=True)) != []
+    found = mistakes(Some(count=np.array([1, 2]), z_um=np.array([1.0, 2.0])))  # type: ignore[arg-type]
+    assert [one.split(", not ")[0] for one in found] == [
+        "count must be a whole number, 1 or more",
+        "z_um must be a number, above 0 (um)",
+    ]
+
+
+def test_infinity_is_recorded_as_what_it_stands_for() -> None:
+    assert record(ReconstructionOptions(z_um=float("inf")))["z_um"] == FAR_UM
 
 
 def test_what_differs_from_the_defaults_is_recorded_and_said() -> None:
