@@ -28,7 +28,7 @@ from instrument.cli.app import (
 )
 from instrument.cli.progress import keys, one_task
 from instrument.files.atomic import require_new
-from instrument.files.errors import duration, size
+from instrument.files.errors import BenchError, duration, size
 from instrument.files.figures import Panel, check_figure, pictures_figure, save_figure
 from instrument.files.seen import as_seen
 from instrument.runs.recorder import RecordingOptions, RecordingStatus, prepare_recording
@@ -142,6 +142,8 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
     if options.figure is not None:
         check_figure(options.figure)
         require_new(options.figure, overwrite=options.force)
+        if options.figure.resolve() == target.resolve():
+            raise BenchError(f"--figure {options.figure}: the photograph itself has that name; give another.")
     with saying_what_is_left(target), naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
         options.set_camera(opened)
         switch_light(opened, light)

@@ -19,8 +19,6 @@ from recon.types import Calibration
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PAGES = (".pdf", ".png", ".svg")
-
 
 @dataclass(frozen=True, kw_only=True)
 class AnalysisFiles:
@@ -107,8 +105,7 @@ def analyze(desk: Desk, files: AnalysisFiles, settings: AnalysisSettings, noise:
     from recon.evaluation.two_points import reached
 
     out, record = files.out, files.out.with_suffix(".json")
-    if out.suffix.lower() not in _PAGES:
-        raise BenchError(f"--out {out}: the page is one of {', '.join(_PAGES)}.")
+    check_figure(out)
     for file in (out, record):
         require_new(file, overwrite=files.force)
     if files.response is not None and (instead := given.flags("cutoff_deg", "fall_off_deg")):

@@ -36,12 +36,11 @@ def optics(desk: Desk, files: OpticsFiles, options: OpticsOptions) -> Done:
     """
     from instrument.evaluation.optics_figure import BEADS, optics_figure
     from instrument.files.atomic import write_text
-    from instrument.files.figures import save_figure
+    from instrument.files.figures import check_figure, save_figure
     from recon.evaluation.optics_compared import compare_optics
 
     table = files.out.with_suffix(".csv")
-    if files.out.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise BenchError(f"--out {files.out}: the page is one of .png, .pdf, .svg.")
+    check_figure(files.out)
     for file in (files.out, table):
         require_new(file, overwrite=files.force)
     if len(set(options.photons)) < len(options.photons):

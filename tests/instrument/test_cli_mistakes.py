@@ -60,6 +60,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     ([*RECONSTRUCT, "--volume", "plain", "--image", "photo.tif", "--z-mm", "30"], "do not apply: --z-mm"),
     ([*RECONSTRUCT, "--volume", "plain", "--image", "photo.tif", "--prior", "tv-haar"], "not for volumes"),
     (["snap", "photo2.tif"], "Did you mean --out photo2.tif?"),
+    (["snap", "--out", "a.png", "--figure", "a.png"], "the photograph itself has that name"),
     (["snap", "--out", "/proc/photo.tif"], "Choose another place"),
     (["analyze", "plain"], "--volume FOLDER"),
     (["compare", "cal", "plain"], "--volume FOLDER"),
