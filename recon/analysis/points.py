@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,6 @@ TOLD = 0.95
 ten are promised."""
 ROUNDS, DRAWS = 3, 8
 """Rounds of two points, later ones about what earlier ones found; pairs of other distances in each."""
-SIXTEEN_DRAWS = 10
 
 PointImage = Callable[[float, float], Array]
 """Image (height, width) of one point ``columns`` sensor pixels off the axis at a place ``s`` on the depth
@@ -43,8 +43,6 @@ HALF_WINDOW = (4, 24)
 _PARTS = 4  # of a plane, at which points' PSFs are made
 FARTHEST = 12.0
 """Pixels, or planes, between two points at most."""
-FACTORS = (1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.4, 2.8, 3.4)
-"""By which both distances of two points are multiplied for sixteen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +105,7 @@ class PointTrial:
     separation_planes: float
     """``separation_px`` and ``separation_planes``: between neighbours."""
     dip: float
-    """The smallest dip between any two neighbours, of all draws but the worst twentieth."""
+    """The smallest dip between any two neighbours, of all draws."""
     map: Floats
     """(n_z, width): the reconstruction of the last draw, summed over rows."""
 
@@ -136,10 +134,10 @@ def try_points(
     seed: int = 0,
     trials: int = TRIALS,
 ) -> PointTrial:
-    """Reconstruct a grid of points; see :class:`PointTrial`. Draws end where too many are not resolved."""
+    """Reconstruct a grid of points; see :class:`PointTrial`. The first draw not resolved is the last."""
     rng = np.random.default_rng(seed)
     dips: list[float] = []
-    while len(dips) < trials and sum(dip < DIP for dip in dips) <= trials // 20:
+    while len(dips) < trials and min(dips, default=DIP) >= DIP:
         # Where the grid's points lie between voxels differs from draw to draw.
         phase_x, phase_z = rng.uniform(-0.5, 0.5, 2)
         x = (np.arange(grid.columns) - (grid.columns - 1) / 2) * grid.separation_px + phase_x
@@ -154,8 +152,7 @@ def try_points(
         seen = problem.solve(noise.expose(light, rng)).sum(axis=1)
         places = np.stack(np.meshgrid(z, x + problem.half[1], indexing="ij"), axis=-1)
         dips.append(smallest_dip(seen, places))
-    told = sorted(dips)[min(trials // 20, len(dips) - 1)]
-    return PointTrial(grid.separation_px, grid.separation_planes, float(told), seen)
+    return PointTrial(grid.separation_px, grid.separation_planes, min(dips), seen)
 
 
 def smallest_dip(seen: Floats, places: Floats) -> float:
@@ -187,16 +184,16 @@ def smallest_dip(seen: Floats, places: Floats) -> float:
 
 
 def smallest_told(
-    try_one: Callable[[float, int], PointTrial], least: float
+    try_one: Callable[[float, int], PointTrial], least: float, most: float = FARTHEST
 ) -> tuple[list[PointTrial], float | None]:
-    """Try pairs at growing separations, each with a seed of its own.
+    """Try points at separations, or multiples of them, from ``least`` to ``most``, each with its own seed.
 
     Returns
     -------
     list of PointTrial
         All that were made, the last one at the separation found.
     float or None
-        The separation at which :data:`TOLD` of the pairs are resolved.
+        The separation at which :data:`TOLD` of them are resolved.
     """
     trials: list[PointTrial] = []
     tried: list[TriedPair] = []
@@ -204,7 +201,7 @@ def smallest_told(
     rng = np.random.default_rng(0)
     for _ in range(ROUNDS):
         for share in (np.arange(DRAWS) + rng.uniform(0, 1, DRAWS)) / DRAWS:
-            apart = min(float(about * wide ** (2 * share - 1)), FARTHEST)
+            apart = min(float(about * wide ** (2 * share - 1)), most)
             trials.append(try_one(apart, len(tried)))
             tried.append(TriedPair(apart, 0, trials[-1].resolved))
         found, _ = stated_px(tried)
@@ -358,8 +355,16 @@ def point_tests(
     sixteen: list[PointTrial] = []
     factor = None
     if px is not None and apart_planes is not None:
-        problem = WindowProblem(planes, HALF_WINDOW)
-        sixteen, factor = _sixteen(problem, point, px, apart_planes, noise, on_progress)
+        square, draw = WindowProblem(planes, HALF_WINDOW), count(1)
+
+        def sixteen_points(by: float, seed: int) -> PointTrial:
+            on_progress(0.5 + 0.5 * next(draw) / (ROUNDS * DRAWS + 1))
+            grid = PointGrid(4, 4, by * px, by * apart_planes)
+            return try_points(square, point, grid, noise, seed=seed, trials=1)
+
+        room = min((square.n_z - 2) / (3 * apart_planes), (2 * square.half[1] - 3) / (3 * px))
+        if room > 1:
+            sixteen, factor = smallest_told(sixteen_points, 1.0, room)
         if factor is None:
             notes.append("16 points were not resolved at any separation that fits the window.")
     return PointTests(
@@ -371,27 +376,6 @@ def point_tests(
         tuple(sixteen),
         tuple(notes),
     )
-
-
-def _sixteen(
-    problem: WindowProblem,
-    point: PointImage,
-    px: float,
-    planes: float,
-    noise: Noise,
-    on_progress: Callable[[float], object],
-) -> tuple[list[PointTrial], float | None]:
-    """Grow both separations of a 4 x 4 grid until it is resolved; returns the trials and the factor."""
-    room = min((problem.n_z - 2) / (3 * planes), (2 * problem.half[1] - 3) / (3 * px))
-    factors = [f for f in FACTORS if f <= room]
-    trials: list[PointTrial] = []
-    for number, factor in enumerate(factors):
-        grid = PointGrid(4, 4, factor * px, factor * planes)
-        trials.append(try_points(problem, point, grid, noise, trials=SIXTEEN_DRAWS))
-        on_progress(0.5 + 0.5 * (number + 1) / len(factors))
-        if trials[-1].resolved:
-            return trials, factor
-    return trials, None
 
 
 class _Shifted:

@@ -41,6 +41,7 @@ from recon.analysis.resolution import (
 )
 from recon.base.brief import brief
 from recon.base.declare import option
+from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.camera_model import choose_model, sort_by_depth
 from recon.camera.refocus import central_psfs
 from recon.errors import InputError
@@ -190,6 +191,7 @@ class Analysis:
         return figures
 
 
+@linear_algebra_on_one_thread()
 def analyse(
     calibration: Calibration,
     settings: AnalysisSettings | None = None,

@@ -223,7 +223,7 @@ def test_a_table_under_a_laser_that_flickers_is_right_or_not_written(
         if not kept:
             with pytest.raises(CalibrationError, match="the light flickers by"):
                 SlmProcedure(levels=9, out=tmp_path / "slm.json").carry_out(bench, tmp_path)
-            assert not list(tmp_path.iterdir())
+            assert not list(tmp_path.glob("*.json"))  # the run with its frames is kept
             return
         found = measure_look_up_table(DisplayBench(bench, 2), n_levels=17)
     true = 7.2 * (np.arange(256) / 255) ** 1.4
