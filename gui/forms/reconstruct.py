@@ -323,16 +323,21 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
         share, note = done, what + expected
         context.offer(lambda: SoFar(share, note, prepared, None, tuple(history)))
 
-    if isinstance(request, VolumeRequest):
-        volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_stage=stage)
-        foretold.ended(volume.stop_reasons)
-        write_volume(outputs, volume, prepared)
-        settled = settle_checkpoint(keeper, volume.stop_reasons)
-    else:
-        picture = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_stage=stage)
-        foretold.ended([picture.stop_reason])
-        write_reconstruction(outputs, picture, prepared, rotate_deg=work.rotate_deg)
-        settled = settle_checkpoint(keeper, [picture.stop_reason])
+    with foretold:
+        if isinstance(request, VolumeRequest):
+            volume = request.solve(
+                prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_stage=stage
+            )
+            foretold.ended(volume.stop_reasons)
+            write_volume(outputs, volume, prepared)
+            settled = settle_checkpoint(keeper, volume.stop_reasons)
+        else:
+            picture = request.solve(
+                prepared, watch=watch, cancel=context.cancel, keeper=keeper, on_stage=stage
+            )
+            foretold.ended([picture.stop_reason])
+            write_reconstruction(outputs, picture, prepared, rotate_deg=work.rotate_deg)
+            settled = settle_checkpoint(keeper, [picture.stop_reason])
     return Written(outputs.image, settled)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from math import log
-from typing import Any
+from typing import Any, Self
 
 from instrument.files import kept_times
 from instrument.files.errors import duration
@@ -130,7 +130,8 @@ class Foretold:
     """Tells what all of a reconstruction will take: before it, where there were like ones, and early in it.
 
     Its ``watch`` and ``stage`` are called with what the reconstruction tells
-    (:func:`recon.reconstruction.reconstruct.reconstruct`); made before it begins.
+    (:func:`recon.reconstruction.reconstruct.reconstruct`); made before it begins. A context, so that
+    compilers are watched no longer than it.
 
     Parameters
     ----------
@@ -155,6 +156,12 @@ class Foretold:
             from numba.core import event
 
             self._timers.enter_context(event.install_timer("numba:compile", self._compiled))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._timers.close()
 
     def _compiled(self, seconds: float) -> None:
         self._compiled_s += seconds

@@ -54,14 +54,15 @@ def reconstruct_photograph(
         what = "volume" if is_volume else "picture"
         with desk.interruptible() as cancel, desk.step(what, 100) as advance:
             like = Like.of(job, request.options)
-            foretold = Foretold(lambda words: desk.fact("Will take", words), like)
+            with Foretold(lambda words: desk.fact("Will take", words), like) as foretold:
 
-            def stage(share: float, what: str) -> None:
-                advance(round(100 * share), note=what)
-                foretold.stage(share, what)
+                def stage(share: float, what: str) -> None:
+                    advance(round(100 * share), note=what)
+                    foretold.stage(share, what)
 
-            result = request.solve(job, watch=foretold.watch, cancel=cancel, keeper=keeper, on_stage=stage)
-            foretold.ended(result.stop_reasons)
+                watch = foretold.watch
+                result = request.solve(job, watch=watch, cancel=cancel, keeper=keeper, on_stage=stage)
+                foretold.ended(result.stop_reasons)
         _tell(desk, result)
         with desk.step("writing"):
             if is_volume:

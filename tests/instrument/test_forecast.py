@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba.core import event
 
 from instrument.files import kept_times
 from instrument.reconstruction.forecast import TRIED, Forecast, Foretold, Like, forecast
 from instrument.reconstruction.job import Job
 from recon import Calibration, reconstruct
+from recon.errors import InputError
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.solvers.base import StopReason
@@ -83,6 +85,16 @@ def test_the_next_like_it_is_told_before_it_begins(tmp_path: Path, monkeypatch: 
     assert like.took() == (2.0, 3e6), "nor what compilers took"
     kept_times.place().write_text('{"reconstruction of a hand": [[1]]}')
     assert like.took() is None
+
+
+def test_one_that_fails_watches_compilers_no_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    before = len(event._registered["numba:compile"])
+    foretold = Foretold(lambda _: None, Like("reconstruction of nothing", 1000))
+    assert len(event._registered["numba:compile"]) == before + 1
+    with pytest.raises(InputError), foretold:
+        raise InputError("There is nothing.")
+    assert len(event._registered["numba:compile"]) == before
 
 
 def test_like_ones_have_the_same_options_and_psfs(scene: tuple[Measurement, Calibration]) -> None:
