@@ -30,6 +30,9 @@ LEARNS = 0.5
 """Part of the iterations in which the spots' phases are free; then they are held while weights go on
 (Kim 2019), which is what makes them even to a part in a thousand."""
 
+MOST_OFF = 0.25
+"""Wavelengths by which a near spot's wave may differ from a round one at the edge of its light."""
+
 
 @dataclass(frozen=True)
 class SpotList:
@@ -127,6 +130,7 @@ class SpotField:
         nu = spots.places - 0.5
         self._planes = []
         for z_mm in np.unique(spots.z_mm):
+            self._require_round(float(z_mm))
             here = np.flatnonzero(spots.z_mm == z_mm)
             rows, row_of = np.unique(nu[here, 0], return_inverse=True)
             down = self._waves(rows, 0, float(z_mm))
@@ -146,6 +150,21 @@ class SpotField:
             return np.ones(height, np.complex64), np.ones(width, np.complex64)
         hy, hx = self.display.defocus(z_mm)
         return hy.astype(np.complex64), hx.astype(np.complex64)
+
+    def _require_round(self, z_mm: float) -> None:
+        """Refuse near spots whose waves, products of a column and a row, are far from round (0172)."""
+        display = self.display
+        if not display.near:
+            return
+        assert display.distance_mm is not None
+        away_mm, pitch_mm = display.distance_mm + z_mm, display.mask_pitch_um * 1e-3
+        off = away_mm * (display.wavelength_nm * 1e-6) ** 3 / (64 * pitch_mm**4)
+        if off > MOST_OFF:
+            raise InputError(
+                f"Spots {away_mm:.4g} mm behind mask pixels of {display.mask_pitch_um:g} um would be "
+                f"computed {off:.2g} wavelengths wrong at the edge of their light (at most {MOST_OFF:g}): "
+                "give a picture of the spots as the target."
+            )
 
     def _waves(self, nu: Array, axis: int, z_mm: float) -> npt.NDArray[np.complex64]:
         """Return what of the mask's rows or columns arrives at places in the field, (places, cells)."""

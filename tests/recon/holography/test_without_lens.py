@@ -121,6 +121,8 @@ def test_near_spots_are_where_and_as_bright_as_asked_for() -> None:
     bright = np.array([light[int(y) - 3 : int(y) + 5, int(x) - 3 : int(x) + 5].sum() for y, x in at])
     assert bright / bright.mean() == pytest.approx([0.75, 0.75, 1.5], rel=0.15)
     assert bright.sum() == pytest.approx(scores.efficiency * light.sum(), rel=0.2)
+    with pytest.raises(InputError, match=r"0\.59 wavelengths wrong"):
+        compute_spots(replace(near(4.0, (512, 512)), slm_pitch_um=2.0), spots)
 
 
 def test_the_limit_of_a_near_picture_tells_that_light_stays_where_it_falls() -> None:
