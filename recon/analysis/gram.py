@@ -20,8 +20,6 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import solve
-from scipy.ndimage import maximum_filter
 
 from recon.base import fft
 from recon.errors import InputError
@@ -211,6 +209,8 @@ class WindowProblem:
         squares do; it ends where none asks for more than :data:`TOLERANCE` of what the first did. Returns
         float32, (n_z, rows, columns) of the window, in units of the PSFs as given.
         """
+        from scipy.ndimage import maximum_filter  # late: importing recon stays light
+
         if data.shape != self.sensor_shape:
             raise InputError(f"The image is {data.shape}, the PSFs are {self.sensor_shape}.")
         target = self.adjoint(data).astype(np.float64)
@@ -229,6 +229,8 @@ class WindowProblem:
 
     def _fit(self, x: Floats, lit: npt.NDArray[np.bool_], target: Floats) -> None:
         """Bring ``x`` to the least squares of the lit voxels; those that would be negative go dark."""
+        from scipy.linalg import solve  # late, as above
+
         while lit.any():
             z, r, c = np.nonzero(lit)
             rows, columns = (2 * h for h in self.half)

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
 
 from recon.analysis.gram import WindowProblem
 from recon.base import fft
@@ -217,6 +216,8 @@ def stated_px(tried: Sequence[TriedPair]) -> tuple[float | None, float | None]:
     Both axes share its slope. Never below the smallest distance tried; None where no pair of an axis was told
     apart, or none beyond.
     """
+    from scipy.optimize import minimize  # late: importing recon stays light
+
     logs = np.log([one.px for one in tried])
     axes = np.array([one.axis for one in tried])
     told = np.array([one.told for one in tried])

@@ -402,7 +402,10 @@ def test_a_folder_in_which_nothing_can_be_kept_is_told_before_anything_moves(
     assert panel.run_bar.start_button.isEnabled()
 
 
-def test_another_routines_form_is_made_while_the_window_answers(qtbot: QtBot, panel: SweepsPanel) -> None:
+def test_another_routines_form_is_made_while_the_window_answers(
+    qtbot: QtBot, panel: SweepsPanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gui.making._SLICE_S", 0.0)  # a fast machine makes it in one slice
     panel.choice.setCurrentIndex(panel.choice.findText("Angular response"))
     assert not panel.views.is_whole("angular"), "made in one go"
     assert not panel.run_bar.start_button.isEnabled()

@@ -253,7 +253,7 @@ def test_an_existing_file_is_spared_and_quality_ends_the_work(capsys):
         (["picture.png", "picture.png"], "Give --z-mm once for each"),
         (["picture.png", "--color"], "needs a colour picture"),
         (["picture.png", "--z-mm", "100000"], "too far"),
-        (["picture.png", "--distance-mm", "2"], "too near for this display: it is shown rightly from"),
+        (["picture.png", "--distance-mm", "2", "--z-mm", "20"], "the farthest plane's distance"),
         (["picture.png", "--distance-mm", "-2"], "distance"),
     ],
 )

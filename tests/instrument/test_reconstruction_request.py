@@ -161,7 +161,7 @@ def test_a_checkpoint_leaves_everything_to_choose(picture_files, option, tmp_pat
         ({"iterations": 0}, "iterations must be a whole number"),
         ({"tolerance": -1.0}, "tolerance must be"),
         ({"prior": "tb"}, "prior must be one of tv.*not 'tb'"),
-        ({"z_um": -5e3}, r"z_um must be a number, above 0 \(um\), not -5000"),
+        ({"z_um": -5e3}, r"z_um must be a number, above 0 \(um\), or inf, not -5000"),
         ({"inputs": InputOptions(noise=-1.0)}, "noise must be"),
     ],
 )

@@ -238,7 +238,7 @@ BAD = np.where(np.arange(12 * 14).reshape(12, 14) == 30, np.nan, GOOD)
         (GOOD, GOOD, {"iterations": True}, "iterations must be a whole number"),
         (GOOD, GOOD, {"time_s": 0.0}, "time_s must be a number, above 0 .s., not 0.0"),
         (GOOD, GOOD, {"tolerance": -1e-3}, "tolerance must be a number, 0 or more"),
-        (GOOD, GOOD, {"z_um": -5}, "z_um must be a number, above 0 .um., not -5"),
+        (GOOD, GOOD, {"z_um": -5}, "z_um must be a number, above 0 .um., or inf, not -5"),
         (GOOD, GOOD, {"prior": 3}, "prior must be one of tv, .* or a Prior, not 3"),
         (GOOD, GOOD, {"field": "half"}, "field must be one of sensor, full, not 'half'"),
         (np.ones((1, 1)), np.ones((1, 1)), {}, "constant"),
