@@ -205,6 +205,7 @@ def draw_row(pictures: list[tuple[str, Array]], path: Path) -> None:
         axis.set_title(name)
         axis.axis("off")
     figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=70)
 
 
