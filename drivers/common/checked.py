@@ -45,7 +45,8 @@ _log = logging.getLogger(__name__)
 _D = TypeVar("_D", bound=type[Device])
 _T = TypeVar("_T")
 _TRAVELS = 100
-_SHORT = {"settings", "own_settings", "position", "display", "snap", "trigger", "off", "blank"}
+_ASKS = {"settings", "own_settings", "position", "commanded_position"}
+_SHORT = {*_ASKS, "display", "snap", "trigger", "off", "blank"}
 """Calls that are waited for as long as their device says, as are all that set something."""
 _MOVES = {"home": 20, "move_to": 20, "move_by": 20, "wait": 20}
 _LONG = {"open": 4, "arm": 20, **_MOVES}
@@ -93,7 +94,7 @@ def _guarded_call(made: type, name: str) -> Callable[..., Any]:
         _require_ended(self)
         return call(self, *args, **named)
 
-    if not (name in _SHORT or name in _LONG or name.startswith("set_")):
+    if not is_timed(name):
         return begins if name in _BEGIN else call
 
     def bounded(self: Device, *args: Any, **named: Any) -> Any:
@@ -102,6 +103,11 @@ def _guarded_call(made: type, name: str) -> Callable[..., Any]:
         return _in_time(self, name, lambda: call(self, *args, **named))
 
     return bounded
+
+
+def is_timed(name: str) -> bool:
+    """Whether a call of this name is given up when it hangs; of the others, who makes them sees to it."""
+    return name in _SHORT or name in _LONG or name.startswith("set_")
 
 
 def call_limit_s(device: Device, name: str) -> float:

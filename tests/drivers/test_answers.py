@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import signal
 import subprocess
@@ -16,12 +17,16 @@ import cv2
 import numpy as np
 import pytest
 
+from drivers.camera import Camera
 from drivers.common.answers import within
-from drivers.common.checked import call_limit_s, checked
+from drivers.common.checked import call_limit_s, checked, is_timed
 from drivers.common.stream import FrameStream
 from drivers.device import Device
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import FrameMetadata
+from drivers.led_array import LedArray
+from drivers.slm import Slm
+from drivers.stage import Stage
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import photograph
 from instrument.live.live import LiveView
@@ -248,6 +253,18 @@ def test_a_device_that_hangs_when_set_or_moved_is_given_up_named_and_undone(
         assert [call for call in calls(bench) if call in ("stage.stop", "led_array.off")] == undone
         assert light_is_off(bench)
         assert device.settings() is not None
+
+
+def test_every_call_of_a_device_has_an_end_or_is_known_to_have_another() -> None:
+    calls = {
+        name
+        for interface in (Camera, Stage, LedArray, Slm)
+        for name, member in vars(interface).items()
+        if not name.startswith("_") and inspect.isfunction(member)
+    }
+    streams = {"start_sequence", "stop_sequence", "next_frame", "next_frame_into", "stream"}
+    computed = {"check", "single", "move_duration_s", "settles_within"}
+    assert {name for name in calls if not is_timed(name)} - streams - computed <= {"close", "play", "stop"}
 
 
 @pytest.mark.usefixtures("mock_drivers")
