@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,8 @@ from drivers.remote.wire import LONGEST_ARRAYS, Call
 class _Upload:
     bytes_: memoryview
     missing: int
+    places: set[int] = field(default_factory=set)
+    """Where pieces have come, so that one that comes twice hides no hole."""
 
 
 class Uploads:
@@ -38,7 +40,10 @@ class Uploads:
             upload = self._waiting[operator, name] = _Upload(np.zeros(size, np.uint8).data, size)
         if len(upload.bytes_) != size or not 0 <= place <= size - len(piece):
             raise ValueError(f"{len(piece)} bytes from {place} on are no piece of an array of {size} bytes")
+        if place in upload.places:
+            raise ValueError(f"the piece from {place} on came twice")
         upload.bytes_[place : place + len(piece)] = piece
+        upload.places.add(place)
         upload.missing -= len(piece)
 
     @property

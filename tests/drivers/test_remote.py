@@ -17,6 +17,7 @@ from drivers.testing.led_array import LedArrayContract
 from drivers.testing.slm import SlmContract
 from drivers.testing.stage import StageContract
 from instrument.bench.config_file import parse_config
+from instrument.serve import uploads
 
 BENCH = """
 [simulated]
@@ -110,10 +111,11 @@ class TestSlm(Over, SlmContract):
 
 
 def test_uploads_are_whole_or_nothing_and_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    uploads = pytest.importorskip("instrument.serve.uploads")
     monkeypatch.setattr(uploads, "LONGEST_ARRAYS", 10)
     kept = uploads.Uploads()
     kept.add("me", "1", 5, 3, b"de")
+    with pytest.raises(ValueError, match="came twice"):
+        kept.add("me", "1", 5, 3, b"de")
     with pytest.raises(ValueError, match="did not come whole"):
         kept.take("me", "1")
     kept.add("me", "1", 5, 3, b"de")
