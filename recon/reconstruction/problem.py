@@ -13,7 +13,7 @@ import numpy.typing as npt
 from recon.base.checks import as_channels, check_psf
 from recon.base.declare import settled
 from recon.camera.camera_model import Depths, Extent, ModelName, choose_model, energies, levelled
-from recon.camera.grid import FAR_UM, Grid
+from recon.camera.grid import Grid
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (
@@ -334,7 +334,7 @@ class Problem:
         (rows, columns), centre = self._placed
         z_um = self.depths.z_um
         if self.n_planes == 1 and self.options.z_um is not None:
-            z_um = np.array([min(float(self.options.z_um), FAR_UM)])
+            z_um = np.array([float(self.options.z_um)])
         geometry = self.calibration.geometry
         pitch, distance = geometry.pixel_pitch_um, geometry.diffuser_distance_mm
         pitches = np.full(len(z_um), np.nan)
