@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from instrument.bench.bench import Bench
     from instrument.bench.config import BenchConfig
     from instrument.cli import Command
+    from instrument.runs.run import Run
 
 
 BenchOption = Annotated[
@@ -53,6 +54,23 @@ class RunFolder:
         flags=("--out", "-o"),
         group="Files",
     )
+    figure: Path | None = option(
+        None, help="Also a page: up to twelve of its frames (.png, .pdf, .svg).", group="Files"
+    )
+
+    def check(self) -> None:
+        """Refuse a page that cannot be written, before anything moves."""
+        from instrument.files.figures import check_figure
+
+        if self.figure is not None:
+            check_figure(self.figure, overwrite=None)
+
+    def draw(self, run: Run) -> None:
+        """Draw the page where one is wanted."""
+        from instrument.runs.inspection import contact_sheet
+
+        if self.figure is not None and contact_sheet(run, self.figure):
+            typer.echo(f"Wrote {self.figure}")
 
 
 _HELP = ("--help", "-h")
