@@ -33,7 +33,7 @@ TIME = re.compile(r"left \d|about [\d.]+ ?\w+ (left|in all)|in all|longer than l
 """Words that tell a time, or how much of how much is done."""
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 STEPS = {
-    "new": "new --out sample.toml",
+    "new": "new sample.toml",
     "check": "check",
     "devices": "devices",
     "drivers": "drivers",
@@ -50,7 +50,7 @@ STEPS = {
     "analyze": "analyze SWEEP --out page.png",
     "compare": "compare SWEEP SWEEP",
     "refocus": "refocus SWEEP --z-mm 150 --out near --figure near.png",
-    "reconstruct": "reconstruct --psf psf.tif --image photo.tif --bin 8 --out scene.tif --figure scene.png",
+    "reconstruct": "reconstruct --psf psf.tif --image photo.tif --bin 8 --out scene.tif --figure page.png",
     "calibrated": "reconstruct --calibration SWEEP --z-mm 200 --image photo.tif --bin 8 --out two.tif",
     "etendue": "etendue",
     "hologram": "hologram photo.png --out slm.png --iterations 20",

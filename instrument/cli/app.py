@@ -67,9 +67,14 @@ class RunFolder:
 
     def draw(self, run: Run) -> None:
         """Draw the page where one is wanted."""
+        if self.figure is None:
+            return
+        from instrument.cli.progress import one_task
         from instrument.runs.inspection import contact_sheet
 
-        if self.figure is not None and contact_sheet(run, self.figure):
+        with one_task("Drawing"):
+            drawn = contact_sheet(run, self.figure)
+        if drawn:
             typer.echo(f"Wrote {self.figure}")
 
 
@@ -238,7 +243,8 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
     kept_times.about(name)
     try:
         # Not through typer's own main, which would answer Ctrl-C itself before a word is said about it.
-        parser = typer.main.get_command(command.load())
+        with _starting(name):
+            parser = typer.main.get_command(command.load())
         with parser.make_context(f"diffuserbench {name}", list(arguments)) as context:
             parser.invoke(context)
     except BaseException as error:
@@ -248,6 +254,18 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
             raise
         return report(error)
     return 0
+
+
+@contextmanager
+def _starting(name: str) -> Iterator[None]:
+    """Say in a terminal that a command is on its way while its libraries are read: a second or two."""
+    shown = sys.stderr.isatty()
+    sys.stderr.write(f"starting {name} ..." if shown else "")
+    sys.stderr.flush()
+    try:
+        yield
+    finally:
+        sys.stderr.write("\r\x1b[2K" if shown else "")
 
 
 def _be_silent_about_half_made_objects() -> None:

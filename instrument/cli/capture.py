@@ -153,7 +153,9 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
         simulated = bool(opened.simulated_kinds)
     _report(target, taken, light)
     if options.figure is not None:
-        typer.echo(f"Wrote {save_figure(_page(target, taken, light, simulated=simulated), options.figure)}")
+        with one_task("Drawing"):
+            drawn = save_figure(_page(target, taken, light, simulated=simulated), options.figure)
+        typer.echo(f"Wrote {drawn}")
 
 
 def _expose(bench: Bench, light: LightState) -> None:

@@ -188,7 +188,7 @@ def _shown(run: Run, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.floa
     full_scale = (1 << run.metadata(index).significant_bits) - 1
     saturated = frame >= full_scale if frame.ndim == 2 else np.any(frame >= full_scale, axis=2)
     picture[saturated] = (1, 0, 0)
-    return picture
+    return np.asarray(picture, np.float32)
 
 
 @dataclass(frozen=True, slots=True)

@@ -220,7 +220,8 @@ def compare(desk: Desk, options: CompareOptions) -> Done:
     if page is not None:
         from instrument.files.figures import save_figure
 
-        save_figure(_compared_page(first, second, found), page)
+        with desk.step("drawing"):
+            save_figure(_compared_page(first, second, found), page)
     return Done(tuple(file for file in (out, page) if file is not None), good=not found.due)
 
 
@@ -327,7 +328,8 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
         return Done((path,))
     from instrument.files.figures import save_figure
 
-    return Done((path, save_figure(_refocused_page(measured, new), options.figure)))
+    with desk.step("drawing"):
+        return Done((path, save_figure(_refocused_page(measured, new), options.figure)))
 
 
 def _refocused_page(measured: Calibration, new: Calibration) -> Figure:

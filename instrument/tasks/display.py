@@ -156,7 +156,8 @@ def etendue(desk: Desk, options: EtendueOptions) -> Done:
     if options.figure is None:
         return Done()
     axes = [options.along(width, q) for q in expansions]
-    return Done((save_figure(_etendue_page(axes, title, options), options.figure),))
+    with desk.step("drawing"):
+        return Done((save_figure(_etendue_page(axes, title, options), options.figure),))
 
 
 def _etendue_page(displays: Sequence[Etendue], title: str, options: EtendueOptions) -> Figure:
