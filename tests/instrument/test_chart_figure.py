@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from instrument.evaluation.chart import ChartData, colours_of
 from instrument.evaluation.chart_figure import MOST_LINES, chart_figure, chosen, draw_chart
@@ -56,3 +59,13 @@ def test_names_stand_apart_beside_the_panel_and_say_what_the_front_costs() -> No
     assert bold
     assert all(text.endswith(("ms", " s")) for text in bold)
     assert len(chart_figure(data).axes) == 2
+
+
+def test_long_names_are_cut_by_no_edge_and_no_panel() -> None:
+    long = tuple(replace(p, setting=f"{p.setting} tv-isotropic background bin 2 float64") for p in _points(9))
+    short = tuple(replace(p, setting=f"{p.setting} other") for p in _points(3))
+    figure = chart_figure(ChartData("reconstruction", {"simulated": True}, (*long, *short), {}, ()))
+    left, right = figure.axes
+    ends = [max(Text.get_window_extent(text).x1 for text in axes.texts) for axes in (left, right)]
+    assert ends[0] < right.get_tightbbox(for_layout_only=True).x0  # type: ignore[union-attr]
+    assert ends[1] < figure.bbox.x1
