@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from io import BytesIO
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -65,6 +66,7 @@ def test_long_names_are_cut_by_no_edge_and_no_panel() -> None:
     long = tuple(replace(p, setting=f"{p.setting} tv-isotropic background bin 2 float64") for p in _points(9))
     short = tuple(replace(p, setting=f"{p.setting} other") for p in _points(3))
     figure = chart_figure(ChartData("reconstruction", {"simulated": True}, (*long, *short), {}, ()))
+    figure.savefig(BytesIO())  # places the names
     left, right = figure.axes
     ends = [max(Text.get_window_extent(text).x1 for text in axes.texts) for axes in (left, right)]
     assert ends[0] < right.get_tightbbox(for_layout_only=True).x0  # type: ignore[union-attr]
