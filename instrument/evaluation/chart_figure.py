@@ -124,14 +124,21 @@ def draw_chart(
 
 
 def chosen(runs: Mapping[str, Sequence[Point]], front: Sequence[Point], score: Axis) -> list[str]:
-    """Return at most MOST_LINES settings: the front's best, each family's best, then the best of the rest.
+    """Return at most MOST_LINES settings: the front's, each family's best, then the best of the rest.
 
-    They come in the order of how good they get, the best first.
+    Of the front its ends come first, then those by which the score rises most along it: a dozen that are all
+    but the best would say nothing about what is quick. They are returned the best first.
     """
     sign = 1.0 if score.more_is_better else -1.0
     best = {name: max(sign * float(getattr(p, score.key)) for p in run) for name, run in runs.items()}
     ranked = sorted(runs, key=lambda name: -best[name])
-    on_front = [name for name in ranked if name in {p.setting for p in front}]
+    rises: dict[str, float] = {}
+    reached = -np.inf
+    for point in front:
+        value = sign * float(getattr(point, score.key))
+        rises[point.setting] = rises.get(point.setting, 0.0) + value - reached
+        reached = value
+    on_front = sorted(rises, key=lambda name: (name != ranked[0], -rises[name]))  # the cheapest rose most
     firsts = list({runs[name][0].family: name for name in reversed(ranked)}.values())
     # A third for families, so that each method's best is there to be compared.
     wanted = [*on_front[: MOST_LINES - min(len(firsts), MOST_LINES // 3)], *sorted(firsts, key=ranked.index)]

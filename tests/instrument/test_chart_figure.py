@@ -47,6 +47,16 @@ def test_a_dozen_lines_hold_the_front_and_the_best_of_each_family() -> None:
     assert len(few) == 5
 
 
+def test_what_is_quick_is_named_where_many_are_nearly_the_best() -> None:
+    quick = [Point(f"quick{n}", 1, 1e-3 * 2**n, psnr_db=20.0 + 3 * n, family="a") for n in range(4)]
+    best = [Point(f"best{n}", 1, 1.0 + n, psnr_db=34.0 + n / 100, family="a") for n in range(20)]
+    runs = {p.setting: [p] for p in (*quick, *best)}
+    shown = chosen(runs, pareto([*quick, *best], SCORE), SCORE)
+    assert len(shown) == MOST_LINES
+    assert {p.setting for p in quick} < set(shown)
+    assert shown[0] == "best19"
+
+
 def test_names_stand_apart_beside_the_panel_and_say_what_the_front_costs() -> None:
     data = ChartData("reconstruction", {"simulated": True}, _points(40), {}, ())
     axes = Figure().subplots()
