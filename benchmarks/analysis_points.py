@@ -106,7 +106,7 @@ def in_a_volume(
     for row, where in places:
         middle = round(row) + height // 2
         line = made.volume[:, middle - 2 : middle + 3].sum(axis=1, dtype=np.float64)
-        found += smallest_dip(line, where + (0.0, width // 2)) >= DIP
+        found += smallest_dip(line, where + np.array([0.0, width // 2])) >= DIP
     return found, len(places), f"{made.solver}, {made.prior}"
 
 

@@ -19,7 +19,7 @@ import pytest
 
 from drivers.camera import Camera
 from drivers.common.answers import within
-from drivers.common.checked import call_limit_s, checked, is_timed
+from drivers.common.checked import call_limit_s, checked, given_up, is_timed
 from drivers.common.stream import FrameStream
 from drivers.device import Device
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
@@ -247,7 +247,7 @@ def test_a_device_that_hangs_when_set_or_moved_is_given_up_named_and_undone(
             device.settings()
         calls(bench).clear()
         let_go.set()
-        for thread in vars(device)["_left"]:
+        for thread in given_up(device):
             thread.join(5)
         undone = {"stage": ["stage.stop"], "led_array": ["led_array.off"]}.get(kind, [])
         assert [call for call in calls(bench) if call in ("stage.stop", "led_array.off")] == undone
@@ -282,7 +282,7 @@ def test_ctrl_c_during_a_move_stops_it_and_waits_for_its_call(monkeypatch: pytes
         monkeypatch.setattr(MockStage, "stop", lambda _: stopped.set())
         with pytest.raises(KeyboardInterrupt):
             stage.move_to({"x_um": 1.0})
-        assert not any(thread.is_alive() for thread in vars(stage)["_left"])
+        assert not any(thread.is_alive() for thread in given_up(stage))
 
 
 @pytest.mark.usefixtures("mock_drivers")
@@ -308,7 +308,7 @@ def test_ctrl_c_stays_ctrl_c_where_the_stop_fails(monkeypatch: pytest.MonkeyPatc
             with pytest.raises(KeyboardInterrupt) as caught:
                 photograph(camera)
             assert stopped.is_set()
-            assert not any(thread.is_alive() for thread in vars(camera)["_left"])
+            assert not any(thread.is_alive() for thread in given_up(camera))
         notes = getattr(caught.value, "__notes__", [])
         assert [note for note in notes if "does not stop" in note] == notes
         assert len(notes) == (not stops)
@@ -324,7 +324,7 @@ def test_nothing_begins_that_the_end_of_a_call_that_hangs_would_end(monkeypatch:
     with pytest.raises(DeviceTimeoutError, match="still hangs: snap has not ended"):
         camera.stream().start()
     let_go.set()
-    for thread in vars(camera)["_left"]:
+    for thread in given_up(camera):
         thread.join(5)
     camera.stream().start().close()
 
