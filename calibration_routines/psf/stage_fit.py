@@ -183,7 +183,7 @@ def judge_visit(
         findings.append(
             f"{where} the reference's pattern moved from {before.shift_px:.1f} to {after.shift_px:.1f} "
             f"pixels off its first place (up to {MAX_PLACE_DRIFT_PX:g} expected): the source or the camera "
-            "moved, or the stage slipped or has play (calibrate stage tells). Fix it and take the sweep again."
+            "moved, or the stage slipped or has play (calibrate stage tells). Mend it, and sweep again."
         )
     return tuple(findings)
 
