@@ -398,7 +398,7 @@ class _Shifted:
     def __call__(self, columns: float, s: float) -> Array:
         return self.of(np.array([columns]), np.array([s]))
 
-    def of(self, columns: Floats, places: Floats) -> Array:
+    def of(self, columns: Array, places: Array) -> Array:
         """Return the light of a point at each of ``columns`` in each of ``places``: one transform."""
         total = np.zeros((self._shape[0], self._shape[1] // 2 + 1), np.complex64)
         for s in places:
