@@ -96,6 +96,14 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.startswith("diffuserbench ")
 
 
+def test_the_module_is_the_program() -> None:
+    shown = subprocess.run(
+        [sys.executable, "-m", "diffuserbench", "snpa"], capture_output=True, text=True, timeout=60
+    )
+    assert shown.returncode == 2
+    assert "no command 'snpa'" in shown.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
