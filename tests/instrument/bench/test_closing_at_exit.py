@@ -122,5 +122,7 @@ def test_the_end_is_asked_for_once_whatever_number_of_benches_is_watched(
     assert registered == [closing._end]
     assert closing._thread is not None
     assert closing._thread.daemon
+    closing.forget(benches[0])
+    assert list(closing._open) == benches[1:]
     closing._end()
     assert closing._done.is_set()
