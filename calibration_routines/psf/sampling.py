@@ -221,10 +221,10 @@ def grid_sweep(
         reasons.append(f"Spacing: {spacing_um / 1e3:.3g} mm at most, as asked")
     seen = [point for point in points if _is_seen(bench, point)]
     if left_out := len(points) - len(seen):
-        words = f"{left_out} of {len(points)} places left out: from there the pattern leaves the sensor"
+        told = f"{left_out} of {len(points)} places left out: from there the pattern leaves the sensor"
         if not seen:
-            raise BenchError(f"{words}. Bring the field nearer to the axis.")
-        reasons.append(words)
+            raise BenchError(f"{told}. Bring the field nearer to the axis.")
+        reasons.append(told)
     return GridSweep(tuple(seen), tuple(dict.fromkeys(reasons)), tuple(shapes))
 
 
