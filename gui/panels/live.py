@@ -208,8 +208,8 @@ class LivePanel(Panel):
         frame = self.picture.frame
         if frame is not None:
             self._judge_age(frame)
-        if self._waits() or frame is None:
-            return
+        if self._waits() or frame is None or not self.session.is_open("camera"):
+            return  # the line says what is waited for, or what failed
         self.picture.measure()
         self.status.setText(self._figures(frame))
 
