@@ -247,7 +247,7 @@ class ProcedurePanel(Panel):
                 if first is not None:
                     return first(bench)
                 assert procedure is not None
-                return procedure.outlook(bench)
+                return procedure.foretold(bench)
             except BenchError as error:
                 return error
 

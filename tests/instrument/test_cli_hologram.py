@@ -7,6 +7,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -334,3 +335,15 @@ def test_etendue_prints_the_dissertations_example(capsys):
     assert "paraxial 1.06 mm" in said
     assert "leaves 12.7 degrees" in said
     assert main(["etendue", "--slm", "big"]) == 2
+
+
+def test_etendue_draws_what_it_says(tmp_path, capsys):
+    page = tmp_path / "page.png"
+    asked = ["etendue", "--fov", "60", "--figure", str(page)]
+    assert main(asked) == 0
+    assert f"Wrote       {page}" in capsys.readouterr().out
+    assert cv2.imread(str(page)).std() > 10
+    assert main(asked) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main([*asked, "--force"]) == 0
+    assert main(["etendue", "--figure", "page.txt"]) == 2
