@@ -260,7 +260,8 @@ def _smoothed(picture: Floats) -> Floats:
 
 def _roughness(picture: Floats) -> float:
     """Return what smoothing takes off a picture, relative to it."""
-    return float(np.linalg.norm(picture - _smoothed(picture)) / max(np.linalg.norm(picture), 1e-30))
+    whole = float(np.linalg.norm(picture))
+    return float(np.linalg.norm(picture - _smoothed(picture))) / whole if whole > 0 else 0.0
 
 
 def _shares(patterns: Floats, path: Path) -> Floats:
