@@ -100,7 +100,7 @@ class SourceOptions:
     )
     calibration: Path | None = option(
         None,
-        help="Instead of --psf: a calibration, or a run with one.",
+        help="A calibration, or a run with one, instead of a PSF image.",
         metavar="FOLDER",
         flags=("--calibration", "-c"),
         applies=("picture", "video", "patterned picture"),

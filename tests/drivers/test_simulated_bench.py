@@ -290,6 +290,28 @@ def test_stop_cuts_a_long_exposure_short() -> None:
         bench.camera.snap()
 
 
+def test_stop_does_not_wait_until_a_new_light_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    begun, computed = threading.Event(), threading.Event()
+    see = bench.world.photons_per_s
+
+    def slowly(weights: Rgb, binning: int = 1) -> object:
+        begun.set()
+        assert computed.wait(30.0)
+        return see(weights, binning)
+
+    monkeypatch.setattr(bench.world, "photons_per_s", slowly)
+    bench.camera.start_sequence()
+    assert begun.wait(10.0)
+    bench.camera.stop_sequence()
+    assert not bench.camera.is_streaming
+    assert not computed.is_set()
+    computed.set()
+    bench.camera.snap()
+    bench.camera.close()
+    assert not any(thread.name == "simulated light" for thread in threading.enumerate())
+
+
 # The camera's electronics ---
 def test_stop_ends_homing_on_the_reference_mark_too() -> None:
     bench = Bench()
