@@ -243,7 +243,7 @@ def forecast(measurement: Measurement, calibration: Calibration, options: Recons
 def _settling(
     measurement: Measurement, calibration: Calibration, options: ReconstructionOptions
 ) -> int | None:
-    """Return after how many iterations a copy of a picture on blocks of pixels settles; None where none does."""
+    """Return after how many iterations a copy of a picture on blocks of pixels settles; None where none."""
     known = (measurement.background, measurement.erasures, measurement.patterns)
     small = min(calibration.psfs.shape[-2:]) < LEAST_PX
     if len(calibration.psfs) > 1 or small or options.tolerance == 0 or any(k is not None for k in known):
