@@ -21,7 +21,7 @@ from drivers.frame import Frame, FrameMetadata
 from drivers.simulated.camera_settings import SimulatedCameraSettings
 from drivers.simulated.faults import disturbed, disturbs
 from drivers.simulated.wire import Pulse
-from drivers.simulated.world import Rgb
+from drivers.simulated.world import Rgb, SimulatedWorld
 from recon.optics.sensor import FixedPattern, Readout, expose
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
@@ -87,6 +87,8 @@ class SimulatedCamera(SimulatedCameraSettings):
     drops_counted_by = "device frame numbers"
     longest_silence_s = 120.0
     """What it sees of a new light is computed first, on a large sensor for many seconds."""
+    longest_birth_s = 3600.0
+    """An animal's first light takes two minutes of a processor, which others may have."""
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         super().__init__(options, shared)
@@ -124,6 +126,12 @@ class SimulatedCamera(SimulatedCameraSettings):
             for look in self._looks:  # no thread is left behind
                 look.thread.join()
             self._is_open = False
+
+    @property
+    def longest_wait_s(self) -> float:
+        """What the next frame may take: much where an animal is to be seen."""
+        alive = isinstance(self.world, SimulatedWorld) and self.world.animal is not None
+        return super().longest_wait_s + (self.longest_birth_s if alive else 0.0)
 
     # Taking images ---
     def snap(self) -> Frame:

@@ -14,6 +14,7 @@ import pytest
 from pydantic import ValidationError
 
 from drivers.camera import Roi
+from drivers.common.checked import call_limit_s
 from drivers.errors import DeviceError, StoppedError
 from drivers.led_array import LedPattern
 from drivers.simulated.camera import SimulatedCamera
@@ -65,6 +66,11 @@ def test_dark_without_leds_and_without_scene() -> None:
     bench.world.scene_lit = True
     bench.camera.set_exposure_ms(300.0)
     assert bench.counts().mean() > 50
+
+
+def test_an_animals_first_light_is_waited_for_on_a_busy_computer() -> None:
+    assert call_limit_s(Bench().camera, "snap") < 200
+    assert call_limit_s(Bench(scene="animal").camera, "snap") > 3600
 
 
 def test_light_adds_up() -> None:
