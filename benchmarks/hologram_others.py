@@ -84,7 +84,7 @@ class Problem:
             np.save(folder / "wanted.npy", self.wanted)
             worker = Path(__file__).resolve().with_name("hologram_others_worker.py")
             quiet = os.environ | {"TQDM_DISABLE": "1"}
-            command = [os.path.abspath(python), str(worker), name, *map(str, COUNTS)]
+            command = [str(Path(python).absolute()), str(worker), name, *map(str, COUNTS)]
             # There, for odak writes a log where it runs.
             subprocess.run(command, check=True, env=quiet, stdout=subprocess.DEVNULL, cwd=name)
             times = json.loads((folder / "times.json").read_text())
