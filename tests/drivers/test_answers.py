@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 
 from drivers.camera import Camera
-from drivers.common.answers import within
+from drivers.common import answers
+from drivers.common.answers import is_bounded, within
 from drivers.common.checked import call_limit_s, checked, given_up, is_timed
 from drivers.common.stream import FrameStream
 from drivers.device import Device
@@ -70,6 +71,39 @@ def test_what_a_call_returns_and_raises_comes_through_and_a_hang_is_named() -> N
     with pytest.raises(DeviceTimeoutError, match="camera: hangs: an answer has not ended"):
         within(0.05, "camera", "an answer", lambda: ended.wait(20))
     ended.set()
+
+
+def test_calls_that_were_given_up_are_known_and_waited_for_at_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    let_go = threading.Event()
+    assert not is_bounded()
+    assert within(5, "a", "b", is_bounded)
+    monkeypatch.setattr(answers, "_given_up", set())
+    within(5, "a", "b", lambda: 1)
+    assert not answers._given_up
+    with pytest.raises(DeviceTimeoutError):
+        within(0.01, "a", "b", lambda: let_go.wait(20))
+    (thread,) = answers._given_up
+    let_go.set()
+    thread.join(5)
+    now_s, waited_s = [100.0], list[float]()
+
+    class Late:
+        def __init__(self, takes_s: float) -> None:
+            self.takes_s = takes_s
+
+        def is_alive(self) -> bool:
+            return self.takes_s > 0
+
+        def join(self, timeout: float) -> None:
+            waited_s.append(timeout)
+            now_s[0] += self.takes_s
+
+    monkeypatch.setattr(answers, "_given_up", [Late(0), Late(1), Late(9), Late(1)])
+    monkeypatch.setattr(answers, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    answers._wait_for_given_up()
+    assert waited_s == [3.0, 2.0, 0.0]
 
 
 @pytest.mark.parametrize("has_ended", [True, False])
