@@ -18,7 +18,7 @@ $(STAMP): pyproject.toml
 	@echo "Installing diffuserbench and what it needs into $(VENV) (once; a minute or more) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
 	@echo "Compiling what is compiled once, and trying it (half a minute) ..."
-	@$(BIN)/diffuserbench test
+	@$(BIN)/diffuserbench test || echo "Installed, but not all of it works as it should: see above."
 	@touch $(STAMP)
 
 demo: $(STAMP) ## the main job on the simulated bench: calibrate, photograph, reconstruct, figure
