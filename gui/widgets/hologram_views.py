@@ -385,6 +385,7 @@ def _facts(computed: Computed) -> list[tuple[str, str]]:
     return [
         *facts,
         ("Light", f"{percent(result.efficiency)} of what falls on the SLM reaches the field"),
+        *(("Limited by", words) for words in result.limited_by),
         ("Stopped", f"{stopped}: {result.hologram.stop_reason}"),
         ("Expansion", f"{display.expansion}x on {columns} x {rows} pixels, {display.wavelength_nm:g} nm"),
         *(("Pattern", str(path)) for path in computed.patterns),

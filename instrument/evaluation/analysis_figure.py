@@ -193,8 +193,17 @@ def _mm(um: float) -> str:
 
 
 def _shown(trials: Sequence[PointTrial]) -> PointTrial | None:
-    """Return the smallest resolved trial, or the last."""
-    return next((t for t in trials if t.resolved), trials[-1] if trials else None)
+    """Return the resolved trial nearest to the distance stated, which the last one has; else that one."""
+    if not trials:
+        return None
+    stated = trials[-1]
+
+    def off(trial: PointTrial) -> float:
+        return abs(trial.separation_px - stated.separation_px) + abs(
+            trial.separation_planes - stated.separation_planes
+        )
+
+    return min((trial for trial in trials if trial.resolved), key=off, default=stated)
 
 
 def _note(
@@ -307,7 +316,7 @@ def _sixteen(axes: Axes, trial: PointTrial, a: Analysis) -> None:
     reach = min(1.5 * trial.separation_px * 1.8 + 2, width / 2)
     axes.set_xlim(-reach, reach)
     factor = a.points.sixteen_factor if a.points is not None else None
-    verdict = f"resolved at {factor:.2g} x" if factor is not None else "not resolved"
+    verdict = f"resolved at {factor:.2g} x" if factor is not None else "not always resolved"
     style(axes, f"16 points: {verdict}", "pixels", "planes")
     axes.grid(False)
 

@@ -366,7 +366,9 @@ def point_tests(
         if room > 1:
             sixteen, factor = smallest_told(sixteen_points, 1.0, room)
         if factor is None:
-            notes.append("16 points were not resolved at any separation that fits the window.")
+            notes.append(
+                "16 points were not resolved at nine in ten places at any separation that fits the window."
+            )
     return PointTests(
         px,
         None if apart_planes is None else apart_planes * step_per_um / 2,
