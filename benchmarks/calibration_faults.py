@@ -149,6 +149,11 @@ def _but_for_brightness(found: Array, usual: Array) -> float:
     return _relative(found * (np.vdot(found, usual) / np.vdot(found, found)), usual)
 
 
+def _of_slides(found: Array, usual: Array) -> float:
+    """Return the largest change of a photograph: a slide's brightness is its own."""
+    return max(_but_for_brightness(one, other) for one, other in zip(found, usual, strict=True))
+
+
 def _of_psfs(found: Array, usual: Array) -> float:
     """Return the largest change of shape, relative brightness and relative place (0.1 pixels: 1 %)."""
     first, second = (psfs.mean(axis=1).astype(np.float32) for psfs in (found, usual))
