@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -135,3 +137,52 @@ def test_why_a_file_may_not_be_written_is_said(tmp_path: Path) -> None:
     assert (tmp_path / "a" / "b").is_dir()
     with pytest.raises(FileError, match="is a file; a folder is expected"):
         output_folder(there)
+
+
+def test_an_array_keeps_what_was_written_and_nothing_half_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: dict[str, Any] = {"n_frames": 12, "frame_shape": (6, 8), "pixel_pitch_um": 2.5, "name": "a"}
+    (tmp_path / ".frames.draft" / "left").mkdir(parents=True)
+    array = FrameArray.create(tmp_path / "frames", dtype="uint16", **made)
+    with pytest.raises(TypeError, match="not int64"):
+        FrameArray.create(tmp_path / "other", dtype="int64", **made)
+    scale = json.loads((array.path / "zarr.json").read_text())["attributes"]["ome"]["multiscales"][0]
+    assert scale["datasets"][0]["coordinateTransformations"][0]["scale"] == [1, 2.5, 2.5]
+    assert [axis["name"] for axis in scale["axes"]] == ["t", "y", "x"]
+    images = {index: frame(index).image for index in (10, 2)}
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    stored = array.write(list(images.items()))
+    with monkeypatch.context() as fails:
+        fails.setattr(SyncPool, "files", lambda *_: (_ for _ in ()).throw(OSError("no disk")))
+        with pytest.raises(OSError, match="no disk"):
+            array.write([(3, images[2])])
+    with monkeypatch.context() as fails:
+        fails.setattr("os.write", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+        with pytest.raises(OSError, match="disk full"):
+            array.write([(4, images[2])])
+    assert len(list(Path("/proc/self/fd").iterdir())) <= before
+    array.close()
+    array.close()
+    assert [chunk.n_bytes for chunk in stored] == [96, 96]
+    assert array.checksum(10) == stored[0]
+    assert FrameArray.indices(array.path) == [2, 10]
+    assert FrameArray.indices(tmp_path) == []
+    assert not list(array.path.rglob("part"))
+    half = array.chunk_path(5).with_name("part")
+    half.parent.mkdir(parents=True)
+    half.write_bytes(b"half")
+    array.remove_half_written()
+    assert not half.exists()
+    for index, image in images.items():
+        assert np.array_equal(array.read(index), image)
+        assert array.n_bytes(index) == 96
+    array.chunk_path(2).write_bytes(bytes(40))
+    with pytest.raises(FileError, match="has 40 bytes; frame 2 takes 96: it is damaged"):
+        array.read(2)
+    for index, image, words in (
+        (12, images[2], "outside the array of 12"),
+        (1, images[2].T, "stores uint16"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            array.write([(index, image)])
