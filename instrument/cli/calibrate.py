@@ -174,7 +174,7 @@ def carry_out(
     if wrong := other_bench_for(config, ("camera", *routine.needs), routine.tried_on):
         raise BenchError(wrong)
     with open_and_say(config) as opened:
-        outlook = procedure.outlook(opened, folder)
+        outlook = procedure.foretold(opened, folder)
         print_lines(console, outlook.reasons)
         if dry_run:
             print_lines(console, outlook.plan_lines or _plan_lines(outlook))

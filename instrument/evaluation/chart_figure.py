@@ -48,7 +48,7 @@ def chart_figure(data: ChartData) -> Figure:
     most = max(len({p.setting for p in data.points if p.group == group}) for group in groups)
     grey = "; grey: the other settings, by name in chart.html" if most > MOST_LINES else ""
     note = f"black: nothing is both cheaper and better; bold: on it, with its score and cost there{grey}"
-    figure.text(0.02, top - 0.005, note, fontsize=10, color=FAINT, va="center")
+    figure.text(0.02, top, note, fontsize=10, color=FAINT, va="center")
     if data.about.get("simulated"):
         mark_simulated(figure, (top + 1) / 2)
     return figure
@@ -67,7 +67,7 @@ def _make_room(figure: Figure, grid: npt.NDArray[np.object_], top: float) -> Non
     width = float(lefts[-1]) - _LEFT / 2
     figure.set_figwidth(width)
     figure.subplots_adjust(
-        hspace=0.3, top=top - 0.36 / height, bottom=0.6 / height, left=0.0, right=1.0, wspace=0.0
+        hspace=0.3, top=top - 0.5 / height, bottom=0.6 / height, left=0.0, right=1.0, wspace=0.0
     )
     for column, left in zip(grid.T, lefts, strict=False):
         for axes in column:
@@ -166,7 +166,7 @@ def _name(
     ends.sort()
     heights = _apart([y for y, *_ in ends])
     for height, (y, x, name, family, best) in zip(heights, ends, strict=True):
-        words = " ".join(word for word in name.split(" ") if word not in common) or name
+        words = _telling(name, common)
         if best:
             words += f"  {float(getattr(best[0], score.key)):.3g}, {_in_words(_x(best[0], cost), cost)}"
         axes.annotate(
@@ -206,6 +206,13 @@ def _apart(wanted: Sequence[float]) -> list[float]:
     return [base + number * step for number, base in enumerate(flat)]
 
 
+def _telling(name: str, common: frozenset[str]) -> str:
+    """Return a name without what all names say, but for what follows its last own word: "1% of the light"."""
+    words = name.split(" ")
+    last = max((n for n, word in enumerate(words) if word not in common), default=-1)
+    return " ".join(word for n, word in enumerate(words) if n > last or word not in common)
+
+
 def _common_words(names: Mapping[str, object]) -> frozenset[str]:
     """Return the words that all names have."""
     words = [set(name.split(" ")) for name in names]
@@ -233,7 +240,8 @@ def _scale(axis: XAxis | YAxis, values: Sequence[float], *, logarithmic: bool) -
 def _in_words(value: float, cost: Axis) -> str:
     if cost is SECONDS and value < 0.1:
         return f"{_short(1e3 * value)} ms"
-    unit = {"seconds": "s", "peak_mib": "MiB", "images": "photographs"}[cost.key]
+    photographs = "photograph" if value == 1 else "photographs"
+    unit = {"seconds": "s", "peak_mib": "MiB", "images": photographs}[cost.key]
     return f"{_short(value)} {unit}"
 
 
