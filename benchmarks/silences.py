@@ -33,7 +33,7 @@ TIME = re.compile(r"left \d|about [\d.]+ ?\w+ (left|in all)|in all|longer than l
 """Words that tell a time, or how much of how much is done."""
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 STEPS = {
-    "new": "new sample.toml",
+    "new": "new --camera sample.toml",
     "check": "check",
     "devices": "devices",
     "drivers": "drivers",

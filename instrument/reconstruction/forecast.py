@@ -243,7 +243,7 @@ def forecast(measurement: Measurement, calibration: Calibration, options: Recons
 def _settling(
     measurement: Measurement, calibration: Calibration, options: ReconstructionOptions
 ) -> int | None:
-    """Return after how many iterations a copy of a picture on blocks of pixels settles; None for others."""
+    """Return after how many iterations a copy of a picture on blocks of pixels settles; None where none."""
     known = (measurement.background, measurement.erasures, measurement.patterns)
     small = min(calibration.psfs.shape[-2:]) < LEAST_PX
     if len(calibration.psfs) > 1 or small or options.tolerance == 0 or any(k is not None for k in known):
@@ -253,4 +253,6 @@ def _settling(
     )
     asked = replace(options, judged=False, refine_psf=False, uncertainty=False)
     found = reconstruct(copy, reduced_calibration(calibration, None, BLOCK), asked)
+    if set(found.stop_reasons) != {StopReason.CONVERGED}:  # its number ended it, which tells nothing
+        return None
     return max(len(history) for history in found.histories)
