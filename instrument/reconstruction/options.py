@@ -149,7 +149,7 @@ class InputOptions:
     )
     erasures: ErasuresChoice = option(
         "saturated",
-        help="Pixels left out: none, saturated, FILE's zeros, a share.",
+        help="Pixels left out: none, saturated (hot and dead ones too), FILE's zeros, a share.",
         metavar="WHICH",
         parse=_erasures,
         applies=_NOT_PATTERNED,
