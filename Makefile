@@ -17,6 +17,8 @@ $(STAMP): pyproject.toml
 	  echo "Could not make a virtual environment in '$(VENV)'. On Debian: sudo apt install python3-venv"; exit 1; }
 	@echo "Installing diffuserbench and what it needs into $(VENV) (once; a minute or more) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+	@echo "Compiling what is compiled once, and trying it (half a minute) ..."
+	@$(BIN)/diffuserbench test
 	@touch $(STAMP)
 
 demo: $(STAMP) ## the main job on the simulated bench: calibrate, photograph, reconstruct, figure

@@ -1,11 +1,13 @@
 """The distances that ``analyze`` states, held against points whose light is propagated.
 
     python benchmarks/analysis_points.py [--pairs 20] [--only across along sixteen]
+    python benchmarks/analysis_points.py --pairs 12 --only volume --shares 1 1.5 2.25
 
 The simulated bench's preset ``tiny``, calibrated at two depths with noise. Then points alone, at places
 between pixels and planes that the analysis has not seen, by wave optics: pairs across in a picture as the
 default reconstruction makes it; pairs along the axis and sixteen in x and z in the window that states them.
-Printed is how many are told apart at the stated distance and at 0.8 of it.
+Printed is how many are told apart at the stated distance and at 0.8 of it. ``volume``: pairs along the axis
+and sixteens, each in a cell of its own with the noise that it would have alone, in one default volume.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from recon.types import Calibration
 
 GREEN = (0.0, 1.0, 0.0)
 SHARES = (1.0, 0.8)
+CELL_PX = 30
 
 
 def calibrated(world: SimulatedWorld, depths_um: tuple[float, ...], electrons: float = 1e5) -> Calibration:
@@ -72,6 +75,41 @@ def across(truth: Truth, calibration: Calibration, axis: int, px: float, rng: np
     return smallest_dip(line, np.array([[[0.0, column], [0.0, column + px]]])) >= DIP
 
 
+def in_a_volume(
+    truth: Truth, stack: np.ndarray, grid: PointGrid, count: int, seed: int = 5
+) -> tuple[int, int, str]:
+    """Tell how many grids of points are told apart in one default volume, of how many there is room for."""
+    rng = np.random.default_rng(seed)
+    height, width = stack.shape[1:]
+    rows, columns = (
+        CELL_PX * np.arange(-(n // 4 // CELL_PX), n // 4 // CELL_PX + 1) for n in (height, width)
+    )
+    cells = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2)
+    light, places, peak = np.zeros((height, width)), [], 0.0
+    for cell in rng.permutation(cells)[:count]:
+        row, column = cell + rng.uniform(-0.5, 0.5, 2)
+        x = column + (np.arange(grid.columns) - (grid.columns - 1) / 2) * grid.separation_px
+        z = (len(stack) - 1) / 2 + (np.arange(grid.planes) - (grid.planes - 1) / 2) * grid.separation_planes
+        z = z + rng.uniform(-0.5, 0.5)
+        depths = [float(1 / np.interp(s, np.arange(len(stack)), truth.planes)) for s in z]
+        alone = np.sum([truth.light(row, float(c), one) for one in depths for c in x], axis=0)
+        light, peak = light + alone, max(peak, float(alone.max()))
+        places.append((row, np.stack(np.meshgrid(z, x, indexing="ij"), axis=-1)))
+    # Photons of all are there; noise is that of one.
+    scale = Noise().electrons / peak
+    noise = rng.poisson(scale * light / len(places)) - scale * light / len(places)
+    seen = light + (noise + rng.normal(0, Noise().read_e, light.shape)) / scale
+    at = np.array([(0.0, 0.0, float(1 / v)) for v in truth.planes])
+    calibration = Calibration(stack[:, None].astype(np.float32), at, geometry=truth.world.geometry)
+    made = reconstruct(seen, calibration, estimate_background=False, judged=False)
+    found = 0
+    for row, where in places:
+        middle = round(row) + height // 2
+        line = made.volume[:, middle - 2 : middle + 3].sum(axis=1, dtype=np.float64)
+        found += smallest_dip(line, where + np.array([0.0, width // 2])) >= DIP
+    return found, len(places), f"{made.solver}, {made.prior}"
+
+
 def told(count: int, one: Callable[[np.random.Generator], bool]) -> str:
     """Return how many of so many are told apart."""
     return f"{sum(one(np.random.default_rng(1000 + seed)) for seed in range(count))} of {count}"
@@ -81,7 +119,8 @@ def main() -> None:
     """Analyse, then count."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--pairs", type=int, default=20)
-    parser.add_argument("--only", nargs="+", choices=["across", "along", "sixteen"], default=None)
+    parser.add_argument("--only", nargs="+", choices=["across", "along", "sixteen", "volume"], default=None)
+    parser.add_argument("--shares", nargs="+", type=float, default=[1.0, 1.5], help="Of a volume's points.")
     arguments = parser.parse_args()
     wanted = arguments.only or ["across", "along", "sixteen"]
     world = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
@@ -104,6 +143,21 @@ def main() -> None:
     assert points.axial_per_um is not None
     assert points.lateral_px is not None
     along = points.axial_per_um / per_plane
+    for share in arguments.shares if "volume" in wanted else ():
+        grids = {"two along": PointGrid(1, 2, separation_planes=share * along)}
+        if points.sixteen_factor is not None:
+            factor = share * points.sixteen_factor
+            grids["sixteen"] = PointGrid(4, 4, factor * points.lateral_px, factor * along)
+        for name, grid in grids.items():
+            if (grid.planes - 1) * grid.separation_planes > len(stack) - 2:
+                continue
+            began = time.process_time()
+            count, of, how = in_a_volume(truth, stack, grid, arguments.pairs)
+            print(
+                f"volume ({how}), {name}, {grid.separation_px:.2f} px, {grid.separation_planes:.2f} half "
+                f"steps ({share:g} of stated): {count} of {of}, {time.process_time() - began:.0f} CPU s",
+                flush=True,
+            )
     for name, half in (("along", (4, 4)), ("sixteen", HALF_WINDOW)):
         if name not in wanted or (name == "sixteen" and points.sixteen_factor is None):
             continue

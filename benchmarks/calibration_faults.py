@@ -8,8 +8,10 @@ Each trial carries a routine out twice as a person would, on a bench without fau
 alone, everything else alike, and holds the results against one another. The change is relative; of PSFs it is
 the largest of three: their shape once registered, their brightness relative to one another, and their places
 relative to the first (a tenth of a pixel counts as 1 %); a common shift and a common brightness are none, nor
-is a photograph's brightness. Of
-the angular and of the field's response it is the largest difference, of the SLM's table in turns.
+is a photograph's brightness. Of the angular and of the field's response it is the largest difference, of the
+SLM's table in turns, of a mask's alignment the root mean square of the displacement over the mask, in mask
+pixels of which a tenth counts as 1 %. Of beads it is the photographs that are solved: what is solved of them
+is theirs alone.
 
 =========  ==============================================================================================
 harmless   the result changed by 2 % at the most, and nothing was said
@@ -37,14 +39,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration_routines.display.mask_alignment import AlignmentReport
 from calibration_routines.optics.angular_response import AngularResponse
+from calibration_routines.optics.beads import BeadSlides, photograph_slides
 from calibration_routines.optics.dpc import DiffuserSurface
 from calibration_routines.optics.photograph import Photograph, measure_field_response
-from calibration_routines.procedure import routines
+from calibration_routines.procedure import Listener, routines
 from calibration_routines.scatter import compare
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config, template
 from instrument.files.errors import BenchError
+from instrument.runs.run_control import RunControl
 from recon.camera.registration import moved
 from recon.errors import InputError
 
@@ -193,6 +198,20 @@ def _table(done: Any) -> Array:
     return np.asarray(done.result.correction.phase_of_level_rad) / (2 * np.pi)
 
 
+def _displacement(done: Any) -> Array:
+    assert isinstance(done.result, AlignmentReport)
+    return done.result.displacement(done.result.mask_shape)
+
+
+def _tenths(found: Array, usual: Array) -> float:
+    return 0.1 * float(np.sqrt(np.mean(np.square(found - usual).sum(axis=-1))))
+
+
+def _beads(bench: Bench, folder: Path) -> tuple[Array, list[str], bool]:
+    taken = photograph_slides(bench, BeadSlides(z_um=80e3, images=3), folder, RunControl(), Listener())
+    return taken.images, list(taken.findings), not taken.findings
+
+
 def _field(bench: Bench, folder: Path) -> tuple[Array, list[str], bool]:
     assert bench.stage is not None
     bench.stage.home()
@@ -204,6 +223,14 @@ def _field(bench: Bench, folder: Path) -> tuple[Array, list[str], bool]:
 
 
 _LED, _DISPLAY = template("led_microscope").replace("pixels = 384", "pixels = 160"), template("display")
+for _key, _value in {
+    "shape": "[200, 280]",
+    "relay_distortion_um": "0.0",
+    "shift_um": "[31.0, -42.0]",
+}.items():
+    _DISPLAY = re.sub(rf"(?m)^{_key} = [^#\n]*", f"{_key} = {_value} ", _DISPLAY)
+_SPOTS = {"reach": 8.0, "depth_um": 100.0, "spots": 25, "refinements": 2, "section_pictures": 2}
+_SLIDE = 'scene = "beads"\nscene_distance_mm = 80.0\nbeads = 20\n'
 _NEAR = {"z_min_um": 60e3, "z_max_um": 150e3}
 TRIALS = {
     "axial": Trial(TINY, _routine("axial", _psfs, **_NEAR, planes=7, reference_every=3), _of_psfs),
@@ -223,7 +250,7 @@ TRIALS = {
     "volume": Trial(
         TINY,
         _routine(
-            "volume", _psfs, **_NEAR, planes=4, spacing_um=8e3, half_field_x_um=8e3, half_field_y_um=8e3
+            "volume", _psfs, **_NEAR, planes=4, spacing_um=8e3, half_field_x_um=4e3, half_field_y_um=4e3
         ),
         _of_psfs,
     ),
@@ -231,11 +258,15 @@ TRIALS = {
         TINY, _routine("angular", _response, largest_deg=9.0, step_deg=3.0, z_um=80e3), _largest
     ),
     "field": Trial(TINY, _field, _largest),
+    "beads": Trial(
+        TINY + 'scene = "beads"\nscene_distance_mm = 80.0\nbeads = 20\n', _beads, _but_for_brightness
+    ),
     "photograph": Trial(TINY, _routine("photograph", _picture), _but_for_brightness),
     "dpc": Trial(
         _LED, _routine("dpc", _height, objective_na=0.1, magnification=4.0), _relative, display=True
     ),
     "slm": Trial(_DISPLAY, _routine("slm", _table), _largest, display=True),
+    "mask": Trial(_DISPLAY, _routine("mask", _displacement, **_SPOTS), _tenths, display=True),
 }
 
 

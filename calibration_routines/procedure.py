@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from calibration_routines.times import timed, took_before
 from instrument.bench.bench import Bench
 from instrument.files.atomic import DOUBTFUL, named_by_worth
 from instrument.files.errors import BenchError, FileError, SettingsError
@@ -201,6 +202,11 @@ class Procedure(ABC):
         Raises SettingsError, PlanError, BenchError when it cannot be done as asked.
         """
 
+    def foretold(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Return the outlook with how long it takes in all, where it was done on this bench before."""
+        outlook = self.outlook(bench, folder)
+        return replace(outlook, reasons=(*outlook.reasons, *took_before(self, bench, outlook)))
+
     def carry_out(
         self,
         bench: Bench,
@@ -214,9 +220,9 @@ class Procedure(ABC):
         Raises EndedEarlyError, RunEndedError when it was aborted or stopped (what was taken is kept);
         BenchError, DeviceError when it cannot be done or a device fails.
         """
-        self.outlook(bench, folder)
+        outlook = self.outlook(bench, folder)
         control = control or RunControl()
-        with control.procedure(bench):
+        with control.procedure(bench), timed(self, bench, outlook):
             return self.perform(bench, folder, control, listener or Listener())
 
     @abstractmethod

@@ -14,9 +14,9 @@ from types import FrameType, TracebackType
 from PySide6.QtCore import QCoreApplication, QSettings, QSize, QTimer, qInstallMessageHandler
 from PySide6.QtWidgets import QApplication
 
-from gui.main_window import MainWindow, theme_of
+from gui.main_window import MainWindow
 from gui.session import BenchSession
-from gui.theme import apply_theme
+from gui.theme import apply_theme, theme_of
 from gui.widgets.dialogues import TextWindow
 from instrument.bench.config import BenchConfig
 from instrument.bench.config_file import no_bench

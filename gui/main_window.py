@@ -29,7 +29,7 @@ from gui.panels import PANELS
 from gui.panels.unserved import UnservedPanel
 from gui.session import BenchSession
 from gui.session_news import OperatorRequest, name_of
-from gui.theme import THEMES, change_theme
+from gui.theme import change_theme
 from gui.widgets.building import PanelPlace, button, fill, in_row, label, tabs
 from gui.widgets.device_chips import DeviceChips
 from gui.widgets.dialogues import Question, TextWindow
@@ -462,9 +462,3 @@ class MainWindow(QMainWindow):
             self.restoreGeometry(geometry)
         if state is not None:
             self.restoreState(state)
-
-
-def theme_of(settings: QSettings) -> str:
-    """Return the theme that was chosen last."""
-    name = str(settings.value("theme", "dark"))
-    return name if name in THEMES else "dark"

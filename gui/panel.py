@@ -8,8 +8,9 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 from PySide6.QtCore import QTimer
 from PySide6.QtGui import QGuiApplication
-from PySide6.QtWidgets import QBoxLayout, QLabel, QSizePolicy, QWidget
+from PySide6.QtWidgets import QAbstractButton, QBoxLayout, QLabel, QSizePolicy, QWidget
 
+from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobRunner, Work
 from gui.session import BenchSession
 from gui.session_news import name_of
@@ -51,6 +52,8 @@ class Panel(QWidget):
         self.copy_button = button("Copy as Python", tip, self.copy_as_python)
         self.copy_button.setObjectName("copy-as-python")
         self.copy_button.setFlat(True)
+        self._tips: dict[QWidget, str] = {}
+        """What was refused here, with the tool tip that it had."""
         self._fade = after_rest(self, _REFUSAL_MS, self.accepted)
         fill(self, (self.body, 1), in_row((self._note, 1), self.copy_button), margins=(8, 8, 8, 4), spacing=4)
 
@@ -92,18 +95,31 @@ class Panel(QWidget):
         own.insertWidget(1, ReconnectButton(self.session, kind, self))
 
     # Telling the user ----------------------------------------------------------------------------
+    @property
+    def options_form(self) -> OptionsForm | None:
+        """The form whose fields messages are about; None where the panel has none."""
+        return None
+
+    def in_its_words(self, text: str) -> str:
+        """Return a message with the form's labels where the terminal's has flags."""
+        return text if self.options_form is None else self.options_form.in_its_words(text)
+
     def refused(self, field: QWidget | None, why: str) -> None:
         """Show why something was refused: at the field, and in the panel's last line."""
+        why = self.in_its_words(why)
         if field is not None:
+            if not field.property("refused"):
+                self._tips[field] = field.toolTip()
             mark(field, "refused", True)
             field.setToolTip(why)
         elided(self._note, why)
         self._fade.start()
 
     def accepted(self, field: QWidget | None = None) -> None:
-        """Clear what ``refused`` showed."""
-        if field is not None:
-            mark(field, "refused", False)
+        """Clear what ``refused`` showed: the line, the field, and all buttons, which hold nothing to mend."""
+        for each in [w for w in self._tips if w is field or isinstance(w, QAbstractButton)]:
+            mark(each, "refused", False)
+            each.setToolTip(self._tips.pop(each))
         self._note.clear()
         self._note.setToolTip("")
 

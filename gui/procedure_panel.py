@@ -185,6 +185,11 @@ class ProcedurePanel(Panel):
         return self.routines[self.choice.currentIndex()]
 
     @property
+    def options_form(self) -> OptionsForm:
+        """The form whose fields messages are about."""
+        return self.view
+
+    @property
     def view(self) -> OptionsForm:
         """The form that is shown, as a widget."""
         return self.views[self.routine.name]
@@ -247,7 +252,7 @@ class ProcedurePanel(Panel):
                 if first is not None:
                     return first(bench)
                 assert procedure is not None
-                return procedure.outlook(bench)
+                return procedure.foretold(bench)
             except BenchError as error:
                 return error
 
@@ -445,5 +450,5 @@ class ProcedurePanel(Panel):
         if self._said_at_end:  # it stays while nothing else is asked for
             text = "\n".join([self._said_at_end, *([text] if wrong else [])])
             wrong = wrong or bool(self.verdict.property("refused"))
-        self.verdict.setPlainText(self.view.in_its_words(text))
+        self.verdict.setPlainText(self.in_its_words(text))
         mark(self.verdict, "refused", wrong)

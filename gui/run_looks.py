@@ -16,6 +16,7 @@ from drivers.frame import FrameMetadata
 from gui.widgets.entry import quantity
 from gui.widgets.image_view import usual_levels
 from instrument.bench.photograph import Progress, read_snapshot
+from instrument.files.errors import percent
 from instrument.files.images import read_image
 from instrument.runs.inspection import Verification, verify
 from instrument.runs.run import Run
@@ -112,7 +113,7 @@ def _about_photograph(path: Path) -> list[str]:
     names = {"bench": "Bench", "camera": "Camera", "light": "Light", "average": "Frames averaged"}
     lines += [f"{name}: {said[key]}" for key, name in names.items() if said.get(key) not in (None, "")]
     share = said.get("saturated_fraction")
-    return [*lines, f"Saturated: {share:.3%} of its pixels"] if share else lines
+    return [*lines, f"Saturated: {percent(share)} of its pixels"] if share else lines
 
 
 def _about_run(run: Run, looked: Verification) -> list[str]:

@@ -11,6 +11,7 @@ from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
+from PySide6.QtCore import QSettings
 from PySide6.QtGui import QColor, QPalette
 from PySide6.QtWidgets import QApplication, QDialog, QWidget
 from shiboken6 import isValid
@@ -135,6 +136,12 @@ def colours() -> Colours:
 def sheet() -> str:
     """Return the style sheet of the theme in use."""
     return _style(colours())
+
+
+def theme_of(settings: QSettings) -> str:
+    """Return the theme that was chosen last."""
+    name = str(settings.value("theme", "dark"))
+    return name if name in THEMES else "dark"
 
 
 def apply_theme(app: QApplication, name: str) -> None:

@@ -234,14 +234,17 @@ def bring_mask(bench: Bench, place: Mapping[str, float]) -> None:
     approach_from_below(bench.stage, place)
 
 
-def find_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:
+def find_camera(
+    io: DisplayBench, display: Display, turned_rad: float | None = None
+) -> tuple[CameraMap, float]:
     """Blank the SLM, register the camera by the mask's speckle, and learn how bright the mean intensity is.
 
     Returns that in counts a millisecond. Raises InputError when the speckle is not recognised.
+    ``turned_rad``: how the camera is turned, where that is known.
     """
     io.show(np.ones(display.slm_shape, complex))
     frame = io.photograph(io.bench.camera.exposure_ms)
-    found = register_camera(frame, display, io.across_px(display))
+    found = register_camera(frame, display, io.across_px(display), turned_rad=turned_rad)
     return found, _inner_mean(frame, found)
 
 

@@ -17,6 +17,7 @@ nothing moves at first: each picture holds many spots, each computed for another
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,12 +45,13 @@ from calibration_routines.display.mask_search import (
 from calibration_routines.display.mask_stage import MaskStage, PlacementCost
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine, home_if_needed
 from calibration_routines.scatter import STEADY, Scatter
+from drivers.errors import StoppedError
 from instrument.bench.bench import Bench
 from instrument.display.hologram import Alignment, bench_display, save_alignment
 from instrument.files.atomic import named_by_worth, require_new
 from instrument.files.record import plain
 from instrument.files.slm_image import load_slm_correction
-from instrument.runs.run_control import RunControl
+from instrument.runs.run_control import EndedEarlyError, RunControl
 from recon.errors import InputError
 from recon.holography import Display
 from recon.holography.camera_map import CameraMap
@@ -151,7 +153,7 @@ class MaskAlignment:
 
         Raises AlignmentFailedError when the pose was not found or too many frames would be needed, with
         the stage back where it was; DeviceError when a device fails or a move is refused, with the stage
-        where that left it.
+        where that left it. What else ends it leaves the stage where it is, and says where.
         """
         stage = self.io.bench.stage
         start = stage.commanded_position() if stage is not None else {}
@@ -162,6 +164,12 @@ class MaskAlignment:
                 approach_from_below(stage, start)
             if isinstance(error, InputError):
                 raise AlignmentFailedError(str(error)) from error
+            raise
+        except (EndedEarlyError, StoppedError, KeyboardInterrupt) as error:
+            if stage is not None:
+                here = stage.commanded_position()
+                moved = f"moved from {_told(start)}" if here != start else "not moved"
+                error.add_note(f"The stage stands at {_told(here)} ({moved}).")
             raise
 
     def _run(self) -> AlignmentReport:
@@ -238,6 +246,10 @@ class MaskAlignment:
             session.register()
             return refine_pose(session, best[1].pose, 2, quick=0)
         return visited[-1][1]
+
+
+def _told(place: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:.5g}" for name, value in place.items())
 
 
 def _place(
@@ -359,6 +371,7 @@ def alignment_of(report: AlignmentReport, bench: Bench, mask_shape: tuple[int, i
         bench.stage.commanded_position() if bench.stage else {},
         mask_shape,
         bool(bench.simulated_kinds),
+        psnr_lost_db=report.psnr_lost_db,
     )
 
 
@@ -367,7 +380,6 @@ def _facts(report: AlignmentReport, bench: Bench) -> dict[str, Any]:
         "bench": bench.label,
         "frames": report.frames,
         "found_at": asdict(report.found_at),
-        "psnr_lost_db": report.psnr_lost_db,
         "repeatability_db": None if np.isnan(report.repeatability_db) else report.repeatability_db,
         "axis_directions": report.directions,
         "camera_residual_px": report.camera.residual_px,

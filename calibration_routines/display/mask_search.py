@@ -34,6 +34,9 @@ ALIGNMENT_FILE = "alignment.json"
 STEADY_FRAMES = 5
 """Pictures of the blank SLM at the end, by which flicker and motion are told."""
 
+SCALE_WITHIN = 0.005
+"""Of the field on the camera; it is known ten times better, lens distortion included."""
+
 
 class AlignmentFailedError(BenchError):
     """The mask's pose was not found; the text says at which step and what was seen."""
@@ -133,7 +136,16 @@ class AlignmentSession:
     def register(self) -> None:
         """Blank SLM: register the camera, and learn how bright the mean intensity is."""
         self.spots.register()
-        self.say(f"camera registered to {self.spots.camera.residual_px:.2f} px")
+        camera, display = self.spots.camera, self.display
+        self.say(f"camera registered to {camera.residual_px:.2f} px")
+        if abs((scale := camera.scale) - 1) > SCALE_WITHIN:
+            raise AlignmentFailedError(
+                f"The field is {100 * abs(scale - 1):.1f} % {'larger' if scale > 1 else 'smaller'} on the "
+                f"camera than [display] says: one of its figures is wrong. Either wavelength_nm is "
+                f"{scale * display.wavelength_nm:.1f}, or focal_mm {scale * display.focal_mm:.2f}, or the "
+                f"mask's pixels are {display.mask_pitch_um / scale:.3f} um wide, or the camera's are not "
+                f"{self.io.bench.camera.pixel_pitch_um:g} um."
+            )
 
     def scatter(self) -> Scatter:
         """Photograph the blank SLM some times in a row; return how light and place change meanwhile."""

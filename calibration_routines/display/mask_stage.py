@@ -147,25 +147,41 @@ class MaskStage:
         moved = refine_pose(session, self._moved(at.pose, steps), pictures, quick=1, floor=-1)
         if moved.efficiency < 0.6 * at.efficiency:
             moved = refine_pose(session, at.pose, pictures, quick=3)
-        before, after, error = self.values(at.pose), self.values(moved.pose), self._errors(at, moved)
-        for name, step in steps.items():
-            found = after[name] - before[name]
-            if abs(abs(found) - abs(step)) > max(0.35 * abs(step), 4 * error[name]):
-                self.go(here)
-                raise AlignmentFailedError(
-                    f"Axis {name} of {self.stage.name} was moved by {step:+.3g}; the spots say {found:+.3g} "
-                    f"+- {error[name]:.2g}. Check which axis it is, its unit, and whether the mask is fixed."
-                )
-            self.direction[name] = 1 if found * step > 0 else -1
+        if unlike := self._unlike(at, moved, steps):
+            session.say(f"{', '.join(unlike)} moved otherwise than asked: measured again")
+            moved = refine_pose(session, moved.pose, 2 * pictures, quick=1)
+            unlike = self._unlike(at, moved, steps)
         self.go(here)
         session.register()
         back = refine_pose(session, at.pose, pictures + 1, quick=0)
+        if unlike:  # what was found before may be what was wrong
+            unlike = self._unlike(back, moved, steps)
+        for name, (found, error) in unlike.items():
+            raise AlignmentFailedError(
+                f"Axis {name} of {self.stage.name} was moved by {steps[name]:+.3g}; the spots say "
+                f"{found:+.3g} +- {error:.2g}, measured twice. Check which axis it is, its unit, and whether "
+                "the mask is fixed."
+            )
+        before, after = self.values(back.pose), self.values(moved.pose)
+        self.direction |= {n: 1 if (after[n] - before[n]) * step > 0 else -1 for n, step in steps.items()}
         turned = [name for name, sign in self.direction.items() if sign < 0]
         session.say(
             f"axes tested: {', '.join(self.direction)}"
             + (f"; reversed: {', '.join(turned)}" if turned else "")
         )
         return back, Pose(*(float(v) for v in back.pose.vector() - at.pose.vector()))
+
+    def _unlike(self, a: Measured, b: Measured, steps: Values) -> dict[str, tuple[float, float]]:
+        """Return what axes did that did not do what they were asked for, and how sure that is."""
+        before, after = self.values(a.pose), self.values(b.pose)
+        total: npt.NDArray[np.float64] = np.hypot(a.error, b.error)
+        error = self.values(Pose(*(float(v) for v in total)))
+        went = {name: (after[name] - before[name], error[name]) for name in steps}
+        return {
+            name: found
+            for name, found in went.items()
+            if abs(abs(found[0]) - abs(steps[name])) > max(0.35 * abs(steps[name]), 4 * found[1])
+        }
 
     def take_out(self, at: Measured) -> Pose | None:
         """Move against a pose; returns the pose to be expected, or None where no axis can do anything.
@@ -221,7 +237,3 @@ class MaskStage:
 
     def _with(self, pose: Pose, values: Values) -> Pose:
         return pose.with_(**{PARAMETERS[n]: v / self._units[n] for n, v in values.items()})
-
-    def _errors(self, a: Measured, b: Measured) -> Values:
-        total: npt.NDArray[np.float64] = np.hypot(a.error, b.error)
-        return self.values(Pose(*(float(v) for v in total)))

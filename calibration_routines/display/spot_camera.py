@@ -80,7 +80,8 @@ class SpotCamera:
         Raises InputError when the speckle is not recognised.
         """
         self._before_frame()
-        self.camera, blank_per_ms = find_camera(self.io, self.display)
+        turned = self.camera.turn_rad if self._brightness_known else None
+        self.camera, blank_per_ms = find_camera(self.io, self.display, turned)
         if not self._brightness_known:
             self._before_frame()
             self.mean_per_ms = random_brightness(self.io, self.display, self.camera, blank_per_ms)

@@ -61,6 +61,7 @@ class SlideChanger(Protocol):
         """Show slide ``number``; each has its beads at other places."""
 
 
+_TAKES, _SHORTER = 3, 0.7
 _SOLVER = BlindSettings()
 _DEFLECTION_DEG = 1.0  # by which the diffuser bends light, for the window
 
@@ -218,20 +219,24 @@ def photograph_slides(
         if exposure_ms is None:
             # Slides differ in brightness where beads overlap: leave room.
             exposure_ms = expose_scene(bench, target=0.5).exposure_ms
-        taken = photograph(
-            bench,
-            exposure_ms,
-            folder,
-            average=slides.average,
-            dark_frames=4,
-            binning=slides.binning,
-            control=control,
-            listener=listener,
-        )
+        for take in range(_TAKES):  # shorter where it saturates: a bead's brightness is free anyway
+            taken = photograph(
+                bench,
+                exposure_ms * _SHORTER**take,
+                folder,
+                average=slides.average,
+                dark_frames=4,
+                binning=slides.binning,
+                control=control,
+                listener=listener,
+            )
+            if taken.saturated_pixels == 0:
+                break
         if taken.saturated_pixels > 0:
             raise CalibrationError(
-                f"Photograph {number + 1} saturates in {taken.saturated_pixels} pixels: dim the light or "
-                "spread the beads, and start again."
+                f"Photograph {number + 1} saturates in {taken.saturated_pixels} pixels, the third time, at "
+                "half the exposure: dim the light or spread the beads, and start again. "
+                + " ".join(taken.findings)
             )
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "binning": slides.binning}
         file = named_by_worth(taken.run.path / SLIDE_FILE, doubted=bool(taken.findings))

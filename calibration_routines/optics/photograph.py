@@ -78,8 +78,13 @@ class Photograph:
 
 
 def photograph_findings(taken: Sequence[Photograph]) -> tuple[str, ...]:
-    """Return what is wrong with light and place of photographs whose brightness is each one's own."""
-    scatter = replace(pooled([one.scatter for one in taken]), flicker=0.0)
+    """Return what is wrong with light and place of photographs whose brightness is each one's own.
+
+    Light that flickers is said only where it saturated a frame.
+    """
+    scatter = pooled([one.scatter for one in taken])
+    if not any(one.saturated_pixels for one in taken):
+        scatter = replace(scatter, flicker=0.0)
     other = max((one.ambient for one in taken), key=abs)
     return (*scatter.findings("photograph"), *ambient_findings(other))
 

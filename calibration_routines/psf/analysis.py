@@ -182,6 +182,7 @@ def analyse_sweep(
         stacked[central].sum(axis=(1, 2, 3), dtype=np.float64),
         binned(geometry, binning),
         scatter.brightness_error,
+        [stacked[i] for i in central],
     )
     return SweepAnalysis(
         psfs=stacked,

@@ -140,6 +140,7 @@ def known(geometry: Geometry, *names: str, what: str, otherwise: str = "") -> li
 
 MOST_POINTS_A_SIDE = 41
 """More points along one axis at one depth are a mistake, or need --spacing."""
+_LEAST_SEEN = 0.1  # of a pattern's width
 _REACH_MARGIN = 0.98  # of the stage's travel
 
 
@@ -218,7 +219,30 @@ def grid_sweep(
             points += [(round(float(x), 3), round(float(y), 3), z_um) for x in across]
     if spacing_um is not None:
         reasons.append(f"Spacing: {spacing_um / 1e3:.3g} mm at most, as asked")
-    return GridSweep(tuple(points), tuple(dict.fromkeys(reasons)), tuple(shapes))
+    seen = [point for point in points if _is_seen(bench, point)]
+    if left_out := len(points) - len(seen):
+        told = f"{left_out} of {len(points)} places left out: from there the pattern leaves the sensor"
+        if not seen:
+            raise BenchError(f"{told}. Bring the field nearer to the axis.")
+        reasons.append(told)
+    return GridSweep(tuple(seen), tuple(dict.fromkeys(reasons)), tuple(shapes))
+
+
+def _is_seen(bench: Bench, point: Position) -> bool:
+    """Whether at least a tenth of a pattern's width lies on the sensor; True where that is not known."""
+    geometry, (x_um, y_um, z_um) = bench.geometry, point
+    d_mm, pitch_um, aperture_mm = (
+        geometry.diffuser_distance_mm,
+        geometry.pixel_pitch_um,
+        geometry.aperture_mm,
+    )
+    if d_mm is None or pitch_um is None or aperture_mm is None:
+        return True
+    per_z = 1e3 * d_mm / z_um
+    return all(
+        abs(place) * per_z <= n * pitch_um / 2 + (0.5 - _LEAST_SEEN) * 1e3 * side * (1 + per_z)
+        for place, n, side in zip((y_um, x_um), bench.camera.frame_shape[:2], aperture_mm, strict=True)
+    )
 
 
 def _check_numbers(

@@ -182,8 +182,8 @@ def judge_visit(
     if not abs(after.shift_px - before.shift_px) <= MAX_PLACE_DRIFT_PX + _SURE * scatter.place_error_px:
         findings.append(
             f"{where} the reference's pattern moved from {before.shift_px:.1f} to {after.shift_px:.1f} "
-            f"pixels off its first place (up to {MAX_PLACE_DRIFT_PX:g} expected): the source, the stage or "
-            "the camera moved. Fix it and take the sweep again."
+            f"pixels off its first place (up to {MAX_PLACE_DRIFT_PX:g} expected): the source or the camera "
+            "moved, or the stage slipped or has play (calibrate stage tells). Mend it, and sweep again."
         )
     return tuple(findings)
 

@@ -7,7 +7,7 @@ failures of any type come as a DeviceError; the bench uses no other. What a diff
 exposure              10 % or 0.2 ms, whichever is more: cameras count in lines and tenths of milliseconds
 gain                  25 % or 0.5, whichever is more: some have steps of 2 dB
 binning, format, ...  none; a region lies within the one asked for
- place of an axis      what its driver lets it settle within (3 times its resolution by default), read
+place of an axis      what its driver lets it settle within (3 times its resolution by default), read
                        once more after the move; of a homed stage at any time, 100 times its travel
                        beyond its ends
 pattern, SLM image    none
@@ -24,6 +24,7 @@ import inspect
 import logging
 import math
 import threading
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar, cast
 
@@ -59,6 +60,8 @@ _ENDED_BY = {"snap": "stop_sequence", **dict.fromkeys(_MOVES, "stop")}
 _UNDONE_BY = {"open": "close", "set_pattern": "off", **_ENDED_BY}
 """What is done after a call that ended when it had been given up: it may have lit or moved something."""
 _INTERRUPTED_S = 2.0
+_hanging: weakref.WeakKeyDictionary[Device, list[threading.Thread]] = weakref.WeakKeyDictionary()
+"""Not with the device: its attributes are its driver's."""
 _REMEDY = "Its readings cannot be trusted: check the device, its firmware and its driver."
 
 
@@ -91,7 +94,7 @@ def _guarded_call(made: type, name: str) -> Callable[..., Any]:
             raise _driver_failed(self, name, error) from error
 
     def begins(self: Device, *args: Any, **named: Any) -> Any:
-        _require_ended(self)
+        require_ended(self)
         return call(self, *args, **named)
 
     if not is_timed(name):
@@ -121,11 +124,16 @@ def call_limit_s(device: Device, name: str) -> float:
     return limit_s
 
 
+def given_up(device: Device) -> list[threading.Thread]:
+    """Return a device's calls that were given up; those that hang are alive."""
+    return _hanging.setdefault(device, [])
+
+
 def _in_time(device: Device, name: str, call: Callable[[], _T]) -> _T:
     """Return what a call of a driver returns; one that hangs is given up, and its device not used again."""
-    left: list[threading.Thread] = device.__dict__.setdefault("_left", [])
+    left = given_up(device)
     if name not in _SAFE:
-        _require_ended(device)
+        require_ended(device)
     undo = getattr(device, _UNDONE_BY[name]) if name in _UNDONE_BY else None
     try:
         return within(
@@ -144,9 +152,12 @@ def _in_time(device: Device, name: str, call: Callable[[], _T]) -> _T:
         raise
 
 
-def _require_ended(device: Device) -> None:
-    """Refuse to go on while a call that was given up, or what undoes it, has not ended."""
-    for thread in tuple(device.__dict__.get("_left", ())):
+def require_ended(device: Device) -> None:
+    """Refuse to go on while a call that was given up, or what undoes it, has not ended.
+
+    Raises DeviceTimeoutError, naming the call.
+    """
+    for thread in tuple(given_up(device)):
         if thread.is_alive():
             problem = f"still hangs: {thread.name.removeprefix(f'{device.name}: ')} has not ended."
             raise DeviceTimeoutError(device.name, problem, "Unplug it or switch it off and on.")

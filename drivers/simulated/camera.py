@@ -6,7 +6,9 @@ import hashlib
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +21,7 @@ from drivers.frame import Frame, FrameMetadata
 from drivers.simulated.camera_settings import SimulatedCameraSettings
 from drivers.simulated.faults import disturbed, disturbs
 from drivers.simulated.wire import Pulse
-from drivers.simulated.world import Rgb
+from drivers.simulated.world import Rgb, SimulatedWorld
 from recon.optics.sensor import FixedPattern, Readout, expose
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
@@ -30,6 +32,43 @@ class _Received(NamedTuple):
 
     pulse: Pulse
     seen: threading.Event
+
+
+class _Look:
+    """Light that is computed in a thread of its own: who ends an exposure does not wait for it.
+
+    Parameters
+    ----------
+    see : callable
+        Returns the light.
+    """
+
+    def __init__(self, see: Callable[[], npt.NDArray[np.float32]]) -> None:
+        self._see = see
+        self._seen: npt.NDArray[np.float32] | None = None
+        self._error: Exception | None = None
+        self._over = threading.Event()
+        self.thread = threading.Thread(target=self._run, name="simulated light", daemon=True)
+        self.thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._seen = self._see()
+        except Exception as error:  # noqa: BLE001 - raised where the light is wanted
+            self._error = error
+        finally:
+            self._over.set()
+
+    def give_up(self) -> None:
+        """Let go of who waits; what is being computed is kept by the world."""
+        self._over.set()
+
+    def light(self) -> npt.NDArray[np.float32] | None:
+        """Wait for the light, or raise what kept it from being computed; None: it was given up."""
+        self._over.wait()
+        if self._error is not None:
+            raise self._error
+        return self._seen
 
 
 _MOST_LATE_FRAMES = 4
@@ -48,6 +87,8 @@ class SimulatedCamera(SimulatedCameraSettings):
     drops_counted_by = "device frame numbers"
     longest_silence_s = 120.0
     """What it sees of a new light is computed first, on a large sensor for many seconds."""
+    longest_birth_s = 3600.0
+    """An animal's first light takes two minutes of a processor, which others may have."""
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         super().__init__(options, shared)
@@ -66,6 +107,7 @@ class SimulatedCamera(SimulatedCameraSettings):
         self._lost = 0
         self._failure: DeviceError | None = None
         self._light: tuple[Any, npt.NDArray[np.float32]] | None = None
+        self._looks: list[_Look] = []
         self._pattern: tuple[Any, FixedPattern] | None = None
         self._replay: tuple[npt.NDArray[np.float32], Any, list[tuple[Pixels, float]]] | None = None
 
@@ -81,7 +123,15 @@ class SimulatedCamera(SimulatedCameraSettings):
         """End any sequence and disconnect."""
         if self._is_open:
             self._end()
+            for look in self._looks:  # no thread is left behind
+                look.thread.join()
             self._is_open = False
+
+    @property
+    def longest_wait_s(self) -> float:
+        """What the next frame may take: much where an animal is to be seen."""
+        alive = isinstance(self.world, SimulatedWorld) and self.world.animal is not None
+        return super().longest_wait_s + (self.longest_birth_s if alive else 0.0)
 
     # Taking images ---
     def snap(self) -> Frame:
@@ -163,6 +213,8 @@ class SimulatedCamera(SimulatedCameraSettings):
 
     def _end(self) -> None:
         self._abort.set()
+        for look in self._looks:
+            look.give_up()
         self.world.wires.deaf()
         with self._arrived:
             producer, self._producer = self._producer, None
@@ -343,15 +395,29 @@ class SimulatedCamera(SimulatedCameraSettings):
         key = (self.world.light_key(), self._roi, self._binning)
         if self._light is not None and self._light[0] == key:
             return self._light[1]
-        rows, columns = self._region()
-        total = np.zeros(self.image_shape, np.float32)
-        for sensitivity, mosaic in self._filters():
-            light = self.world.photons_per_s(sensitivity, self._binning)
-            if light is not None:
-                total += light[rows, columns] if mosaic is None else light[rows, columns] * mosaic
+        self._looks = [look for look in self._looks if look.thread.is_alive()]
+        look = _Look(partial(self._absorbed, self._region(), self._binning, self._filters()))
+        self._looks.append(look)
+        total = None if self._abort.is_set() else look.light()
+        if total is None:
+            raise StoppedError(self.name, "the exposure was stopped.")
         # What changed meanwhile (another thread switched a light) must not be found under the old key later.
         unchanged = self.world.light_key() == key[0]
         self._light = (key, total) if unchanged else None
+        return total
+
+    def _absorbed(
+        self,
+        region: tuple[slice, slice],
+        binning: int,
+        filters: list[tuple[Rgb, npt.NDArray[np.float32] | None]],
+    ) -> npt.NDArray[np.float32]:
+        rows, columns = region
+        total = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.float32)
+        for sensitivity, mosaic in filters:
+            light = self.world.photons_per_s(sensitivity, binning)
+            if light is not None:
+                total += light[rows, columns] if mosaic is None else light[rows, columns] * mosaic
         return total
 
     def _filters(self) -> list[tuple[Rgb, npt.NDArray[np.float32] | None]]:

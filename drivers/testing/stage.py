@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from drivers.common.checked import checked
 from drivers.errors import LimitError, StoppedError
 from drivers.stage import Stage
 from drivers.testing.device import DeviceContract
@@ -55,6 +56,16 @@ class StageContract(DeviceContract):
             device.home()
             assert device.is_homed
             assert not device.is_moving
+
+    def test_it_works_as_a_bench_uses_it(self) -> None:
+        device = self.make()
+        device.__class__ = checked(type(device))
+        assert isinstance(device, Stage)
+        with device:
+            device.home()
+            place = device.position()
+            assert device.move_to(place) == pytest.approx(place)
+            assert device.settings() is not None
 
     def test_moves_end_where_they_should(self, stage: Stage) -> None:
         for share in (0.3, 0.6):

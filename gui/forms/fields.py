@@ -54,6 +54,8 @@ class Behaviour:
         empty where it does. One that does not apply has its default.
     beside : callable, optional
         Makes what stands beside a number: a button that finds it.
+    worded : callable
+        Puts the form's labels where a declaration's words have the terminal's flags.
     """
 
     browse: Browse = "open"
@@ -66,6 +68,13 @@ class Behaviour:
     offers: Callable[[], Sequence[str]] | None = None
     enabled_when: Callable[[dict[str, Any]], str] | None = None
     beside: Callable[[], QWidget] | None = None
+    worded: Callable[[str], str] = str
+
+
+def bare_label(option: Option) -> str:
+    """Return an option's label without its unit."""
+    said = option.declaration
+    return option.label.removesuffix(f" ({said.shown_unit or said.unit})")
 
 
 class OptionField(QObject):
@@ -113,8 +122,7 @@ class OptionField(QObject):
     @property
     def bare_label(self) -> str:
         """Its label without the unit."""
-        said = self.option.declaration
-        return self.option.label.removesuffix(f" ({said.shown_unit or said.unit})")
+        return bare_label(self.option)
 
     @property
     def label(self) -> str:
@@ -130,7 +138,7 @@ class OptionField(QObject):
             lines.append(f"{', '.join(limits)}{unit}".capitalize() + ".")
         if default := self.option.declaration.default_words:
             lines.append(f"Default: {default}.")
-        return "\n".join(lines)
+        return self.behaviour.worded("\n".join(lines))
 
     @property
     def default(self) -> Any:
@@ -172,7 +180,7 @@ class NumberField(OptionField):
         empty = ""
         if option.default is None:  # an empty field shows no unit by itself
             said = option.declaration
-            empty = said.default_words or said.none_word or "none"
+            empty = behaviour.worded(said.default_words or said.none_word or "none")
             empty += f" ({self.unit})" if self.unit else ""
         self.widget: NumberEdit = NumberEdit(self.unit, integer=option.is_whole, tip=self.tip, empty=empty)
         self.widget.check = lambda number: self.problem(self._in_own_unit(number))
@@ -298,7 +306,7 @@ class EntryField(OptionField):
         super().__init__(option, behaviour)
         optional = option.default is None and not behaviour.needed
         empty = default_shown(option) or ("none" if optional else "")
-        self.widget: Entry = Entry(self._understood, self.tip, empty)
+        self.widget: Entry = Entry(self._understood, self.tip, behaviour.worded(empty))
         self.whole = self.widget
         if Path in (option.item, *option.kinds[:1]) and len(option.kinds) == 1:
             browse = "folder" if option.declaration.metavar == "FOLDER" else behaviour.browse

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,7 +13,15 @@ from PySide6.QtCore import Qt, QTimer, Signal
 from PySide6.QtWidgets import QFormLayout, QLabel, QLineEdit, QScrollArea, QToolButton, QWidget
 
 from gui.background import NewestOnly
-from gui.forms.fields import Behaviour, ChoiceField, LinesField, OptionField, SwitchField, field_for
+from gui.forms.fields import (
+    Behaviour,
+    ChoiceField,
+    LinesField,
+    OptionField,
+    SwitchField,
+    bare_label,
+    field_for,
+)
 from gui.jobs import JobRunner
 from gui.widgets.building import fill, in_row, label, mark
 from instrument.files.errors import BenchError
@@ -23,6 +33,7 @@ FOLDED = ("Rarely needed", "Advanced")
 """Groups that are folded away, wherever they are declared."""
 
 _ABOVE_HEADING_PX = 6
+_FLAG = re.compile(r"--[a-z][\w-]*")
 _T = TypeVar("_T")
 
 
@@ -86,7 +97,8 @@ class OptionsForm(QWidget):
     def parts(self) -> Iterator[None]:
         """Make the fields, then their rows, with a ``yield`` after each."""
         for option in self._offered:
-            field = field_for(option, self._given.get(option.name, Behaviour()))
+            behaviour = replace(self._given.get(option.name, Behaviour()), worded=self.in_its_words)
+            field = field_for(option, behaviour)
             field.show(field.default)
             self.fields[option.name], self.widgets[option.name] = field, field.widget
             yield
@@ -180,10 +192,8 @@ class OptionsForm(QWidget):
 
     def in_its_words(self, text: str) -> str:
         """Return a message with the fields' labels where the terminal's has flags."""
-        for field in sorted(self.fields.values(), key=lambda f: -len(f.option.flag)):
-            if field.option.flag.startswith("--"):
-                text = text.replace(field.option.flag, f"“{field.bare_label}”")
-        return text
+        labels = {option.flag: f"“{bare_label(option)}”" for option in self._offered}
+        return _FLAG.sub(lambda flag: labels.get(flag[0], flag[0]), text)
 
     # What applies --------------------------------------------------------------------------------
     def applies(self, name: str) -> bool:

@@ -20,6 +20,7 @@ from gui.widgets.building import button, cell, fill, in_row, label, split, table
 from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import follow_orientation
 from gui.widgets.plots import curve_pen, dots, plot_widget
+from instrument.files.errors import percent
 from recon.holography.pose import NAMES
 
 _TRIED = {
@@ -51,6 +52,7 @@ class AlignmentPanel(ProcedurePanel):
         """Make the widgets."""
         self.spots = ImageView()
         follow_orientation(self.session, "frames", self.spots.orient)
+        yield
         self.spot_words = label("No picture yet.", "dim", yields=True)
         self.score: Any = plot_widget("hypothesis", "spot / ideal")
         yield
@@ -61,6 +63,7 @@ class AlignmentPanel(ProcedurePanel):
         self.after = DisplacementPlot("After")
         yield
         self.pose = PoseView()
+        yield
         yield from super().parts()
         self._older: Any = self.score.plot([], [])
         self._points: Any = self.score.plot([], [])
@@ -151,7 +154,7 @@ class AlignmentPanel(ProcedurePanel):
         pens = [warning if n == best else ring for n in range(len(look.spots))]
         self._rings.setData(x=look.columns + 0.5, y=look.rows + 0.5, size=14, brush=None, pen=pens)
         brightest = (
-            f", the brightest at {look.brightness[best]:.0%} of the ideal" if look.of_whole_slm else ""
+            f", the brightest at {percent(look.brightness[best])} of the ideal" if look.of_whole_slm else ""
         )
         self.spot_words.setText(f"{len(look.spots)} spots{brightest}")
         self.spot_words.setToolTip("Each spot is a hypothesis about the mask's pose")

@@ -48,7 +48,7 @@ class ChartsPanel(Panel):
         make = partial(session.handed_on.emit, "tasks", ("chart photograph", {}))
         self.chart = ChartView(Hint(_NO_CHART, "Make one…", make, ("Open…", self._choose)))
         yield
-        tip = "A stability.json or chart.json, made by the commands of those names"
+        tip = "A stability.json or chart.json, made in Files (a chart, a map) or in the terminal"
         self.open_button = button("Open…", tip, self._choose)
         tip = "The maps that come with the program, by which verdicts are made"
         self.shipped_button = button("Shipped maps", tip, lambda: self.open(SHIPPED))

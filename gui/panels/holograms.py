@@ -59,7 +59,7 @@ class _PanelOptions:
     )
     correction: Path | None = option(
         None,
-        help="The SLM's look-up table and flatness, from calibrate slm.",
+        help="The SLM's look-up table and flatness, by the SLM calibration in Sweeps.",
         default_words="an ideal SLM",
         label="SLM's table",
         group="Display",
@@ -89,6 +89,7 @@ class HologramsPanel(Panel):
         yield from self.form.parts()
         self._names = SuggestedName(self.jobs, self.form, session.runs_folder / "holograms", ".png")
         self.views = HologramViews()
+        yield from self.views.parts()
         yield
         self.empty, self.shown = self._hint(), QStackedWidget()
         self.shown.addWidget(self.empty)
@@ -146,6 +147,11 @@ class HologramsPanel(Panel):
             self.form.set_values({"picture": path})
 
         choose_path(self, "open", "Choose a picture", "", chosen, _IMAGES)
+
+    @property
+    def options_form(self) -> OptionsForm:
+        """The form whose fields messages are about."""
+        return self.form
 
     def _make_form(self) -> OptionsForm:
         own, order = ({o.name: o for o in options_of(cls)} for cls in (_PanelOptions, HologramOrder))

@@ -208,8 +208,8 @@ class LivePanel(Panel):
         frame = self.picture.frame
         if frame is not None:
             self._judge_age(frame)
-        if self._waits() or frame is None:
-            return
+        if self._waits() or frame is None or not self.session.is_open("camera"):
+            return  # the line says what is waited for, or what failed
         self.picture.measure()
         self.status.setText(self._figures(frame))
 
@@ -236,7 +236,7 @@ class LivePanel(Panel):
             return False
         words = f"Waiting for {'the first' if frame is None else 'a'} frame for {seconds:.0f} s."
         if self.session.state("camera").simulated:
-            words += " The simulated scene is computed once for each new light: 15 to 30 s at 5 megapixels."
+            words += " The simulated scene is computed once for each new light: some 10 s at 5 megapixels."
         self.status.setText(words)
         return True
 
@@ -249,14 +249,7 @@ class LivePanel(Panel):
             self._camera_words(now),
             f"dropped {now.dropped}",
         ]
-        if frame.metadata.saturated_fraction:
-            words.append(f"saturated {frame.metadata.saturated_fraction:.3%}")
-        state = self.form.state
-        if state is not None and state.temperature_c is not None:
-            words.append(f"{state.temperature_c:.1f} °C")
-        if cross := self.picture.under_cross():
-            words.append(cross)
-        return "   ".join(words)
+        return "   ".join([*words, *filter(None, (self.picture.under_cross(), self.picture.region_words()))])
 
     def _camera_words(self, now: LiveCameraStatus) -> str:
         if now.running:

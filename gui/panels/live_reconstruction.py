@@ -206,14 +206,15 @@ class LiveReconstructionPanel(Panel):
 
         self._reader.ask(read, self._got_calibration)
 
-    def refused(self, field: QWidget | None, why: str) -> None:
-        """Show why something was refused, in the words of the form."""
-        super().refused(field, self.options.in_its_words(why))
+    @property
+    def options_form(self) -> OptionsForm:
+        """The form whose fields messages are about."""
+        return self.options
 
     def _refuse(self, why: str) -> None:
         self.refused(self.file, why)
         if self.loaded is None:
-            self.hint.say(self.options.in_its_words(why))
+            self.hint.say(self.in_its_words(why))
             self.status.setText(_NO_CALIBRATION)
 
     def _got_calibration(self, read: tuple[Path, Calibration] | None) -> None:

@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QTab
 
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
-from gui.forms.options_form import SuggestedName
+from gui.forms.options_form import OptionsForm, SuggestedName
 from gui.forms.reconstruct import CALIBRATION, PSF, ReconstructForm, SoFar, Written, reconstruct_job
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
@@ -142,9 +142,10 @@ class ReconstructionsPanel(Panel):
         self.form.options.settled.connect(self._settled)
         self.refresh()
 
-    def refused(self, field: QWidget | None, why: str) -> None:
-        """Show why something was refused, in the words of the form."""
-        super().refused(field, self.form.options.in_its_words(why))
+    @property
+    def options_form(self) -> OptionsForm:
+        """The form whose fields messages are about."""
+        return self.form.options
 
     # Results -------------------------------------------------------------------------------------
     def refresh(self) -> None:
@@ -188,8 +189,9 @@ class ReconstructionsPanel(Panel):
         self.result = result
         self.heading.setText(f"<b>{result.path.name}</b>")
         self.heading.setToolTip(str(result.path))
-        warnings = [self.form.options.in_its_words(warning) for warning in result.warnings]
-        self.facts.show_facts(result.facts(), warnings, simulated=result.simulated)
+        warnings = [self.in_its_words(warning) for warning in result.warnings]
+        facts = [(name, self.in_its_words(value)) for name, value in result.facts()]
+        self.facts.show_facts(facts, warnings, simulated=result.simulated)
         self.convergence.show_histories(result.histories, result.noise_norm)
         self.export_button.setEnabled(True)
         misfit = any(_REFINABLE in warning for warning in result.warnings)
@@ -328,8 +330,7 @@ class ReconstructionsPanel(Panel):
         self.follow(job)
         self.form.set_running(True)
         self.form.show_progress(0.0, words)
-        said = self.form.options.in_its_words
-        job.failed.connect(lambda why: self.form.show_progress(0.0, said(why).splitlines()[0]))
+        job.failed.connect(lambda why: self.form.show_progress(0.0, self.in_its_words(why).splitlines()[0]))
         job.ended.connect(lambda: self.form.set_running(False))
 
     def _explained(self, choice: Choice) -> None:
@@ -338,7 +339,7 @@ class ReconstructionsPanel(Panel):
             facts.append((decision.name.capitalize(), f"{decision.value}: {decision.why}"))
             steps = (("up", decision.up), ("down", decision.down))
             facts += [("", f"one step {way}: {option}") for way, option in steps if option is not None]
-        self.facts.show_facts(facts)
+        self.facts.show_facts([(name, self.in_its_words(words)) for name, words in facts])
         self.form.show_progress(0.0, f"Chosen in {choice.seconds:.1f} s; the reasons are below the picture.")
 
     def _stop(self) -> None:

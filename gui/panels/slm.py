@@ -42,8 +42,8 @@ class SlmPanel(DevicePanel):
         self.load_button = button("Show", tip, self.load)
         self.blank_button = button("Blank", "All pixels to grey level 0", self.blank)
         self.table_file, self.table_button = path_field(
-            "look-up table: calibration.json from calibrate slm",
-            "What calibrate slm wrote",
+            "look-up table: calibration.json of an SLM calibration",
+            "The calibration.json that the SLM calibration wrote (Sweeps)",
             self.load_table,
             filters="Calibration (*.json)",
         )

@@ -84,12 +84,14 @@ class SweepsPanel(ProcedurePanel):
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
         self.path = PathPlot()
+        yield
         self.frame = ImageView()
         follow_orientation(self.session, "frames", self.frame.orient)
         yield
         self.frame_words = label("No frame yet.", "dim", yields=True)
         self.psfs = PsfTable()
         self.picture = Picture()
+        yield
         yield from super().parts()
         above, self.tabs = split(), tabs({})
         fill(self.right, split(above, self.tabs, sizes=[360, 400], down=True, firm=True))

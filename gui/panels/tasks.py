@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from PySide6.QtCore import Qt, QUrl
 from PySide6.QtGui import QDesktopServices, QFontDatabase, QImage, QPixmap
-from PySide6.QtWidgets import QLineEdit, QListWidget, QListWidgetItem, QStackedWidget, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QVBoxLayout, QWidget
 
 from gui.background import NewestOnly
 from gui.forms.fields import Behaviour
@@ -127,6 +127,11 @@ class TasksPanel(Panel):
         """The task that is chosen."""
         return str(self.choice.currentData())
 
+    @property
+    def options_form(self) -> OptionsForm | None:
+        """The form whose fields messages are about."""
+        return self._pages[self.name].form if self.name in self._pages else None
+
     def choose(self, name: str, **values: Any) -> None:
         """Choose a task and fill in some of its options, as soon as its form is there.
 
@@ -177,9 +182,6 @@ class TasksPanel(Panel):
         if task.subject:
             form.show_for(task.subject)
         form.refused.connect(self.refused)
-        for widget in form.widgets.values():
-            if isinstance(widget, QLineEdit):
-                widget.setPlaceholderText(form.in_its_words(widget.placeholderText()))
         form.set_values({"bench": self.session.config.path})
         names = None
         if place is not None:

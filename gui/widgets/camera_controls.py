@@ -185,7 +185,7 @@ class CameraForm(QWidget):
         widget = self.widgets[name]
         if not isValid(widget):
             return
-        self._panel.accepted()
+        self._panel.accepted()  # what Auto could not do in the settings before is over, too
         if isinstance(widget, QLineEdit):
             widget.setModified(False)
         self._show(state)

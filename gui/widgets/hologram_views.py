@@ -6,7 +6,7 @@ the fovea (Alt with Up and Down: its radius), or a brush for Space.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -23,6 +23,7 @@ from gui.widgets.image_view import ImageView, StretchedImage
 from gui.widgets.plots import curve_pen, plot_widget
 from gui.widgets.result_views import FactsView, ViewGrid
 from instrument.display.hologram_files import drawn_pattern
+from instrument.files.errors import percent
 from recon.holography import HologramRecord, Scores, foveal_weights, painted_weights
 
 WeightsMode = Literal["uniform", "fovea", "painted"]
@@ -244,24 +245,35 @@ _SATURATED = 1e-3
 class HologramViews(QWidget):
     """Shows a hologram as it is computed, and what the camera saw of it.
 
-    ``plane`` chooses the plane that is looked at; the panel has a place for it.
+    ``plane`` chooses the plane that is looked at; the panel has a place for it. It is there once its
+    ``parts`` are made.
     """
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.computed: Computed | None = None
+
+    def parts(self) -> Iterator[None]:
+        """Make the views, with a ``yield`` after each."""
         self.target = WeightsView()
         self.target.graphics.setToolTip(
             "A fovea is dragged, or moved by arrow keys (Alt with Up and Down: its radius). Painting: left "
             "button or Space paints, right button or Backspace rubs out, arrow keys move the brush"
         )
-        self.seen, self.phase, self.captured = ImageView(), ImageView(), ImageView()
+        yield
+        self.seen = ImageView()
+        yield
+        self.phase = ImageView()
+        yield
+        self.captured = ImageView()
+        yield
         self.plane = narrow(choice((), "The plane that is looked at", self._show_plane))
         self.plane.hide()
         self.metrics = FactsView()
         self.plot = plot_widget("iteration", "PSNR", y_unit="dB")
         self.plot.setMinimumSize(120, 80)
         self.plot.setToolTip("PSNR of the seen image, computed, as the optimiser goes")
+        yield
         for view in (self.target, self.seen, self.phase, self.captured):
             view.setMinimumSize(70, 50)
         top = ViewGrid(
@@ -276,6 +288,14 @@ class HologramViews(QWidget):
         both = split(top, below, sizes=[560, 150], down=True)
         both.setStretchFactor(0, 4)
         fill(self, both)
+        self._say_what_is_missing()
+
+    def _say_what_is_missing(self) -> None:
+        """Say in each view that is empty what fills it."""
+        by_solver = "Preview or Compute fills this in"
+        missing = {self.seen: by_solver, self.phase: by_solver, self.captured: "Show and photograph takes it"}
+        for view, words in missing.items():
+            view.set_caption("" if view.image is not None else words)
 
     def begin(self) -> None:
         """Call what is shown of the hologram before by its name, while another is computed."""
@@ -291,6 +311,7 @@ class HologramViews(QWidget):
             self.phase.clear()
         else:
             self._show_phase(self.computed)
+        self._say_what_is_missing()
 
     def _show_phase(self, computed: Computed) -> None:
         self.phase.show_image(drawn_pattern(computed.result.hologram.slm[0]), 0.0, 2 * np.pi)
@@ -299,6 +320,7 @@ class HologramViews(QWidget):
     def show_progress(self, progress: Progress) -> None:
         """Show the phase so far, and how good it is."""
         self.phase.show_image(progress.phase_rad, 0.0, 2 * np.pi)
+        self._say_what_is_missing()
         self._draw_history(progress.history)
 
     def show_computed(self, computed: Computed) -> None:
@@ -309,18 +331,19 @@ class HologramViews(QWidget):
         offer(self.plane, [(f"seen at {z_mm:g} mm", z_mm) for z_mm in depths])
         self.plane.setVisible(len(depths) > 1)
         self._show_plane(0)
-        self.go_back()
         self.captured.clear()
+        self.go_back()
         self.metrics.show_facts(_facts(computed))
 
     def show_photographed(self, photographed: Photographed, picture: str) -> None:
         """Show what the camera saw of it, and how close it is to the target."""
         assert self.computed is not None
         self.captured.show_image(np.maximum(photographed.capture.seen, 0), 0.0, 1.0)
+        self._say_what_is_missing()
         warnings = []
         if photographed.capture.saturated_fraction > _SATURATED:
             warnings.append(
-                f"{photographed.capture.saturated_fraction:.1%} of the camera's pixels are saturated."
+                f"{percent(photographed.capture.saturated_fraction)} of the camera's pixels are saturated."
             )
         if self.computed.order.alignment is None:
             warnings.append(
@@ -361,7 +384,8 @@ def _facts(computed: Computed) -> list[tuple[str, str]]:
     rows, columns = display.slm_shape
     return [
         *facts,
-        ("Light", f"{result.efficiency:.1%} of what falls on the SLM reaches the field"),
+        ("Light", f"{percent(result.efficiency)} of what falls on the SLM reaches the field"),
+        *(("Limited by", words) for words in result.limited_by),
         ("Stopped", f"{stopped}: {result.hologram.stop_reason}"),
         ("Expansion", f"{display.expansion}x on {columns} x {rows} pixels, {display.wavelength_nm:g} nm"),
         *(("Pattern", str(path)) for path in computed.patterns),

@@ -225,6 +225,7 @@ class LivePicture(QWidget):
         self.view.keys.moved.connect(lambda across, down: self._by_keys(across, down, alt=False))
         self.view.keys.resized.connect(lambda across, down: self._by_keys(across, down, alt=True))
         self.view.keys.acted.connect(lambda send: self.region_sent.emit() if send else None)
+        yield
         self.histogram = HistogramPlot()
         self.histogram.levels_dragged.connect(self._levels_by_hand)
         yield
@@ -312,6 +313,13 @@ class LivePicture(QWidget):
         inside = pixel[1] < image.shape[0] and pixel[0] < image.shape[1]
         return f"✛ {self.view.describe(*pixel)}" if inside else ""
 
+    def region_words(self) -> str:
+        """Return the region in the sensor's pixels, as it would be sent; empty where none is drawn."""
+        rectangle, frame = self.region_box.rectangle, self.frame
+        if rectangle is None or frame is None:
+            return ""
+        return f"region {', '.join(map(str, sensor_roi(frame.metadata, *rectangle).as_tuple()))}"
+
     # Inside --------------------------------------------------------------------------------------
     def _measure(self, frame: Frame) -> None:
         self._measured = frame
@@ -329,9 +337,6 @@ class LivePicture(QWidget):
                 f"along the line from x {x0:.0f} y {y0:.0f} to x {x1:.0f} y {y1:.0f} of the sensor (pixels)"
             )
             self.profile_plot.setLabel("bottom", words)
-        if (rectangle := self.region_box.rectangle) is not None:
-            region = sensor_roi(frame.metadata, *rectangle)
-            self.apply_region.setText(f"Send {', '.join(map(str, region.as_tuple()))}")
 
     def _stretch_chosen(self) -> None:
         if self.frame is not None:  # at once, and where the frame is held as well

@@ -15,6 +15,7 @@ from PySide6.QtWidgets import QGraphicsItem, QWidget
 from gui.theme import NAMES, colours
 from gui.widgets.building import button, choice, fill, label, mark, narrow
 from gui.widgets.entry import NumberEdit
+from instrument.files.errors import percent
 from instrument.files.seen import levels_of
 from instrument.live.frame_view import FrameFigures, grouped
 
@@ -47,7 +48,8 @@ def plot_widget(
     """
     plot = _Plot(enableMenu=False)
     plot.restyle()
-    plot.getPlotItem().layout.setContentsMargins(0, 0, 0, 4)  # letters that reach below the line
+    # Room for letters below the line, and for the half of a number that stands at an axis' end.
+    plot.getPlotItem().layout.setContentsMargins(0, 6, 16, 4)
     plot.setLabel("bottom", _label(x_label, x_unit))
     plot.setLabel("left", _label(y_label, y_unit))
     plot.showGrid(x=grid, y=grid, alpha=0.15)
@@ -216,10 +218,10 @@ class RangeBar(QWidget):
     def show_figures(self, figures: FrameFigures) -> None:
         """Show the figures of a frame."""
         self.figures = figures
-        words = f"max {figures.largest} ({figures.share:.1%})   mean {figures.mean:.1f}"
+        words = f"max {figures.largest} ({percent(figures.share)})   mean {figures.mean:.1f}"
         warns = ""
         if figures.saturated > 0:
-            words += f"   SATURATED {max(figures.saturated, 1e-6):.2g}".replace("e-0", "e-") + " of pixels"
+            words += f"   SATURATED {percent(figures.saturated)} of pixels"
             warns = "error"
         elif figures.share > _NEAR_FULL:
             words += "   near full scale"

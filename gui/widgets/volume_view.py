@@ -4,37 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QSignalBlocker, Qt, Signal
-from PySide6.QtGui import QKeySequence, QShortcut
-from PySide6.QtWidgets import (
-    QButtonGroup,
-    QCheckBox,
-    QGridLayout,
-    QProgressBar,
-    QSlider,
-    QStackedWidget,
-    QWidget,
-)
+from PySide6.QtWidgets import QGridLayout, QProgressBar, QStackedWidget, QWidget
 
 from gui.background import NewestOnly
 from gui.jobs import Job, JobContext, JobRunner
 from gui.theme import colours, spares_hues
-from gui.widgets.building import button, fill, in_row, label
+from gui.widgets.building import fill, in_row, label
 from gui.widgets.image_view import StretchedImage, whole_steps
 from gui.widgets.measure import LengthBar, Measure, Region, region_words
 from gui.widgets.plots import LevelsBar, curve_pen, plot_widget
 from gui.widgets.proportions import MOST_BYTES, bytes_in_proportion, in_proportion
 from gui.widgets.turning_view import Planes, TurningView, middle_pitch_um
+from gui.widgets.volume_tools import Mode, PlaneSlider, VolumeTools
 from instrument.files.volumes import Plane, VolumeSource
 from instrument.reconstruction.result_figures import Projections, grey, in_colour_of_depth, project
 from recon.camera.grid import Grid, metric_grid
 
-Mode = Literal["brightest", "slices", "turning"]
 Axis = Literal["z", "y", "x"]
 _AXES: tuple[Axis, Axis, Axis] = ("z", "y", "x")
 
@@ -88,10 +78,14 @@ class VolumeView(QWidget):
 
     def parts(self) -> Iterator[None]:
         """Make the widgets, with a ``yield`` after each part."""
-        self.front, self.coloured = StretchedImage(), StretchedImage()
+        self.front = StretchedImage()
         self.bar = LengthBar(self.front)
         yield
-        self.side, self.top = StretchedImage(keep_aspect=False), StretchedImage(keep_aspect=False)
+        self.coloured = StretchedImage()
+        yield
+        self.side = StretchedImage(keep_aspect=False)
+        yield
+        self.top = StretchedImage(keep_aspect=False)
         yield
         self.profile = plot_widget("plane")
         self._along: Any = self.profile.plot(pen=curve_pen(0))
@@ -112,55 +106,21 @@ class VolumeView(QWidget):
             view.hovered.connect(self.hovered)
         self.profile.setMinimumSize(70, 50)
         yield
-        self.brightest_button = button(
-            "Brightest",
-            "The brightest voxels along each axis (Ctrl+B)",
-            lambda: self.set_mode("brightest"),
-            shortcut="Ctrl+B",
-            checkable=True,
-        )
-        self.slices_button = button(
-            "Slices",
-            "Slices through one point: a click or arrows in a view move it (Ctrl+J)",
-            lambda: self.set_mode("slices"),
-            shortcut="Ctrl+J",
-            checkable=True,
-        )
-        self.turning_button = button(
-            "From any side",
-            "The volume in three dimensions: drag or arrow keys turn it, space keeps it turning (Ctrl+T)",
-            lambda: self.set_mode("turning"),
-            shortcut="Ctrl+T",
-            checkable=True,
-        )
+        self.tools = VolumeTools()
+        self.tools.chosen.connect(self.set_mode)
         yield
         self.turning = TurningView(self._jobs)
         self.turning.failed.connect(self.failed)
         self.turning.opened.connect(self._measure_again)
         self.views, self.stack = QWidget(), QStackedWidget()
-        tip = "Drag over the front view: size, mean, deviation, most, and the mean along depth (Ctrl+M)"
-        self.measure_button = button("Measure", tip, shortcut="Ctrl+M", checkable=True)
         self.measure = Measure(self.front)
-        self.measure_button.toggled.connect(self.measure.set_on)
+        self.tools.measure.toggled.connect(self.measure.set_on)
         self.measure.chosen.connect(self._measured)
-        self.proportions = QCheckBox("True proportions")
-        self.proportions.setToolTip(
-            "Voxels of one size, upright: shapes and lengths as in the scene; without, a plane's voxels are "
-            "as wide as it is far away"
-        )
-        self.proportions.setEnabled(False)
-        self.proportions.toggled.connect(self._look)
+        self.tools.proportions.toggled.connect(self._look)
         self.measured = label(role="value", selectable=True, wraps=True)
         self.measured.hide()
-        group = QButtonGroup(self)
-        for each in (self.brightest_button, self.slices_button, self.turning_button):
-            group.addButton(each)
-        for keys, by in ((Qt.Key.Key_PageUp, -1), (Qt.Key.Key_PageDown, 1)):
-            step = QShortcut(QKeySequence(keys), self, context=Qt.ShortcutContext.WidgetWithChildrenShortcut)
-            step.activated.connect(partial(self._step_plane, by))
-        self.slider = QSlider(Qt.Orientation.Horizontal)
-        self.slider.setToolTip("Depth plane of the front view (arrow keys; Page up and down from every view)")
-        self.slider.setAccessibleName("Depth plane")
+        self.slider = PlaneSlider(self)
+        self.slider.stepped.connect(self._step_plane)
         self.slider.valueChanged.connect(lambda z: self.go_to(z, *self.point[1:]))
         self.plane_label = label()
         self.progress = QProgressBar()
@@ -186,12 +146,10 @@ class VolumeView(QWidget):
         grid.setRowStretch(3, 2)
         grid.setColumnStretch(0, 3)
         grid.setColumnStretch(1, 2)
-        modes = (self.brightest_button, self.slices_button, self.turning_button)
-        bar = in_row(*modes, self.measure_button, self.proportions, None)
         fill(self.views, (grid, 1), in_row((self.slider, 1), self.plane_label))
         self.stack.addWidget(self.views)
         self.stack.addWidget(self.turning)
-        fill(self, bar, self.progress, (self.stack, 1), self.measured, self.levels)
+        fill(self, self.tools, self.progress, (self.stack, 1), self.measured, self.levels)
 
     # What is shown -------------------------------------------------------------------------------
     def open(self, source: VolumeSource, grid: Grid | None = None) -> Job:
@@ -208,9 +166,9 @@ class VolumeView(QWidget):
             grid = None
         self._given, self._grid = source, grid
         size = None if grid is None else bytes_in_proportion(source, grid)
-        self.proportions.setEnabled(size is not None)
-        with QSignalBlocker(self.proportions):
-            self.proportions.setChecked(size is not None and size <= MOST_BYTES)
+        self.tools.proportions.setEnabled(size is not None)
+        with QSignalBlocker(self.tools.proportions):
+            self.tools.proportions.setChecked(size is not None and size <= MOST_BYTES)
         job = self._look()
         assert job is not None
         return job
@@ -221,7 +179,7 @@ class VolumeView(QWidget):
         if given is None:
             return None
         self._show_no_more()
-        if grid is None or not self.proportions.isChecked():
+        if grid is None or not self.tools.proportions.isChecked():
             return self._browse(given, grid)
         job = self._begin(
             f"Bringing {given.path.name} to true proportions",
@@ -276,7 +234,7 @@ class VolumeView(QWidget):
         if self._given is not None:
             self._reader.forget(last=self._given.close)
         self._given = self._grid = None
-        self.proportions.setEnabled(False)
+        self.tools.proportions.setEnabled(False)
 
     def _show_no_more(self) -> None:
         if self._job is not None:
@@ -293,12 +251,11 @@ class VolumeView(QWidget):
     def set_mode(self, mode: Mode) -> None:
         """Show the brightest along each axis, slices through a point, or the volume from any side."""
         self.mode = mode
-        buttons = {"brightest": self.brightest_button, "slices": self.slices_button}
-        buttons.get(mode, self.turning_button).setChecked(True)
+        self.tools.modes[mode].setChecked(True)
         slices, turning = mode == "slices", mode == "turning"
         self.stack.setCurrentWidget(self.turning if turning else self.views)
-        self.measure_button.setVisible(not turning)
-        self.measured.setVisible(not turning and self.measure_button.isChecked())
+        self.tools.measure.setVisible(not turning)
+        self.measured.setVisible(not turning and self.tools.measure.isChecked())
         if turning:
             self._load_renderer()
             self.turning.setFocus()
@@ -372,9 +329,6 @@ class VolumeView(QWidget):
         if self._source is not None and not self.turning.is_open:
             self.turning.open(self._source, self._planes)
 
-    def _show_turning(self) -> None:
-        self.turning.set_looks(self.levels.levels, self.levels.colour_map)
-
     def _measured(self, region: Region) -> None:
         """Say what is in a region of the front view, and draw its mean along depth."""
         shown = self._front_pixels()
@@ -432,7 +386,7 @@ class VolumeView(QWidget):
         for view in (self.front, self.side, self.top, self.coloured):
             view.set_colour_map(self.levels.colour_map)
         if self.mode == "turning":
-            self._show_turning()
+            self.turning.set_looks(self.levels.levels, self.levels.colour_map)
         elif self.mode == "slices":
             self._show_slices()
         elif self.projections is not None:
@@ -444,8 +398,8 @@ class VolumeView(QWidget):
         self._draw(self.top, p.top, levels)
         self._draw(self.side, np.ascontiguousarray(p.side.T), levels)
         self._draw(self.coloured, self._coloured(p), (0.0, 1.0))
-        first, last = (self._depth_words(z) or f", plane {z + 1}" for z in (0, len(p.top) - 1))
-        hues = f"depth as colour: blue{first}, red{last}".replace("blue, ", "blue ").replace("red, ", "red ")
+        first, last = (self._depth_words(z)[2:] or f"plane {z + 1}" for z in (0, len(p.top) - 1))
+        hues = f"depth as colour: blue {first}, red {last}"
         self._name(
             "x–y, brightest over depth",
             "z–y, brightest over x",

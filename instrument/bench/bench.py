@@ -13,7 +13,7 @@ from typing import Self, cast
 
 from drivers.camera import Camera
 from drivers.common.answers import STOP_ANSWER_S, within
-from drivers.common.checked import checked
+from drivers.common.checked import checked, given_up, require_ended
 from drivers.device import Device, SharedPart
 from drivers.errors import DeviceLostError, LimitError
 from drivers.frame import Frame, FrameMetadata
@@ -32,6 +32,8 @@ from recon.types import Geometry
 
 _log = logging.getLogger(__name__)
 _at_exit = ClosingAtExit()
+_hung: dict[str, tuple[Device, Claim]] = {}
+"""Claims of closed benches that are kept, since a call of the device had not ended: it may still act."""
 
 
 class Bench:
@@ -159,8 +161,23 @@ class Bench:
         held = {claim.resource for claim in self._claims}
         device = self.config.devices[kind]
         for resource in device.driver.claims(device.options):
-            if resource not in held:
-                self._claims.append(Claim(resource, self.devices[kind].name))
+            if resource in held:
+                continue
+            if resource in _hung:
+                old, claim = _hung[resource]
+                require_ended(old)
+                del _hung[resource]
+                claim.release()
+            self._claims.append(Claim(resource, self.devices[kind].name))
+
+    def _release(self, claim: Claim) -> None:
+        """Give a device free, unless a call of it hangs: what that does late must meet nobody's work."""
+        for kind, configured in self.config.devices.items():
+            hangs = any(call.is_alive() for call in given_up(self.devices[kind]))
+            if hangs and claim.resource in configured.driver.claims(configured.options):
+                _hung[claim.resource] = self.devices[kind], claim
+                return
+        claim.release()
 
     # What the bench is -------------------------------------------------------------------------
     @property
@@ -351,7 +368,7 @@ class Bench:
             (f"close {device.name}", partial(self.close_device, kind))
             for kind, device in reversed(list(self.devices.items()))
         ]
-        steps += [(f"release {claim.resource}", claim.release) for claim in self._claims]
+        steps += [(f"release {claim.resource}", partial(self._release, claim)) for claim in self._claims]
         self._claims = []
         try:
             try_all(steps)
@@ -365,7 +382,7 @@ class Bench:
         """
         device = self.devices[kind]
         self._opened.discard(device)
-        within(2 * STOP_ANSWER_S, device.name, "closing", device.close)
+        within(2 * STOP_ANSWER_S, device.name, "closing", device.close, left=given_up(device))
 
     def _safe_steps(self) -> list[SafeStep]:
         blanks = self.slm is not None and cast(SlmTable, self.config.devices["slm"].settings).blank_when_safe

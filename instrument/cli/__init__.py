@@ -6,7 +6,10 @@ is one row of the table and one :class:`~instrument.cli.app.App`: ``app`` of its
 
 from __future__ import annotations
 
+import atexit
+import os
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -95,6 +98,26 @@ COMMANDS: Mapping[str, Command] = {
     "table7.1": _task(DISPLAY, "table7.1"),
     "etendue": _task(DISPLAY, "etendue"),
 }
+
+
+def console() -> int:
+    """Run the command line as the program's whole life; returns the exit status.
+
+    Where a thread goes on that nothing can end (a job of the window, a driver's call that hangs), the process
+    ends here, after all that is done when Python ends: foreign code that comes back to an interpreter that is
+    ending aborts it, with a status that says nothing.
+    """
+    status = main()
+    if any(thread.daemon for thread in threading.enumerate()):
+        threading._shutdown()  # type: ignore[attr-defined]  # waits for all others
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            try:
+                stream.flush()
+            except (OSError, ValueError):  # whoever read it has gone
+                status = status or 1
+        os._exit(status)
+    return status
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from instrument.bench.bench import Bench
     from instrument.bench.config import BenchConfig
     from instrument.cli import Command
+    from instrument.runs.run import Run
 
 
 BenchOption = Annotated[
@@ -53,6 +54,28 @@ class RunFolder:
         flags=("--out", "-o"),
         group="Files",
     )
+    figure: Path | None = option(
+        None, help="Also a page: up to twelve of its frames (.png, .pdf, .svg).", group="Files"
+    )
+
+    def check(self) -> None:
+        """Refuse a page that cannot be written, before anything moves."""
+        from instrument.files.figures import check_figure
+
+        if self.figure is not None:
+            check_figure(self.figure, overwrite=None)
+
+    def draw(self, run: Run) -> None:
+        """Draw the page where one is wanted."""
+        if self.figure is None:
+            return
+        from instrument.cli.progress import one_task
+        from instrument.runs.inspection import contact_sheet
+
+        with one_task("Drawing"):
+            drawn = contact_sheet(run, self.figure)
+        if drawn:
+            typer.echo(f"Wrote {self.figure}")
 
 
 _HELP = ("--help", "-h")
@@ -220,7 +243,8 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
     kept_times.about(name)
     try:
         # Not through typer's own main, which would answer Ctrl-C itself before a word is said about it.
-        parser = typer.main.get_command(command.load())
+        with _starting(name):
+            parser = typer.main.get_command(command.load())
         with parser.make_context(f"diffuserbench {name}", list(arguments)) as context:
             parser.invoke(context)
     except BaseException as error:
@@ -230,6 +254,18 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
             raise
         return report(error)
     return 0
+
+
+@contextmanager
+def _starting(name: str) -> Iterator[None]:
+    """Say in a terminal that a command is on its way while its libraries are read: a second or two."""
+    shown = sys.stderr.isatty()
+    sys.stderr.write(f"starting {name} ..." if shown else "")
+    sys.stderr.flush()
+    try:
+        yield
+    finally:
+        sys.stderr.write("\r\x1b[2K" if shown else "")
 
 
 def _be_silent_about_half_made_objects() -> None:

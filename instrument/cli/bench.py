@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from instrument.cli.app import App, BenchOption, examples, load_and_say
+from instrument.cli.progress import one_task
 from instrument.files.errors import BenchError, FileError
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 new_app, check_app, drivers_app, devices_app, gui_app = App(), App(), App(), App(), App()
 
+LOOKING = "Looking for what is connected"
 _OF_THE_WINDOW = ("PySide6", "shiboken6", "pyqtgraph")
 
 
@@ -73,7 +75,10 @@ def new(
     if len(chosen) > 1:
         raise BenchError("Give one of --camera, --display, --microscope and --screen.")
     name = chosen[0] if chosen else _asked_for(TEMPLATES)
-    found = _found_lines() if look else ""
+    found = ""
+    if look:
+        with one_task(LOOKING):
+            found = _found_lines()
     write_text(out, template(name) + found)
     typer.echo(f"Wrote {out}: a SIMULATED {TEMPLATES[name][0]}.")
     if found:
@@ -156,7 +161,8 @@ def check(
     try:
         for kind in opened.devices:
             try:
-                device = opened.open_device(kind)
+                with one_task(f"Opening: {kind}"):
+                    device = opened.open_device(kind)
                 _print_device(console, kind, device)
             except DeviceError as error:
                 failures.append(str(error))
@@ -332,7 +338,8 @@ def devices(
     """
     from drivers.registry.registry import list_devices
 
-    listing = list_devices(probe=probe, say=lambda sentence: typer.echo(sentence, err=True))
+    with one_task(LOOKING):
+        listing = list_devices(probe=probe, say=lambda sentence: typer.echo(sentence, err=True))
     typer.echo(_listing_json(listing) if as_json else _listing_words(listing))
 
 

@@ -174,7 +174,7 @@ def carry_out(
     if wrong := other_bench_for(config, ("camera", *routine.needs), routine.tried_on):
         raise BenchError(wrong)
     with open_and_say(config) as opened:
-        outlook = procedure.outlook(opened, folder)
+        outlook = procedure.foretold(opened, folder)
         print_lines(console, outlook.reasons)
         if dry_run:
             print_lines(console, outlook.plan_lines or _plan_lines(outlook))
@@ -314,7 +314,7 @@ class _RunListener(TerminalListener):
         self.note("  ".join(words))
 
 
-def carry_out_run(procedure: Procedure, bench: Bench, folder: Path) -> None:
+def carry_out_run(procedure: Procedure, bench: Bench, folder: Path) -> Outcome:
     """Carry out a plan, or a run that goes on, with keys; say how it ended and what to do next."""
     control = RunControl()
 
@@ -339,6 +339,7 @@ def carry_out_run(procedure: Procedure, bench: Bench, folder: Path) -> None:
     if isinstance(done.result, Run) and done.result.condition is not RunCondition.COMPLETED:
         typer.echo(f"Go on with: diffuserbench resume {done.result.path}")
     typer.echo(f"{duration(listener.seconds)}. Light off, nothing moving: {bench.label}", err=True)
+    return done
 
 
 def print_lines(console: Console, lines: Sequence[str]) -> None:

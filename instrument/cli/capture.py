@@ -27,7 +27,6 @@ from instrument.cli.app import (
     open_and_say,
 )
 from instrument.cli.progress import keys, one_task
-from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError, duration, size
 from instrument.files.figures import Panel, check_figure, pictures_figure, save_figure
 from instrument.files.seen import as_seen
@@ -140,8 +139,7 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
     target = options.out or Path(photograph_name())
     check_photograph_file(target, options.average, force=options.force)
     if options.figure is not None:
-        check_figure(options.figure)
-        require_new(options.figure, overwrite=options.force)
+        check_figure(options.figure, overwrite=options.force)
         if options.figure.resolve() == target.resolve():
             raise BenchError(f"--figure {options.figure}: the photograph itself has that name; give another.")
     with saying_what_is_left(target), naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
@@ -155,7 +153,9 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
         simulated = bool(opened.simulated_kinds)
     _report(target, taken, light)
     if options.figure is not None:
-        typer.echo(f"Wrote {save_figure(_page(target, taken, light, simulated=simulated), options.figure)}")
+        with one_task("Drawing"):
+            drawn = save_figure(_page(target, taken, light, simulated=simulated), options.figure)
+        typer.echo(f"Wrote {drawn}")
 
 
 def _expose(bench: Bench, light: LightState) -> None:
@@ -240,6 +240,7 @@ def record(
     recording has gaps there, never a shifted index.
     """
     light = capture.light()
+    files.check()
     with naming_as_is(), open_and_say(bench, as_is=capture.as_is) as opened:
         capture.set_camera(opened)
         switch_light(opened, light)
@@ -249,6 +250,7 @@ def record(
             with keys({"q": recorder.stop}):
                 run = recorder.execute()
     _last_words(run)
+    files.draw(run)
 
 
 def _note(status: RecordingStatus) -> str:

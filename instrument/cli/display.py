@@ -158,7 +158,11 @@ def _compute(
 def _frames(target: list[Path], *, video: bool) -> list[list[Pixels]]:
     """Return, for each video frame (or once), the pictures of its planes."""
     if not video:
-        return [[read_image(path).pixels for path in target]]
+        images = [read_image(path) for path in target]
+        for image in images:
+            for note in image.notes:
+                typer.echo(f"{image.path.name}: {note}.", err=True)
+        return [[image.pixels for image in images]]
     if len(target) != 1:
         raise BenchError("--video takes one folder or stack of pictures.")
     return [[frame] for frame in read_stack(target[0]).pixels]
@@ -190,3 +194,5 @@ def _print(label: str, result: HologramResult, options: HologramOptions) -> None
         "through the eye's low-pass)"
     )
     typer.echo(f"  light: {light_words(result, options)}")
+    for words in result.limited_by:
+        typer.echo(f"  limited by {words}")

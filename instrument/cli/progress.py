@@ -49,6 +49,9 @@ class _Left(TimeRemainingColumn):
 
     def render(self, task: Task) -> Text:
         if task.total is not None:
+            if task.time_remaining is None and task.completed and task.elapsed:  # the first step of several
+                left_s = task.elapsed * (task.total / task.completed - 1)
+                return Text(f"left about {duration(left_s)}")
             return Text("left ") + super().render(task)
         expected_s = task.fields.get("expected_s")
         if expected_s is None or task.elapsed is None:

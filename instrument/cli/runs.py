@@ -73,8 +73,11 @@ def run(
     from instrument.cli.calibrate import carry_out_run
 
     plan = load_plan(file)
+    files.check()
     with open_and_say(bench) as opened:
-        carry_out_run(PlanProcedure(plan), opened, files.out or opened.config.data_folder)
+        done = carry_out_run(PlanProcedure(plan), opened, files.out or opened.config.data_folder)
+    if isinstance(done.result, Run):
+        files.draw(done.result)
 
 
 @resume_app.command(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say
+from instrument.cli.progress import one_task
 from instrument.display.hologram import HOLOGRAM, PHOTOGRAPHED, CaptureOptions
 from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError, FileError
@@ -361,9 +362,10 @@ def _show_run(run: Path, picture: Path | None) -> None:
         typer.echo(f"{'to do:':<14}{remedy}")
     damaged = {frame.index for frame in looked.damaged}
     target = picture or run / "summary.png"
-    if not contact_sheet(found, target, leave_out=damaged):
-        return
-    typer.echo(f"{'picture:':<14}{target}")
+    with one_task("Drawing"):
+        drawn = contact_sheet(found, target, leave_out=damaged)
+    if drawn:
+        typer.echo(f"{'picture:':<14}{target}")
 
 
 def _facts(run: Run) -> list[tuple[str, str]]:

@@ -35,6 +35,7 @@ from recon.holography import (
 from recon.holography.display import greatest_defocus_mm, no_mask
 from recon.holography.judge import compare
 from recon.holography.learned import Learned
+from recon.holography.limit import limited_by
 from recon.holography.options import Fit
 from recon.holography.pose import NODES, Pose
 from recon.holography.target import EVERYWHERE, FIRST_ORDER, Window, band_of, near_window
@@ -78,6 +79,8 @@ class HologramResult:
     efficiency: float
     """Part of the light on the SLM that reaches the field, DC term and envelope included; of mirrors the part
     that reaches the picture."""
+    limited_by: tuple[str, ...] = ()
+    """What keeps it from being better, in words."""
 
     def facts(self, options: HologramOptions) -> dict[str, Any]:
         """Return metrics and options, JSON-compatible."""
@@ -86,6 +89,7 @@ class HologramResult:
             "computed": True,
             "metrics": [asdict(score) for score in self.scores],
             "efficiency": round(self.efficiency, 6),
+            "limited_by": list(self.limited_by),
             "metrics_computed_for": {
                 "grid": "alias-free",
                 "envelope": options.envelope,
@@ -111,7 +115,8 @@ def compute_and_judge(
 ) -> HologramResult:
     """Compute one hologram (of one or more planes) and judge it on the alias-free grid.
 
-    ``part`` is where in the field it is judged; by default where the targets count.
+    ``part`` is where in the field it is judged; by default where the targets count. What limits it is told
+    where it has no start, ``initial``.
     """
     model = HologramModel(display, targets, options)
     hologram = compute_hologram(model, initial=initial, callback=callback, cancel=cancel)
@@ -127,7 +132,8 @@ def compute_and_judge(
     efficiency = model.efficiency(hologram.slm)
     if targets[0].window is not None:
         efficiency *= float(within(targets[0].window, whole[0]).sum() / whole[0].sum())
-    return HologramResult(hologram, wanted, seen, raw, scores, efficiency)
+    why = limited_by(display, targets, hologram, model.options, efficiency) if initial is None else ()
+    return HologramResult(hologram, wanted, seen, raw, scores, efficiency, why)
 
 
 def within(window: Window | None, image: npt.NDArray[Any]) -> Image:
@@ -157,6 +163,7 @@ def prepare_target(
     """
     options = options or HologramOptions()
     image = options.lift + (1 - options.lift) * field_picture(pixels, fit=options.fit, srgb=options.srgb)
+    white = float(image.max())  # phases dim nothing: a dark picture is shown, and judged, as a bright one
     window = None if options.mirrors is None else FIRST_ORDER
     if display.near:
         window = near_window(display)
@@ -172,7 +179,7 @@ def prepare_target(
     if share < 1:
         image = _placed(image, EVERYWHERE.shrunk(share))
         window = None if window is None else window.shrunk(share)
-    return Target(image, z_mm, white=1.0, window=window)
+    return Target(image, z_mm, white=white or None, window=window)
 
 
 def _placed(image: Image, window: Window) -> Image:
@@ -213,12 +220,11 @@ def field_picture(
 
     Stretched, it keeps its own number of pixels.
     """
-    image = np.asarray(pixels, np.float64)
-    if image.ndim == 3:
-        image = image.mean(axis=2)
-    image /= _white(pixels)
+    image = np.asarray(pixels, np.float64) / _white(pixels)
     if srgb:
         image = np.where(image <= 0.04045, image / 12.92, ((np.abs(image) + 0.055) / 1.055) ** 2.4)
+    if image.ndim == 3:
+        image = image.mean(axis=2)
     height, width = image.shape
     side = min(height, width) if fit == "cover" else max(height, width)
     if fit == "cover":
@@ -385,6 +391,8 @@ class Alignment:
     """What photographs taught of the display."""
     corrected: bool | None = None
     """Whether they were taken with an SLM calibration, which holds from then on."""
+    psnr_lost_db: float | None = None
+    """What a hologram loses to what is not known of the mask's place."""
 
     def of(self, display: Display) -> Display:
         """Return the display with this mask's displacement.
@@ -398,6 +406,7 @@ class Alignment:
                 f"holds for a mask of {self.mask_shape} pixels; this display's has {display.mask.shape}.",
             )
         displacement = self.pose.displacement(self.mask_shape) + self.rest
+        display = replace(display, lost_db=self.psnr_lost_db)
         if self.learned is None:
             return replace(display, displacement=displacement)
         if display.distance_mm is not None:

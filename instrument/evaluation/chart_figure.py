@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from instrument.evaluation.chart import ChartData, colours_of, title_of
 from instrument.files.figures import FAINT, INK, mark_simulated, style
@@ -22,6 +23,8 @@ _LEAST = {"seconds": 1e-4, "peak_mib": 0.1}
 """Smaller ones are drawn here: what costs next to nothing has no place on a logarithmic axis."""
 _NARROW = 3.0
 """Times the least value up to which an axis is linear, whatever it should be."""
+_PANEL, _LEFT, _NAME_GAP = 4.9, 0.75, 0.22
+"""Inches: of a panel, of its scale and words at the left, from it to the names at its right."""
 _LINE_HEIGHT = 0.068
 """Of a name, in the height of a panel."""
 
@@ -33,33 +36,43 @@ def chart_figure(data: ChartData) -> Figure:
     groups = list(dict.fromkeys(p.group for p in data.points))
     views, colours = _views(data), colours_of(data)
     figure = Figure(figsize=(8.6 * len(views), 1.2 + 4.6 * len(groups)), dpi=100, facecolor="white")
-    top = 1 - 0.6 / figure.get_figheight()
-    grid = figure.subplots(
-        len(groups),
-        len(views),
-        squeeze=False,
-        gridspec_kw={
-            "left": 0.045,
-            "right": 0.83,
-            "wspace": 0.78,
-            "hspace": 0.3,
-            "top": top - 0.36 / figure.get_figheight(),
-            "bottom": 0.6 / figure.get_figheight(),
-        },
-    )
+    grid = figure.subplots(len(groups), len(views), squeeze=False)
     for row, group in zip(grid, groups, strict=True):
         own = [p for p in data.points if p.group == group]
         for axes, (cost, score) in zip(row, views, strict=True):
             draw_chart(axes, own, cost, score, colours)
             axes.set_title(group, fontsize=11, loc="left", color=INK)
+    top = 1 - 0.6 / figure.get_figheight()
+    _make_room(figure, grid, top)
     figure.text(0.02, (top + 1) / 2, title_of(data), fontsize=13, color=INK, weight="bold", va="center")
     most = max(len({p.setting for p in data.points if p.group == group}) for group in groups)
     grey = "; grey: the other settings, by name in chart.html" if most > MOST_LINES else ""
     note = f"black: nothing is both cheaper and better; bold: on it, with its score and cost there{grey}"
-    figure.text(0.02, top - 0.005, note, fontsize=10, color=FAINT, va="center")
+    figure.text(0.02, top, note, fontsize=10, color=FAINT, va="center")
     if data.about.get("simulated"):
         mark_simulated(figure, (top + 1) / 2)
     return figure
+
+
+def _make_room(figure: Figure, grid: npt.NDArray[np.object_], top: float) -> None:
+    """Place the panels, each as wide as another, with room for the longest name beside each column."""
+    from matplotlib.text import Text
+
+    height = figure.get_figheight()
+    names = [  # the text's own width: an annotation's takes its arrow in
+        max(Text.get_window_extent(text).width for axes in column for text in axes.texts) / figure.dpi
+        for column in grid.T
+    ]
+    lefts = np.cumsum([_LEFT, *(_PANEL + _NAME_GAP + name + _LEFT for name in names)])
+    width = float(lefts[-1]) - _LEFT / 2
+    figure.set_figwidth(width)
+    figure.subplots_adjust(
+        hspace=0.3, top=top - 0.5 / height, bottom=0.6 / height, left=0.0, right=1.0, wspace=0.0
+    )
+    for column, left in zip(grid.T, lefts, strict=False):
+        for axes in column:
+            place = axes.get_position()
+            axes.set_position((left / width, place.y0, _PANEL / width, place.height))
 
 
 def _views(data: ChartData) -> list[tuple[Axis, Axis]]:
@@ -111,14 +124,21 @@ def draw_chart(
 
 
 def chosen(runs: Mapping[str, Sequence[Point]], front: Sequence[Point], score: Axis) -> list[str]:
-    """Return at most MOST_LINES settings: the front's best, each family's best, then the best of the rest.
+    """Return at most MOST_LINES settings: the front's, each family's best, then the best of the rest.
 
-    They come in the order of how good they get, the best first.
+    Of the front its ends come first, then those by which the score rises most along it: a dozen that are all
+    but the best would say nothing about what is quick. They are returned the best first.
     """
     sign = 1.0 if score.more_is_better else -1.0
     best = {name: max(sign * float(getattr(p, score.key)) for p in run) for name, run in runs.items()}
     ranked = sorted(runs, key=lambda name: -best[name])
-    on_front = [name for name in ranked if name in {p.setting for p in front}]
+    rises: dict[str, float] = {}
+    reached = -np.inf
+    for point in front:
+        value = sign * float(getattr(point, score.key))
+        rises[point.setting] = rises.get(point.setting, 0.0) + value - reached
+        reached = value
+    on_front = sorted(rises, key=lambda name: (name != ranked[0], -rises[name]))  # the cheapest rose most
     firsts = list({runs[name][0].family: name for name in reversed(ranked)}.values())
     # A third for families, so that each method's best is there to be compared.
     wanted = [*on_front[: MOST_LINES - min(len(firsts), MOST_LINES // 3)], *sorted(firsts, key=ranked.index)]
@@ -146,13 +166,13 @@ def _name(
     ends.sort()
     heights = _apart([y for y, *_ in ends])
     for height, (y, x, name, family, best) in zip(heights, ends, strict=True):
-        words = " ".join(word for word in name.split(" ") if word not in common) or name
+        words = _telling(name, common)
         if best:
             words += f"  {float(getattr(best[0], score.key)):.3g}, {_in_words(_x(best[0], cost), cost)}"
         axes.annotate(
             words,
             (x, y),
-            xytext=(1.04, height),
+            xytext=(1.0 + _NAME_GAP / _PANEL, height),
             xycoords="axes fraction",
             textcoords="axes fraction",
             color=colours[family],
@@ -186,6 +206,13 @@ def _apart(wanted: Sequence[float]) -> list[float]:
     return [base + number * step for number, base in enumerate(flat)]
 
 
+def _telling(name: str, common: frozenset[str]) -> str:
+    """Return a name without what all names say, but for what follows its last own word: "1% of the light"."""
+    words = name.split(" ")
+    last = max((n for n, word in enumerate(words) if word not in common), default=-1)
+    return " ".join(word for n, word in enumerate(words) if n > last or word not in common)
+
+
 def _common_words(names: Mapping[str, object]) -> frozenset[str]:
     """Return the words that all names have."""
     words = [set(name.split(" ")) for name in names]
@@ -213,7 +240,8 @@ def _scale(axis: XAxis | YAxis, values: Sequence[float], *, logarithmic: bool) -
 def _in_words(value: float, cost: Axis) -> str:
     if cost is SECONDS and value < 0.1:
         return f"{_short(1e3 * value)} ms"
-    unit = {"seconds": "s", "peak_mib": "MiB", "images": "photographs"}[cost.key]
+    photographs = "photograph" if value == 1 else "photographs"
+    unit = {"seconds": "s", "peak_mib": "MiB", "images": photographs}[cost.key]
     return f"{_short(value)} {unit}"
 
 

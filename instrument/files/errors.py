@@ -148,6 +148,11 @@ def size(n_bytes: float) -> str:
     raise AssertionError
 
 
+def percent(share: float) -> str:
+    """Return a share for people; a little of something is never called nothing."""
+    return "less than 0.001 %" if 0 < share < 1e-5 else f"{100 * share:.3g} %"
+
+
 def count(number: int, noun: str) -> str:
     """Return how many of something there are: ``1 frame``, ``2 frames``."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

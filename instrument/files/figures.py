@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import whole_file
+from instrument.files.atomic import require_new, whole_file
 from instrument.files.errors import FileError
 
 if TYPE_CHECKING:
@@ -105,13 +105,14 @@ def summary_figure(summary: Summary) -> Figure:
     return figure
 
 
-def check_figure(path: Path) -> None:
-    """Refuse a name that no figure is written under.
+def check_figure(path: Path, *, overwrite: bool | None = True) -> None:
+    """Refuse a name that no figure is written under, or of a file that may not be overwritten.
 
-    Raises FileError.
+    ``overwrite`` is as for :func:`~instrument.files.atomic.require_new`. Raises FileError.
     """
     if path.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise FileError(path, "a figure is written as .png, .pdf or .svg.")
+    require_new(path, overwrite=overwrite)
 
 
 def pictures_figure(

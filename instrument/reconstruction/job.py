@@ -20,7 +20,6 @@ from instrument.reconstruction.mosaic import (
     mosaic_psf,
     on_every_pixel,
     pattern_of,
-    reduce_mosaic,
     suspected_mosaic,
 )
 from instrument.reconstruction.options import InputOptions, NoiseChoice
@@ -58,10 +57,23 @@ class Reduction:
     crop: Crop | None
     binning: int
     """Last."""
+    mosaic: Pattern | None = None
+    """Of a raw frame, whose colours come apart."""
 
     def apply(self, pixels: npt.NDArray[Any]) -> FloatImage:
         """Return a photograph (height, width[, 3]) as a measurement."""
-        return reduce(bin_image(pixels, self.first_binning), self.dark, self.crop, self.binning)
+        return self.seen(pixels)[0]
+
+    def seen(
+        self, pixels: npt.NDArray[Any], valid: npt.NDArray[np.bool_] | None = None
+    ) -> tuple[FloatImage, npt.NDArray[np.bool_] | None]:
+        """Return the same, and which of its ``valid`` pixels were measured; None where all are."""
+        if self.mosaic is None:
+            binned = bin_image(pixels, self.first_binning) if self.first_binning > 1 else pixels
+            return reduce(binned, self.dark, self.crop, self.binning), valid
+        raw = reduce(pixels, on_every_pixel(self.dark, self.first_binning, pixels.shape), None, 1)
+        image, known = matched_mosaic(raw, self.mosaic, self.first_binning, self.crop, self.binning)
+        return image, known if valid is None else known & valid[..., None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,13 +139,11 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
     if pattern is not None and binning is None and factor > 1:
         factor += factor % 2
     erased = erasures_of(inputs.erasures, image, None if pattern else psf.pixels)
-    valid = _reduced_valid(erased, crop, factor)
+    reduction = Reduction(1, level.image, crop, factor, pattern)
+    measurement, valid = reduction.seen(image.pixels, _reduced_valid(erased, crop, factor))
     if pattern is None:
-        measurement = reduce(image.pixels, level.image, crop, factor)
         psf_pixels = reduce(psf.pixels, level.psf, crop, factor)
     else:
-        measurement, known = reduce_mosaic(reduce(image.pixels, level.image, None, 1), pattern, crop, factor)
-        valid = known if valid is None else known & valid[..., None]
         psf_pixels = mosaic_psf(reduce(psf.pixels, level.psf, None, 1), pattern, crop, factor)
     psf_pixels = np.maximum(psf_pixels, 0)
     if not psf_pixels.any():
@@ -166,7 +176,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
             "mosaic": pattern,
         },
         psf.is_simulated or image.is_simulated,
-        Reduction(1, level.image, crop, factor),
+        reduction,
         noise_of(image),
     )
 
@@ -193,20 +203,14 @@ def job_with(
     pattern = pattern_of(inputs.mosaic, image)
     if calibration.psfs.shape[1] > 1 and not (image.is_colour or pattern):
         raise FileError(image.path, f"is grey, but the calibration {folder} is colour.")
-    pixels, level = calibrated_dark(inputs.dark, image, calibration, match)
+    level = calibrated_dark(inputs.dark, image, calibration, match)
     factor = inputs.binning or 1
     nearest = np.moveaxis(calibration.psfs[calibration.nearest_to_axis()], 0, -1)
     erased = erasures_of(inputs.erasures, image, None if pattern else nearest)
     matched = replace(erased, valid=None if erased.valid is None else reduce_valid(erased.valid, None, match))
-    valid = _reduced_valid(matched, crop, factor)
-    if pattern is None:
-        measurement = reduce(pixels, level.image, crop, factor)
-    else:
-        offset = on_every_pixel(level.image, match, image.pixels.shape)
-        measurement, known = matched_mosaic(
-            reduce(image.pixels, offset, None, 1), pattern, match, crop, factor
-        )
-        valid = known if valid is None else known & valid[..., None]
+    reduction = Reduction(match, level.image, crop, factor, pattern)
+    measurement, valid = reduction.seen(image.pixels, _reduced_valid(matched, crop, factor))
+    if pattern is not None:
         calibration = in_colour(calibration, pattern, match)
     return Job(
         measurement,
@@ -234,7 +238,7 @@ def job_with(
             "mosaic": pattern,
         },
         bool(calibration.provenance.get("simulated")) or image.is_simulated,
-        Reduction(match, level.image, crop, factor),
+        reduction,
         noise_of(image),
     )
 

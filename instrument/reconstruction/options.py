@@ -22,6 +22,7 @@ NoiseChoice = NoiseModel | float | Literal["estimate"] | None
 _FILES, _PHOTOGRAPH, _VIDEO, _OUTPUT = "Input", "The photograph", "Videos", "Output"
 _KEPT = ("picture", "volume")
 _NOT_PATTERNED = ("picture", "volume", "video")
+_EVERY = (*_NOT_PATTERNED, "patterned picture")
 
 
 def _dark(text: str) -> DarkChoice:
@@ -100,7 +101,7 @@ class SourceOptions:
     )
     calibration: Path | None = option(
         None,
-        help="Instead of --psf: a calibration, or a run with one.",
+        help="A calibration, or a run with one, instead of a PSF image.",
         metavar="FOLDER",
         flags=("--calibration", "-c"),
         applies=("picture", "video", "patterned picture"),
@@ -133,7 +134,7 @@ class InputOptions:
         help="Window in pixels, of PSF and image; HxW is centred.",
         metavar="T,L,H,W|HxW",
         parse=Crop.parse,
-        applies=_NOT_PATTERNED,
+        applies=_EVERY,
         group=_PHOTOGRAPH,
     )
     binning: int | None = option(
@@ -144,7 +145,7 @@ class InputOptions:
         least=1,
         flags=("--bin",),
         metavar="N|auto",
-        applies=(*_NOT_PATTERNED, "patterned picture"),
+        applies=_EVERY,
         group=_PHOTOGRAPH,
     )
     erasures: ErasuresChoice = option(
@@ -152,7 +153,7 @@ class InputOptions:
         help="Pixels left out: none, saturated (hot and dead ones too), FILE's zeros, a share.",
         metavar="WHICH",
         parse=_erasures,
-        applies=_NOT_PATTERNED,
+        applies=_EVERY,
         group=_PHOTOGRAPH,
     )
     mosaic: MosaicChoice = option(
@@ -162,7 +163,7 @@ class InputOptions:
         flags=("--bayer",),
         metavar="MOSAIC",
         parse=mosaic_named,
-        applies=("picture", "volume"),
+        applies=_EVERY,
         label="Colour mosaic",
         group=_PHOTOGRAPH,
     )
@@ -172,7 +173,7 @@ class InputOptions:
         default_words="by metadata",
         metavar="COUNTS",
         parse=_noise,
-        applies=_NOT_PATTERNED,
+        applies=_EVERY,
         group=_PHOTOGRAPH,
     )
     allow_saturated: bool = option(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tempfile
 import threading
 import zipfile
 from collections.abc import Callable
@@ -15,9 +16,11 @@ import numpy.typing as npt
 
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError, FileError
+from instrument.files.images import ImageFile
 from instrument.plan.model import DARK, PATTERN
-from instrument.reconstruction.job import Job, find_calibration, reduced_calibration
-from instrument.reconstruction.preparation import reduce
+from instrument.reconstruction.job import Job, find_calibration, job_with
+from instrument.reconstruction.mosaic import pattern_of
+from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import refocused
 from instrument.runs.run import Run
 from recon import Measurement, reconstruct
@@ -34,6 +37,9 @@ SHEET_ITERATIONS = 60
 SMOOTHING_SHARE = 0.03
 """Width of the patterns' smoothing relative to the picture's short side: light of LEDs varies slowly, the
 noise of a sheet's picture does not."""
+
+SWAPPED = 1.5
+"""Times as rough as the scene is a sheet that is taken for one."""
 
 LEAST_LIGHT = 0.05
 """Where the sheet, lit by all groups together, shines less than this share of its bright part, its patterns
@@ -52,8 +58,8 @@ class PatternedRequest:
     """A run of the same plan, a plain white sheet in the scene's place; or patterns themselves as ``.npy``,
     (n_patterns, height, width) on the calibration's pixels."""
     calibration: Path
-    binning: int = 1
-    """Of the calibration's pixels."""
+    inputs: InputOptions = field(default_factory=InputOptions)
+    """How every frame becomes part of the measurement; the plan has its own dark frame."""
     options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
 
 
@@ -63,9 +69,8 @@ class PreparedPatterned:
 
     job: Job
     """Its measurement is the sum of all frames: the scene in even light."""
-    frames: Floats
-    patterns: Floats
-    """float32, (n_patterns, height, width): counts less dark; shares of the light of all groups together."""
+    measurement: Measurement
+    """All frames, with what is known of them, under the patterns: shares of the light of all groups."""
     request: PatternedRequest
 
 
@@ -80,32 +85,29 @@ def prepare_patterned(
     together.
     """
     folder = find_calibration(request.calibration)
-    calibration = _grey(load_calibration(folder), request.binning)
+    calibration = replace(load_calibration(folder), background=None)
     run = Run.open(request.run)
-    frames = _frames(run, calibration, request.binning)
-    warnings = list(_saturation(run))
-    simulated = run.is_simulated or bool(calibration.provenance.get("simulated"))
-    job = Job(
-        frames.sum(axis=0),
-        calibration,
-        {
-            "Calibration": f"{folder}: PSFs of {frames.shape[1]} x {frames.shape[2]}",
-            "Image": f"{run.path}: {len(frames)} patterns",
+    lit = _Lit.of(run, calibration, folder, request.inputs)
+    job = replace(
+        lit.job,
+        measurement=lit.frames.sum(axis=0),
+        notes={
+            **{name: text for name, text in lit.job.notes.items() if name not in ("Image", "Dark")},
+            "Image": f"{run.path}: {len(lit.frames)} patterns",
             "Sheet": str(request.sheet),
         },
-        warnings=(),
         provenance={
+            **lit.job.provenance,
             "run": str(run.path.resolve()),
             "sheet": str(request.sheet.resolve()),
-            "calibration": str(folder.resolve()),
-            "binning": request.binning,
         },
-        simulated=simulated,
+        simulated=lit.job.simulated or run.is_simulated,
     )
     if request.options.z_um is not None:
         job = refocused(job, request.options.z_um)
+    warnings = [*job.warnings, *_saturation(run)]
     if request.sheet.suffix.lower() == ".npy":
-        patterns = _patterns_from_file(request.sheet, frames.shape)
+        patterns = _patterns_from_file(request.sheet, lit.frames.shape[:3])
     else:
         sheet = Run.open(request.sheet)
         if sheet.path.samefile(run.path):
@@ -116,8 +118,17 @@ def prepare_patterned(
             )
         _require_same_plan(run, sheet)
         warnings += _saturation(sheet)
-        patterns = _patterns_of(_frames(sheet, calibration, request.binning), job, request, on_progress)
-    return PreparedPatterned(replace(job, warnings=tuple(warnings)), frames, patterns, request)
+        white = _Lit.of(sheet, calibration, folder, request.inputs)
+        patterns, rough = _patterns_of(white, job, request, on_progress)
+        even = None if lit.erased is None else lit.erased.any(axis=0)
+        if rough > SWAPPED * _roughness(_look(Measurement(job.measurement, erasures=even), job, request)):
+            warnings.append(
+                f"{sheet.path} is rougher than {run.path}, as a scene is and a plain sheet is not: the two "
+                "may be swapped."
+            )
+    noise = job.binned_noise(request.inputs.noise)
+    measurement = Measurement(lit.frames, noise, erasures=lit.erased, patterns=patterns)
+    return PreparedPatterned(replace(job, warnings=tuple(warnings)), measurement, request)
 
 
 def solve_patterned(
@@ -129,7 +140,7 @@ def solve_patterned(
     """Reconstruct the one picture that explains all frames, in the brightness of all groups together."""
     request = prepared.request
     return reconstruct(
-        Measurement(prepared.frames, patterns=prepared.patterns),
+        prepared.measurement,
         prepared.job.calibration,
         request.options,
         on_progress=None if watch is None else lambda record, _: watch(record),
@@ -137,46 +148,50 @@ def solve_patterned(
     )
 
 
-def _frames(run: Run, calibration: Calibration, binning: int) -> Floats:
-    """Return a run's pattern frames less its dark one, grey, on the picture's pixels."""
-    labels = {step.label for step in run.steps()} if run.plan is not None else set()
-    if not {DARK, PATTERN} <= labels:
-        raise FileError(
-            run.path,
-            f"is no run of active illumination: it has no frames called {DARK!r} and {PATTERN!r}.",
-            "diffuserbench plan illumination writes a plan that has them; diffuserbench run carries it out.",
-        )
-    if run.missing():
-        raise FileError(
-            run.path, f"lacks {len(run.missing())} frames.", "diffuserbench resume takes the rest."
-        )
-    if any("bayer" in r.metadata.pixel_format.lower() for r in run.records.values()):
-        raise FileError(run.path, "has raw frames of a colour mosaic; active illumination takes grey frames.")
-    dark = _as_grey(run.images(DARK)).mean(axis=0)
-    lit = _as_grey(run.images(PATTERN)) - dark
-    height, width = (n * binning for n in calibration.psfs.shape[-2:])
-    match = max(lit.shape[1] // height, 1)
-    # The calibration's own rest, less than a binned pixel, is left out at the right and below.
-    fits = [n // match // binning for n in lit.shape[1:]] == list(calibration.psfs.shape[-2:])
-    if not fits:
-        raise FileError(
-            run.path,
-            f"has frames of {lit.shape[1]} x {lit.shape[2]}, but the PSFs are {height} x {width}: no whole "
-            "binning brings one to the other.",
-            "Photograph with the region of interest and binning of the calibration.",
-        )
-    return np.stack([reduce(frame, 0.0, None, match * binning) for frame in lit])
+@dataclass(frozen=True, slots=True)
+class _Lit:
+    """A run's pattern frames on the picture's pixels."""
 
+    job: Job
+    """Of the first one."""
+    frames: Floats
+    """(n_patterns, height, width[, 3]): less the dark frame."""
+    erased: npt.NDArray[np.bool_] | None
 
-def _as_grey(images: npt.NDArray[Any]) -> Floats:
-    images = images.astype(np.float32)
-    return images.mean(axis=-1) if images.ndim == 4 else images
-
-
-def _grey(calibration: Calibration, binning: int) -> Calibration:
-    """Return the calibration with grey PSFs on binned pixels."""
-    grey = replace(calibration, psfs=calibration.psfs.mean(axis=1, keepdims=True), background=None)
-    return reduced_calibration(grey, None, binning)
+    @classmethod
+    def of(cls, run: Run, calibration: Calibration, folder: Path, inputs: InputOptions) -> _Lit:
+        """Bring each frame to the calibration as a photograph is brought; grey ones have grey PSFs."""
+        labels = {step.label for step in run.steps()} if run.plan is not None else set()
+        if not {DARK, PATTERN} <= labels:
+            raise FileError(
+                run.path,
+                f"is no run of active illumination: it has no frames called {DARK!r} and {PATTERN!r}.",
+                "diffuserbench plan illumination writes a plan that has them; diffuserbench run carries it "
+                "out.",
+            )
+        if run.missing():
+            raise FileError(
+                run.path, f"lacks {len(run.missing())} frames.", "diffuserbench resume takes the rest."
+            )
+        jobs = []
+        with tempfile.TemporaryDirectory() as where:
+            dark = Path(where) / "dark.npy"
+            images = run.images(DARK)
+            np.save(dark, images[0] if len(images) == 1 else images.mean(axis=0, dtype=np.float32))
+            for index, step in enumerate(run.steps(PATTERN)):
+                told = {"pixel_format": run.metadata(step.index).pixel_format}
+                frame = ImageFile(Path(f"{run.path} pattern {index}"), run.frame(step), metadata=told)
+                if not (frame.is_colour or pattern_of(inputs.mosaic, frame)):
+                    calibration = replace(calibration, psfs=calibration.psfs.mean(axis=1, keepdims=True))
+                jobs.append(job_with(calibration, folder, frame, replace(inputs, dark=dark)))
+        frames = np.stack([job.measurement for job in jobs])
+        if all(job.valid is None for job in jobs):
+            return cls(jobs[0], frames, None)
+        valid = np.ones(frames.shape, bool)
+        for seen, job in zip(valid, jobs, strict=True):
+            if job.valid is not None:
+                seen &= job.valid if job.valid.ndim == seen.ndim else job.valid[..., None]
+        return cls(jobs[0], frames, ~valid)
 
 
 def _require_same_plan(run: Run, sheet: Run) -> None:
@@ -210,22 +225,43 @@ def _patterns_from_file(path: Path, shape: tuple[int, ...]) -> Floats:
 
 
 def _patterns_of(
-    sheet: Floats, job: Job, request: PatternedRequest, on_progress: Callable[[int, int], object]
-) -> Floats:
-    """Reconstruct the sheet under each group, smooth, and take the share of each in all of them."""
+    sheet: _Lit, job: Job, request: PatternedRequest, on_progress: Callable[[int, int], object]
+) -> tuple[Floats, float]:
+    """Reconstruct the sheet under each group, smooth, and take the share of each in all of them.
+
+    Beside it: how rough the sheet is in all light.
+    """
+    pictures = []
+    on_progress(0, len(sheet.frames))
+    for index, frame in enumerate(sheet.frames):
+        erased = None if sheet.erased is None else sheet.erased[index]
+        pictures.append(_look(Measurement(frame, erasures=erased), job, request))
+        on_progress(len(pictures), len(sheet.frames))
+    smooth = np.stack([np.maximum(_smoothed(picture), 0) for picture in pictures])
+    return _shares(smooth, request.sheet), _roughness(np.sum(pictures, axis=0))
+
+
+def _look(measurement: Measurement, job: Job, request: PatternedRequest) -> Floats:
+    """Return a quick grey picture in one light."""
+    image = reconstruct(
+        measurement, job.calibration, z_um=request.options.z_um, solver="admm", iterations=SHEET_ITERATIONS,
+        model="convolution", judged=False,
+    ).image  # fmt: skip
+    grey: Floats = image.mean(axis=-1) if image.ndim == 3 else image
+    return grey
+
+
+def _smoothed(picture: Floats) -> Floats:
     from scipy.ndimage import gaussian_filter
 
-    sigma = SMOOTHING_SHARE * min(sheet.shape[1:])
-    pictures = []
-    on_progress(0, len(sheet))
-    for frame in sheet:
-        found = reconstruct(
-            frame, job.calibration, z_um=request.options.z_um, solver="admm", iterations=SHEET_ITERATIONS,
-            model="convolution", judged=False,
-        )  # fmt: skip
-        pictures.append(np.maximum(gaussian_filter(found.image, sigma), 0))
-        on_progress(len(pictures), len(sheet))
-    return _shares(np.stack(pictures), request.sheet)
+    smooth: Floats = gaussian_filter(picture, SMOOTHING_SHARE * min(picture.shape))
+    return smooth
+
+
+def _roughness(picture: Floats) -> float:
+    """Return what smoothing takes off a picture, relative to it."""
+    whole = float(np.linalg.norm(picture))
+    return float(np.linalg.norm(picture - _smoothed(picture))) / whole if whole > 0 else 0.0
 
 
 def _shares(patterns: Floats, path: Path) -> Floats:

@@ -310,25 +310,22 @@ def dark_level(choice: DarkChoice, psf: ImageFile, image: ImageFile) -> Dark:
     return dark_from_counts(choice)
 
 
-def calibrated_dark(
-    choice: DarkChoice, image: ImageFile, calibration: Calibration, match: int
-) -> tuple[FloatImage, Dark]:
-    """Return the image on the calibration's pixels, and what to subtract there; the PSFs need nothing."""
-    pixels = bin_image(image.pixels, match)
+def calibrated_dark(choice: DarkChoice, image: ImageFile, calibration: Calibration, match: int) -> Dark:
+    """Return what to subtract from an image on the calibration's pixels; the PSFs need nothing."""
     if isinstance(choice, Path):
         dark = dark_from_file(read_image(choice), image)
-        return pixels, replace(dark, image=bin_image(np.asarray(dark.image), match))
+        return replace(dark, image=bin_image(np.asarray(dark.image), match))
     if choice != "auto":
-        return pixels, dark_from_counts(choice)
+        return dark_from_counts(choice)
     if calibration.background is not None:
         background = np.moveaxis(calibration.background, 0, -1)
-        return pixels, Dark(
+        return Dark(
             background[..., 0] if background.shape[-1] == 1 else background,
             0.0,
             f"the calibration's background (mean {float(background.mean()):.1f} counts)",
         )
     darkest = darkest_block(image.pixels)
-    return pixels, Dark(darkest, 0.0, f"{darkest:.4g} counts: the image's darkest 10 x 10 pixels (estimated)")
+    return Dark(darkest, 0.0, f"{darkest:.4g} counts: the image's darkest 10 x 10 pixels (estimated)")
 
 
 # Size ------------------------------------------------------------------------------------------------

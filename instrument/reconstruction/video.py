@@ -17,6 +17,7 @@ import numpy as np
 from instrument.files.atomic import write_json
 from instrument.files.errors import BenchError, FileError
 from instrument.files.films import as_shown, write_mp4
+from instrument.files.images import write_image
 from instrument.files.record import plain
 from instrument.files.volumes import is_zarr_name, stem_of
 from instrument.reconstruction.job import Job, Reduction
@@ -259,8 +260,8 @@ def _first_picture(request: VideoRequest, run: Run, index: int) -> Job:
     if inputs.erasures == "saturated":
         inputs = replace(inputs, erasures="none")
     with tempfile.TemporaryDirectory() as folder:
-        image = Path(folder) / f"{run.path.name} frame {index}.npy"
-        np.save(image, run.frame(index))
+        image = Path(folder) / f"{run.path.name} frame {index}.tif"
+        write_image(image, run.frame(index), {"pixel_format": run.metadata(index).pixel_format})
         asked = PictureRequest(
             image=image,
             psf=request.psf,

@@ -29,6 +29,7 @@ from instrument.files.errors import FileError
 from instrument.files.record import RecordFormat, plain
 from instrument.files.volumes import stem_of
 from instrument.reconstruction.job import Reduction
+from instrument.reconstruction.mosaic import mosaic_named
 from instrument.reconstruction.preparation import Crop
 from recon.base.declare import record
 from recon.base.noise import NoiseModel
@@ -99,6 +100,7 @@ class VideoJob:
             "dark": np.asarray(reduction.dark, np.float32),
             "binning": np.array([reduction.first_binning, reduction.binning]),
             "crop": _crop_array(reduction.crop),
+            "mosaic": np.array(reduction.mosaic or ""),
         }
         with whole_file(folder / _CAMERA) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
@@ -170,7 +172,9 @@ class VideoJob:
         first, last = (int(n) for n in a["binning"])
         dark = a["dark"] if a["dark"].ndim else float(a["dark"])
         crop = Crop(*(int(n) for n in a["crop"])) if a["crop"].size else None
-        return Reduction(first, dark, crop, last)
+        mosaic = mosaic_named(str(a["mosaic"]) or "none")
+        assert mosaic != "auto"
+        return Reduction(first, dark, crop, last, mosaic)
 
 
 def _problem_arrays(problem: Problem) -> dict[str, Any]:

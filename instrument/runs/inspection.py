@@ -13,6 +13,7 @@ from instrument.bench.photograph import PHOTOGRAPHS, Progress
 from instrument.files.errors import ranges
 from instrument.files.figures import save_figure
 from instrument.files.images import image_metadata
+from instrument.files.seen import as_seen
 from instrument.runs.repair import file_problems
 from instrument.runs.run import DamagedFrame, FinishReason, Run, RunCondition, is_run
 from instrument.runs.run_files import LOG, FileProblem, RunError
@@ -144,9 +145,9 @@ COLUMNS, ROWS = 4, 3
 
 
 def contact_sheet(run: Run, path: Path, *, leave_out: Collection[int] = ()) -> list[int]:
-    """Write a picture of up to twelve of a run's frames, spread evenly, as PNG; returns which.
+    """Write a page of up to twelve of a run's frames, spread evenly; returns which.
 
-    Each frame is stretched from its 0.1th to its 99.9th percentile; pixels at full scale are red. Frames to
+    Each frame is shown as it is seen (sRGB, contrast by percentiles); pixels at full scale are red. Frames to
     ``leave_out`` are not shown; where none are left, nothing is written.
 
     Raises FileError when ``path`` cannot be written.
@@ -181,14 +182,13 @@ def contact_sheet(run: Run, path: Path, *, leave_out: Collection[int] = ()) -> l
 def _shown(run: Run, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
     frame = run.frame(index)
     step = max(1, frame.shape[1] // 640)
-    frame = frame[::step, ::step].astype(np.float32)
-    low, high = np.percentile(frame, (0.1, 99.9))
-    grey = np.clip((frame - low) / max(high - low, 1.0), 0, 1)
-    picture = grey if grey.ndim == 3 else np.repeat(grey[..., None], 3, axis=2)
+    frame = frame[::step, ::step]
+    seen = as_seen(frame, raw=True).astype(np.float32) / 255
+    picture = seen if seen.ndim == 3 else np.repeat(seen[..., None], 3, axis=2)
     full_scale = (1 << run.metadata(index).significant_bits) - 1
     saturated = frame >= full_scale if frame.ndim == 2 else np.any(frame >= full_scale, axis=2)
     picture[saturated] = (1, 0, 0)
-    return picture.astype(np.float32)
+    return np.asarray(picture, np.float32)
 
 
 @dataclass(frozen=True, slots=True)

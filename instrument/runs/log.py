@@ -68,8 +68,10 @@ class FrameRecord:
         """Return what :meth:`to_json` wrote."""
         unknown: dict[str, Any] = {}
         metadata = value_of(FrameMetadata, line["metadata"], unknown)
-        if not all(isinstance(number, int) for number in (*metadata.roi, metadata.binning)):
-            raise TypeError(f"region {metadata.roi} and binning {metadata.binning!r} are no whole numbers")
+        one = metadata
+        whole = (*one.roi, one.binning, one.frame_id, one.host_time_ns, one.dropped_before)
+        if not all(isinstance(number, int) for number in (*whole, one.device_time_ns or 0)):
+            raise TypeError(f"not all of {whole} and {one.device_time_ns!r} are whole numbers")
         if metadata.binning < 1:
             raise ValueError(f"there is no binning {metadata.binning}")
         if not (isinstance(bits := metadata.significant_bits, int) and 1 <= bits <= 64):
@@ -305,7 +307,7 @@ def _record(line: bytes) -> dict[str, Any] | None:
     try:
         record = parse_json(text)
         if not found and isinstance(record, dict) and record.get("kind") == "frame":
-            FrameRecord.from_json(record)
+            FrameRecord.from_json(record).shape_and_type()
     except (LookupError, TypeError, ValueError, AttributeError):
         return None
     return record if isinstance(record, dict) else None

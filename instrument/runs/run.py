@@ -333,7 +333,10 @@ class Run:
         except (OSError, LookupError, TypeError, ValueError, FileError) as error:
             if first is None:
                 raise RunError(self.path / FRAMES, f"is damaged: {error}.") from error
-        return FrameArray(self.path / FRAMES, description_of(self.n_frames, *first.shape_and_type()))
+        try:
+            return FrameArray(self.path / FRAMES, description_of(self.n_frames, *first.shape_and_type()))
+        except ValueError as error:
+            raise RunError(self.path / LOG, f"is damaged: frame {first.index}: {error}.") from error
 
     @property
     def frames(self) -> zarr.Array[Any]:

@@ -29,7 +29,7 @@ class ActivityFiles:
     """What is looked at, and where results go."""
 
     video: Path = option(
-        help="A video of reconstruct --video, or a recording (then with --calibration).",
+        help="A reconstructed video, or a recording (then with --calibration).",
         metavar="VIDEO|RUN",
         positional=True,
         group="Files",

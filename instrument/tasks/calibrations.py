@@ -19,6 +19,8 @@ from recon.types import Calibration
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from recon.analysis.compare import Comparison
+
 
 @dataclass(frozen=True, kw_only=True)
 class AnalysisFiles:
@@ -79,7 +81,8 @@ class CompareOptions:
     out: Path | None = option(
         None, help="Write the figures as JSON.", metavar="FILE", flags=("--out", "-o"), label="Figures"
     )
-    force: bool = option(False, help="Overwrite a file that exists.", label="Overwrite")
+    figure: Path | None = option(None, help="Also a page: the PSFs on one another (.png, .pdf, .svg).")
+    force: bool = option(False, help="Overwrite files that exist.", label="Overwrite")
 
 
 @task(
@@ -105,9 +108,8 @@ def analyze(desk: Desk, files: AnalysisFiles, settings: AnalysisSettings, noise:
     from recon.evaluation.two_points import reached
 
     out, record = files.out, files.out.with_suffix(".json")
-    check_figure(out)
-    for file in (out, record):
-        require_new(file, overwrite=files.force)
+    check_figure(out, overwrite=files.force)
+    require_new(record, overwrite=files.force)
     if files.response is not None and (instead := given.flags("cutoff_deg", "fall_off_deg")):
         raise BenchError(f"--response says what {' and '.join(instead)} would: give one of them.")
     measured_response = None if files.response is None else load_response(files.response)
@@ -169,7 +171,7 @@ def _titles(calibration: Calibration, folder: Path) -> tuple[str, str]:
 
 @task(
     "diffuserbench compare runs/last-week runs/today",
-    "diffuserbench compare before after --out bump.json",
+    "diffuserbench compare before after --out bump.json --figure bump.png",
 )
 def compare(desk: Desk, options: CompareOptions) -> Done:
     """Say what moved between two calibrations: shift, scale, rotation, likeness, brightness.
@@ -182,9 +184,11 @@ def compare(desk: Desk, options: CompareOptions) -> Done:
     from instrument.reconstruction.job import find_calibration
     from recon.analysis.compare import compare as compare_calibrations
 
-    out = options.out
+    out, page = options.out, options.figure
     if out is not None:
         require_new(out, overwrite=options.force)
+    if page is not None:
+        check_figure(page, overwrite=options.force)
     folders = [find_calibration(folder) for folder in (options.old, options.new)]
     with desk.step("reading"):
         first, second = (load_calibration(folder) for folder in folders)
@@ -213,7 +217,39 @@ def compare(desk: Desk, options: CompareOptions) -> Done:
     if out is not None:
         record = {"old": str(folders[0].resolve()), "new": str(folders[1].resolve()), **asdict(found)}
         write_json(out, plain(record))
-    return Done(() if out is None else (out,), good=not found.due)
+    if page is not None:
+        from instrument.files.figures import save_figure
+
+        with desk.step("drawing"):
+            save_figure(_compared_page(first, second, found), page)
+    return Done(tuple(file for file in (out, page) if file is not None), good=not found.due)
+
+
+def _compared_page(old: Calibration, new: Calibration, found: Comparison) -> Figure:
+    """Draw both PSFs at the middle one of the compared depths, and on one another; what moved beside them."""
+    import numpy as np
+
+    from instrument.files.figures import Panel, pictures_figure
+    from instrument.files.seen import as_seen
+    from recon.analysis.compare import binned_alike
+    from recon.camera.refocus import psf_at
+
+    old, new, _ = binned_alike(old, new)
+    z_um = found.changes[len(found.changes) // 2].z_um
+    before, after = (as_seen(psf) / 255 for psf in (psf_at(old, z_um), psf_at(new, z_um)))
+    where = depth_in_words(z_um)
+    panels = [
+        Panel("old", before, where, white=1.0),
+        Panel("new", after, where, white=1.0),
+        Panel("both", np.stack([before, after, after], axis=-1), "old red, new cyan, alike grey", white=1.0),
+    ]
+    lines = [("due", "recalibrate" if found.due else "no recalibration")]
+    for c in found.changes:
+        turned = "" if c.rotation_deg is None else f", turned {c.rotation_deg:+.3f}°"
+        moved = f"{c.columns:+.2f}, {c.rows:+.2f} px{turned}"
+        lines += [(depth_in_words(c.z_um), moved), ("", f"alike {c.as_is:.3f}, aligned {c.aligned:.3f}")]
+    simulated = any(c.provenance.get("simulated") for c in (old, new))
+    return pictures_figure("Two calibrations compared", panels, lines, simulated=bool(simulated))
 
 
 @task(
@@ -242,8 +278,7 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
     if "points" in given and options.response is None:
         raise BenchError("--points is how many places --response makes: give --response too.")
     if options.figure is not None:
-        check_figure(options.figure)
-        require_new(options.figure, overwrite=options.force)
+        check_figure(options.figure, overwrite=options.force)
     folder = find_calibration(options.calibration)
     with desk.step("reading"):
         measured = load_calibration(folder)
@@ -293,7 +328,8 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
         return Done((path,))
     from instrument.files.figures import save_figure
 
-    return Done((path, save_figure(_refocused_page(measured, new), options.figure)))
+    with desk.step("drawing"):
+        return Done((path, save_figure(_refocused_page(measured, new), options.figure)))
 
 
 def _refocused_page(measured: Calibration, new: Calibration) -> Figure:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from instrument.display.hologram_files import rows, write_chart, write_csv
 from instrument.files.atomic import require_new
+from instrument.files.figures import ACCENT, INK, check_figure, save_figure, style
 from instrument.files.sample_images import DEFAULT_SAMPLES, SAMPLES, load_sample
 from instrument.tasks.task import Desk, Done, saying_what_is_left, task
 from recon.base.declare import option
@@ -20,6 +23,9 @@ from recon.holography import (
     pixels_per_degree,
 )
 from recon.holography.judge import GRIDS, METHODS, Cell, run_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def _pictures(typed: str) -> list[str]:
@@ -57,6 +63,8 @@ class EtendueOptions:
         None, help="Say the eyebox left at this width of field.", unit="deg", above=0, flags=("--fov",)
     )
     eyebox_mm: float | None = option(None, help="Say the field left with this eyebox.", unit="mm", above=0)
+    figure: Path | None = option(None, help="Also a page: eyebox against field of view (.png, .pdf, .svg).")
+    force: bool = option(False, help="Overwrite a page that exists.", label="Overwrite")
 
     def along(self, pixels: int, expansion: float) -> Etendue:
         """Return one axis of the display."""
@@ -101,6 +109,7 @@ class TableOptions:
     "diffuserbench etendue --slm 2464x4160 --pitch-um 3.74 --wavelength-nm 532 --fov 120",
     "diffuserbench etendue --slm 2464x4160 --pitch-um 3.74 --wavelength-nm 532 --eyebox-mm 10",
     "diffuserbench etendue --slm 540x960 --pitch-um 16 --expansion 16 --f1-mm 75 --f2-mm 150",
+    "diffuserbench etendue --fov 60 --figure etendue.png",
 )
 def etendue(desk: Desk, options: EtendueOptions) -> Done:
     """Field of view, eyebox and pixels per degree of a holographic display (Kuo 2020, Eqs. 7.1 to 7.10).
@@ -109,6 +118,8 @@ def etendue(desk: Desk, options: EtendueOptions) -> Done:
     approximation (the dissertation's 1.05 mm for the GAEA-2 at 120 degrees is the latter).
     """
     (height, width), fov, eyebox_mm = options.slm, options.fov_deg, options.eyebox_mm
+    if options.figure is not None:
+        check_figure(options.figure, overwrite=options.force)
     expansions = (options.expansion,) if options.expansion else (1.0, 4.0, 16.0, 36.0)
     nm = options.wavelength_nm
     lines = []
@@ -142,7 +153,31 @@ def etendue(desk: Desk, options: EtendueOptions) -> Done:
     if fov is not None and eyebox_mm is not None:
         exact_n, small_n = (pixels_for(nm, fov, eyebox_mm, paraxial=p) for p in (False, True))
         desk.say(f"Both without a mask need {exact_n} pixels (paraxial {small_n}) along the width.")
-    return Done()
+    if options.figure is None:
+        return Done()
+    axes = [options.along(width, q) for q in expansions]
+    with desk.step("drawing"):
+        return Done((save_figure(_etendue_page(axes, title, options), options.figure),))
+
+
+def _etendue_page(displays: Sequence[Etendue], title: str, options: EtendueOptions) -> Figure:
+    """Draw what each expansion leaves of eyebox and field of view; a dot where these lenses put it."""
+    import numpy as np
+    from matplotlib.figure import Figure
+
+    page = Figure(figsize=(7.5, 5.2), dpi=110, layout="constrained", facecolor="white")
+    axes = page.add_subplot()
+    degrees = np.linspace(2, 178, 177)
+    for display in displays:
+        left_mm = [eyebox_for_field_of_view(display, float(deg)) for deg in degrees]
+        (line,) = axes.semilogy(degrees, left_mm, label=f"expansion {display.expansion:g}")
+        axes.plot(display.field_of_view_deg, display.eyebox_mm, "o", color=line.get_color())
+    for wanted, draw in ((options.fov_deg, axes.axvline), (options.eyebox_mm, axes.axhline)):
+        if wanted is not None:
+            draw(wanted, color=ACCENT, linewidth=1, linestyle="--")
+    style(axes, title, "field of view (degrees)", "eyebox (mm)")
+    axes.legend(frameon=False, labelcolor=INK, title="dots: with these lenses")
+    return page
 
 
 @task(

@@ -93,7 +93,7 @@ def patterned(
     desk: Desk,
     runs: PatternedRuns,
     source: Annotated[SourceOptions, Only("patterned", "calibration")],
-    inputs: Annotated[InputOptions, Only("binning")],
+    inputs: Annotated[InputOptions, Only("crop", "binning", "erasures", "mosaic", "noise")],
     options: ReconstructionOptions,
     output: Annotated[OutputOptions, Only("out", "rotate_deg", "force")],
 ) -> Done:
@@ -107,7 +107,7 @@ def patterned(
         run=runs.run,
         sheet=source.patterned,
         calibration=source.calibration,
-        binning=inputs.binning or 1,
+        inputs=inputs,
         options=options,
     )
     return reconstruct_patterns(desk, request, Outputs.named(output.out or PICTURE), output)

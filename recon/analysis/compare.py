@@ -93,7 +93,7 @@ def _size(calibration: Calibration) -> str:
     return f"{pixels}, {channels} colour{'s' if channels > 1 else ''}"
 
 
-def _binned_alike(old: Calibration, new: Calibration) -> tuple[Calibration, Calibration, float]:
+def binned_alike(old: Calibration, new: Calibration) -> tuple[Calibration, Calibration, float]:
     """Return both on the coarser one's pixels, and the side of the new one's pixels over the old one's.
 
     Raises InputError where they cannot be laid on one another: another camera, or another region of interest.
@@ -142,7 +142,7 @@ def compare(old: Calibration, new: Calibration) -> Comparison:
 
     Raises InputError when the PSFs are of other regions or cameras, or depths are not known.
     """
-    old, new, ratio = _binned_alike(old, new)
+    old, new, ratio = binned_alike(old, new)
     depths, planes = central_psfs(new)
     chosen = sorted({0, len(depths) // 2, len(depths) - 1})
     exposure = _exposure_ratio(old, new)

@@ -79,11 +79,12 @@ def correlate(first: Array, second: Array) -> Correlation:
     if first.shape != second.shape or first.ndim != 2:
         raise InputError(f"Two images of one shape are correlated, not {first.shape} and {second.shape}.")
     shape = fft.fast_shape([2 * n - 1 for n in first.shape])
+    single = first.dtype == second.dtype == np.float32
     spectra, norm = [], 1.0
     for image in (first, second):
-        padded = np.zeros(shape, np.float64)
+        padded = np.zeros(shape, np.float32 if single else np.float64)
         padded[: image.shape[0], : image.shape[1]] = image
-        norm *= float(np.linalg.norm(padded))
+        norm *= float(np.linalg.norm(np.asarray(image, np.float64)))
         spectra.append(fft.rfft(padded))
     circular = fft.irfft(spectra[0] * np.conj(spectra[1]), shape[1])
     height, width = first.shape

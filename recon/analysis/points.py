@@ -147,7 +147,10 @@ def try_points(
                 f"{grid.columns} x {grid.planes} points {grid.separation_px:.3g} px and "
                 f"{grid.separation_planes:.3g} planes apart do not fit the window."
             )
-        light = np.sum([image(float(c), float(s)) for s in z for c in x], axis=0)
+        if isinstance(image, _Shifted):
+            light = image.of(x, z)
+        else:
+            light = np.sum([image(float(c), float(s)) for s in z for c in x], axis=0)
         seen = problem.solve(noise.expose(light, rng)).sum(axis=1)
         places = np.stack(np.meshgrid(z, x + problem.half[1], indexing="ij"), axis=-1)
         dips.append(smallest_dip(seen, places))
@@ -320,18 +323,14 @@ def point_tests(
             "the axis only. Choose a nearer depth for tests along it."
         )
     planes = np.stack([psf_at(float(1 / v)) for v in inverse])
-    shifted = _Shifted(psf_at, inverse, planes.shape[1:])
-
-    def point(columns: float, s: float) -> Array:
-        return shifted(columns, s) if image is None else image(columns, shifted.depth_um(s))
-
-    on_progress(0.1)
     middle = len(planes) // 2
+    points: list[PointImage] = []
+    for of in (inverse, inverse[middle : middle + 1]):
+        shifted = _Shifted(psf_at, of, planes.shape[1:])
+        points.append(shifted if image is None else shifted.seen_by(image))
+    point, in_plane = points
+    on_progress(0.1)
     across = WindowProblem(planes[middle][None], HALF_WINDOW)
-
-    def in_plane(columns: float, _s: float) -> Array:
-        return point(columns, middle)
-
     lateral, px = smallest_told(
         lambda apart, seed: try_points(
             across, in_plane, PointGrid(2, separation_px=apart), noise, seed=seed, trials=1
@@ -392,17 +391,27 @@ class _Shifted:
         """Return the depth of a place between planes, evenly in 1/z."""
         return float(1 / np.interp(s, np.arange(len(self._inverse)), self._inverse))
 
+    def seen_by(self, image: Callable[[float, float], Array]) -> PointImage:
+        """Return points between the planes by images of points at depths."""
+        return lambda columns, s: image(columns, self.depth_um(s))
+
     def __call__(self, columns: float, s: float) -> Array:
-        height, width = self._light
-        part = int(_PARTS * s)
-        share = _PARTS * s - part if len(self._inverse) > 1 else 0.0
-        spectrum = (1 - share) * self._spectrum(part)
-        if share > 0:
-            spectrum = spectrum + share * self._spectrum(part + 1)
+        return self.of(np.array([columns]), np.array([s]))
+
+    def of(self, columns: Array, places: Array) -> Array:
+        """Return the light of a point at each of ``columns`` in each of ``places``: one transform."""
+        total = np.zeros((self._shape[0], self._shape[1] // 2 + 1), np.complex64)
+        for s in places:
+            part = int(_PARTS * s)
+            share = np.float32(_PARTS * s - part if len(self._inverse) > 1 else 0.0)
+            total += (1 - share) * self._spectrum(part)
+            if share > 0:
+                total += share * self._spectrum(part + 1)
         frequency = np.fft.rfftfreq(self._shape[1])
-        moved = (spectrum * np.exp(-2j * np.pi * frequency * columns)).astype(np.complex64)
-        shifted: Array = fft.irfft(np.ascontiguousarray(moved), self._shape[1])[:height, :width]
-        return shifted
+        total *= np.exp(-2j * np.pi * np.multiply.outer(columns, frequency)).sum(axis=0).astype(np.complex64)
+        height, width = self._light
+        light: Array = fft.irfft(total, self._shape[1])[:height, :width]
+        return light
 
     def _spectrum(self, part: int) -> Array:
         """Return the PSF's at this part of a plane: between two of them the light hardly changes."""

@@ -280,7 +280,7 @@ class PatternedCamera(LinearOperator):
     Parameters
     ----------
     camera : LinearOperator
-        Of one channel: domain (1, n_z, grid height, grid width), range (1, height, width).
+        Domain (n_channels, n_z, grid height, grid width), range (n_channels, height, width).
     patterns : ndarray, (n_patterns, height, width)
         Relative light on the part of the scene opposite to the sensor; beyond it the nearest edge's.
     window : (slice, slice)
@@ -292,26 +292,28 @@ class PatternedCamera(LinearOperator):
         grid = camera.domain_shape[2:]
         margins = [(w.start, n - w.stop) for w, n in zip(window, grid, strict=True)]
         self._patterns = np.pad(patterns, ((0, 0), *margins), mode="edge").astype(camera.dtype)
-        super().__init__(camera.domain_shape, (len(patterns), *camera.range_shape[1:]), camera.dtype)
+        channels, *pixels = camera.range_shape
+        self._frames = (channels, len(patterns), *pixels)
+        super().__init__(camera.domain_shape, (channels * len(patterns), *pixels), camera.dtype)
         brightest = float(np.max(np.sum(self._patterns.astype(np.float64) ** 2, axis=0)))
         self._norm_bound = camera.norm_bound * float(np.sqrt(brightest))
 
     def forward(self, x: Array, out: Array | None = None) -> Array:
-        """Return the frames of a scene (1, n_z, grid height, grid width)."""
+        """Return the frames of a scene, each channel's in turn."""
         out = np.empty(self.range_shape, self.dtype) if out is None else out
         lit = np.empty(self.domain_shape, self.dtype)
-        for frame, pattern in zip(out[:, None], self._patterns, strict=True):
-            seen = self.camera.forward(np.multiply(pattern, x, out=lit), frame)
-            if seen is not frame:
-                frame[...] = seen
+        frames = out.reshape(self._frames)
+        for k, pattern in enumerate(self._patterns):
+            frames[:, k] = self.camera.forward(np.multiply(pattern, x, out=lit))
         return out
 
     def adjoint(self, y: Array, out: Array | None = None) -> Array:
         """Apply the camera's adjoint to each frame, weigh it with its pattern, and add up."""
         out = np.empty(self.domain_shape, self.dtype) if out is None else out
         out[...] = 0
-        for frame, pattern in zip(y[:, None], self._patterns, strict=True):
-            back = self.camera.adjoint(frame)
+        frames = y.reshape(self._frames)
+        for k, pattern in enumerate(self._patterns):
+            back = self.camera.adjoint(np.ascontiguousarray(frames[:, k]))
             out += np.multiply(pattern, back, out=back)
         return out
 

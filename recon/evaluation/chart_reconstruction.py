@@ -80,14 +80,20 @@ class ChartProblem(Subject[Setting]):
     def left_out(self) -> tuple[str, ...]:
         """Say which settings are not applicable, and why."""
         asked = _asked(self)
-        refused: dict[tuple[str, str], list[str]] = {}
-        for solver, prior in product(SOLVERS, PRIORS):
-            if (reason := Setting(solver, "convolution", prior).refusal(asked)) is not None:
-                refused.setdefault((solver, reason), []).append(prior)
-        found = [
-            solver + ("" if len(priors) == len(PRIORS) else " with " + ", ".join(priors)) + f": {reason}"
-            for (solver, reason), priors in refused.items()
-        ]
+        found = []
+        for solver in SOLVERS:
+            taken, who = list(PRIORS), solver
+            for background in (False, True):
+                refused: dict[str, list[str]] = {}
+                for prior in taken:
+                    setting = Setting(solver, "convolution", prior, background=background)
+                    if (reason := setting.refusal(asked)) is not None:
+                        refused.setdefault(reason, []).append(prior)
+                for reason, priors in refused.items():
+                    only = "" if priors == taken else f" with {', '.join(priors)}"
+                    found.append(f"{who}{only}: {reason}")
+                taken = [prior for prior in taken if not any(prior in p for p in refused.values())]
+                who = f"{solver} beside a background"
         if not _varies(self):
             found.append("the local and low-rank models: the calibration has one PSF a depth")
         for camera in CAMERAS.values():
@@ -163,11 +169,13 @@ def _settings_for(problem: ChartProblem) -> tuple[Setting, ...]:
 
 @lru_cache(maxsize=2)
 def _asked(problem: ChartProblem) -> Problem:
-    """Return the problem that solvers are asked about."""
+    """Return the problem that solvers are asked about: with pixels held out, as every run has them."""
     calibration = problem.calibration
     if not problem.volume:
         calibration = calibration.part(members_of_depths(calibration.source_positions_um)[0][:1])
-    measurement = Measurement(problem.measurement, erasures=problem.erasures, noise=problem.noise)
+    erasures = np.zeros(problem.pixels, bool) if problem.erasures is None else problem.erasures.copy()
+    erasures[np.unravel_index(erasures.argmin(), erasures.shape)] = True
+    measurement = Measurement(problem.measurement, erasures=erasures, noise=problem.noise)
     return Problem.of(measurement, calibration, ReconstructionOptions(model="convolution"))
 
 

@@ -27,7 +27,7 @@ from recon.types import Calibration
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
 
-PICTURES, PAIRS = 4, 16
+PICTURES, PAIRS = 3, 22
 """Pictures that are reconstructed, and pairs in each, half of them along each axis.
 
 Where there is no room for so many, up to three times as many pictures.
@@ -165,29 +165,35 @@ def _focus_um(
     """
     focus = 1 / tests.z_um
     steps = step_per_um * _FARTHEST * np.arange(1, _DEPTHS + 1) / _DEPTHS
-    ends: list[float] = []
-    for sign in (1, -1):
-        inverse = [focus + sign * float(step) for step in steps if sign > 0 or spread * step < focus]
-        if not inverse:
-            ends.append(0.0)
-            continue
-        told: list[bool] = []
-        while len(told) < len(inverse) and all(told):
-            pairs = tests.pairs([px] * 2 * (len(inverse) - len(told)))
-            tried = inverse[len(told) :][: len(pairs) // 2]
-            if not tried:
-                return None
-            light = np.zeros(tests.calibration.psfs.shape[-2:])
-            for n, place in enumerate(tried):
-                here = np.concatenate([pair.points for pair in pairs[2 * n : 2 * n + 2]])
-                light += shifted(tests.psf(float(1 / (focus + spread * (place - focus)))), here)
-            each = tests.told_apart(pairs[: 2 * len(tried)], light)
-            told += [each[2 * n] and each[2 * n + 1] for n in range(len(tried))]
-        count = [*told, False].index(False)
-        ends.append(focus if count == 0 else inverse[count - 1])
-        if sign < 0 and count == len(inverse) == int((steps < focus).sum()) < _DEPTHS:
-            ends[-1] = 0.0
-    near, far = ends
+    sides = [
+        [focus + sign * float(step) for step in steps if sign > 0 or spread * step < focus]
+        for sign in (1, -1)
+    ]
+    told: list[list[bool]] = [[], []]
+    while True:
+        asked = [
+            (side, place) for side in (0, 1) if all(told[side]) for place in sides[side][len(told[side]) :]
+        ]
+        if not asked:
+            break
+        pairs = tests.pairs([px] * 2 * len(asked))
+        asked = asked[: len(pairs) // 2]
+        if not asked:
+            return None
+        light = np.zeros(tests.calibration.psfs.shape[-2:])
+        for n, (_, place) in enumerate(asked):
+            here = np.concatenate([pair.points for pair in pairs[2 * n : 2 * n + 2]])
+            light += shifted(tests.psf(float(1 / (focus + spread * (place - focus)))), here)
+        each = tests.told_apart(pairs[: 2 * len(asked)], light)
+        for n, (side, _) in enumerate(asked):
+            told[side].append(each[2 * n] and each[2 * n + 1])
+    counts = [[*one, False].index(False) for one in told]
+    near, far = (
+        sides[side][count - 1] if count else (focus if sides[side] else 0.0)
+        for side, count in enumerate(counts)
+    )
+    if counts[1] == len(sides[1]) == int((steps < focus).sum()) < _DEPTHS:
+        far = 0.0
     return 1 / near, (1 / far if far > 0 else float("inf"))
 
 

@@ -43,6 +43,31 @@ class CameraMap:
     coefficients: npt.NDArray[np.float64]
     residual_px: float = float("nan")
 
+    def turned(self, rad: float) -> CameraMap:
+        """Return the map of a camera that is nominally in its place, but turned."""
+        coefficients = np.zeros((10, 2))
+        across, along = self.pixels_across * np.sin(rad), self.pixels_across * (np.cos(rad) - 1)
+        coefficients[_X], coefficients[_Y] = (-across, along), (along, across)
+        return CameraMap(self.shape, self.pixels_across, coefficients)
+
+    @property
+    def turn_rad(self) -> float:
+        """How the camera is turned."""
+        gradient = self.gradient(0.0, 0.0)
+        return float(np.arctan2(gradient[1, 0] - gradient[0, 1], gradient[0, 0] + gradient[1, 1]))
+
+    @property
+    def scale(self) -> float:
+        """How large the field is around its middle, over what it is nominally."""
+        return float(np.sqrt(abs(np.linalg.det(self.gradient(0.0, 0.0)))) / self.pixels_across)
+
+    def gradient(self, y: float, x: float) -> npt.NDArray[np.float64]:
+        """Return by how many (rows, columns) a place moves with y (first column) and x around it."""
+        step = 0.01
+        here = self.pixels(np.array(y), np.array(x))
+        there = (np.array(y + step), np.array(x)), (np.array(y), np.array(x + step))
+        return np.array([np.subtract(self.pixels(*place), here) for place in there]).T / step
+
     def pixels(self, y: Array, x: Array) -> tuple[Array, Array]:
         """Return row and column (0 is the centre of the first pixel) of places in fractions of the field."""
         y, x = np.asarray(y, float), np.asarray(x, float)
@@ -78,6 +103,10 @@ class CameraMap:
         return np.asarray(kept / np.sinc(down)[:, None] / np.sinc(across), np.complex128)
 
 
+_X, _Y = 1, 4
+"""Where the terms of first order are."""
+
+
 def _terms(y: Array, x: Array) -> Array:
     return np.stack([y**i * x**j for i in range(4) for j in range(4 - i)], axis=-1)
 
@@ -102,8 +131,22 @@ def mask_speckle(display: Display) -> npt.NDArray[np.float32]:
     return np.asarray(far * y[:, None] * x, np.float32)
 
 
+TURNS_RAD = 0.02 * np.arange(-10, 11)
+"""Rotations of the camera that are tried."""
+_CLEAR = 6.0
+"""Standard deviations by which the correlation of a block that is recognised stands out."""
+_WIDE = 60
+"""Largest shift of the middle, pixels."""
+
+
 def register_camera(
-    frame: Array, display: Display, pixels_across: float, *, blocks: int = 9, search: int = 10
+    frame: Array,
+    display: Display,
+    pixels_across: float,
+    *,
+    blocks: int = 9,
+    search: int = 10,
+    turned_rad: float | None = None,
 ) -> CameraMap:
     """Find the map from a frame taken with a blank SLM.
 
@@ -118,6 +161,9 @@ def register_camera(
         Along each axis.
     search : int
         Largest local shift, pixels.
+    turned_rad : float, optional
+        How the camera was turned when it was registered last, where that is known; else it is looked for
+        (:data:`TURNS_RAD`).
 
     Raises InputError when the speckle is not found: the frame is dark, another mask is in the beam, or the
     map is far off.
@@ -127,12 +173,14 @@ def register_camera(
     speckle = mask_speckle(display)
     samples = (speckle.shape[0] / pixels_across, speckle.shape[1] / pixels_across)
     speckle = gaussian_filter(speckle, [0.4 * s for s in samples])
-    found = CameraMap((frame.shape[0], frame.shape[1]), pixels_across, np.zeros((10, 2)))
     image = gaussian_filter(np.asarray(frame, np.float32), 0.5)
     # A small mask's speckles are large: the middle needs as many of them.
     middle = int(np.clip(60 * pixels_across / min(display.mask.shape), 160, 400)) // 2 * 2
+    found = CameraMap((frame.shape[0], frame.shape[1]), pixels_across, np.zeros((10, 2)))
+    turn = _turn(image, speckle, found, middle) if turned_rad is None else turned_rad
+    found = found.turned(turn)
     # The middle first, with a wide search; then outwards with the map found so far.
-    for reach, count, wide, order in ((0.08, 1, 60, 0), (0.25, 5, search, 1), (0.45, blocks, search, 3)):
+    for reach, count, wide, order in ((0.08, 1, _WIDE, 0), (0.25, 5, search, 1), (0.45, blocks, search, 3)):
         places, shifts, weights = [], [], []
         side = middle if count == 1 else 96
         for y in np.linspace(-reach, reach, count) if count > 1 else (0.0,):
@@ -144,6 +192,20 @@ def register_camera(
                     weights.append(match[2])
         found = _refit(found, np.array(places), np.array(shifts), np.array(weights), order, count)
     return found
+
+
+def _turn(image: Array, speckle: Array, nominal: CameraMap, side: int) -> float:
+    """Return the rotation at which the middle is recognised best; 0 where it clearly is without one."""
+
+    def contrast(rad: float) -> float:
+        match = _match(image, speckle, nominal.turned(rad), 0.0, 0.0, side, _WIDE)
+        return 0.0 if match is None else match[2]
+
+    if contrast(0.0) > 4 * _CLEAR:
+        return 0.0
+    found = np.array([contrast(float(rad)) for rad in TURNS_RAD])
+    best = int(np.clip(np.argmax(found), 1, len(found) - 2))
+    return float(TURNS_RAD[best] + _vertex(found[best - 1 : best + 2]) * (TURNS_RAD[1] - TURNS_RAD[0]))
 
 
 def _match(
@@ -159,17 +221,7 @@ def _match(
     if left + side + search > image.shape[1]:
         return None
     # What the block should look like: places in the field of each of its pixels, by the map's linear part.
-    step = 0.01
-    gradient = (
-        np.array(
-            [
-                np.subtract(found.pixels(np.array(y + step), np.array(x)), (row, column)),
-                np.subtract(found.pixels(np.array(y), np.array(x + step)), (row, column)),
-            ]
-        ).T
-        / step
-    )
-    inverse = np.linalg.inv(gradient)
+    inverse = np.linalg.inv(found.gradient(y, x))
     rows, columns = np.meshgrid(np.arange(side) + top - row, np.arange(side) + left - column, indexing="ij")
     fy, fx = (
         y + inverse[0, 0] * rows + inverse[0, 1] * columns,
@@ -198,7 +250,7 @@ def _vertex(three: Array) -> float:
 def _refit(
     found: CameraMap, places: Array, shifts: Array, contrast: Array, order: int, count: int
 ) -> CameraMap:
-    clear = contrast > 6 if len(contrast) else np.zeros(0, bool)
+    clear = contrast > _CLEAR if len(contrast) else np.zeros(0, bool)
     if clear.sum() < max(1, count * count // 3):
         raise InputError(
             f"The mask's speckle was recognised in {int(clear.sum())} of {count * count} places on the "

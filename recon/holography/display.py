@@ -127,6 +127,8 @@ class Display:
         Without a Fourier lens: where the picture is behind the mask. ``focal_mm`` does not count then. The
         picture is ``wavelength_nm distance_mm / mask_pitch_um`` wide (Fresnel diffraction), or where that is
         too :attr:`near`, as the mask's shorter side (angular spectrum).
+    lost_db : float or None
+        What a hologram that is shown loses to what is not known of the mask's place; for telling it only.
     """
 
     slm_shape: tuple[int, int]
@@ -139,6 +141,7 @@ class Display:
     displacement: npt.NDArray[np.float64] | None = None
     learned: Learned | None = None
     distance_mm: float | None = None
+    lost_db: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("slm_pitch_um", "wavelength_nm", "focal_mm"):

@@ -15,8 +15,8 @@ modulate is one more row, which all frames share.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -26,7 +26,14 @@ import numpy.typing as npt
 from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.model import HologramModel
-from recon.holography.optimise import HologramRecord, HologramStop, _Lbfgs, _Watch
+from recon.holography.optimise import (
+    Hologram,
+    HologramRecord,
+    HologramStop,
+    _Lbfgs,
+    _Watch,
+    compute_hologram,
+)
 from recon.holography.options import HologramOptions
 from recon.holography.target import ORDER, Target
 from recon.holography.variables import Point
@@ -116,6 +123,71 @@ def hologram_limit(
         reason,
         history[-1].seconds,
     )
+
+
+SMALL, SMALL_ITERATIONS = 2000, 40
+"""SLM pixels and iterations from which :func:`gain_of_frames` tells."""
+
+
+def gain_of_frames(display: Display, targets: Sequence[Target], options: HologramOptions) -> float:
+    """Return about how many decibels any number of frames would gain over those that were asked for.
+
+    From a part of the SLM and its mask, behind which both are computed: quick, and for telling whether frames
+    are what a picture lacks. Where that is not the question (a complex SLM, mirrors, near pictures): nan.
+    """
+    if options.complex_slm or options.mirrors is not None or display.near:
+        return float("nan")
+    k, (height, width) = display.factor, display.slm_shape
+    part = min(1.0, (SMALL / (height * width)) ** 0.5)
+    rows, columns = (max(round(part * n), min(n, 8)) for n in (height, width))
+    mask = replace(display.mask, levels=np.ascontiguousarray(display.mask.levels[: rows * k, : columns * k]))
+    small = replace(display, slm_shape=(rows, columns), mask=mask, displacement=None, learned=None)
+    settings = HologramOptions(
+        loss="frequency", frames=options.frames, iterations=SMALL_ITERATIONS, seed=options.seed
+    )
+    alone = compute_hologram(HologramModel(small, targets, settings)).history[-1].psnr_db
+    model = HologramModel(small, targets, settings, frames=max(COLUMNS, options.frames))
+    variable = _Rows(model)
+    rng = np.random.default_rng(options.seed)
+    start = rng.normal(size=(2, model.frames, *small.slm_shape)).astype(np.float32)
+    search = _Lbfgs(variable, variable.pack(start[0] + 1j * start[1]))
+    history, _ = _Watch(settings, None, None).run(search, SMALL_ITERATIONS, None)
+    return history[-1].psnr_db - alone
+
+
+_CLEARLY_DB, _DIM, _FELT_DB = 3.0, 0.1, 0.3
+
+
+def limited_by(
+    display: Display,
+    targets: Sequence[Target],
+    hologram: Hologram,
+    options: HologramOptions,
+    efficiency: float,
+) -> tuple[str, ...]:
+    """Return what keeps a hologram from being better: search, frames or contrast, light, alignment."""
+    found = []
+    history = hologram.history
+    late_db = history[-1].psnr_db - history[int(0.8 * (len(history) - 1))].psnr_db
+    ended = (HologramStop.ITERATIONS, HologramStop.TIME, HologramStop.CANCELLED)
+    if late_db > 0.5 and hologram.stop_reason in ended:
+        found.append(f"search: it still gained {late_db:.1f} dB in its last fifth (--iterations)")
+    gain_db = gain_of_frames(display, targets, options)
+    if gain_db > _CLEARLY_DB:
+        found.append(f"frames: many would reach about {gain_db:.0f} dB more (--frames {2 * options.frames})")
+    elif not np.isnan(gain_db):
+        mask = "" if display.factor == 1 else "through this mask "
+        found.append(
+            f"contrast: many frames would gain {max(gain_db, 0.0):.1f} dB only; phases cannot make so much "
+            f"of the field as dark {mask}as this picture asks (--lift 0.2, --complex, less --expansion)"
+        )
+    if efficiency < _DIM:
+        found.append(f"light: {efficiency:.1%} of what falls on the SLM is used")
+    if display.lost_db is not None and display.lost_db > _FELT_DB:
+        found.append(f"alignment: what is not known of the mask's place costs about {display.lost_db:.1f} dB")
+    elif display.factor > 1 and display.displacement is None:
+        found.append("alignment: none is given, the mask is taken to be exactly in its place (align mask)")
+    return tuple(found)
 
 
 class _Rows:

@@ -202,10 +202,7 @@ class HologramModel:
         errors = []
         for plane in range(len(self.targets)):
             self._intensity_spectrum(patterns, plane)
-            error = self._kernels.filtered_power(
-                self._spectrum, self._wanted[plane], self.band.cutoff, self.band.top, self.band.full
-            )
-            plane_loss, error = self._loss(plane, error)
+            plane_loss, error = self._loss(plane)
             errors.append(error / self.peaks[plane] ** 2)
             loss += plane_loss
             self._kernels.columns(self._spectrum, False, get_threads())
@@ -371,13 +368,14 @@ class HologramModel:
             in_blocks(rows, self.band.shape[0], grain=64)
         self._kernels.columns(self._spectrum, True, get_threads())
 
-    def _loss(self, plane: int, error: float) -> tuple[float, float]:
-        """Return loss and mean square error, and turn the kept lags into ``dL/dI``'s (Kuo 2020, Eq. A.9).
-
-        ``error`` is that of the whole field, which is returned where no window is.
-        """
+    def _loss(self, plane: int) -> tuple[float, float]:
+        """Return loss and mean square error, and turn the kept lags into ``dL/dI``'s (Kuo 2020, Eq. A.9)."""
         band, spectrum = self.band, self._spectrum
-        counted = error
+        lags = (spectrum, self._wanted[plane], band.cutoff, band.top, band.full)
+        if self.loss.mean_square and self._cutoff:
+            error = self._kernels.filter_twice(*lags)
+            return error / 2, error
+        counted = error = self._kernels.filtered_power(*lags)
         if self._cutoff == 0:
             counted = self._kernels.filtered_power(spectrum, self._wanted[plane], 0.0, band.top, band.full)
         self._kernels.subtract_and_filter(spectrum, self._wanted[plane], self._cutoff, band.top)

@@ -375,11 +375,12 @@ def _read(
     dark; a pixel on its border has the part that is inside.
     """
     cubic, lost = radial
+    cos, sin = np.cos(roll), np.sin(roll)
     for i in range(sensor.shape[0]):
         for j in range(sensor.shape[1]):
             a = (i - 0.5 * (sensor.shape[0] - 1)) * pixel + offset[0]
             b = (j - 0.5 * (sensor.shape[1] - 1)) * pixel + offset[1]
-            y, x = a + roll * b, b - roll * a
+            y, x = cos * a + sin * b, cos * b - sin * a
             # The lens moves the image point at r to r (1 + cubic r^2); here its inverse, to first order.
             shrink = 1.0 / (1.0 + cubic * (x * x + y * y))
             y, x = y * shrink, x * shrink

@@ -32,7 +32,7 @@ class Measurement:
     Attributes
     ----------
     image : array, (height, width) or (height, width, n_channels)
-        Any real dtype, any exposure. With ``patterns`` the grey frames, (n_patterns, height, width).
+        Any real dtype, any exposure. With ``patterns`` the frames, (n_patterns, height, width[, n_channels]).
     noise : NoiseModel or float, optional
         The camera's noise, or its standard deviation in counts; default: estimated from the image.
     background : array or number, optional
@@ -55,7 +55,12 @@ class Measurement:
     @property
     def flat(self) -> bool:
         """Whether the image has no axis of channels."""
-        return np.ndim(self.image) == 2 or self.patterns is not None
+        return np.ndim(self.image) == (2 if self.patterns is None else 3)
+
+    @property
+    def frames(self) -> int:
+        """Frames of each channel: one, or one a pattern."""
+        return 1 if self.patterns is None else len(np.asarray(self.patterns))
 
     def with_holes_erased(self) -> tuple[Measurement, str]:
         """Return it with its NaN pixels erased, and that in words; itself and no words without any."""
@@ -72,7 +77,7 @@ class Measurement:
         return replace(self, image=filled, erasures=np.maximum(erased, holes)), said
 
     def channels(self) -> Floats:
-        """Return the image as it came, channels (or frames under patterns) first."""
+        """Return the image as it came, channels first; under patterns each channel's frames in turn."""
         if self.patterns is None:
             return as_channels(self.image, "measurement")
         return _frames(self.image, self.light())
@@ -110,14 +115,17 @@ class Measurement:
         return Counts(data, valid, warnings)
 
     def like(self, image: npt.ArrayLike, data: Floats, name: str) -> Floats:
-        """Broadcast a number, one image, or one for each channel (of patterned light: frame) to the data.
+        """Broadcast a number, one image, or one for each channel (under patterns: each frame) to the data.
 
         Raises InputError when it is shaped otherwise.
         """
         if np.ndim(image) == 0:
             return np.full_like(data, float(np.asarray(image)))
-        if self.patterns is not None and np.ndim(image) == 3:  # shaped as the frames: patterns first
-            image = np.moveaxis(np.asarray(image), 0, -1)
+        if self.patterns is not None and np.ndim(image) >= 3:  # shaped as the frames: patterns first
+            frames = np.asarray(image)
+            if frames.ndim == 3 and not self.flat:  # one for all colours
+                frames = np.repeat(frames[..., None], np.shape(self.image)[-1], axis=-1)
+            image = np.moveaxis(_by_channel(frames), 0, -1)
         channels = as_channels(image, name)
         if channels.shape[1:] != data.shape[1:] or len(channels) not in (1, len(data)):
             one = "channels" if self.patterns is None else "frames"
@@ -141,15 +149,19 @@ class Measurement:
         return erased
 
     def deviations(self, counts: Counts) -> npt.NDArray[np.float64]:
-        """Return every channel's noise deviation, counts; of frames under patterns their root mean square."""
+        """Return every channel's noise deviation, counts; under patterns its frames' root mean square."""
         each = np.array(
             [channel_noise(d, v, self.noise) for d, v in zip(counts.data, counts.valid, strict=True)]
         )
-        return each if self.patterns is None else np.full(len(each), float(np.sqrt(np.mean(each**2))))
+        of_channels = np.sqrt(np.mean(each.reshape(-1, self.frames) ** 2, axis=1))
+        return each if self.patterns is None else np.repeat(of_channels, self.frames)
 
 
 class Counts(NamedTuple):
-    """An image less its background, (n_channels, height, width), which of its pixels count, and warnings."""
+    """An image less its background, (rows, height, width), which of its pixels count, and warnings.
+
+    A row is a channel; under patterns a frame of one.
+    """
 
     data: Floats
     valid: npt.NDArray[np.bool_]
@@ -229,15 +241,20 @@ def central(calibration: Calibration) -> Calibration:
 
 
 def _frames(frames: npt.ArrayLike, light: Floats) -> Floats:
-    """Return frames that fit their patterns."""
+    """Return frames that fit their patterns, each channel's in turn."""
     data = np.asarray(frames, np.float32)
-    if data.shape != light.shape:
+    if data.ndim not in (3, 4) or data.shape[:3] != light.shape:
         raise InputError(
-            f"One pattern a frame is expected, both (n, height, width); got frames {data.shape} and patterns "
-            f"{light.shape}."
+            "One pattern a frame is expected, patterns (n, height, width), frames alike or with channels "
+            f"last; got frames {data.shape} and patterns {light.shape}."
         )
     require_finite(data, "measurement")
-    return data
+    return _by_channel(data)
+
+
+def _by_channel(frames: Array) -> Array:
+    """Return frames (n, height, width[, n_channels]) as one row of frames, each channel's in turn."""
+    return frames if frames.ndim == 3 else np.moveaxis(frames, -1, 0).reshape(-1, *frames.shape[1:3])
 
 
 def _doubt(channel: int, values: Array) -> str:

@@ -197,7 +197,7 @@ class ReconstructionOptions:
         flags=("--time",),
         metavar="S",
         group=_STOP,
-        applies=("picture", "volume", "video"),
+        applies=("picture", "volume", "video", "patterned picture"),
         identifies=False,
     )
     tolerance: float | None = option(
@@ -208,14 +208,14 @@ class ReconstructionOptions:
         least=0,
         metavar="X",
         group=_STOP,
-        applies=("picture", "volume", "video"),
+        applies=("picture", "volume", "video", "patterned picture"),
         identifies=False,
     )
     stop_at_noise: bool = option(
         False,
         help="Stop as soon as the residual is down to the expected noise.",
         group=_STOP,
-        applies=("picture", "volume"),
+        applies=("picture", "volume", "patterned picture"),
         identifies=False,
     )
     model: ModelName = option(
@@ -223,7 +223,7 @@ class ReconstructionOptions:
         help="local, lowrank: PSFs that vary over the field; auto: the smallest that explains the data.",
         choices=model_names,
         group=_CHOICE,
-        applies=("picture", "volume", "video", "live picture"),
+        applies=("picture", "volume", "video", "live picture", "patterned picture"),
     )
     choose: Overrides | None = option(
         None,
@@ -242,13 +242,13 @@ class ReconstructionOptions:
         flags=("--background/--no-background",),
         label="Smooth background",
         group=_CHOICE,
-        applies=("picture", "volume", "video", "live picture"),
+        applies=("picture", "volume", "video", "live picture", "patterned picture"),
     )
     positive_background: bool = option(
         False,
         help="A background that is nowhere negative; up to three more runs.",
         group=_RARE,
-        applies=("picture", "volume"),
+        applies=("picture", "volume", "patterned picture"),
     )
     refine_psf: bool = option(
         False,
@@ -289,7 +289,7 @@ class ReconstructionOptions:
         help="auto: float32, unless that would show. float64: twice the memory, up to twice the time.",
         choices=("auto", *PRECISIONS),
         group=_COMPUTE,
-        applies=("picture", "volume", "live picture"),
+        applies=("picture", "volume", "live picture", "patterned picture"),
     )
     memory_gib: float | None = option(
         None,
@@ -301,7 +301,7 @@ class ReconstructionOptions:
         metavar="GIB",
         group=_COMPUTE,
         recorded=False,
-        applies=("picture", "volume", "live picture"),
+        applies=("picture", "volume", "live picture", "patterned picture"),
     )
     scratch: Path | None = option(
         None,

@@ -128,8 +128,8 @@ class Part:
 
     @property
     def _rows(self) -> slice:
-        """The data of these channels: all frames under patterns."""
-        return slice(None) if self.problem.patterned else self.channels
+        """The data of these channels."""
+        return self.problem.rows(self.channels)
 
     def _make_camera(self) -> LinearOperator:
         problem, depths = self.problem, self.problem.levelled[0]

@@ -142,8 +142,7 @@ class Problem:
         if measurement.patterns is not None and options.model == "auto":
             options = settled(options, model="convolution")
         calibration, depths, doubts = depths_of(calibration, options)
-        lone = measurement.patterns is not None
-        require_same_channels(calibration.psfs, counts.data[:1] if lone else counts.data)
+        require_same_channels(calibration.psfs, counts.data[:: measurement.frames])
         require_same_pixels(calibration.psfs[0], counts.data)
         if extent.psf_window is not None:
             depths = depths.within(extent.psf_window)
@@ -217,7 +216,19 @@ class Problem:
     @property
     def n_channels(self) -> int:
         """Colour channels of the object."""
-        return 1 if self.patterned else len(self.data)
+        return len(self.data) // self.measurement.frames
+
+    def rows(self, channels: slice) -> slice:
+        """Return where the data of some channels are: under patterns all their frames."""
+        frames = self.measurement.frames
+        return slice(channels.start * frames, channels.stop * frames)
+
+    def as_measured(self, rows: Array) -> Floats:
+        """Return rows of data, (n, height, width), in the measurement's shape, or with its channels."""
+        frames, *pixels = self.measurement.frames, *rows.shape[1:]
+        channels = rows.astype(np.float32).reshape(-1, frames, *pixels) if self.patterned else rows
+        found = channels[0] if self.flat else np.moveaxis(channels, 0, -1)
+        return np.ascontiguousarray(found, np.float32)
 
     @property
     def n_planes(self) -> int:
@@ -298,7 +309,8 @@ class Problem:
     @property
     def image_scale(self) -> Floats:
         """From the scaled problem's object to measurement units, (n_channels, 1, 1, 1)."""
-        return np.asarray(self.noise[: self.n_channels] / self.energy, np.float32)[:, None, None, None]
+        noise = self.noise[:: self.measurement.frames]
+        return np.asarray(noise / self.energy, np.float32)[:, None, None, None]
 
     @cached_property
     def levelled(self) -> tuple[Depths, Floats]:
@@ -432,7 +444,7 @@ class Problem:
             "valid_share": float(np.count_nonzero(self.valid) / self.valid.size),
             "model": self.model,
             "model_reason": self.reason,
-            **({"patterns": len(self.data)} if self.patterned else {}),
+            **({"patterns": self.measurement.frames} if self.patterned else {}),
             "options": record(self.options),
         }
 

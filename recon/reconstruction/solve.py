@@ -265,7 +265,7 @@ def _run(
     residual = float("nan") if rest is None else float(np.linalg.norm(rest))
     if outcome.history:
         residual = outcome.history[-1].data_residual
-    rows = slice(None) if problem.patterned else part.channels
+    rows = problem.rows(part.channels)
     doubts = [
         *residual_in_words(problem, outcome, residual, part.noise_norm, (part.tau or 0.0, part.held)),
         *background_in_words(problem, smooth, rows),
@@ -277,7 +277,7 @@ def _run(
     return _Solved(
         volume=problem.measured(solution, part.channels),
         state=_state(part, solution),
-        background=None if smooth is None else smooth * problem.noise[part.channels, None, None],
+        background=None if smooth is None else smooth * problem.noise[rows, None, None],
         outcome=replace(outcome, solution=np.empty(0)),
         tau=part.tau if outcome.tau is None else outcome.tau,
         empty=solver.empty if isinstance(solver, DouglasRachford) else EmptyPlanes(),
@@ -332,8 +332,8 @@ def _together(
         histories=tuple(f.outcome.history for f in found),
         stop_reasons=tuple(f.outcome.stop_reason for f in found),
         seconds=sum(f.outcome.seconds for f in found) + (0.0 if look is None else look.seconds),
-        background=_stacked([f.background for f in found if f.background is not None], problem.flat),
-        residual=_stacked([f.rest for f in found if f.rest is not None], problem.flat),
+        background=_stacked([f.background for f in found if f.background is not None], problem),
+        residual=_stacked([f.rest for f in found if f.rest is not None], problem),
         empty_planes=empty,
         warnings=tuple(
             dict.fromkeys(
@@ -364,12 +364,9 @@ def _uncertified(empty: tuple[EmptyPlanes, ...]) -> list[str]:
     ]
 
 
-def _stacked(images: list[Array], flat: bool) -> npt.NDArray[np.float32] | None:
+def _stacked(images: list[Array], problem: Problem) -> npt.NDArray[np.float32] | None:
     """Return channels (some, height, width) in the measurement's shape."""
-    if not images:
-        return None
-    channels = np.concatenate(images).astype(np.float32)
-    return channels[0] if flat else np.ascontiguousarray(np.moveaxis(channels, 0, -1))
+    return problem.as_measured(np.concatenate(images)) if images else None
 
 
 def may_go_on(outcome: Outcome) -> bool:

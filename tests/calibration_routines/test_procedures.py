@@ -5,23 +5,26 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibration_routines import CalibrationError
+from calibration_routines import CalibrationError, times
 from calibration_routines.optics.angular import AngularProcedure, AngularSweep
 from calibration_routines.plan_procedures import PlanProcedure, ResumeProcedure
-from calibration_routines.procedure import Listener, Outcome, RunEndedError
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, RunEndedError
 from calibration_routines.psf.sweep_options import AxialSweep, LateralSweep, VolumeSweep
 from calibration_routines.psf.sweep_procedure import SweepProcedure
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
+from instrument.files import kept_times
 from instrument.files.errors import SettingsError
-from instrument.plan import Part, Plan, PlanError
+from instrument.plan import Part, Plan, PlanError, estimate
 from instrument.plan.abilities import SPARE_BYTES
 from instrument.runs import acquire
+from instrument.runs.acquire import abilities_of
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import RunState, RunStatus
@@ -73,6 +76,53 @@ def test_an_outlook_moves_nothing_and_counts_what_the_run_then_takes(bench: Benc
     assert done.good, done.verdict
     assert done.calibration is not None
     assert (done.calibration / "calibration.json").is_file()
+
+
+CLOCK = [0.0]
+
+
+@dataclass(frozen=True)
+class Waiting(Procedure):
+    """Takes two seconds a frame of its plan, by a clock of the test's; without one what it is told."""
+
+    plan: Plan | None = None
+    seconds: float = 0.0
+    out: Path | None = None
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        cost = None if self.plan is None else estimate(self.plan, abilities_of(bench, Path()))
+        return Outlook(("A reason.",), self.plan, cost)
+
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
+        if self.seconds < 0:
+            raise CalibrationError("It failed.")
+        cost = self.outlook(bench).cost
+        CLOCK[0] += self.seconds if cost is None else 2.0 * cost.frames
+        return Outcome((), good=True)
+
+
+def test_what_it_took_last_time_tells_how_long_all_of_it_takes(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(kept_times, "_window", True)
+    monkeypatch.setattr(times.time, "monotonic", lambda: CLOCK[0])
+
+    def told(procedure: Procedure) -> tuple[str, ...]:
+        return procedure.foretold(bench).reasons[1:]
+
+    few, many = (Plan(label="wait", parts=(Part(label="scene", repeats=n),)) for n in (10, 40))
+    assert told(Waiting(few)) == ()
+    Waiting(few).carry_out(bench)
+    assert told(Waiting(many)) == ("In all, by what it took last time: about 80.0 s.",)
+    assert told(Waiting(Plan(label="another", parts=few.parts))) == ()
+    # Without a plan the options tell, but for where the result goes.
+    Waiting(seconds=7.0, out=tmp_path / "a").carry_out(bench)
+    assert told(Waiting(seconds=7.0)) == ("In all, by what it took last time: about 7.0 s.",)
+    assert told(Waiting(seconds=8.0)) == ()
+    with pytest.raises(CalibrationError):
+        Waiting(seconds=-1.0).carry_out(bench)
+    assert told(Waiting(seconds=-1.0)) == ()
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 
 from drivers.camera import Camera
-from drivers.common.answers import within
-from drivers.common.checked import call_limit_s, checked, is_timed
+from drivers.common import answers
+from drivers.common.answers import is_bounded, within
+from drivers.common.checked import call_limit_s, checked, given_up, is_timed
 from drivers.common.stream import FrameStream
 from drivers.device import Device
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
@@ -70,6 +71,39 @@ def test_what_a_call_returns_and_raises_comes_through_and_a_hang_is_named() -> N
     with pytest.raises(DeviceTimeoutError, match="camera: hangs: an answer has not ended"):
         within(0.05, "camera", "an answer", lambda: ended.wait(20))
     ended.set()
+
+
+def test_calls_that_were_given_up_are_known_and_waited_for_at_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    let_go = threading.Event()
+    assert not is_bounded()
+    assert within(5, "a", "b", is_bounded)
+    monkeypatch.setattr(answers, "_given_up", set())
+    within(5, "a", "b", lambda: 1)
+    assert not answers._given_up
+    with pytest.raises(DeviceTimeoutError):
+        within(0.01, "a", "b", lambda: let_go.wait(20))
+    (thread,) = answers._given_up
+    let_go.set()
+    thread.join(5)
+    now_s, waited_s = [100.0], list[float]()
+
+    class Late:
+        def __init__(self, takes_s: float) -> None:
+            self.takes_s = takes_s
+
+        def is_alive(self) -> bool:
+            return self.takes_s > 0
+
+        def join(self, timeout: float) -> None:
+            waited_s.append(timeout)
+            now_s[0] += self.takes_s
+
+    monkeypatch.setattr(answers, "_given_up", [Late(0), Late(1), Late(9), Late(1)])
+    monkeypatch.setattr(answers, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    answers._wait_for_given_up()
+    assert waited_s == [3.0, 2.0, 0.0]
 
 
 @pytest.mark.parametrize("has_ended", [True, False])
@@ -247,7 +281,7 @@ def test_a_device_that_hangs_when_set_or_moved_is_given_up_named_and_undone(
             device.settings()
         calls(bench).clear()
         let_go.set()
-        for thread in vars(device)["_left"]:
+        for thread in given_up(device):
             thread.join(5)
         undone = {"stage": ["stage.stop"], "led_array": ["led_array.off"]}.get(kind, [])
         assert [call for call in calls(bench) if call in ("stage.stop", "led_array.off")] == undone
@@ -282,7 +316,7 @@ def test_ctrl_c_during_a_move_stops_it_and_waits_for_its_call(monkeypatch: pytes
         monkeypatch.setattr(MockStage, "stop", lambda _: stopped.set())
         with pytest.raises(KeyboardInterrupt):
             stage.move_to({"x_um": 1.0})
-        assert not any(thread.is_alive() for thread in vars(stage)["_left"])
+        assert not any(thread.is_alive() for thread in given_up(stage))
 
 
 @pytest.mark.usefixtures("mock_drivers")
@@ -308,7 +342,7 @@ def test_ctrl_c_stays_ctrl_c_where_the_stop_fails(monkeypatch: pytest.MonkeyPatc
             with pytest.raises(KeyboardInterrupt) as caught:
                 photograph(camera)
             assert stopped.is_set()
-            assert not any(thread.is_alive() for thread in vars(camera)["_left"])
+            assert not any(thread.is_alive() for thread in given_up(camera))
         notes = getattr(caught.value, "__notes__", [])
         assert [note for note in notes if "does not stop" in note] == notes
         assert len(notes) == (not stops)
@@ -324,7 +358,7 @@ def test_nothing_begins_that_the_end_of_a_call_that_hangs_would_end(monkeypatch:
     with pytest.raises(DeviceTimeoutError, match="still hangs: snap has not ended"):
         camera.stream().start()
     let_go.set()
-    for thread in vars(camera)["_left"]:
+    for thread in given_up(camera):
         thread.join(5)
     camera.stream().start().close()
 

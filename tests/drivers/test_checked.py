@@ -40,6 +40,7 @@ def made(driver: type[Device]) -> Any:
 def test_an_exposure_that_is_none_or_another_is_refused(said: float) -> None:
     class Lying(MockCamera):
         def set_exposure_ms(self, exposure_ms: float) -> float:
+            self.exposure_ms = said
             return said
 
     with pytest.raises(DeviceError, match=r"was asked for an exposure \(ms\) of 20 and says "):
@@ -179,6 +180,9 @@ class Short(MockCamera):
         frame = super().snap()
         return Frame(frame.image[:, ::2].astype(np.uint8), frame.metadata)
 
+    def next_frame_into(self, buffer: Any, timeout_s: float) -> Any:
+        return super().snap().metadata
+
 
 class Misses(MockStage):
     def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
@@ -284,6 +288,10 @@ class Faulty(MockStage):
     def is_moving(self) -> bool:  # type: ignore[override]
         raise KeyError("busy")
 
+    @property
+    def is_homed(self) -> bool:  # type: ignore[override]
+        raise DeviceError(self.name, "does not answer.")
+
 
 def test_a_drivers_mistake_is_a_sentence_and_its_traceback_is_in_the_log(
     caplog: pytest.LogCaptureFixture,
@@ -297,6 +305,8 @@ def test_a_drivers_mistake_is_a_sentence_and_its_traceback_is_in_the_log(
     assert "Traceback" in caplog.text
     with pytest.raises(DeviceError, match="its driver failed in is_moving: KeyError"):
         _ = stage.is_moving
+    with pytest.raises(DeviceError, match=r"^stage \(mock\): does not answer\."):
+        _ = stage.is_homed
 
 
 def test_what_a_driver_says_in_words_and_an_interruption_pass() -> None:

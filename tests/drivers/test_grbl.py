@@ -405,6 +405,7 @@ def test_soft_limits_switched_off_are_warned_of(
     [
         ({"axes": {"x_um": {}, "y_um": {"letter": "X"}}}, "are both axis X"),
         ({"homing": "here"}, "needs lower_limit and upper_limit"),
+        ({"homing": "here", "axes": {"x_um": {"lower_limit": 0}}}, "needs lower_limit and upper_limit"),
         ({"axes": {"x_mm": {}}}, "must be an axis of the bench"),
         ({"axes": {}}, "at least 1"),
     ],

@@ -175,6 +175,11 @@ def test_the_travel_lies_where_homing_puts_it(
     assert ControllerSettings(BASE | settings, info).travel(0) == travel
 
 
+def test_without_a_pull_off_nothing_is_left_out_of_the_travel() -> None:
+    values = {number: value for number, value in BASE.items() if number != 27}
+    assert ControllerSettings(values | {21: 1, 22: 1}, {}).travel(0) == (-100.0, 0.0)
+
+
 @pytest.mark.parametrize("missing", [100, 111, 132])
 def test_missing_settings_are_named(missing: int) -> None:
     values = {number: value for number, value in BASE.items() if number != missing}

@@ -111,6 +111,13 @@ def test_elliptec_failures_are_said(tmp_path: Path) -> None:
         bus.axes["0"].halt()
         with pytest.raises(DeviceError, match=r"x_um \(module 0\): it did not reach its place in time"):
             stage.wait(5.0)
+        stage.home()
+        for line in (b"0GS02x", b"0PO02", b"0GS00"):
+            stage._unasked(line)
+            assert not stage._faults
+        stage._unasked(b"0GS02")
+        assert [*stage._faults] == ["x_um"]
+        assert "it did not reach its place in time" in stage._faults["x_um"]
     wrong = {"port": str(bus.link), "axes": {"x_um": {"address": "1"}}}
     with pytest.raises(DeviceError, match=r"is an ELL14, which turns .*cannot be x_um"):
         ElliptecStage(ElliptecOptions.model_validate(wrong)).open()

@@ -14,6 +14,7 @@ import pytest
 from pydantic import ValidationError
 
 from drivers.camera import Roi
+from drivers.common.checked import call_limit_s
 from drivers.errors import DeviceError, StoppedError
 from drivers.led_array import LedPattern
 from drivers.simulated.camera import SimulatedCamera
@@ -65,6 +66,11 @@ def test_dark_without_leds_and_without_scene() -> None:
     bench.world.scene_lit = True
     bench.camera.set_exposure_ms(300.0)
     assert bench.counts().mean() > 50
+
+
+def test_an_animals_first_light_is_waited_for_on_a_busy_computer() -> None:
+    assert call_limit_s(Bench().camera, "snap") < 200
+    assert call_limit_s(Bench(scene="animal").camera, "snap") > 3600
 
 
 def test_light_adds_up() -> None:
@@ -288,6 +294,28 @@ def test_stop_cuts_a_long_exposure_short() -> None:
     threading.Timer(0.1, bench.camera.stop_sequence).start()
     with pytest.raises(StoppedError):
         bench.camera.snap()
+
+
+def test_stop_does_not_wait_until_a_new_light_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    begun, computed = threading.Event(), threading.Event()
+    see = bench.world.photons_per_s
+
+    def slowly(weights: Rgb, binning: int = 1) -> object:
+        begun.set()
+        assert computed.wait(30.0)
+        return see(weights, binning)
+
+    monkeypatch.setattr(bench.world, "photons_per_s", slowly)
+    bench.camera.start_sequence()
+    assert begun.wait(10.0)
+    bench.camera.stop_sequence()
+    assert not bench.camera.is_streaming
+    assert not computed.is_set()
+    computed.set()
+    bench.camera.snap()
+    bench.camera.close()
+    assert not any(thread.name == "simulated light" for thread in threading.enumerate())
 
 
 # The camera's electronics ---

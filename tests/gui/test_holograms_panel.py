@@ -130,8 +130,11 @@ def test_compute_show_and_photograph(qtbot: QtBot, panel: HologramsPanel) -> Non
 
 
 def test_a_preview_writes_nothing(qtbot: QtBot, panel: HologramsPanel) -> None:
+    assert panel.views.seen.caption == "Preview or Compute fills this in"
     computed(qtbot, panel, panel.preview_button)
     assert panel.views.seen.image is not None
+    assert (panel.views.seen.caption, panel.views.phase.caption) == ("", "")
+    assert panel.views.captured.caption == "Show and photograph takes it"
     assert not (panel.session.runs_folder / "holograms").exists()
 
 

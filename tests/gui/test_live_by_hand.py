@@ -214,3 +214,17 @@ def test_a_path_of_which_nothing_is_there_is_refused(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(Path, "exists", lambda _: False)  # a drive that is not connected
     with pytest.raises(FileError, match="not even its disk"):
         free_bytes(Path("somewhere/else"))
+
+
+def test_what_auto_could_not_do_is_over_with_another_exposure(qtbot: QtBot, live: LivePanel) -> None:
+    auto = live.form.auto_button
+    tip = auto.toolTip()
+    for _ in range(2):  # the tip that comes back is its own
+        live.refused(auto, "It is too dark.")
+    assert auto.property("refused")
+    assert auto.toolTip() in live._note.text()
+    _type_only(qtbot, live.form.widgets["exposure_ms"], "7")
+    qtbot.keyClick(live.form.widgets["exposure_ms"], Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: not auto.property("refused"), timeout=WAIT_MS)
+    assert live.session.bench.camera.exposure_ms == 7
+    assert (auto.toolTip(), live._note.text()) == (tip, "")

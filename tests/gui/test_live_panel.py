@@ -107,7 +107,7 @@ def test_auto_finds_the_exposure_and_the_figures_beside_the_histogram_say_what_i
     assert not_stretched((100.0, 120.0), 65535)[1] > 4000, "noise in the dark looks dark"
     counts[65535] = 2
     live.picture.histogram.show_counts(counts, FrameFigures.of(counts, 65535), 0, 1)
-    assert "SATURATED" in live.picture.histogram.range.words.text()
+    assert "SATURATED 25 % of pixels" in live.picture.histogram.range.words.text()
     assert live.picture.histogram.range.words.property("warns") == "error"
 
 
@@ -148,6 +148,7 @@ def test_a_region_dragged_is_sent_to_the_camera(qtbot: QtBot, live: LivePanel) -
     qtbot.mouseClick(live.picture.region_button, Qt.MouseButton.LeftButton)
     live.picture.region_box.item.setPos((40, 60))
     live.picture.region_box.item.setSize((80, 100))
+    qtbot.waitUntil(lambda: "region 60, 40, 100, 80" in live.status.text(), timeout=WAIT_MS)
     qtbot.mouseClick(live.picture.apply_region, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: live.session.bench.camera.roi.as_tuple() == (60, 40, 100, 80), timeout=WAIT_MS)
     qtbot.waitUntil(

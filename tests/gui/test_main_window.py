@@ -17,6 +17,7 @@ from calibration_routines.procedure import Outlook, Procedure
 from gui.jobs import JobContext, JobState
 from gui.main_window import MainWindow
 from gui.panels import PANELS, PanelEntry
+from gui.panels.live import LivePanel
 from gui.procedure_panel import ProcedurePanel
 from gui.session import BenchSession
 from gui.theme import THEMES
@@ -129,9 +130,14 @@ def test_the_stop_button_ends_an_exclusive_job_and_the_live_view_goes_on(
 def test_an_unplugged_camera_is_named_and_comes_back(qtbot: QtBot, window: MainWindow) -> None:
     session = window.session
     world = session.bench.shared["simulated"]
+    live = window.show_panel("live")
+    assert isinstance(live, LivePanel)
+    qtbot.waitUntil(lambda: live.picture.frame is not None, timeout=WAIT_MS)
     world.unplug("camera")  # type: ignore[attr-defined]
     qtbot.waitUntil(lambda: session.state("camera").condition == "failed", timeout=WAIT_MS)
     assert "unplugged" in session.state("camera").text
+    live.count()
+    assert "unplugged" in live.status.text(), "below the old picture, not its figures"
     button = window.chips.reconnect_buttons["camera"]
     assert button.isVisible()
     assert session.is_open("stage")

@@ -1,4 +1,4 @@
-"""Reconstructions by mouse and keys: the form, the work, the viewers, export, and the lines of Python."""
+"""Reconstructions by mouse and keys: the form, the work, the viewers, and the lines of Python."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QApplication, QFileDialog
+from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from gui.forms.reconstruct import PSF, VOLUME
@@ -18,14 +18,11 @@ from gui.jobs import JobState
 from gui.panel import whole
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
-from gui.theme import apply_theme, change_theme
-from gui.widgets.dialogues import Question
 from gui.widgets.entry import NumberEdit
 from instrument.files.calibration_file import load_calibration, newest_calibration, save_calibration
 from instrument.files.images import read_image, write_image
-from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.request import VolumeRequest
-from instrument.reconstruction.stored_result import StoredResult, open_result
+from instrument.reconstruction.stored_result import StoredResult
 from recon.camera.transformed import Transformation
 from recon.reconstruction.options import Overrides
 from recon.types import Calibration
@@ -142,7 +139,7 @@ def test_a_volume_by_mouse_and_slices_by_click(qtbot: QtBot, panel: Reconstructi
     voxels = tifffile.imread(panel.result.path)
     np.testing.assert_array_equal(view.projections.front, voxels.max(axis=0))
     brightest = np.unravel_index(voxels.argmax(), voxels.shape)
-    qtbot.mouseClick(view.slices_button, Qt.MouseButton.LeftButton)
+    qtbot.mouseClick(view.tools.modes["slices"], Qt.MouseButton.LeftButton)
     view.front.clicked.emit(int(brightest[2]), int(brightest[1]))
     view.slider.setFocus()
     view.slider.setValue(0)
@@ -327,42 +324,6 @@ def test_choices_of_a_volume_are_those_of_the_command_line(
     assert form.widgets["choose"].property("refused")
 
 
-def test_export_writes_values_and_views(qtbot: QtBot, panel: ReconstructionsPanel, tmp_path) -> None:
-    picture = np.random.default_rng(0).random((20, 30), np.float32)
-    write_image(tmp_path / "p.tif", picture)
-    voxels = np.random.default_rng(0).random((4, 20, 30), np.float32)
-    np.save(tmp_path / "v.npy", voxels)
-
-    def export(name: str) -> None:
-        job = panel.export.to(tmp_path / name)
-        with qtbot.waitSignal(job.succeeded, timeout=WAIT_MS):
-            pass
-
-    panel.open(tmp_path / "p.tif")
-    qtbot.waitUntil(lambda: panel.result is not None, timeout=WAIT_MS)
-    turns = {action.text(): action for action in panel.picture.turn.menu().actions()}
-    turns["Turn left"].trigger()
-    turns["Mirror left and right"].trigger()
-    export("out.npy")
-    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.rot90(picture)[:, ::-1])
-    export("out.png")
-    assert read_image(tmp_path / "out.png").pixels.shape == (30, 20, 3)
-    panel.open(tmp_path / "v.npy")
-    qtbot.waitUntil(lambda: panel.volume.projections is not None, timeout=WAIT_MS)
-    export("out.tif")
-    np.testing.assert_array_equal(tifffile.imread(tmp_path / "out.tif"), voxels)
-    export("out.ome.zarr")
-    copy = open_result(tmp_path / "out.ome.zarr")
-    np.testing.assert_array_equal(copy.volume.plane(2), voxels[2])
-    export("view.png")
-    names = sorted(p.name for p in tmp_path.glob("view-*.png"))
-    assert names == ["view-depth.png", "view-front.png", "view-side.png", "view-top.png"]
-    job = panel.export.to(tmp_path / "out.tif")
-    with qtbot.waitSignal(job.failed, timeout=WAIT_MS):
-        pass
-    assert "exists already" in panel._note.toolTip()
-
-
 def test_a_psf_that_does_not_fit_is_fitted_by_a_button(
     qtbot: QtBot, panel: ReconstructionsPanel, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -413,138 +374,6 @@ def test_a_fitted_psf_is_kept_and_used_from_then_on(
         48,
     )  # 15 pixels from the middle, 18 now
     assert made.source_positions_um[0] == pytest.approx([600.0, 0.0, 2e4])
-
-
-@pytest.mark.parametrize("opened_during", ["the name", "the question"])
-def test_another_result_is_not_exported_under_the_name_of_the_first(
-    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path, opened_during: str
-) -> None:
-    for name in ("first", "second"):
-        write_image(tmp_path / f"{name}.tif", np.random.default_rng(0).random((20, 30), np.float32))
-    target = tmp_path / "target.tif"
-    target.write_bytes(b"kept")
-
-    def show(name: str) -> None:
-        panel.open(tmp_path / f"{name}.tif")
-        qtbot.waitUntil(lambda: panel.result is not None and panel.result.path.stem == name, timeout=WAIT_MS)
-
-    show("first")
-    qtbot.mouseClick(panel.export_button, Qt.MouseButton.LeftButton)
-    (dialogue,) = panel.findChildren(QFileDialog)
-    if opened_during == "the name":
-        show("second")
-    dialogue.fileSelected.emit(str(target))
-    dialogue.close()
-    if opened_during == "the question":
-        qtbot.waitUntil(lambda: bool(panel.findChildren(Question)), timeout=WAIT_MS)
-        (question,) = panel.findChildren(Question)
-        show("second")
-        (replace,) = (button for button in question.buttons() if button.text() == "Replace")
-        qtbot.mouseClick(replace, Qt.MouseButton.LeftButton)
-    assert not panel.findChildren(Question) or opened_during == "the question"
-    assert "first.tif is not open any more" in panel._note.toolTip()
-    assert not any(job.title.startswith("Exporting") for job in panel.session.jobs.jobs)
-    assert target.read_bytes() == b"kept"
-
-
-def test_the_views_exported_are_those_that_were_asked_about(
-    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path
-) -> None:
-    np.save(tmp_path / "v.npy", np.random.default_rng(0).random((4, 20, 30), np.float32))
-    panel.open(tmp_path / "v.npy")
-    qtbot.waitUntil(lambda: panel.volume.projections is not None, timeout=WAIT_MS)
-    (tmp_path / "view-front.png").write_bytes(b"old")
-    qtbot.mouseClick(panel.export_button, Qt.MouseButton.LeftButton)
-    (dialogue,) = panel.findChildren(QFileDialog)
-    dialogue.fileSelected.emit(str(tmp_path / "view.png"))
-    dialogue.close()
-    qtbot.waitUntil(lambda: bool(panel.findChildren(Question)), timeout=WAIT_MS)
-    (question,) = panel.findChildren(Question)
-    panel.volume.set_mode("slices")  # by a key, behind the question
-    (replace,) = (button for button in question.buttons() if button.text() == "Replace")
-    qtbot.mouseClick(replace, Qt.MouseButton.LeftButton)
-    qtbot.waitUntil(lambda: len(list(tmp_path.glob("view-*.png"))) == 4, timeout=WAIT_MS)
-    names = sorted(p.name for p in tmp_path.glob("view-*.png"))
-    assert names == ["view-depth.png", "view-front.png", "view-side.png", "view-top.png"]
-    qtbot.waitUntil(lambda: not panel.session.jobs.jobs, timeout=WAIT_MS)
-    assert read_image(tmp_path / "view-front.png").pixels.shape == (20, 30, 3)
-
-
-def test_levels_by_typing_and_automatic(qtbot: QtBot, panel: ReconstructionsPanel, tmp_path) -> None:
-    write_image(tmp_path / "p.tif", np.linspace(0, 10, 400, dtype=np.float32).reshape(20, 20))
-    panel.open(tmp_path / "p.tif")
-    qtbot.waitUntil(lambda: panel.result is not None, timeout=WAIT_MS)
-    bar = panel.picture.levels
-    assert bar.levels == (0.0, pytest.approx(10, rel=0.01))
-    bar.high.selectAll()
-    qtbot.keyClicks(bar.high, "5")
-    qtbot.keyClick(bar.high, Qt.Key.Key_Return)
-    assert bar.levels == (0.0, 5.0)
-    bar.low.selectAll()
-    qtbot.keyClicks(bar.low, "7")
-    qtbot.keyClick(bar.low, Qt.Key.Key_Return)
-    assert bar.levels == (0.0, 5.0)
-    assert bar.low.property("refused")
-    qtbot.mouseClick(bar.auto, Qt.MouseButton.LeftButton)
-    assert bar.levels[1] == pytest.approx(10, rel=0.01)
-
-
-def test_no_voxel_is_read_in_the_windows_thread(
-    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path, monkeypatch
-) -> None:
-    voxels = np.random.default_rng(0).random((6, 64, 48), np.float32)
-    np.save(tmp_path / "v.npy", voxels)
-    threads: set[str] = set()
-    for name in ("plane", "across_y", "across_x"):
-        read = getattr(VolumeSource, name)
-
-        def watched(self, index, read=read):
-            threads.add(threading.current_thread().name)
-            return read(self, index)
-
-        monkeypatch.setattr(VolumeSource, name, watched)
-    panel.open(tmp_path / "v.npy")
-    view = panel.volume
-    qtbot.waitUntil(lambda: view.projections is not None, timeout=WAIT_MS)
-    qtbot.mouseClick(view.slices_button, Qt.MouseButton.LeftButton)
-    view.go_to(5, 9, 8)
-    at = {"z": 5, "y": 9, "x": 8}
-    qtbot.waitUntil(lambda: {a: s.index for a, s in view.slices.items()} == at, timeout=WAIT_MS)
-    assert threads
-    assert threading.main_thread().name not in threads
-
-
-def test_another_volume_ends_the_reading_of_the_first(
-    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path
-) -> None:
-    first, second = (np.full((4, 8, 8), value, np.float32) for value in (1, 2))
-    np.save(tmp_path / "a.npy", first)
-    np.save(tmp_path / "b.npy", second)
-    panel.open(tmp_path / "a.npy")
-    panel.open(tmp_path / "b.npy")
-    qtbot.waitUntil(lambda: panel.volume.projections is not None, timeout=WAIT_MS)
-    assert panel.result.path.name == "b.npy"
-    assert panel.volume.projections.front.max() == 2
-    panel.shutdown()
-    qtbot.waitUntil(lambda: not panel.jobs.jobs, timeout=WAIT_MS)
-
-
-def test_the_red_theme_shows_nothing_but_red(
-    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path, qapp: QApplication
-) -> None:
-    np.save(tmp_path / "v.npy", np.random.default_rng(0).random((4, 40, 40), np.float32))
-    panel.open(tmp_path / "v.npy")
-    qtbot.waitUntil(lambda: panel.volume.projections is not None, timeout=WAIT_MS)
-    try:
-        list(change_theme("red", panel, [panel]))
-        shown = panel.volume.coloured.image
-        assert shown[..., 0].max() > 0.5
-        assert shown[..., 1:].max() == 0
-        image = panel.volume.front.grab().toImage()
-        middle = image.pixelColor(image.width() // 2, image.height() // 2)
-        assert middle.red() >= middle.green() == middle.blue() == 0
-    finally:
-        apply_theme(qapp, "dark")
 
 
 def test_stop_during_explain_stops_that_and_not_what_was_done_before(

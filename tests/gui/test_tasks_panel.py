@@ -51,6 +51,11 @@ def test_every_task_has_a_form_of_its_own_declarations(qtbot: QtBot, panel: Task
         offered = {o.name for _, options in panel._pages[name].task.parts.values() for o in options}
         assert {n for n in offered if n in form.fields} == set(form.fields)
         assert all(field.tip for field in form.fields.values())
+        told = [
+            form.widgets[n].toolTip() + getattr(form.widgets[n], "placeholderText", str)()
+            for n in form.fields
+        ]
+        assert not [words for words in told if "--" in words], "fields are called by their labels"
         needed = panel._pages[name].task.needed
         required = [n for n, field in form.fields.items() if field.option.is_required or n in needed]
         assert panel.objects() is None if required else panel.objects() is not None

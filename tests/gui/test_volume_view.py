@@ -28,7 +28,7 @@ def test_a_volume_is_turned_stepped_through_and_measured(qtbot: QtBot) -> None:
     view.show()
     grid = Grid(voxels.shape, (15, 20), np.linspace(1e4, 2e4, 8), np.full(8, 25.0))
     view.open(volume_in_memory(voxels, Path("volume.npy")), grid)
-    assert not view.proportions.isEnabled()  # its voxels are of one size
+    assert not view.tools.proportions.isEnabled()  # its voxels are of one size
     qtbot.waitUntil(lambda: view.projections is not None, timeout=WAIT_MS)
     view.set_mode("turning")
     canvas = view.turning.canvas
@@ -48,11 +48,11 @@ def test_a_volume_is_turned_stepped_through_and_measured(qtbot: QtBot) -> None:
     QTest.keyClick(view.slider, Qt.Key.Key_PageDown)
     assert view.point[0] == 5
     qtbot.waitUntil(lambda: view.slices["z"].index == 5, timeout=WAIT_MS)
-    view.measure_button.setChecked(True)
+    view.tools.measure.setChecked(True)
     view.measure._dragged(QPointF(12, 12), QPointF(21, 16))
     assert "10 x 5 at 12, 12 pixels (250 µm x 125 µm): mean 3" in view.measured.text()
     assert "most along depth at plane 6" in view.measured.text()
-    view.measure_button.setChecked(False)
+    view.tools.measure.setChecked(False)
     assert not view.measure.regions
     view.release()
     qtbot.waitUntil(lambda: not jobs.jobs, timeout=WAIT_MS)
@@ -76,7 +76,7 @@ def test_a_perspective_volume_is_shown_in_true_proportions(qtbot: QtBot) -> None
         return view.projections is not None and np.allclose(view.projections.front, front, atol=1e-5)
 
     view.open(source, grid)
-    assert view.proportions.isChecked()
+    assert view.tools.proportions.isChecked()
     qtbot.waitUntil(lambda: shows(metric.max(axis=0)), timeout=WAIT_MS)
     assert view.bar.bar.text.textItem.toPlainText() == "200 µm"  # a quarter is 400
     assert view.bar.bar.size * on.pitch_um[0] == pytest.approx(200)
@@ -91,7 +91,7 @@ def test_a_perspective_volume_is_shown_in_true_proportions(qtbot: QtBot) -> None
     qtbot.waitUntil(lambda: "y" in view.slices and view.slices["y"].index == 10, timeout=WAIT_MS)
     np.testing.assert_allclose(view.slices["y"].pixels, metric[:, 10], atol=1e-5)
     view.set_mode("turning")
-    view.proportions.click()
+    view.tools.proportions.click()
     qtbot.waitUntil(lambda: shows(voxels.max(axis=0)), timeout=WAIT_MS)
     qtbot.waitUntil(lambda: view.turning.renderer is not None, timeout=WAIT_MS)
     assert view.turning.renderer.shape == voxels.shape
@@ -99,4 +99,4 @@ def test_a_perspective_volume_is_shown_in_true_proportions(qtbot: QtBot) -> None
     view.release()
     qtbot.waitUntil(lambda: not jobs.jobs, timeout=WAIT_MS)
     assert closed == [True]
-    assert not view.proportions.isEnabled()
+    assert not view.tools.proportions.isEnabled()

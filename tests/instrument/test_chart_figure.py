@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from io import BytesIO
+
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from instrument.evaluation.chart import ChartData, colours_of
 from instrument.evaluation.chart_figure import MOST_LINES, chart_figure, chosen, draw_chart
@@ -43,6 +47,16 @@ def test_a_dozen_lines_hold_the_front_and_the_best_of_each_family() -> None:
     assert len(few) == 5
 
 
+def test_what_is_quick_is_named_where_many_are_nearly_the_best() -> None:
+    quick = [Point(f"quick{n}", 1, 1e-3 * 2**n, psnr_db=20.0 + 3 * n, family="a") for n in range(4)]
+    best = [Point(f"best{n}", 1, 1.0 + n, psnr_db=34.0 + n / 100, family="a") for n in range(20)]
+    runs = {p.setting: [p] for p in (*quick, *best)}
+    shown = chosen(runs, pareto([*quick, *best], SCORE), SCORE)
+    assert len(shown) == MOST_LINES
+    assert {p.setting for p in quick} < set(shown)
+    assert shown[0] == "best19"
+
+
 def test_names_stand_apart_beside_the_panel_and_say_what_the_front_costs() -> None:
     data = ChartData("reconstruction", {"simulated": True}, _points(40), {}, ())
     axes = Figure().subplots()
@@ -56,3 +70,14 @@ def test_names_stand_apart_beside_the_panel_and_say_what_the_front_costs() -> No
     assert bold
     assert all(text.endswith(("ms", " s")) for text in bold)
     assert len(chart_figure(data).axes) == 2
+
+
+def test_long_names_are_cut_by_no_edge_and_no_panel() -> None:
+    long = tuple(replace(p, setting=f"{p.setting} tv-isotropic background bin 2 float64") for p in _points(9))
+    short = tuple(replace(p, setting=f"{p.setting} other") for p in _points(3))
+    figure = chart_figure(ChartData("reconstruction", {"simulated": True}, (*long, *short), {}, ()))
+    figure.savefig(BytesIO())  # places the names
+    left, right = figure.axes
+    ends = [max(Text.get_window_extent(text).x1 for text in axes.texts) for axes in (left, right)]
+    assert ends[0] < right.get_tightbbox(for_layout_only=True).x0  # type: ignore[union-attr]
+    assert ends[1] < figure.bbox.x1

@@ -96,6 +96,14 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.startswith("diffuserbench ")
 
 
+def test_the_module_is_the_program() -> None:
+    shown = subprocess.run(
+        [sys.executable, "-m", "diffuserbench", "snpa"], capture_output=True, text=True, timeout=60
+    )
+    assert shown.returncode == 2
+    assert "no command 'snpa'" in shown.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
@@ -423,3 +431,29 @@ def test_bash_completes_commands_options_and_their_words(tmp_path: Path) -> None
         ["bash", "-c", "\n".join(lines)], capture_output=True, text=True, cwd=tmp_path, check=True
     )
     assert said.stdout.splitlines() == list(asked.values())
+
+
+def test_a_thread_that_still_computes_does_not_abort_the_end_of_the_program() -> None:
+    """What a C++ library does with an interpreter that ends under it: exit status 134, and no word."""
+    program = (
+        "import atexit, sys, threading\n"
+        "from concurrent.futures import ThreadPoolExecutor\n"
+        "import numpy as np, scipy.fft\n"
+        "from instrument import cli\n"
+        "def compute():\n"
+        "    picture = np.ones((1500, 1500))\n"
+        "    while True:\n"
+        "        scipy.fft.fft2(picture)\n"
+        "        begun.set()\n"
+        "begun = threading.Event()\n"
+        "def main():\n"
+        "    threading.Thread(target=compute, daemon=True).start()\n"
+        "    begun.wait()\n"
+        "    ThreadPoolExecutor(1).submit(int).result()\n"
+        "    atexit.register(print, 'closed')\n"
+        "    return 3\n"
+        "cli.main = main\n"
+        "sys.exit(cli.console())\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (3, "closed\n", "")

@@ -135,8 +135,10 @@ def test_a_plan_file_reads_back_as_it_was_written(here: Path, suffix: str) -> No
 
 
 def test_run_list_show_verify(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "plan.toml"]) == 0
+    assert main(["run", "plan.toml", "--figure", "frames.png"]) == 0
+    assert main(["run", "plan.toml", "--figure", "frames.png"]) == 2, "it is there already"
     shown = capsys.readouterr()
+    assert "Wrote frames.png" in shown.out
     assert "completed: 7 of 7 frames" in shown.out
     assert "SIMULATED" in shown.out + shown.err
     run = the_run(here)
@@ -216,7 +218,8 @@ def test_a_stage_without_reference_is_homed_before_the_run(
 
 
 def test_a_recording_cut_off_is_closed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["record", "--frames", "5", "--label", "beads"]) == 0
+    assert main(["record", "--frames", "5", "--label", "beads", "--figure", "page.png"]) == 0
+    assert (here / "page.png").stat().st_size > 1000
     shown = capsys.readouterr()
     assert "of 5 frames" in shown.out
     assert "the camera dropped" in shown.err  # the mock camera says that it drops one before each frame

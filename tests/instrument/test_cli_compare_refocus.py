@@ -116,9 +116,11 @@ def test_comparing_tells_whether_a_calibration_is_due(
     same = str(folder / "calibration")
     assert main(["compare", same, same]) == 0
     assert "No recalibration is due" in capsys.readouterr().out
-    out = tmp_path / "bump.json"
-    assert main(["compare", same, str(folder / "other"), "--out", str(out)]) == 1
+    out, page = tmp_path / "bump.json", tmp_path / "bump.png"
+    other = str(folder / "other")
+    assert main(["compare", same, other, "--out", str(out), "--figure", str(page)]) == 1
     assert "RECALIBRATE" in capsys.readouterr().out
+    assert np.ptp(cv2.imread(str(page)).astype(int), axis=2).max() > 100, "what differs is coloured"
     record = json.loads(out.read_text())
     assert record["due"] is True
     assert len(record["changes"]) == 2

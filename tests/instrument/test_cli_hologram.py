@@ -7,6 +7,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -51,6 +52,8 @@ def test_the_pattern_file_shows_the_picture(capsys):
     assert main(["hologram", "picture.png", "--iterations", "40"]) == 0
     said = capsys.readouterr().out
     assert "alias-free grid, envelope shade, 1 frame(s)" in said
+    assert "limited by frames: many would reach about" in said
+    assert "limited by alignment: none is given" in said
     levels, facts = read_slm_image("slm.png")
     assert levels.shape == (96, 128)
     assert (levels[::2, ::2] == levels[1::2, 1::2]).all()
@@ -65,6 +68,23 @@ def test_the_pattern_file_shows_the_picture(capsys):
     assert found == pytest.approx(facts["metrics"][0]["psnr_db"], abs=0.3)
     assert found > 20
     assert read_image("slm-preview.png").is_colour
+
+
+@pytest.mark.usefixtures("here")
+def test_a_dark_picture_is_judged_by_its_own_white_and_alpha_is_told(capsys):
+    grey = read_image("picture.png").pixels
+    files = {"bright.png": grey, "dark.png": (grey.astype(np.uint16) << 4)}
+    found = []
+    for name, pixels in files.items():
+        write_image(name, pixels)
+        assert main(["hologram", name, "-n", "5", "--out", f"of-{name}"]) == 0
+        found.append(json.loads(Path(f"of-{name}").with_suffix(".json").read_text())["metrics"][0]["psnr_db"])
+    assert found[0] == pytest.approx(found[1], abs=0.05)  # 12 bits of 16: 27 dB more by the type's white
+    ground = np.stack([grey] * 3 + [np.zeros_like(grey)], axis=-1)
+    assert cv2.imwrite("clear.png", ground)
+    capsys.readouterr()
+    assert main(["hologram", "clear.png", "-n", "1", "--out", "clear-slm.png"]) == 0
+    assert "clear.png: alpha channel left out." in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("here")
@@ -334,3 +354,15 @@ def test_etendue_prints_the_dissertations_example(capsys):
     assert "paraxial 1.06 mm" in said
     assert "leaves 12.7 degrees" in said
     assert main(["etendue", "--slm", "big"]) == 2
+
+
+def test_etendue_draws_what_it_says(tmp_path, capsys):
+    page = tmp_path / "page.png"
+    asked = ["etendue", "--fov", "60", "--figure", str(page)]
+    assert main(asked) == 0
+    assert f"Wrote       {page}" in capsys.readouterr().out
+    assert cv2.imread(str(page)).std() > 10
+    assert main(asked) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main([*asked, "--force"]) == 0
+    assert main(["etendue", "--figure", "page.txt"]) == 2

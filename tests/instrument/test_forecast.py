@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from instrument.reconstruction.forecast import TRIED, Forecast, Foretold, Like, 
 from instrument.reconstruction.job import Job
 from recon import Calibration, reconstruct
 from recon.errors import InputError
+from recon.evaluation.scene import make_scene
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.solvers.base import StopReason
@@ -42,6 +44,18 @@ def test_a_forecast_counts_iterations_of_all_channels_and_stops_at_a_time(
     short = Forecast(1.0, 0.1, 1000, 2.0**30, time_s=5.0)
     assert short.seconds == 6.0
     assert str(short) == "at most 6.0 s, 100 ms an iteration (6 were tried); 1.00 GiB of memory"
+
+
+def test_a_picture_is_told_by_when_a_copy_on_blocks_settles() -> None:
+    made = make_scene("sparse-picture", size=64)
+    asked = ReconstructionOptions(judged=False)
+    told = forecast(Measurement(made.measurement), made.calibration, asked)
+    took = len(reconstruct(made.measurement, made.calibration, asked).history)
+    assert told.settles == pytest.approx(took, rel=0.4)
+    assert told.seconds == pytest.approx(told.beside_s + told.settles * told.iteration_s)
+    assert f", {told.settles} of them (so many settle a copy" in str(told)
+    limited = forecast(Measurement(made.measurement), made.calibration, replace(asked, tolerance=0.0))
+    assert limited.settles is None, "it takes as many as were asked for"
 
 
 def test_solvers_in_one_step_are_forecast_too(scene: tuple[Measurement, Calibration]) -> None:

@@ -12,8 +12,10 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, read_image, write_image
 from instrument.reconstruction.mosaic import mosaic_named, mosaic_of, reduce_mosaic, require_mosaic
 from instrument.reconstruction.preparation import Crop
+from instrument.reconstruction.video_files import VideoPictures
 from recon.camera.factors import PATTERNS
 from recon.errors import InputError
+from tests.mocks.recordings import write_recording
 
 HEIGHT, WIDTH = 36, 48
 COLOURS = np.array([1.0, 0.5, 0.2])
@@ -102,6 +104,19 @@ def test_a_volume_takes_a_raw_frame_too(files):
     arguments = ["--volume", files / "psfs.tif", "-i", files / "raw.tif", "--dark", 0, "-n", 2]
     assert main(["reconstruct", *map(str, arguments), "-o", str(files / "v.tif")]) == 0
     assert tifffile.imread(files / "v.tif").shape == (2, 3, HEIGHT, WIDTH)  # OME's order: z, channel, y, x
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+def test_a_recording_of_raw_frames_becomes_a_video_in_colour(files, binning):
+    """Every frame, not only the first that settles everything."""
+    raw = tifffile.imread(files / "raw.tif")
+    run = write_recording(files, {0: raw // 2, 1: raw}, pixel_format="BayerGR12")
+    arguments = ["--video", "-p", files / "psf.tif", "--dark", 0, "--bin", binning, "-n", 40, "--no-mp4"]
+    assert main(["reconstruct", str(run), *map(str, arguments), "-o", str(files / "v.ome.zarr")]) == 0
+    image = VideoPictures(files / "v.ome.zarr").flat(1)
+    assert image.shape == (HEIGHT // binning, WIDTH // binning, 3)
+    square = image[15 // binning : 21 // binning, 21 // binning : 27 // binning].mean(axis=(0, 1))
+    assert square / square[0] == pytest.approx(COLOURS, abs=0.05)
 
 
 def test_none_takes_the_frame_as_grey(files):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,10 @@ import tifffile
 from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError, FileError
+from instrument.files.images import read_image
 from instrument.plan.model import illumination_plan, load_plan
 from instrument.plan.patterns import group_lights, groups_from_text
+from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned
 from recon import Calibration, Options
 from recon.base.metrics import psnr
@@ -54,12 +57,19 @@ def scene() -> np.ndarray:
 
 
 def write_run(
-    folder: Path, reflects: np.ndarray, groups: list[list[int]] = GROUPS, **settings: object
+    folder: Path,
+    reflects: np.ndarray,
+    groups: list[list[int]] = GROUPS,
+    tint: tuple[float, ...] = (),
+    **settings: object,
 ) -> Path:
+    """``tint``: of red, green and blue, as a mosaic sensor's raw frames (RGGB) have them."""
     rng = np.random.default_rng(3)
     frames = {0: rng.normal(DARK_COUNTS, 1, SHAPE)}
+    row, column = np.indices(SHAPE)
+    sees = np.array(tint)[(row % 2) + (column % 2)] if tint else 1.0
     for number, light in enumerate(lights(), start=1):
-        clean = 20000 * cast(reflects * light) + DARK_COUNTS
+        clean = 20000 * sees * cast(reflects * light) + DARK_COUNTS
         frames[number] = clean + rng.normal(0, 1, SHAPE)
     frames = {index: np.clip(np.round(frame), 0, 65535) for index, frame in frames.items()}
     plan = illumination_plan(group_lights(groups), exposure_ms=10)
@@ -96,6 +106,28 @@ def test_one_picture_of_all_patterns(files: tuple[Path, Path, Path], tmp_path: P
     assert record["provenance"]["patterns"] == 3
 
 
+def test_a_colour_camera_in_patterned_light(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    """Its raw frames, each colour where it was measured; of a pixel size and window of one's own."""
+    calibration, tint = files[2], (1.0, 0.6, 0.3)
+    run = write_run(tmp_path / "red", scene(), tint=tint, pixel_format="BayerRG12")
+    sheet = write_run(tmp_path / "white", np.ones(SHAPE), tint=tint, pixel_format="BayerRG12")
+    out = tmp_path / "colour.tif"
+    command = ["reconstruct", str(run), "--patterned", str(sheet), "--calibration", str(calibration)]
+    assert main([*command, "--out", str(out), "--iterations", "100", "--bin", "2", "--crop", "24x28"]) == 0
+    image = read_image(out).pixels
+    assert image.shape == (12, 14, 3)
+    light = image.reshape(-1, 3).sum(axis=0)
+    np.testing.assert_allclose(light / light[0], tint, rtol=0.1)
+    truth = (scene() * lights().sum(axis=0))[:, 1:29].reshape(12, 2, 14, 2).mean(axis=(1, 3))
+    assert psnr(image[..., 0], truth, fit_scale=True) > 13  # of a quarter of the pixels
+    asked = PatternedRequest(run=run, sheet=tmp_path / "patterns.npy", calibration=calibration)
+    np.save(tmp_path / "patterns.npy", lights())
+    whole = prepare_patterned(asked).measurement
+    erased = np.asarray(whole.erasures)
+    assert np.shape(whole.image) == erased.shape == (3, *SHAPE, 3)
+    np.testing.assert_allclose(1 - erased.mean(axis=(0, 1, 2)), (0.25, 0.5, 0.25))
+
+
 def test_patterns_are_the_shares_of_the_light(files: tuple[Path, Path, Path]) -> None:
     run, sheet, calibration = files
     told: list[tuple[int, int]] = []
@@ -104,11 +136,12 @@ def test_patterns_are_the_shares_of_the_light(files: tuple[Path, Path, Path]) ->
     assert told == [(n, 3) for n in range(4)]
     truth = lights() / lights().sum(axis=0)
     middle = np.s_[:, 5:-5, 5:-5]
-    assert np.abs(prepared.patterns - truth)[middle].mean() < 0.06
-    assert prepared.patterns.sum(axis=0)[5:-5, 5:-5] == pytest.approx(1, abs=1e-5)
-    assert abs(float(prepared.frames[0].mean()) - 20000 * float(cast(scene() * lights()[0]).mean())) < 5
-    binned = prepare_patterned(PatternedRequest(run=run, sheet=sheet, calibration=calibration, binning=2))
-    assert binned.frames.shape == binned.patterns.shape == (3, 12, 15)
+    assert np.abs(np.asarray(prepared.measurement.patterns) - truth)[middle].mean() < 0.06
+    assert np.asarray(prepared.measurement.patterns).sum(axis=0)[5:-5, 5:-5] == pytest.approx(1, abs=1e-5)
+    first = float(np.asarray(prepared.measurement.image)[0].mean())
+    assert abs(first - 20000 * float(cast(scene() * lights()[0]).mean())) < 5
+    binned = prepare_patterned(replace(request, inputs=InputOptions(binning=2))).measurement
+    assert np.shape(binned.image) == np.shape(binned.patterns) == (3, 12, 15)
 
 
 def test_patterns_may_come_from_a_file(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
@@ -116,7 +149,7 @@ def test_patterns_may_come_from_a_file(files: tuple[Path, Path, Path], tmp_path:
     np.save(tmp_path / "patterns.npy", lights())
     request = PatternedRequest(run=run, sheet=tmp_path / "patterns.npy", calibration=calibration)
     truth = lights() / lights().sum(axis=0)
-    np.testing.assert_allclose(prepare_patterned(request).patterns, truth, atol=1e-5)
+    np.testing.assert_allclose(prepare_patterned(request).measurement.patterns, truth, atol=1e-5)
     np.save(tmp_path / "patterns.npy", lights()[:2])
     with pytest.raises(FileError, match=r"\(3, 24, 30\)"):
         prepare_patterned(request)
@@ -153,10 +186,21 @@ def test_what_does_not_belong_together_is_refused(files: tuple[Path, Path, Path]
     assert "lacks 3 frames" in refused(sheet, missing)
     small = write_recording(
         tmp_path / "small",
-        {n: np.ones((10, 10)) for n in range(4)},
+        {n: np.arange(100.0).reshape(10, 10) for n in range(4)},
         plan=illumination_plan(group_lights(GROUPS), exposure_ms=1),
     )
     assert "24 x 30" in refused(sheet, small)
+
+
+def test_scene_and_sheet_swapped_are_told(files: tuple[Path, Path, Path]) -> None:
+    run, sheet, calibration = files
+
+    def said(run: Path, sheet: Path) -> bool:
+        prepared = prepare_patterned(PatternedRequest(run=run, sheet=sheet, calibration=calibration))
+        return any("swapped" in warning for warning in prepared.job.warnings)
+
+    assert not said(run, sheet)
+    assert said(sheet, run)
 
 
 def test_saturated_frames_are_told(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
@@ -171,10 +215,9 @@ def test_saturated_frames_are_told(files: tuple[Path, Path, Path], tmp_path: Pat
     [
         ["--video"],
         ["--psf", "x.tif"],
-        ["--time", "3"],
         ["--workers", "2"],
         ["--dark", "3"],
-        ["--crop", "0,0,9,9"],
+        ["--figure", "x.png"],
     ],
 )
 def test_options_that_do_not_apply_are_named(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from rich.progress import Progress
 
+from instrument.cli import main
 from instrument.cli.progress import _Left, _Note
 from instrument.files import kept_times
 
@@ -54,6 +55,14 @@ def test_the_oldest_times_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None
     assert [kept_times.expected_s(name) is None for name in ("a", "b", "c")] == [False, True, False]
 
 
+def test_a_terminal_is_told_that_a_command_is_on_its_way(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)  # this test's own
+    assert main(["drivers"]) == 0
+    assert capsys.readouterr().err.startswith("starting drivers ...\r\x1b[2K")
+
+
 def test_a_bar_says_what_is_left_and_what_is_compiled() -> None:
     from numba.core import event
 
@@ -63,7 +72,12 @@ def test_a_bar_says_what_is_left_and_what_is_compiled() -> None:
     assert str(_Left().render(task)).endswith(" left, as last time")
     task.fields["expected_s"] = 0.0
     assert "longer than last time" in str(_Left().render(task))
-    bar.update(task.id, total=10, completed=3)
+    bar.update(task.id, total=10, completed=0)
+    assert str(_Left().render(task)).startswith("left -")
+    task.start_time = task.get_time() - 30
+    task.completed = 3  # the first that was done: there is no speed yet
+    assert str(_Left().render(task)) in ("left about 70.0 s", "left about 70.1 s")
+    bar.update(task.id, total=10, completed=4)
     assert str(_Left().render(task)).startswith("left ")
     column = _Note()
     assert not str(column.render(task))

@@ -34,6 +34,7 @@ def write_recording(
     plan: Plan | None = None,
     saturated: float = 0.0,
     stage: Mapping[int, Mapping[str, float]] | None = None,
+    pixel_format: str = "Mono12",
 ) -> Path:
     """Write frames, uint16, by their number; numbers left out are gaps. Returns the run's folder.
 
@@ -54,7 +55,7 @@ def write_recording(
                 utc=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
                 exposure_ms=10.0,
                 gain=1.0,
-                pixel_format="Mono12",
+                pixel_format=pixel_format,
                 significant_bits=12,
                 black_level=0.0,
                 roi=(0, 0, *image.shape[:2]),

@@ -12,7 +12,9 @@ _RUNS = tuple(
         "interrupt",
         "recorder",
         "resume",
+        "run_control",
         "runner",
+        "runner_in_pieces",
         "store",
         "store_order",
         "timed",
@@ -30,6 +32,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
         (
             "tests/instrument/bench/test_bench_safety.py",
+            "tests/instrument/bench/test_source_and_scene.py",
             "tests/instrument/bench/test_closing_at_exit.py",
             "tests/instrument/bench/test_bench_lock.py",
             "tests/drivers/test_answers.py",

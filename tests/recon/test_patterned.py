@@ -121,3 +121,33 @@ def test_patterned_light_is_a_camera_and_goes_with_what_other_cameras_go_with() 
         reconstruct(Measurement(frames, patterns=lit), psf(), solver="admm")
     problem = Problem.of(Measurement(frames, patterns=lit), psf())
     assert (problem.n_channels, problem.n_planes, len(problem.data)) == (1, 1, 3)
+
+
+def test_colours_are_seen_under_the_same_patterns() -> None:
+    lit, tint = patterns(3), np.array([1.0, 0.5, 0.2])
+    plain = np.stack([cast(scene() * pattern) for pattern in lit])
+    mirrored = np.stack([cast(scene()[:, ::-1] * pattern) for pattern in lit])
+    frames = np.stack([plain, mirrored, plain], axis=-1) * tint
+    told = {"noise": 1e-3, "patterns": lit}
+    found = reconstruct(Measurement(frames, **told), psf(), iterations=150)
+    assert found.image.shape == (*SHAPE, 3)
+    for colour, truth in enumerate((scene(), scene()[:, ::-1], scene())):
+        picture = found.image[..., colour]
+        gain = float(np.vdot(picture, truth) / np.vdot(picture, picture))
+        assert 1 / gain == pytest.approx(tint[colour], rel=0.1)
+        assert psnr(gain * picture, truth) > 17
+    # What a mosaic leaves out of each colour is left out of each of its frames; a background is one a frame.
+    row, column = np.indices(SHAPE)
+    erased = np.stack([(row % 2) + (column % 2) != colour for colour in range(3)], axis=-1)
+    erased = np.broadcast_to(erased, frames.shape)
+    settings = {"iterations": 60, "tolerance": 0.0, "tau": 1e-2, "estimate_background": True}
+    part = reconstruct(
+        Measurement(np.where(erased, 99.0, frames), erasures=erased, **told), psf(), **settings
+    )
+    assert part.background is not None
+    assert part.background.shape == frames.shape
+    known = Measurement(frames[..., 0], erasures=erased[..., 0], **told)
+    alone = reconstruct(known, psf(), **settings)
+    assert alone.background is not None
+    assert alone.background.shape == plain.shape
+    assert psnr(part.image[..., 0], alone.image) > 50  # the brightest colour, so that weights are the same

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calibration_routines.display.mask_alignment import (
+    AlignmentFailedError,
+    AlignmentProcedure,
+    AlignmentSettings,
+)
 from calibration_routines.display.slm_calibration import SlmProcedure
 from calibration_routines.plan_procedures import ResumeProcedure
 from calibration_routines.procedure import Listener, Outcome
@@ -70,6 +76,29 @@ def test_a_table_that_ended_early_goes_on(tmp_path: Path, monkeypatch: pytest.Mo
     assert len(Run.open(path).records) == len(run.records)
     with pytest.raises(BenchError, match="of another picture"):
         measured(tmp_path, "other.json", again=path, levels=17)
+
+
+def test_an_alignment_that_was_interrupted_says_where_the_stage_is_and_goes_on(tmp_path: Path) -> None:
+    settings = AlignmentSettings(reach=8.0, depth_um=100.0, spots=25, max_frames=7, out=tmp_path / "a.json")
+    control = RunControl()
+    with Bench(parse_config(small(), None)).open() as bench, pytest.raises(EndedEarlyError) as ended:
+        AlignmentProcedure(settings).carry_out(bench, tmp_path, control=control, listener=Ends(control))
+    (path,) = (p for p in tmp_path.iterdir() if p.is_dir())
+    notes = " ".join(ended.value.__notes__)
+    assert "The stage stands at x_um 0, y_um 0" in notes
+    assert f"align mask --again {path}" in notes
+    kept = len(Run.open(path).records)
+    assert 0 < kept < 7
+    began = Run.open(path).metadata(kept - 1).host_time_ns
+    going_on = AlignmentProcedure(replace(settings, again=path))
+    with (
+        Bench(parse_config(small(), None)).open() as bench,
+        pytest.raises(AlignmentFailedError, match="gave up after 7 frames"),
+    ):
+        going_on.carry_out(bench, tmp_path)
+    run = Run.open(path)
+    assert len(run.records) == 7
+    assert run.metadata(kept - 1).host_time_ns == began  # seen again, not taken again
 
 
 def test_a_run_of_something_else_is_refused(tmp_path: Path) -> None:

@@ -78,6 +78,27 @@ def test_another_mask_is_noticed_at_once() -> None:
         aligned(bench)
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"wavelength_nm": "653.4", "sensor_roll_mrad": "150.0"},
+            "1.0 % smaller .*wavelength_nm is 653.[3-5]",
+        ),
+        ({"focal_mm": "35.6"}, "1.7 % larger .*focal_mm 35.6"),
+    ],
+)
+def test_a_wrong_wavelength_or_focal_length_is_told_by_the_scale(changes: dict[str, str], words: str) -> None:
+    head, tail = small().split("\n[simulated_display]")
+    for key, value in changes.items():
+        tail = re.sub(rf"(?m)^{key} = .*", "", tail) + f"\n{key} = {value}\n"
+    with (
+        Bench(parse_config(f"{head}\n[simulated_display]{tail}", None)).open() as bench,
+        pytest.raises(AlignmentFailedError, match=words),
+    ):
+        aligned(bench)
+
+
 def test_frames_are_counted_and_limited() -> None:
     few = AlignmentSettings(reach=16.0, depth_um=300.0, spots=27, max_frames=4)
     with (

@@ -326,6 +326,18 @@ def test_the_grid_covers_what_a_reconstruction_shows(bench: Bench) -> None:
         grid_sweep(bench, (Z_UM,), spacing_um=100.0)
 
 
+def test_no_place_is_planned_from_which_the_pattern_leaves_the_sensor(bench: Bench) -> None:
+    asked = grid_sweep(bench, (Z_UM,), half_field_um=(50e3, 50e3), spacing_um=10e3)
+    x, y = np.abs(np.array(asked.points_um))[:, :2].max(axis=0)
+    assert (x, y) == (
+        30e3,
+        20e3,
+    )  # of 10 mm each: farther, less than a tenth is seen
+    assert any(reason.startswith("86 of 121 places left out") for reason in asked.reasons)
+    with pytest.raises(BenchError, match="leaves the sensor"):
+        grid_sweep(bench, (Z_UM,), half_field_um=(0.0, 0.0), spacing_um=10e3, x_um=50e3)
+
+
 def test_lateral_spacing_is_the_dissertations() -> None:
     # 0.4 mm for the microscope (Kuo 2020, Sec. 6.4), whose nearest depth is 1.7 mm
     assert lateral_spacing(gaussian_fall_off(13.0), 1700.0).value == pytest.approx(400.0, rel=0.06)

@@ -10,6 +10,8 @@ import pytest
 from calibration_routines.psf.mount_fit import fit_mount, off_middle
 from calibration_routines.psf.psf_quality import PsfQuality
 from calibration_routines.psf.sweep_plan import size_findings
+from recon.camera.refocus import paraxial_scale
+from recon.camera.registration import moved, rescaled
 from recon.types import Geometry
 
 GEOMETRY = Geometry(pixel_pitch_um=13.0, diffuser_distance_mm=8.9, aperture_mm=(1.5, 2.0))
@@ -54,6 +56,41 @@ def test_a_lamp_that_flickers_is_no_wrong_mount() -> None:
     found = fit_mount(planes(), unsteady, GEOMETRY, brightness_error=0.05)
     assert found is not None
     assert found.findings == ()
+
+
+def test_a_wrong_distance_is_told_by_the_patterns_growth_whatever_the_pitch() -> None:
+    spots = np.zeros((120, 160), np.float32)
+    spots[tuple(RNG.integers(20, n - 20, 60) for n in spots.shape)] = RNG.uniform(1, 3, 60)
+    sharp = rescaled(spots, 0.98)
+    patterns = []
+    for number, z in enumerate(DEPTHS):
+        grown = rescaled(sharp, 1 / paraxial_scale(DEPTHS[-1], z, 8.9e3))
+        noisy = moved(grown, 0.3 * number, -0.2 * number) + RNG.normal(0, 0.002, spots.shape)
+        patterns.append(noisy.astype(np.float32)[None])
+
+    def told(d_mm: float, pitch_um: float = 13.0, farther_um: float = 0.0) -> tuple[float, str]:
+        geometry = replace(GEOMETRY, diffuser_distance_mm=d_mm, pixel_pitch_um=pitch_um)
+        recorded = [replace(plane, z_um=plane.z_um - farther_um) for plane in planes()]
+        found = fit_mount(recorded, light(), geometry, psfs=patterns)
+        assert found is not None
+        assert found.distance is not None
+        return found.distance[0] * d_mm, " ".join(w for w in found.findings if "grows" in w)
+
+    for d_mm in (8.9, 1.3 * 8.9):
+        found_mm, words = told(d_mm)
+        assert found_mm == pytest.approx(8.9, rel=0.02)
+        assert ("check diffuser_distance_mm" in words) == (d_mm != 8.9)
+    assert told(8.9, pitch_um=26.0)[1] == ""
+    assert told(8.9, farther_um=4e3)[1] == ""  # the light tells that the source stands elsewhere
+    wide = [replace(plane, radius_px=70.0) for plane in planes()]  # light that was bent that far tells less
+    lenslets = fit_mount(wide, light(), GEOMETRY, psfs=patterns)
+    assert lenslets is not None
+    assert lenslets.distance is not None
+    assert lenslets.distance[1] > 0.1
+    alike = [patterns[0]] * len(patterns)
+    grown = fit_mount(planes(), light(), GEOMETRY, psfs=alike)  # a pattern that does not grow tells no d
+    assert grown is not None
+    assert grown.distance is None
 
 
 def test_a_pinhole_wider_than_the_resolution_is_said() -> None:

@@ -7,16 +7,19 @@ import os
 import secrets
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
+from drivers.common.checked import given_up
 from drivers.device import Device, DriverOptions, port_claim
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, DeviceTimeoutError
 from drivers.registry.claim import PLACE_VARIABLE, Claim, DeviceBusyError
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config, template
-from tests.mocks.devices import MockWorld
+from instrument.bench.safety import StepsFailedError
+from tests.mocks.devices import MockStage, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers", "own_locks")
 
@@ -71,6 +74,36 @@ def test_the_second_program_is_refused_before_it_touches_anything() -> None:
         holder.communicate()
     with bench_on("none", "/dev/ttyMOCK1", "none").open():
         pass
+
+
+@pytest.mark.parametrize("name", ["home", "close"])
+def test_a_device_whose_call_hangs_is_not_opened_anew_before_it_ends(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """By another bench of this program neither: what comes back late would stop what that one has begun."""
+    port, let_go = "/dev/ttyMOCK7", threading.Event()
+    bench = bench_on("none", port, "none").open()
+    stage = bench.devices["stage"]
+    monkeypatch.setattr("drivers.common.checked.call_limit_s", lambda *_: 0.05)
+    monkeypatch.setattr("instrument.bench.bench.STOP_ANSWER_S", 0.05)
+    with monkeypatch.context() as hangs:
+        hangs.setattr(MockStage, name, lambda _: let_go.wait(20))
+        with pytest.raises((DeviceTimeoutError, StepsFailedError), match=r"hangs: (home|closing)"):
+            bench.stage.home() if name == "home" and bench.stage else bench.close()
+        if name == "home":
+            bench.close()
+    for _ in range(2):
+        with pytest.raises(DeviceTimeoutError, match=r"^stage \(mock\): still hangs: (home|closing) has not"):
+            bench_on("none", port, "none").open()
+    with pytest.raises(DeviceBusyError):  # as another program would be told
+        Claim(port_claim(port), "stage")
+    let_go.set()
+    for call in given_up(stage):
+        call.join(5)
+    with bench_on("none", port, "none").open() as again:
+        assert again.stage is not None
+        assert again.stage.is_open
+    Claim(port_claim(port), "stage").release()
 
 
 def test_programs_know_of_each_other_whatever_folder_for_temporary_files_they_have(

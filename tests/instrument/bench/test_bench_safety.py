@@ -11,7 +11,7 @@ import pytest
 from drivers.errors import DeviceError, DeviceLostError, LimitError, StoppedError
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
-from instrument.bench.safety import StepsFailedError
+from instrument.bench.safety import StepsFailedError, stop_until
 from instrument.files.errors import BenchError, OperatorNeededError
 from tests.mocks.devices import MockDevice, MockWorld
 
@@ -109,6 +109,7 @@ def test_a_device_that_was_lost_never_counts_as_safe(kind: str, words: str, fail
         ) as caught:
             leave()
         assert caught.value.exit_code == 1
+        assert (f"{step} failed." in str(caught.value)) == fails
         assert len(caught.value.failures) == 1
     assert calls(bench)[-4:] == CLOSING
     bench.close()  # closed: nothing left to doubt
@@ -202,6 +203,20 @@ def test_the_source_is_placed_through_the_configured_offset() -> None:
         assert bench.led_array.pattern.is_dark
 
 
+def test_an_axis_with_play_comes_from_below_unless_it_has_done_so() -> None:
+    extra = '[stage]\ndriver = "mock"\nplay = { x_um = 2.0 }\n'
+    with bench_with(extra=extra, kinds=("camera",)).open() as bench:
+        for place, moves in ({"x_um": 50.0}, 1), ({"x_um": 51.0}, 1), ({"x_um": 50.0}, 2), ({"z_um": 3.0}, 1):
+            before = len(calls(bench))
+            bench.place_source(**place)
+            assert calls(bench)[before:] == ["stage.move_to"] * moves
+        assert bench.stage is not None
+        bench.stage.move_to({"x_um": 20.0})  # by someone else: nobody knows from where it came
+        before = len(calls(bench))
+        bench.place_source(x_um=21.0)
+        assert calls(bench)[before:] == ["stage.move_to"] * 2
+
+
 def test_the_simulated_scene_is_switched_and_dark_after_closing() -> None:
     with bench_with(extra='[scene]\ncontrol = "simulated"\n').open() as bench:
         world = bench.shared["mock"]
@@ -232,7 +247,7 @@ def test_where_nobody_can_be_asked_that_is_an_error() -> None:
 
 def test_closing_a_device_has_twenty_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     bench, waits_s = bench_with().open(), list[float]()
-    monkeypatch.setattr("instrument.bench.bench.within", lambda seconds, *_: waits_s.append(seconds))
+    monkeypatch.setattr("instrument.bench.bench.within", lambda seconds, *_, **__: waits_s.append(seconds))
     bench.close()
     assert waits_s == [20.0] * 4
 
@@ -241,6 +256,39 @@ def test_the_bench_says_that_it_is_simulated() -> None:
     with bench_with().open() as bench:
         assert "SIMULATED" in bench.label
         assert str(bench).count("SIMULATED") == 5
+
+
+@pytest.mark.parametrize(
+    ("simulated", "mark"), [((), ""), (("camera", "slm"), " SIMULATED: camera, slm"), (KINDS, " SIMULATED")]
+)
+def test_the_label_names_what_is_simulated_of_a_mixed_bench(
+    monkeypatch: pytest.MonkeyPatch, simulated: tuple[str, ...], mark: str
+) -> None:
+    bench = bench_with(extra='[bench]\nname = "ours"\n')
+    monkeypatch.setattr(Bench, "simulated_kinds", simulated)
+    assert bench.label == f"{bench.config.label}{mark}"
+
+
+@pytest.mark.parametrize(("once", "ends_after", "stops"), [(True, 9, 1), (False, 3, 3), (False, 1, 1)])
+def test_stopping_goes_on_until_what_runs_has_ended(*, once: bool, ends_after: int, stops: int) -> None:
+    ended, tried = threading.Event(), list[int]()
+
+    def stop() -> None:
+        tried.append(1)
+        if len(tried) == ends_after:
+            ended.set()
+        raise StepsFailedError([(f"step {len(tried)}", DeviceError("stage", "failed."))])
+
+    with pytest.raises(StepsFailedError, match=f"step {stops}:"):
+        stop_until(stop, ended, once=once)
+    assert len(tried) == stops
+
+
+def test_stopping_what_does_not_end_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("instrument.bench.safety._STOP_WAIT_S", 0.05)
+    tried: list[int] = []
+    stop_until(lambda: tried.append(1), threading.Event())
+    assert len(tried) > 1
 
 
 def test_stop_from_another_thread_ends_a_move_and_darkens_the_source() -> None:

@@ -105,3 +105,24 @@ def test_what_is_open_at_the_end_is_closed_and_nothing_is_said(
     closing._end()
     assert bench.closed
     assert not caplog.text
+
+
+def test_the_end_is_asked_for_once_whatever_number_of_benches_is_watched(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Left:
+        def close(self) -> None:
+            pass
+
+    registered: list[object] = []
+    monkeypatch.setattr("instrument.bench.safety.atexit.register", registered.append)
+    closing, benches = ClosingAtExit(), [Left(), Left()]
+    for bench in benches:
+        closing.watch(bench)
+    assert registered == [closing._end]
+    assert closing._thread is not None
+    assert closing._thread.daemon
+    closing.forget(benches[0])
+    assert list(closing._open) == benches[1:]
+    closing._end()
+    assert closing._done.is_set()

@@ -401,21 +401,6 @@ def test_darkening_leaves_alone_what_no_step_has_lit() -> None:
         assert calls(bench) == before
 
 
-def test_progress_is_counted_and_a_runner_carries_out_once(tmp_path: Path) -> None:
-    told: list[RunStatus] = []
-    with open_mock_bench() as bench:
-        runner = prepare(bench, plan(), tmp_path, on_progress=told.append)
-        runner.execute()
-        with pytest.raises(RuntimeError, match="once"):
-            runner.execute()
-    stored = {status.done: status for status in told if status.done and status.step is not None}
-    assert [(s.done_here, s.total, s.dropped) for s in stored.values()] == [
-        (n, 5, n + 1) for n in range(1, 6)
-    ]
-    assert [s.seconds_left == pytest.approx(s.seconds / n * (5 - n)) for n, s in stored.items()] == [True] * 5
-    assert 0 < stored[1].seconds < 60
-
-
 def test_what_a_bench_lacks_is_said_when_a_step_needs_it() -> None:
     with open_mock_bench(["camera"]) as bench:
         settings, red = StepSettings(bench), Light(kind="pattern", leds=((0, 255, 0, 0),))

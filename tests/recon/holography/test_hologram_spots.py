@@ -109,13 +109,14 @@ def test_the_displacement_field_is_what_the_pose_says():
     np.testing.assert_allclose(moved, np.broadcast_to([0.0, 0.5], moved.shape), atol=1e-9)
 
 
-def test_the_camera_is_found_by_the_masks_speckle_to_a_tenth_of_a_pixel():
+@pytest.mark.parametrize("turned_rad", [0.0, 0.15, -0.11])
+def test_the_camera_is_found_by_the_masks_speckle_to_a_tenth_of_a_pixel(turned_rad):
     display = Display((120, 120), random_mask((480, 480), seed=4))
     speckle = mask_speckle(display)
-    truth = CameraMap((560, 560), 500.0, np.zeros((10, 2)))
-    truth.coefficients[0] = [3.4, -7.2]
-    truth.coefficients[1] = [1.5, -2.0]
-    truth.coefficients[9] = [4.0, 0.0]
+    truth = CameraMap((560, 560), 500.0, np.zeros((10, 2))).turned(turned_rad)
+    truth.coefficients[0] += [3.4, -7.2]
+    truth.coefficients[1] += [1.5, -2.0]
+    truth.coefficients[9] += [4.0, 0.0]
     rows, columns = np.meshgrid(np.arange(560), np.arange(560), indexing="ij")
     # Invert the map by iteration, then look the speckle up there.
     y, x = (rows - 279.5) / 500, (columns - 279.5) / 500
@@ -130,5 +131,7 @@ def test_the_camera_is_found_by_the_masks_speckle_to_a_tenth_of_a_pixel():
     places = np.random.default_rng(1).uniform(-0.4, 0.4, (2, 50))
     error = np.hypot(*(np.array(found.pixels(*places)) - truth.pixels(*places)))
     assert error.max() < 0.15
+    assert found.turn_rad == pytest.approx(truth.turn_rad, abs=1e-3)
+    assert found.scale * 503 == pytest.approx(truth.scale * 500, rel=1e-3)
     with pytest.raises(InputError, match="speckle was recognised in"):
         register_camera(np.random.default_rng(2).random((560, 560)), display, 500.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from recon.errors import InputError
 from recon.holography import (
     DcTerm,
     Display,
+    Hologram,
     HologramModel,
     HologramOptions,
+    HologramRecord,
     HologramStop,
     Target,
     compute_hologram,
@@ -20,7 +23,7 @@ from recon.holography import (
     random_mask,
 )
 from recon.holography.learned import Learned
-from recon.holography.limit import COLUMNS, DENSE, _below_least, _gap
+from recon.holography.limit import COLUMNS, DENSE, _below_least, _gap, gain_of_frames, limited_by
 
 SHAPE, K = (12, 16), 4
 
@@ -93,3 +96,38 @@ def test_it_can_be_interrupted_and_is_a_bound_all_the_same():
         hologram_limit(display, Target(picture()), HologramOptions(loss="none"))
     with pytest.raises(InputError, match="learned from photographs"):
         hologram_limit(display.taught(Learned.nothing(display)), Target(picture()))
+
+
+def hologram(*psnr_db: float, reason: HologramStop = HologramStop.ITERATIONS) -> Hologram:
+    history = tuple(HologramRecord(n, 0.0, 1.0, value) for n, value in enumerate(psnr_db))
+    return Hologram(np.ones((1, *SHAPE), np.complex64), history, reason, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("background", "factor", "limits"), [(0.0, 6, "contrast"), (0.3, 2, "frames"), (0.0, 1, "frames")]
+)
+def test_what_a_picture_lacks_is_frames_or_contrast(background, factor, limits):
+    shape = (28, 36)
+    display = Display(shape, random_mask((shape[0] * factor, shape[1] * factor), seed=1))
+    image = np.full((64, 64), background)
+    image[28:34, 20:40] = 1.0
+    words = limited_by(display, [Target(image)], hologram(1, 2, 2.1, 2.2, 2.3, 2.4), HologramOptions(), 0.6)
+    assert [line.partition(":")[0] for line in words] == [limits, *(["alignment"] if factor > 1 else [])]
+    if limits == "frames":
+        assert gain_of_frames(display, [Target(image)], HologramOptions()) > gain_of_frames(
+            display, [Target(image)], HologramOptions(frames=4)
+        )
+
+
+def test_search_light_and_alignment_are_told_where_they_limit():
+    display = replace(
+        Display(SHAPE, random_mask((SHAPE[0] * 2, SHAPE[1] * 2), seed=1)),
+        displacement=np.zeros((2, 2, 2)),
+        lost_db=0.8,
+    )
+    options = HologramOptions(complex_slm=True)
+    words = limited_by(display, [Target(picture())], hologram(1, 2, 3, 4, 5, 6), options, 0.06)
+    assert [line.partition(":")[0] for line in words] == ["search", "light", "alignment"]
+    assert "0.8 dB" in words[-1]
+    settled = hologram(1, 2, 3, 4, 5, 6, reason=HologramStop.CONVERGED)
+    assert limited_by(replace(display, lost_db=0.1), [Target(picture())], settled, options, 0.5) == ()

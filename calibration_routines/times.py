@@ -1,0 +1,61 @@
+"""How long a procedure takes in all: by what it took on this bench last time.
+
+A plan's estimate has exposures and motion. What comes on top (homing, looking for exposures, computing, and
+routines whose next picture depends on the last one, which have no plan) is only known from having done it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+from zlib import crc32
+
+from instrument.files import kept_times
+from instrument.files.errors import duration
+from instrument.files.record import plain
+
+if TYPE_CHECKING:
+    from calibration_routines.procedure import Outlook, Procedure
+    from instrument.bench.bench import Bench
+
+_NO_MATTER = ("out", "overwrite")
+
+
+def took_before(procedure: Procedure, bench: Bench, outlook: Outlook) -> tuple[str, ...]:
+    """Return in words how long it will take in all, by how long it took; nothing where that is not known."""
+    try:
+        frames, seconds = kept_times.recall(_key(procedure, bench, outlook))
+        expected_s = float(seconds) * _frames(outlook) / float(frames)
+    except (LookupError, TypeError, ValueError, ZeroDivisionError):
+        return ()
+    return (f"In all, by what it took last time: about {duration(expected_s)}.",)
+
+
+@contextmanager
+def timed(procedure: Procedure, bench: Bench, outlook: Outlook) -> Iterator[None]:
+    """Remember how long the block takes, unless it fails or nobody sees what is foretold."""
+    began_s = time.monotonic()
+    yield
+    took_s = round(time.monotonic() - began_s, 2)
+    kept_times.remember(_key(procedure, bench, outlook), [_frames(outlook), took_s])
+
+
+def _frames(outlook: Outlook) -> int:
+    """Return the frames of the plan, which time goes with; 1 without a plan."""
+    return 1 if outlook.cost is None else max(outlook.cost.frames, 1)
+
+
+def _key(procedure: Procedure, bench: Bench, outlook: Outlook) -> str:
+    """Return what it is known by: without a plan its options, too, but for where the result goes."""
+    what = f"{type(procedure).__name__} {bench.config.label} {crc32(bench.config.text.encode()):08x}"
+    if outlook.plan is not None:
+        return f"{what} {outlook.plan.label}"
+    return f"{what} {crc32(repr(_asked(plain(procedure))).encode()):08x}"
+
+
+def _asked(options: Any) -> Any:
+    if not isinstance(options, dict):
+        return options
+    return {name: _asked(value) for name, value in options.items() if name not in _NO_MATTER}

@@ -1,0 +1,8 @@
+"""``python -m diffuserbench`` is ``diffuserbench``, where its script is not on the path."""
+
+import sys
+
+from instrument.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

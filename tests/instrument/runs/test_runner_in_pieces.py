@@ -1,0 +1,187 @@
+"""What a runner counts, waits for and writes, on a bench of mocks and without a disk."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
+
+import pytest
+
+from instrument.bench.bench import Bench
+from instrument.files.errors import FileError
+from instrument.plan import Plan
+from instrument.runs import runner as module
+from instrument.runs.acquire import abilities_of, free_bytes
+from instrument.runs.run import FinishReason
+from instrument.runs.runner import Runner, RunState, RunStatus, StepSettings
+from tests.instrument.runs.test_runner import calls, open_mock_bench, plan
+
+pytestmark = pytest.mark.usefixtures("mock_drivers")
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with open_mock_bench() as bench:
+        yield bench
+
+
+@pytest.fixture
+def ended(monkeypatch: pytest.MonkeyPatch) -> list[FinishReason]:
+    """Has the end of a run write nothing; returns why each ended."""
+    reasons: list[FinishReason] = []
+
+    def end_run(_bench: Bench, _writer: Any, reason: FinishReason, _error: object) -> Any:
+        reasons.append(reason)
+        return SimpleNamespace(records=(), n_frames=0, path="runs/one", reason=reason)
+
+    monkeypatch.setattr(module, "end_run", end_run)
+    return reasons
+
+
+def made(bench: Bench, plan: Plan, **kind: Any) -> tuple[Runner, Any]:
+    writer = Mock(path=Path("runs/one"), mended=None)
+    return Runner(bench, plan, writer, **kind), writer
+
+
+def notes(writer: Any) -> list[str]:
+    return [call.args[0] for call in writer.note.call_args_list]
+
+
+def test_what_is_done_is_counted_and_the_rest_estimated(
+    bench: Bench, ended: list[FinishReason], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s, seen = [1000.0], list[RunStatus]()
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+
+    def progress(status: RunStatus) -> None:
+        if status.newest is not None and (not seen or status.done > seen[-1].done):
+            seen.append(status)
+        now_s[0] += 1.0
+
+    runner, writer = made(bench, plan(), todo=[1, 2, 4], on_progress=progress)
+    assert (runner.status.state, runner.status.done, runner.status.total) == (RunState.IDLE, 2, 5)
+    assert runner.mended == ()
+    runner.execute()
+    assert ended == [FinishReason.COMPLETED]
+    writer.start.assert_called_once_with(steps=3)
+    stored = [[frame.index for frame in call.args[0]] for call in writer.write.call_args_list]
+    assert stored == [[1], [2], [4]]
+    assert [(s.done, s.done_here, s.dropped) for s in seen] == [(3, 1, 1), (4, 2, 2), (5, 3, 3)]
+    for s in seen:
+        assert s.seconds > 0
+        assert s.seconds_left == pytest.approx(s.seconds / s.done_here * (3 - s.done_here))
+    assert runner.status.reason is FinishReason.COMPLETED
+
+
+@pytest.mark.parametrize("todo", [[0, 1, 2], [2], [3, 4], [1, 2, 4, 5]])
+def test_a_part_that_goes_on_does_not_wait_for_what_was_done_before(
+    bench: Bench, ended: list[FinishReason], monkeypatch: pytest.MonkeyPatch, todo: list[int]
+) -> None:
+    part = {"label": "a", "light": "off", "repeats": 3, "interval_s": 600.0}
+    whole = Plan.model_validate({"label": "p", "parts": [part, {**part, "label": "b"}]})
+    runner, _ = made(bench, whole, todo=todo)
+    waits_s: list[float] = []
+    monkeypatch.setattr(runner, "_wait_until", lambda when_s: waits_s.append(when_s - time.monotonic()))
+    runner.execute()
+    first = {index // 3: index % 3 for index in reversed(todo)}
+    expected = [600.0 * (index % 3 - first[index // 3]) for index in todo]
+    assert waits_s == pytest.approx(expected, abs=200.0)
+    assert ended == [FinishReason.COMPLETED]
+
+
+@pytest.mark.parametrize("how", ["resume", "abort", "stop"])
+def test_a_paused_run_waits_in_the_dark_until_it_is_told_to_go_on_or_to_end(
+    bench: Bench, ended: list[FinishReason], how: str
+) -> None:
+    paused, seen = threading.Event(), list[RunState]()
+
+    def progress(status: RunStatus) -> None:
+        seen.append(status.state)
+        if status.state is RunState.PAUSED:
+            paused.set()
+
+    runner, writer = made(bench, plan(1), on_progress=progress)
+    runner.pause()
+    assert runner.is_pausing
+    thread = threading.Thread(target=runner.execute)
+    thread.start()
+    assert paused.wait(20)
+    time.sleep(0.03)
+    assert notes(writer) == ["paused"]
+    assert "camera.snap" not in calls(bench)
+    getattr(runner, how)()
+    thread.join(20)
+    assert notes(writer) == ["paused", "resumed"]
+    reasons = {"resume": FinishReason.COMPLETED, "abort": FinishReason.ABORTED, "stop": FinishReason.STOPPED}
+    assert ended == [reasons[how]]
+    assert calls(bench).count("camera.snap") == (3 if how == "resume" else 0)  # a dark mean of two, a PSF
+    assert runner.is_pausing == (how != "resume")
+    assert seen[:3] == [RunState.RUNNING, RunState.PAUSED, RunState.RUNNING]
+
+
+@pytest.mark.parametrize("asked", ["pause", "abort", "stop"])
+def test_an_interval_is_waited_for_in_the_dark_and_ended_by_what_is_asked(
+    bench: Bench, ended: list[FinishReason], asked: str
+) -> None:
+    part = {"label": "a", "light": "source", "repeats": 2, "interval_s": 600.0}
+    runner, writer = made(bench, Plan.model_validate({"label": "p", "parts": [part]}))
+    thread = threading.Thread(target=runner.execute)
+    thread.start()
+    deadline_s = time.monotonic() + 20
+    while "led_array.off" not in calls(bench) and time.monotonic() < deadline_s:
+        time.sleep(0.001)
+    assert calls(bench).count("camera.snap") == 1
+    getattr(runner, asked)()
+    if asked == "pause":
+        while not notes(writer) and time.monotonic() < deadline_s:
+            time.sleep(0.001)
+        assert notes(writer) == ["paused"]
+        runner.abort()
+    thread.join(20)
+    assert ended == [FinishReason.STOPPED if asked == "stop" else FinishReason.ABORTED]
+    assert calls(bench).count("camera.snap") == 1
+
+
+@pytest.mark.parametrize("during", ["before", "a setting", "the exposures"])
+@pytest.mark.parametrize("takes", ["_take", "_take_sequence"])
+def test_nothing_is_taken_once_stop_was_asked_for(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, during: str, takes: str
+) -> None:
+    runner, _ = made(bench, plan(2))
+    steps, done = list(plan(2).whole_steps()), list[str]()
+
+    def do(what: str) -> Any:
+        done.append(what)
+        if what == during:
+            runner._stopping.set()
+        return [], ()
+
+    monkeypatch.setattr(StepSettings, "actions", lambda *_, **__: [lambda: do("a setting")])
+    monkeypatch.setattr(module, "take_steps", lambda *_: do("the exposures"))
+    monkeypatch.setattr(bench, "snap", lambda *_: do("the exposures"))
+    if during == "before":
+        runner._stopping.set()
+    wire = SimpleNamespace(source=bench.led_array)
+    with pytest.raises(module._EndedEarlyError) as caught:
+        runner._take(steps[0]) if takes == "_take" else runner._take_sequence(wire, steps)  # type: ignore[arg-type]
+    assert caught.value.reason is FinishReason.STOPPED
+    assert done == {"before": [], "a setting": ["a setting"]}.get(during, ["a setting", "the exposures"])
+
+
+def test_a_bench_is_read_once_for_what_plans_are_checked_against(bench: Bench, tmp_path: Path) -> None:
+    found = abilities_of(bench, tmp_path / "runs" / "of today")
+    assert (found.has_trigger_wire, found.stage_homed, found.n_leds > 1) == (False, True, True)
+    assert found.stage_target is not None
+    assert found.stage_target((1.0, 0.0, 2.0)) == {"x_um": 1.0, "z_um": 2.0}
+    assert found.free_bytes is not None
+    assert found.free_bytes > 0
+    assert abilities_of(bench).free_bytes is None
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(FileError, match="is a file, not a folder"):
+            free_bytes(folder)
