@@ -207,7 +207,8 @@ def defective_pixels(pixels: npt.NDArray[Any], psf: npt.NDArray[Any]) -> npt.NDA
             low, high = np.nanpercentile(channels[::4, ::4, c], [1, 99])
             if usual := float(np.percentile(odd, 99)):
                 defective[..., c] = odd > max(times * usual, LEAST_ODD * (high - low))
-    return (defective & np.isfinite(channels)).reshape(pixels.shape)
+    defective &= np.isfinite(channels)
+    return defective.reshape(pixels.shape)
 
 
 def _oddness(plane: npt.NDArray[Any]) -> FloatImage:
