@@ -82,10 +82,11 @@ class Problem:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             np.save(folder / "wanted.npy", self.wanted)
-            worker = Path(__file__).with_name("hologram_others_worker.py")
+            worker = Path(__file__).resolve().with_name("hologram_others_worker.py")
             quiet = os.environ | {"TQDM_DISABLE": "1"}
-            command = [python, str(worker), name, *map(str, COUNTS)]
-            subprocess.run(command, check=True, env=quiet, stdout=subprocess.DEVNULL)
+            command = [str(Path(python).absolute()), str(worker), name, *map(str, COUNTS)]
+            # There, for odak writes a log where it runs.
+            subprocess.run(command, check=True, env=quiet, stdout=subprocess.DEVNULL, cwd=name)
             times = json.loads((folder / "times.json").read_text())
             print(times.pop("versions"))
             for label, cpu_s in times.items():
