@@ -368,7 +368,8 @@ class MainWindow(QMainWindow):
         self.job_progress.setVisible(any(j.exclusive or not j.lanes for j in running))
         if running:
             self.job_label.setText(f"{running[0].title} …")
-        elif job.state.value == "succeeded":
+        # What was told meanwhile stays.
+        elif job.state.value == "succeeded" and self.job_label.text() == f"{job.title} …":
             self.job_label.setText(f"{job.title}: {job.became}")
 
     def _shown_jobs(self) -> list[Job]:

@@ -138,7 +138,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
     factor = auto_binning(window) if binning is None else binning
     if pattern is not None and binning is None and factor > 1:
         factor += factor % 2
-    erased = erasures_of(inputs.erasures, image)
+    erased = erasures_of(inputs.erasures, image, None if pattern else psf.pixels)
     reduction = Reduction(1, level.image, crop, factor, pattern)
     measurement, valid = reduction.seen(image.pixels, _reduced_valid(erased, crop, factor))
     if pattern is None:
@@ -205,7 +205,8 @@ def job_with(
         raise FileError(image.path, f"is grey, but the calibration {folder} is colour.")
     level = calibrated_dark(inputs.dark, image, calibration, match)
     factor = inputs.binning or 1
-    erased = erasures_of(inputs.erasures, image)
+    nearest = np.moveaxis(calibration.psfs[calibration.nearest_to_axis()], 0, -1)
+    erased = erasures_of(inputs.erasures, image, None if pattern else nearest)
     matched = replace(erased, valid=None if erased.valid is None else reduce_valid(erased.valid, None, match))
     reduction = Reduction(match, level.image, crop, factor, pattern)
     measurement, valid = reduction.seen(image.pixels, _reduced_valid(matched, crop, factor))

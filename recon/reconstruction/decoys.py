@@ -48,6 +48,9 @@ CLIPPED_BLOCK, MOST_CLIPPED = 0.1, 0.5
 is called foreign: what is left is what was dark."""
 CONTRADICTIONS = ((Fit.OFF, Fit.FITS), (Fit.FITS, Fit.FOREIGN), (Fit.UNTOLD, Fit.FOREIGN))
 """What the quick and the thorough way may say: then the photograph does not tell."""
+STRUCTURED = 0.1
+"""Mean square of a photograph's fine structure beyond noise from which it tells anything of a calibration: a
+white wall and mere noise have up to 0.08, of 25 scenes under stresses 24 have 0.2 and more."""
 MOST_PLANES = 6
 """Depths that take part, evenly spaced."""
 WEIGHT = 1.0
@@ -99,6 +102,8 @@ def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | Non
     few, lit = _small(problem, few_px), problem.smooth or problem.n_planes > 1
     if not few.decoys():
         return None
+    if few.fine() < STRUCTURED:
+        return CalibrationCheck(Fit.UNTOLD, {}, 0)
     check = compete(few, quick, lit=lit)
     if check.sure:
         return check
@@ -143,12 +148,15 @@ class _Small:
         return int(np.size(self.photograph.image) - (0 if erasures is None else np.count_nonzero(erasures)))
 
     def structure(self) -> float:
-        """Return the mean square of the photograph's fine structure beyond noise; 0 if PSFs resolve none."""
+        """Return how much of :meth:`fine` the PSFs resolve: all or nothing."""
+        problem = self._problem(self.calibration, background=False)
+        finest = lateral_resolution(problem.depths.central[problem.n_depths // 2, 0]).mean_px
+        return self.fine() if finest <= FINE_PX else 0.0
+
+    def fine(self) -> float:
+        """Return the mean square of the photograph's fine structure beyond noise."""
         problem = self._problem(self.calibration, background=False)
         valid = problem.valid[0]
-        finest = lateral_resolution(problem.depths.central[problem.n_depths // 2, 0]).mean_px
-        if not finest <= FINE_PX:
-            return 0.0
         return float(np.mean(fine_structure(problem.data[0].astype(np.float64), valid)[valid] ** 2)) - 1
 
     def unexplained(self, *, background: bool) -> float:
@@ -248,6 +256,7 @@ def _small(problem: Problem, longest_px: int) -> _Small:
     calibration = replace(calibration, psfs=_on_sensor(psfs, problem.sensor_shape), background=None)
     calibration = reduced_calibration(calibration, factor, None)
     varies = _given(problem).depths.varies
+    clipped = max(clipped, saturated_share(counts))  # erased ones, too
     return _Small(photograph, calibration, varies, "local" if local else "convolution", clipped)
 
 

@@ -145,6 +145,7 @@ def test_an_unplugged_camera_is_named_and_comes_back(qtbot: QtBot, window: MainW
     qtbot.mouseClick(button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: not session.jobs.jobs, timeout=WAIT_MS)
     assert session.state("camera").condition == "failed"
+    assert "unplugged" in window.job_label.text(), "not that connecting is done"
     world.plug_in("camera")  # type: ignore[attr-defined]
     qtbot.mouseClick(button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: session.live.newest() is not None, timeout=WAIT_MS)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError, FileError
@@ -21,6 +22,7 @@ from instrument.reconstruction.preparation import (
     check_pair,
     check_psf,
     dark_from_corners,
+    defective_pixels,
     erasures_of,
     reduce,
     reduce_valid,
@@ -247,6 +249,26 @@ def test_pixels_clipped_below_full_scale_are_erased_too_each_channel_at_its_own_
     np.testing.assert_array_equal(valid[..., 1], clipped // 2 < 400)
     assert valid[..., 2].all()
     assert check_psf(file(clipped))[0].startswith(f"{np.count_nonzero(scene >= 800)} pixels")  # not certain
+
+
+def test_hot_and_dead_pixels_are_erased_unless_the_psf_has_spots_as_narrow() -> None:
+    rng = np.random.default_rng(5)
+    psf, scene = (gaussian_filter(rng.random((120, 160)), 2.5) for _ in range(2))
+    psf = np.maximum(psf - psf.mean(), 0) * 1e6 + rng.normal(0, 50, psf.shape)
+    image = 4000 + 2e5 * (scene - scene.mean()) + rng.normal(0, 20, scene.shape)
+    planted = image.copy()
+    planted[20, 30], planted[70, 80], planted[71, 80], planted[119, 0] = 60_000, 30_000, 30_000, -9000
+    planted[50, 50] = np.nan
+    odd = defective_pixels(planted, psf)
+    assert np.argwhere(odd).tolist() == [[20, 30], [70, 80], [71, 80], [119, 0]]
+    assert not defective_pixels(image, psf).any()
+    spots = np.zeros(psf.shape)
+    spots[rng.integers(0, 120, 30), rng.integers(0, 160, 30)] = 1.0
+    assert not defective_pixels(planted, spots).any()
+    erased = erasures_of(
+        "saturated", file(np.nan_to_num(planted, nan=image[50, 50]).clip(0).astype(np.uint16)), psf
+    )
+    assert erased.reason == "4 hot or dead pixels; --erasures none uses them"
 
 
 def test_a_share_is_erased_at_random_and_the_same_every_time() -> None:

@@ -3,6 +3,8 @@
     python -m tests.mutants                       a sample of every area, 30 minutes at most
     python -m tests.mutants solvers --sample 50   so many of each area that is named
     python -m tests.mutants --list                what can be changed, and do nothing
+    python -m tests.mutants safety --sample 999 --only checked.py --tests tests/drivers/test_checked.py
+                                                  every mutant of one module, soon: what those tests notice
 
 A mutant is one small mistake in one function: ``<`` for ``<=``, ``+`` for ``-``, a call or a ``raise`` left
 out, a number changed, a condition negated. First each test runs once and is watched: which lines it comes
@@ -85,6 +87,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=30.0, help="no mutant is begun after so long")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     parser.add_argument("--only", default="", help="only mutants in whose name this stands")
+    parser.add_argument("--tests", nargs="+", default=[], help="only these [default: those of the areas]")
     parser.add_argument("--list", action="store_true", help="print the sample and end")
     options = parser.parse_args()
     areas = options.area or list(AREAS)
@@ -93,7 +96,7 @@ def main() -> int:
         for area, mutant in chosen:
             print(f"{area}: {mutant.name}")
         return 0
-    tests = sorted({test for area in areas for test in AREAS[area][1]})
+    tests = options.tests or sorted({test for area in areas for test in AREAS[area][1]})
     modules = sorted({path for area in areas for path in AREAS[area][0]})
     trials = Trials(ROOT, modules, chosen, options.jobs, 60 * options.minutes, NO_MUTANT_EVERY)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it

@@ -16,6 +16,7 @@ _RUNS = tuple(
         "runner",
         "runner_in_pieces",
         "store",
+        "store_in_pieces",
         "store_order",
         "timed",
     )

@@ -158,4 +158,5 @@ def test_the_estimate_is_to_rounding_what_it_was(height, width, kept, bright_noi
 def test_noise_of_nothing_is_nothing():
     assert estimate_deviation(np.ones((1, 1))) == 0
     assert estimate_deviation(np.ones((50, 50))) == 0
+    assert estimate_deviation(np.full((130, 130), 5.0)) == 0
     assert estimate_deviation(np.ones((50, 50)), np.zeros((50, 50), bool)) == 0

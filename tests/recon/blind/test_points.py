@@ -8,7 +8,15 @@ from scipy import ndimage
 
 from recon.blind import BlindSettings, calibrate_from_beads
 from recon.blind.points import PointMixer, solve_smooth, support_of
-from recon.camera.points import FieldFunctions, PointImages, Points, cleaned, overlooked, refine
+from recon.camera.points import (
+    FieldFunctions,
+    PointImages,
+    Points,
+    cleaned,
+    overlooked,
+    points_on_grid,
+    refine,
+)
 from recon.errors import InputError
 
 SENSOR, PSF = (40, 44), (19, 17)
@@ -144,3 +152,30 @@ def test_photographs_that_cannot_be_moved_slides_of_beads_are_refused() -> None:
     texture = np.stack([ndimage.gaussian_filter(rng.random((56, 60)), 1) for _ in range(3)])
     with pytest.raises(InputError, match="beads found explain"):
         calibrate_from_beads((texture - texture.min()).astype(np.float32), PSF, QUICK)
+
+
+def test_places_and_lights_are_to_rounding_what_they_were() -> None:
+    """Of points on a grid, of one that was overlooked, and of one step of refinement."""
+    beads = np.zeros((40, 44))
+    for row, column, light in ((9.3, 12.8, 1.0), (25.6, 30.1, 0.7), (30.2, 8.4, 0.05)):
+        y, x = np.mgrid[:40, :44]
+        beads += light * np.exp(-((y - row) ** 2 + (x - column) ** 2) / 2)
+    found = points_on_grid(beads, (20, 22))
+    np.testing.assert_allclose(found.places, [[-10.7241917, -9.1844216], [5.6337877, 8.0923761]], atol=1e-6)
+    np.testing.assert_allclose(found.light, [6.1378295, 4.2890393], rtol=1e-6)
+    psfs, functions = one_psf()
+    camera = PointImages(psfs, functions, SENSOR)
+    true = Points(np.array([[-4.0, 6.0], [7.0, -9.0]]), np.array([1.0, 0.8]))
+    image = camera.image(true)
+    first = Points(true.places[:1], true.light[:1])
+    seen = overlooked(camera, image - camera.image(first), first, 0.01)
+    (brightest,) = (
+        np.flatnonzero(seen.light[1:] == seen.light[1:].max()) + 1
+    )  # the pattern is like itself moved
+    np.testing.assert_allclose(seen.places[[0, brightest]], true.places, atol=1e-6)
+    np.testing.assert_allclose(seen.light[[0, brightest]], true.light, rtol=1e-4)
+    near = Points(true.places + 0.3, true.light * 0.9)
+    better, left = refine(camera, image, near, sweeps=1)
+    np.testing.assert_allclose(better.places, [[-4.0198026, 5.9779425], [6.9801993, -9.0220617]], atol=1e-4)
+    np.testing.assert_allclose(better.light, [0.9998344, 0.7998681], rtol=1e-4)
+    assert float(np.abs(left).max()) == pytest.approx(0.0238375, rel=1e-3)

@@ -19,6 +19,7 @@ from recon.optics.scene import bar_target, picture
 from recon.optics.wave import WavePropagator
 from recon.reconstruction import decoys
 from recon.reconstruction.decoys import check_calibration
+from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions as Options
 from recon.reconstruction.pilot import pilot
 from recon.reconstruction.problem import Problem
@@ -93,9 +94,10 @@ def test_another_diffusers_is_foreign_and_never_reliable(seen: tuple[Image, Imag
     assert first.startswith("not reliable: the calibration does not")
 
 
-def test_where_nothing_is_lit_nothing_is_told(seen: tuple[Image, Image]) -> None:
-    noise = np.random.default_rng(3).normal(1000, 30, seen[0].shape).astype(np.float32)
-    assert fit(noise, seen[1])[0] is Fit.UNTOLD
+def test_where_nothing_is_lit_or_all_is_nothing_is_told(seen: tuple[Image, Image]) -> None:
+    for wall in (1000, 4000):
+        noise = np.random.default_rng(3).normal(wall, 30, seen[0].shape).astype(np.float32)
+        assert fit(noise, seen[1])[0] is Fit.UNTOLD
 
 
 def test_a_photograph_mostly_at_full_scale_has_its_noise_and_makes_nobody_foreign(
@@ -106,6 +108,10 @@ def test_a_photograph_mostly_at_full_scale_has_its_noise_and_makes_nobody_foreig
     foreign = CalibrationCheck(Fit.FOREIGN, GOOD, 9000)
     monkeypatch.setattr(decoys, "_competition", lambda *_: foreign)
     assert [fit(image, seen[1])[0] for image in (seen[0], clipped)] == [Fit.FOREIGN, Fit.UNTOLD]
+    without = Measurement(clipped, erasures=clipped == clipped.max())
+    check = check_calibration(Problem.of(without, seen[1]))
+    assert check is not None
+    assert check.fit is Fit.UNTOLD
 
 
 @pytest.mark.parametrize("said", decoys.CONTRADICTIONS)

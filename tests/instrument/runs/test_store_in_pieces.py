@@ -1,0 +1,188 @@
+"""Arrays that grow, colours, pictures of runs, and the words of what may not be written: tables."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from instrument.files.atomic import check_writable, output_folder, require_new
+from instrument.files.errors import FileError
+from instrument.files.images import write_image
+from instrument.runs import inspection
+from instrument.runs.frame_array import FrameArray, SyncPool, description_of
+from instrument.runs.inspection import contact_sheet, summary, verify
+from instrument.runs.log import Gap
+from instrument.runs.run import FinishReason, Run
+from instrument.runs.writer import RunWriter
+from tests.instrument.runs.test_store import BENCH, frame
+
+
+@pytest.mark.parametrize(
+    ("shape", "axes"), [((6, 8), ["t", "y", "x"]), ((6, 8, 3), ["t", "c", "y", "x"])], ids=["grey", "colour"]
+)
+@pytest.mark.parametrize("data_type", ["uint8", "uint16", "float32"])
+def test_an_array_says_what_it_holds(shape: tuple[int, ...], axes: list[str], data_type: str) -> None:
+    described = description_of(5, shape, data_type)
+    sides = [3, 6, 8] if len(shape) == 3 else [6, 8]
+    assert described["shape"] == [5, *sides]
+    assert described["chunk_grid"]["configuration"]["chunk_shape"] == [1, *sides]
+    assert described["dimension_names"] == axes
+    array = FrameArray(Path("nowhere"), described)
+    assert (array.n_frames, array.frame_shape, array.is_colour) == (5, shape, len(shape) == 3)
+    assert array.frame_bytes == np.prod(shape) * np.dtype(data_type).itemsize
+
+
+@pytest.mark.parametrize("shape", [[5, 6], [5, 3, 6, 8, 1], [5, 0, 8], [5, 3, 6, 0]])
+def test_what_no_frames_have_is_refused(shape: list[int]) -> None:
+    with pytest.raises(ValueError, match="no frames have the shape"):
+        FrameArray(Path("nowhere"), {**description_of(1, (6, 8), "uint16"), "shape": shape})
+    with pytest.raises(ValueError, match="and the type 'int64'"):
+        FrameArray(Path("nowhere"), {**description_of(1, (6, 8), "uint16"), "data_type": "int64"})
+
+
+def test_every_file_is_synced_and_the_first_failure_is_raised(tmp_path: Path) -> None:
+    pool, file = SyncPool(2), (tmp_path / "a").open("w")
+    try:
+        pool.files([file.fileno()] * 3)
+        pool.folders([tmp_path])
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            pool.files([file.fileno(), 10**6])
+        with pytest.raises(FileNotFoundError):
+            pool.folders([tmp_path / "gone", tmp_path])
+    finally:
+        file.close()
+        pool.close()
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "grown"), [(0, 255, 256), (3, 256, 512), (0, 511, 512), (3, 600, 601)]
+)
+def test_a_recordings_array_grows_with_it_and_ends_with_its_last_frame(
+    tmp_path: Path, first: int, then: int, grown: int
+) -> None:
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as writer:
+        writer.start()
+        writer.write([frame(first)])
+        assert writer._array is not None
+        assert writer._array.n_frames == 256
+        for missed in ((0, first), (first + 1, then - first - 1)):
+            if missed[1]:
+                writer.gap(Gap(missed[0], missed[1], 0))
+        writer.write([frame(then)])
+        assert writer._array.n_frames == grown
+        run = writer.finish(FinishReason.COMPLETED)
+    assert run.array.n_frames == run.n_frames == then + 1
+    assert sorted(run.records) == [first, then]
+    assert np.array_equal(run.frame(then), frame(then).image)
+    assert verify(run).is_sound
+
+
+def test_a_contact_sheet_shows_frames_spread_evenly_and_none_of_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[Path] = []
+    monkeypatch.setattr(inspection, "save_figure", lambda _, path: written.append(path))
+    monkeypatch.setattr(inspection, "ROWS", 1)
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as writer:
+        writer.start()
+        writer.write([frame(i) for i in range(7)])
+        run = writer.finish(FinishReason.COMPLETED)
+    sheet = tmp_path / "sheet.png"
+    assert contact_sheet(run, sheet) == [0, 2, 4, 6]
+    assert contact_sheet(run, sheet, leave_out=range(6)) == [6]
+    assert contact_sheet(run, sheet, leave_out=range(7)) == []
+    assert written == [sheet, sheet]
+
+
+def test_a_photograph_and_a_run_are_summed_up(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.tif", np.zeros((4, 5), np.uint16))
+    photo = summary(tmp_path / "a.tif")
+    assert (photo.stored, photo.frames, photo.kind, photo.is_simulated) == (1, 1, "photograph", False)
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as writer:
+        writer.start()
+        writer.write([frame(0)])
+        path = writer.finish(FinishReason.COMPLETED).path
+    found = summary(path)
+    assert (found.stored, found.frames, found.kind, found.became) == (1, 1, "recording", "completed")
+    Run.open(path).array.chunk_path(0).unlink()
+    assert summary(path).became == "completed, DAMAGED"
+
+
+def test_why_a_file_may_not_be_written_is_said(tmp_path: Path) -> None:
+    there = tmp_path / "there.txt"
+    there.write_text("")
+    require_new(tmp_path / "new.txt")
+    require_new(there, overwrite=True)
+    for overwrite, remedy in ((None, False), (False, True)):
+        with pytest.raises(FileError, match="exists already and was left as it is") as caught:
+            require_new(there, overwrite=overwrite)
+        assert ("--force" in str(caught.value)) == remedy
+    check_writable(there, 1)
+    for path, words in (
+        (tmp_path, "is a folder; a file name is expected"),
+        (tmp_path / "no" / "a.txt", r"its folder .*no does not exist"),
+        (there / "a.txt", r"its folder .*there.txt is no folder"),
+        (Path("/dev/null"), "is a device or pipe"),
+    ):
+        with pytest.raises(FileError, match=words):
+            check_writable(path)
+    with pytest.raises(FileError, match=r"needs 1000000000000\.0 MB, and .* MB are free on its disk"):
+        check_writable(tmp_path / "huge", 10**18)
+    output_folder(tmp_path / "a" / "b")
+    output_folder(tmp_path / "a" / "b")
+    assert (tmp_path / "a" / "b").is_dir()
+    with pytest.raises(FileError, match="is a file; a folder is expected"):
+        output_folder(there)
+
+
+def test_an_array_keeps_what_was_written_and_nothing_half_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: dict[str, Any] = {"n_frames": 12, "frame_shape": (6, 8), "pixel_pitch_um": 2.5, "name": "a"}
+    (tmp_path / ".frames.draft" / "left").mkdir(parents=True)
+    array = FrameArray.create(tmp_path / "frames", dtype="uint16", **made)
+    with pytest.raises(TypeError, match="not int64"):
+        FrameArray.create(tmp_path / "other", dtype="int64", **made)
+    scale = json.loads((array.path / "zarr.json").read_text())["attributes"]["ome"]["multiscales"][0]
+    assert scale["datasets"][0]["coordinateTransformations"][0]["scale"] == [1, 2.5, 2.5]
+    assert [axis["name"] for axis in scale["axes"]] == ["t", "y", "x"]
+    images = {index: frame(index).image for index in (10, 2)}
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    stored = array.write(list(images.items()))
+    with monkeypatch.context() as fails:
+        fails.setattr(SyncPool, "files", lambda *_: (_ for _ in ()).throw(OSError("no disk")))
+        with pytest.raises(OSError, match="no disk"):
+            array.write([(3, images[2])])
+    with monkeypatch.context() as fails:
+        fails.setattr("os.write", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+        with pytest.raises(OSError, match="disk full"):
+            array.write([(4, images[2])])
+    assert len(list(Path("/proc/self/fd").iterdir())) <= before
+    array.close()
+    array.close()
+    assert [chunk.n_bytes for chunk in stored] == [96, 96]
+    assert array.checksum(10) == stored[0]
+    assert FrameArray.indices(array.path) == [2, 10]
+    assert FrameArray.indices(tmp_path) == []
+    assert not list(array.path.rglob("part"))
+    half = array.chunk_path(5).with_name("part")
+    half.parent.mkdir(parents=True)
+    half.write_bytes(b"half")
+    array.remove_half_written()
+    assert not half.exists()
+    for index, image in images.items():
+        assert np.array_equal(array.read(index), image)
+        assert array.n_bytes(index) == 96
+    array.chunk_path(2).write_bytes(bytes(40))
+    with pytest.raises(FileError, match="has 40 bytes; frame 2 takes 96: it is damaged"):
+        array.read(2)
+    for index, image, words in (
+        (12, images[2], "outside the array of 12"),
+        (1, images[2].T, "stores uint16"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            array.write([(index, image)])
