@@ -2,7 +2,7 @@
 
 import sys
 
-from instrument.cli import main
+from instrument.cli import console
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(console())

@@ -72,6 +72,7 @@ class _Look:
 
 
 _MOST_LATE_FRAMES = 4
+_LAST_LOOK_S = 5.0
 """So many frames a camera holds back for a host that does not fetch them; what is later than that is lost."""
 
 
@@ -123,8 +124,8 @@ class SimulatedCamera(SimulatedCameraSettings):
         """End any sequence and disconnect."""
         if self._is_open:
             self._end()
-            for look in self._looks:  # no thread is left behind
-                look.thread.join()
+            for look in self._looks:  # one that takes longer (a large sensor, a busy machine) ends by itself
+                look.thread.join(timeout=_LAST_LOOK_S)
             self._is_open = False
 
     @property

@@ -163,11 +163,10 @@ class Bench:
         for resource in device.driver.claims(device.options):
             if resource in held:
                 continue
-            if resource in _hung:
-                old, claim = _hung[resource]
-                require_ended(old)
-                del _hung[resource]
-                claim.release()
+            if (kept := _hung.get(resource)) is not None:
+                require_ended(kept[0])
+                if _hung.pop(resource, None) is not None:  # another thread may open a bench as well
+                    kept[1].release()
             self._claims.append(Claim(resource, self.devices[kind].name))
 
     def _release(self, claim: Claim) -> None:

@@ -74,8 +74,7 @@ class RunFolder:
 
         with one_task("Drawing"):
             drawn = contact_sheet(run, self.figure)
-        if drawn:
-            typer.echo(f"Wrote {self.figure}")
+        typer.echo(f"Wrote {self.figure}" if drawn else f"{self.figure} is not drawn: the run has no frames.")
 
 
 _HELP = ("--help", "-h")

@@ -149,8 +149,12 @@ def size(n_bytes: float) -> str:
 
 
 def percent(share: float) -> str:
-    """Return a share for people; a little of something is never called nothing."""
-    return "less than 0.001 %" if 0 < share < 1e-5 else f"{100 * share:.3g} %"
+    """Return a share for people; a little is never called nothing, nor nearly all all."""
+    if 0 < share < 1e-5:
+        return "less than 0.001 %"
+    if 0.9995 <= share < 1:
+        return "more than 99.9 %"
+    return f"{100 * share:.3g} %" if share < 9.995 else f"{100 * share:.0f} %"
 
 
 def count(number: int, noun: str) -> str:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import pytest
 
 from drivers.frame import FrameMetadata
-from instrument.files.errors import FileError
+from instrument.files.errors import FileError, percent
 from instrument.files.record import RecordFormat, plain, value_of
 
 TEA = RecordFormat(
@@ -191,3 +191,18 @@ def test_metadata_of_frames_come_back() -> None:
         stage_position={"x_um": 1.0}, led_pattern="off",
     )  # fmt: skip
     assert value_of(FrameMetadata, json.loads(json.dumps(plain(metadata)))) == metadata
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [
+        (0.0, "0 %"),
+        (4e-6, "less than 0.001 %"),
+        (0.123456, "12.3 %"),
+        (0.9998, "more than 99.9 %"),
+        (1.0, "100 %"),
+        (12.34, "1234 %"),
+    ],
+)
+def test_shares_are_neither_nothing_nor_all_by_rounding(share: float, words: str) -> None:
+    assert percent(share) == words
