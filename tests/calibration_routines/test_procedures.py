@@ -159,7 +159,7 @@ def test_what_leaves_the_stage_is_refused(bench: Bench) -> None:
     assert [name for name, _ in refused.value.problems] == ["z_max_um"]
     with pytest.raises(PlanError, match="outside the stage's limits"):
         SweepProcedure(
-            LateralSweep(z_um=1e5, half_field_x_um=1e6, half_field_y_um=0, spacing_um=5e5)
+            LateralSweep(z_um=2.9e5, half_field_x_um=6.5e4, half_field_y_um=0, spacing_um=6.5e4)
         ).outlook(bench)
 
 
