@@ -71,8 +71,8 @@ class _Look:
         return self._seen
 
 
-_MOST_LATE_FRAMES = 4
 _LAST_LOOK_S = 5.0
+_MOST_LATE_FRAMES = 4
 """So many frames a camera holds back for a host that does not fetch them; what is later than that is lost."""
 
 

@@ -103,16 +103,16 @@ COMMANDS: Mapping[str, Command] = {
 def console() -> int:
     """Run the command line as the program's whole life; returns the exit status.
 
-    Where a daemon thread goes on (a job of the window, a driver's call that hangs, or only the one that closes
-    benches at exit), the process ends here, after all that is done when Python ends: foreign code that comes
-    back to an interpreter that is ending aborts it, with a status that says nothing.
+    Where a daemon thread goes on (a job of the window, a driver's call that hangs, or only the one that
+    closes benches at exit), the process ends here, after all that is done when Python ends: foreign code that
+    comes back to an interpreter that is ending aborts it, with a status that says nothing.
     """
     status = main()
     if any(thread.daemon for thread in threading.enumerate()):
         threading._shutdown()  # type: ignore[attr-defined]  # waits for all others
         try:
             atexit._run_exitfuncs()
-        except BaseException:  # told by atexit
+        except Exception:  # noqa: BLE001 - told by atexit; the process ends all the same
             status = status or 1
         for stream in (sys.stdout, sys.stderr):
             try:
