@@ -7,6 +7,7 @@ routines share is here too: errors, declared options, the record of what a run's
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -14,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from calibration_routines.times import timed, took_before
+from calibration_routines.times import took, took_before
 from instrument.bench.bench import Bench
 from instrument.files.atomic import DOUBTFUL, named_by_worth
 from instrument.files.errors import BenchError, FileError, SettingsError
@@ -146,6 +147,11 @@ class Outcome:
     """What the routine returned: ``SweepCalibration``, ``AngularResponse``, ``DiffuserSurface``,
     ``BeadCalibration``, ``SlmCalibration``, ``AlignmentReport`` or ``Run``."""
 
+    @property
+    def whole(self) -> bool:
+        """Whether it is not a run that was ended before its last frame."""
+        return not isinstance(self.result, Run) or self.result.condition is RunCondition.COMPLETED
+
     def __post_init__(self) -> None:
         """Say of a result that is kept under a doubtful name that it is (:func:`named_by_worth`)."""
         kept = [path.name for path in (self.calibration, *self.files) if path is not None]
@@ -222,8 +228,12 @@ class Procedure(ABC):
         """
         outlook = self.outlook(bench, folder)
         control = control or RunControl()
-        with control.procedure(bench), timed(self, bench, outlook):
-            return self.perform(bench, folder, control, listener or Listener())
+        with control.procedure(bench):
+            began_s = time.monotonic()
+            outcome = self.perform(bench, folder, control, listener or Listener())
+            if control.ending is None and outcome.whole:
+                took(self, bench, outlook, time.monotonic() - began_s)
+            return outcome
 
     @abstractmethod
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:

@@ -6,9 +6,6 @@ routines whose next picture depends on the last one, which have no plan) is only
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 from zlib import crc32
 
@@ -26,20 +23,23 @@ _NO_MATTER = ("out", "overwrite")
 def took_before(procedure: Procedure, bench: Bench, outlook: Outlook) -> tuple[str, ...]:
     """Return in words how long it will take in all, by how long it took; nothing where that is not known."""
     try:
-        frames, seconds = kept_times.recall(_key(procedure, bench, outlook))
-        expected_s = float(seconds) * _frames(outlook) / float(frames)
+        known = kept_times.recall(_key(procedure, bench, outlook))
+        frames, took_s, planned_s = (kept_times.sane(number) for number in known)
+        now_s = 0.0 if outlook.cost is None else outlook.cost.seconds
+        if took_s >= planned_s:  # what came on top of exposures and motion goes with the frames
+            expected_s = now_s + (took_s - planned_s) * _frames(outlook) / frames
+        else:  # quicker than planned: a simulated bench whose time runs faster
+            expected_s = took_s * now_s / planned_s
     except (LookupError, TypeError, ValueError, ZeroDivisionError):
         return ()
     return (f"In all, by what it took last time: about {duration(expected_s)}.",)
 
 
-@contextmanager
-def timed(procedure: Procedure, bench: Bench, outlook: Outlook) -> Iterator[None]:
-    """Remember how long the block takes, unless it fails or nobody sees what is foretold."""
-    began_s = time.monotonic()
-    yield
-    took_s = round(time.monotonic() - began_s, 2)
-    kept_times.remember(_key(procedure, bench, outlook), [_frames(outlook), took_s])
+def took(procedure: Procedure, bench: Bench, outlook: Outlook, seconds: float) -> None:
+    """Remember how long all of it took, and what was planned, unless nobody sees what is foretold."""
+    planned_s = 0.0 if outlook.cost is None else outlook.cost.seconds
+    known = [_frames(outlook), round(seconds, 2), round(planned_s, 2)]
+    kept_times.remember(_key(procedure, bench, outlook), known)
 
 
 def _frames(outlook: Outlook) -> int:

@@ -62,6 +62,7 @@ class SlideChanger(Protocol):
 
 
 _TAKES, _SHORTER = 3, 0.7
+"""Times that a slide which saturates is photographed, and the share of the exposure each time."""
 _SOLVER = BlindSettings()
 _DEFLECTION_DEG = 1.0  # by which the diffuser bends light, for the window
 
@@ -198,8 +199,11 @@ def photograph_slides(
 ) -> BeadPhotographs:
     """Photograph a slide of beads several times, moved in between by the simulated world or the operator.
 
+    A slide that saturates is photographed again, shorter, and those after it as short: a bead's brightness is
+    free anyway. The listener is told.
+
     Raises OperatorNeededError when the slide has to be moved by hand and nobody can be asked;
-    CalibrationError when an image saturates.
+    CalibrationError when an image saturates still, the last time or at the camera's shortest exposure.
     """
     changer = next((part for part in bench.shared.values() if isinstance(part, SlideChanger)), None)
     ask = bench.ask
@@ -209,6 +213,7 @@ def photograph_slides(
             "Photograph it with snap, and give the images: calibrate beads FILE FILE ..."
         )
     exposure_ms: float | None = None
+    shortest_ms = bench.camera.exposure_limits_ms[0]
     photographs: list[Photograph] = []
     for number in range(slides.images):
         control.check()
@@ -219,10 +224,10 @@ def photograph_slides(
         if exposure_ms is None:
             # Slides differ in brightness where beads overlap: leave room.
             exposure_ms = expose_scene(bench, target=0.5).exposure_ms
-        for take in range(_TAKES):  # shorter where it saturates: a bead's brightness is free anyway
+        for take in range(1, _TAKES + 1):
             taken = photograph(
                 bench,
-                exposure_ms * _SHORTER**take,
+                exposure_ms,
                 folder,
                 average=slides.average,
                 dark_frames=4,
@@ -230,13 +235,20 @@ def photograph_slides(
                 control=control,
                 listener=listener,
             )
-            if taken.saturated_pixels == 0:
+            shorter_ms = max(_SHORTER * exposure_ms, shortest_ms)
+            if taken.saturated_pixels == 0 or take == _TAKES or not shorter_ms < exposure_ms:
                 break
+            listener.said(
+                f"Photograph {number + 1} saturates in {taken.saturated_pixels} pixels at {exposure_ms:.4g} "
+                f"ms: it is taken again at {shorter_ms:.4g} ms, and those that follow as short."
+            )
+            exposure_ms = shorter_ms
         if taken.saturated_pixels > 0:
+            least = ", the camera's shortest exposure" if exposure_ms <= shortest_ms else ""
             raise CalibrationError(
-                f"Photograph {number + 1} saturates in {taken.saturated_pixels} pixels, the third time, at "
-                "half the exposure: dim the light or spread the beads, and start again. "
-                + " ".join(taken.findings)
+                f"Photograph {number + 1} saturates in {taken.saturated_pixels} pixels, taken {take} "
+                f"{'time' if take == 1 else 'times'}, at {exposure_ms:.4g} ms{least}: dim the light or "
+                "spread the beads, and start again. " + " ".join(taken.findings)
             )
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "binning": slides.binning}
         file = named_by_worth(taken.run.path / SLIDE_FILE, doubted=bool(taken.findings))

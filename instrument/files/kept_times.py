@@ -15,6 +15,7 @@ MOST = 300
 """Steps that are remembered; beyond, the oldest are forgotten."""
 WORTH_S = 0.5
 """Shorter ones need not be foretold."""
+_LARGEST = 1e9  # thirty years; frames, too
 _of = ""
 _window = False
 
@@ -45,7 +46,7 @@ def in_a_window() -> None:
 def expected_s(what: str) -> float | None:
     """Return how long a step took last time; None where it was never done, or was quick."""
     try:
-        return float(recall(_key(what)))
+        return sane(recall(_key(what)))
     except (LookupError, TypeError, ValueError):
         return None
 
@@ -58,6 +59,13 @@ def kept(what: str) -> Iterator[None]:
     took_s = time.monotonic() - began_s
     if took_s >= WORTH_S:
         remember(_key(what), round(took_s, 2))
+
+
+def sane(number: Any) -> float:
+    """Return a number that was remembered; TypeError, ValueError where it is none: a damaged file."""
+    if isinstance(number, str | bool) or not 0 <= number < _LARGEST:
+        raise ValueError("This is no time and no number of frames.")
+    return float(number)
 
 
 def recall(key: str) -> Any:
@@ -88,6 +96,6 @@ def _key(what: str) -> str:
 def _read() -> dict[str, Any]:
     try:
         found = json.loads(place().read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}

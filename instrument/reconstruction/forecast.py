@@ -125,8 +125,12 @@ class Like:
         NaN bytes where the system did not say.
         """
         try:
-            known = {int(size): (float(s), float(b)) for size, s, b in kept_times.recall(self.key)}
-        except (LookupError, TypeError, ValueError):
+            known = {
+                int(kept_times.sane(size)): (kept_times.sane(s), float(b))
+                for size, s, b in kept_times.recall(self.key)
+            }
+            known.pop(0, None)
+        except (LookupError, TypeError, ValueError, OverflowError):
             return None
         nearest = min(known, key=lambda size: abs(log(size / self.size)), default=0)
         if not nearest or abs(log(self.size / nearest)) > log(MOST_TIMES):
@@ -137,7 +141,7 @@ class Like:
     def keep(self, seconds: float, memory_bytes: float) -> None:
         """Remember what it took."""
         try:
-            known = {int(size): [size, *rest] for size, *rest in kept_times.recall(self.key)}
+            known = {int(kept_times.sane(size)): [size, *rest] for size, *rest in kept_times.recall(self.key)}
         except (LookupError, TypeError, ValueError):
             known = {}
         known.pop(self.size, None)

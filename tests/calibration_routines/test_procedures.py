@@ -20,7 +20,7 @@ from calibration_routines.psf.sweep_procedure import SweepProcedure
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files import kept_times
-from instrument.files.errors import SettingsError
+from instrument.files.errors import SettingsError, duration
 from instrument.plan import Part, Plan, PlanError, estimate
 from instrument.plan.abilities import SPARE_BYTES
 from instrument.runs import acquire
@@ -106,7 +106,7 @@ def test_what_it_took_last_time_tells_how_long_all_of_it_takes(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(kept_times, "_window", True)
-    monkeypatch.setattr(times.time, "monotonic", lambda: CLOCK[0])
+    monkeypatch.setattr(time, "monotonic", lambda: CLOCK[0])
 
     def told(procedure: Procedure) -> tuple[str, ...]:
         return procedure.foretold(bench).reasons[1:]
@@ -123,6 +123,45 @@ def test_what_it_took_last_time_tells_how_long_all_of_it_takes(
     with pytest.raises(CalibrationError):
         Waiting(seconds=-1.0).carry_out(bench)
     assert told(Waiting(seconds=-1.0)) == ()
+    # What is exposed or moved longer takes longer by that; what came on top goes with the frames.
+    slow = Plan(label="wait", parts=(Part(label="scene", repeats=10, exposures_ms=(9000.0,)),))
+    costs_s = [estimate(plan, abilities_of(bench, Path())).seconds for plan in (few, slow)]
+    assert told(Waiting(slow)) == (
+        f"In all, by what it took last time: about {duration(20 - costs_s[0] + costs_s[1])}.",
+    )
+    key = times._key(Waiting(few), bench, Waiting(few).outlook(bench))
+    for damaged in (
+        "[10, NaN, 1]",
+        "[10, Infinity, 1]",
+        "[10, -5, 1]",
+        f"[10, 1{400 * '0'}, 1]",
+        "[0, 9, 1]",
+    ):
+        kept_times.place().write_text(f'{{"{key}": {damaged}}}')
+        assert told(Waiting(few)) == ()
+    kept_times.place().write_text(90_000 * "[")
+    assert told(Waiting(few)) == ()
+
+
+def test_what_was_aborted_does_not_tell_how_long_the_whole_takes(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(kept_times, "_window", True)
+    wanted = PlanProcedure(Plan(label="three", parts=(Part(label="scene", repeats=3),)))
+    control = RunControl()
+
+    class Impatient(Listener):
+        def frame(self, status: RunStatus) -> None:
+            control.abort()
+
+    ended = wanted.carry_out(bench, tmp_path, control=control, listener=Impatient())
+    assert isinstance(ended.result, Run)
+    assert ended.result.condition is RunCondition.ABORTED
+    assert not ended.whole
+    assert wanted.foretold(bench).reasons == wanted.outlook(bench).reasons
+    assert wanted.carry_out(bench, tmp_path).whole
+    assert len(wanted.foretold(bench).reasons) == len(wanted.outlook(bench).reasons) + 1
 
 
 @pytest.mark.parametrize(

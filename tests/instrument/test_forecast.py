@@ -97,8 +97,12 @@ def test_the_next_like_it_is_told_before_it_begins(tmp_path: Path, monkeypatch: 
     compiling._compiled(1.0)
     compiling.ended(["settled"])
     assert like.took() == (2.0, 3e6), "nor what compilers took"
-    kept_times.place().write_text('{"reconstruction of a hand": [[1]]}')
-    assert like.took() is None
+    for damaged in ("[1]", "[NaN, 2, 1]", "[-5, 2, 1]", "[1000, Infinity, 1]", f"[1000, 2, 1{400 * '0'}]"):
+        kept_times.place().write_text(f'{{"reconstruction of a hand": [{damaged}]}}')
+        assert like.took() is None
+    kept_times.place().write_text('{"reconstruction of a hand": [[-5, 2, 1], [1000, 2]]}')
+    like.keep(2.0, 3e6)
+    assert like.took() == (2.0, 3e6)
 
 
 def test_one_that_fails_watches_compilers_no_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -42,7 +42,8 @@ def test_a_step_is_expected_to_take_as_long_as_last_time(
     with kept_times.kept("reading"):
         time.sleep(0.05)
     assert kept_times.expected_s("reading") == told, "nobody saw it"
-    for damaged in ("", "[]", '{"snap: reading": [0, 1]}', '{"snap: reading": "soon"}'):
+    numbers = ("[0, 1]", '"soon"', "NaN", "Infinity", "-5", f"1{400 * '0'}")
+    for damaged in ("", "[]", 90_000 * "[", *(f'{{"snap: reading": {number}}}' for number in numbers)):
         cache.write_text(damaged)
         assert kept_times.expected_s("reading") is None
 
