@@ -3,7 +3,8 @@
 Light through the aperture falls off with the square of the distance, so that planes tell how far the source
 is beyond where it is recorded, whatever d. The pattern's centroid runs as ``-x d / z`` (Kuo 2020, Eq. 3.1),
 which tells how far beside the aperture's middle it stands. And it grows towards the diffuser as ``1 + d / z``
-(Eq. 5.2): that tells ``d``, whatever the pixel pitch, which shifts across tell.
+(Eq. 5.2): that tells ``d``. The pixel pitch, which shifts across tell, enters only by the share that the
+diffuser bends (:func:`_bent`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
+from scipy.stats import t as student
 
 from calibration_routines.psf.psf_quality import MAX_CLIPPED, PsfQuality
 from calibration_routines.scatter import compare, growth, reduction
@@ -32,7 +34,9 @@ _BESIDE_PX = 2.0  # of the centroid's way over the sweep
 _OFF_MIDDLE = 0.03  # of a pattern's radius: its light need not be even
 _UNEVEN = 0.02  # of a plane's brightness: a step away from the law
 _GROWN = 7  # planes that are held against one another for d: of more, these, evenly among them
-_ROUNDS = 3
+_ROUNDS, _FOUND = 12, 0.002  # at most, and the step, of d, at which it is found
+_TELLS = 0.5  # of d: known less than that it is not said
+_ONE_SIDED = 0.99865  # the share of cases below three standard deviations
 _LAW = 0.015  # of d: what Eq. 5.2 leaves out (1.6 % under the smooth diffuser, 0.7 on a large sensor)
 _WRONG_D, _SURE_OF_D = 0.05, 3.0
 
@@ -105,7 +109,8 @@ def fit_mount(
             "recorded: check the mount, and set the z of [source] offset_um, or the stage's zero."
         )
     uneven = float(np.abs(rest).max())
-    if uneven > max(_UNEVEN, _SURE * max(brightness_error, _LEAST_ERROR)):
+    unlike_law = uneven > max(_UNEVEN, _SURE * max(brightness_error, _LEAST_ERROR))
+    if unlike_law:
         worst = z[int(np.argmax(np.abs(rest)))] / 1e3
         found.append(
             f"the light departs from the square law by {uneven:.1%} at z = {worst:.4g} mm: z lost steps "
@@ -118,7 +123,9 @@ def fit_mount(
             "middle: centre it, set [source] offset_um, or see whether the rail leans."
         )
     d_mm, distance = geometry.diffuser_distance_mm, None
-    if psfs and d_mm is not None and geometry.pixel_pitch_um is not None:
+    # Where light does not tell the depths there is no d either.
+    told = not unlike_law and bool(np.all(z + farther > 0))
+    if psfs and told and d_mm is not None and geometry.pixel_pitch_um is not None:
         bent = _bent([planes[i] for i in kept], z + farther, geometry)
         unsure = float(np.hypot(2 * error / np.median(z), (1 - bent) / 2))
         distance = _distance([psfs[i] for i in kept], z + farther, 1e3 * d_mm, bent, unsure)
@@ -177,16 +184,28 @@ def _distance(
             change = compare(near, enlarged)
             if not np.isfinite(change.shift_px):
                 return None
-            rest.append(growth(moved(near, -change.rows, -change.columns), enlarged))
+            laid = moved(near, -change.rows, -change.columns)
+            # Noise in what an image is held against makes it seem larger, either way round.
+            rest.append((growth(laid, enlarged) - growth(enlarged, laid)) / 2)
         slope = 1 / (depths[:-1] + found) - 1 / (depths[1:] + found)
         step = float(slope @ rest / (slope @ slope))
         found += float(np.clip(step, -0.3 * d_um, 0.3 * d_um))
         if not 0.2 * d_um < found < 5 * d_um:
             return None
+        if abs(step) < _FOUND * d_um:
+            break
+    else:
+        return None
     # What is left goes on from plane to plane under lenslets, so that more planes make it no surer.
-    left = float(np.sqrt(np.mean((np.array(rest) - slope * step) ** 2) / np.mean(slope**2))) / d_um
+    # Few pairs may agree by chance: Student's quantile says how often.
+    pairs = len(rest)
+    left = (
+        float(np.sqrt(((np.array(rest) - slope * step) ** 2).sum() / (pairs - 1) / np.mean(slope**2))) / d_um
+    )
+    left *= max(1.0, float(student.ppf(_ONE_SIDED, pairs - 1)) / _SURE_OF_D / np.sqrt(pairs))
+    error = float(np.sqrt(left**2 + _LAW**2 + unsure**2))
     ratio = found / d_um / bent
-    return ratio, float(np.sqrt(left**2 + _LAW**2 + unsure**2)) * ratio
+    return (ratio, error * ratio) if error < _TELLS else None
 
 
 def _beside(
