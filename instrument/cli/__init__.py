@@ -117,7 +117,7 @@ def console() -> int:
         for stream in (sys.stdout, sys.stderr):
             try:
                 stream.flush()
-            except (OSError, ValueError):  # whoever read it has gone
+            except (OSError, ValueError, AttributeError):  # whoever read it has gone, or never was
                 status = status or 1
         os._exit(status)
     return status

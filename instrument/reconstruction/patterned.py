@@ -97,7 +97,8 @@ def prepare_patterned(
             "Sheet": str(request.sheet),
         },
         provenance={
-            **lit.job.provenance,
+            **{key: found for key, found in lit.job.provenance.items() if key != "image"},
+            "dark": {**lit.job.provenance["dark"], "from": f"the frames {DARK!r} of the run"},
             "run": str(run.path.resolve()),
             "sheet": str(request.sheet.resolve()),
         },

@@ -172,7 +172,7 @@ class VideoJob:
         first, last = (int(n) for n in a["binning"])
         dark = a["dark"] if a["dark"].ndim else float(a["dark"])
         crop = Crop(*(int(n) for n in a["crop"])) if a["crop"].size else None
-        mosaic = mosaic_named(str(a["mosaic"]) or "none")
+        mosaic = mosaic_named(str(a.get("mosaic", "")) or "none")  # none in jobs of before
         assert mosaic != "auto"
         return Reduction(first, dark, crop, last, mosaic)
 

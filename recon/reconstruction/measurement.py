@@ -128,9 +128,14 @@ class Measurement:
             image = np.moveaxis(_by_channel(frames), 0, -1)
         channels = as_channels(image, name)
         if channels.shape[1:] != data.shape[1:] or len(channels) not in (1, len(data)):
-            one = "channels" if self.patterns is None else "frames"
+            if self.patterns is not None:
+                shape = np.shape(self.image)
+                raise InputError(
+                    f"The {name} is {np.shape(image)}, and the frames are {shape}: give a number, one image "
+                    f"{shape[1:3]} for all frames, or one for each, patterns first."
+                )
             raise InputError(
-                f"The {name} has {_size(channels)} pixels and {len(channels)} {one}; the measurement has "
+                f"The {name} has {_size(channels)} pixels and {len(channels)} channels; the measurement has "
                 f"{_size(data)} and {len(data)}."
             )
         return np.broadcast_to(channels, data.shape)

@@ -310,10 +310,12 @@ def test_stop_does_not_wait_until_a_new_light_is_computed(monkeypatch: pytest.Mo
     bench.camera.start_sequence()
     assert begun.wait(10.0)
     time.sleep(0.1)  # until the exposure waits for its light
-    threading.Timer(5.0, computed.set).start()
+    late = threading.Timer(20.0, computed.set)
+    late.start()
     bench.camera.stop_sequence()
     assert not bench.camera.is_streaming
     assert not computed.is_set()
+    late.cancel()
     computed.set()
     bench.camera.snap()
     bench.camera.close()

@@ -455,5 +455,7 @@ def test_a_thread_that_still_computes_does_not_abort_the_end_of_the_program() ->
         "cli.main = main\n"
         "sys.exit(cli.console())\n"
     )
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
+    )
     assert (ended.returncode, ended.stdout, ended.stderr) == (3, "closed\n", "")

@@ -104,6 +104,8 @@ def test_one_picture_of_all_patterns(files: tuple[Path, Path, Path], tmp_path: P
     assert record["simulated"]
     assert record["inputs"]["sheet"] == str(sheet)
     assert record["provenance"]["patterns"] == 3
+    assert record["inputs"]["dark"]["from"].startswith("the frames")
+    assert "image" not in record["inputs"]
 
 
 def test_a_colour_camera_in_patterned_light(files: tuple[Path, Path, Path], tmp_path: Path) -> None:

@@ -84,9 +84,10 @@ def test_a_device_whose_call_hangs_is_not_opened_anew_before_it_ends(
     port, let_go = "/dev/ttyMOCK7", threading.Event()
     bench = bench_on("none", port, "none").open()
     stage = bench.devices["stage"]
-    monkeypatch.setattr("drivers.common.checked.call_limit_s", lambda *_: 0.05)
-    monkeypatch.setattr("instrument.bench.bench.STOP_ANSWER_S", 0.05)
     with monkeypatch.context() as hangs:
+        hangs.setattr("drivers.common.checked.call_limit_s", lambda _, call: 0.05 if call == name else 30.0)
+        if name == "close":
+            hangs.setattr("instrument.bench.bench.STOP_ANSWER_S", 0.05)
         hangs.setattr(MockStage, name, lambda _: let_go.wait(20))
         with pytest.raises((DeviceTimeoutError, StepsFailedError), match=r"hangs: (home|closing)"):
             bench.stage.home() if name == "home" and bench.stage else bench.close()
