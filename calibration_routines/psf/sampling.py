@@ -153,7 +153,9 @@ class GridSweep:
     reasons: tuple[str, ...]
     """What the numbers come from, in words."""
     shapes: tuple[tuple[int, int], ...]
-    """Points along y and x at each depth."""
+    """Points along y and x at each depth, before those are left out from which too little is seen."""
+    seen: tuple[int, ...]
+    """How many of them are left at each depth."""
 
 
 def grid_sweep(
@@ -183,13 +185,13 @@ def grid_sweep(
     x_um, y_um : float
         The grid's centre.
 
-    Raises BenchError when a number makes no sense, the geometry is not known, there is no stage, or the grid
-    would be too large.
+    Raises BenchError when a number makes no sense, the geometry is not known, there is no stage, the grid
+    would be too large, or from no place of a depth enough of the pattern is seen.
     """
     _check_numbers(depths_um, half_field_um, spacing_um, (x_um, y_um))
     points: list[Position] = []
     reasons: list[str] = []
-    shapes = []
+    shapes, seen, planned = [], [], 0
     for number, z_um in enumerate(depths_um):
         (half_y, half_x), field = _half_field(bench, z_um, half_field_um, (y_um, x_um))
         axes, words = [], []
@@ -214,22 +216,25 @@ def grid_sweep(
         shapes.append((len(axes[0]), len(axes[1])))
         if number in (0, len(depths_um) - 1):
             reasons += [f"Field: {field}", *(f"Spacing: {w}" for w in words)]
+        here: list[Position] = []
         for row, y in enumerate(axes[0]):
             across = axes[1] if row % 2 == 0 else axes[1][::-1]
-            points += [(round(float(x), 3), round(float(y), 3), z_um) for x in across]
+            here += [(round(float(x), 3), round(float(y), 3), z_um) for x in across]
+        planned += len(here)
+        here = [point for point in here if _is_seen(bench, point)]
+        points += here
+        seen.append(len(here))
     if spacing_um is not None:
         reasons.append(f"Spacing: {spacing_um / 1e3:.3g} mm at most, as asked")
-    seen = [point for point in points if _is_seen(bench, point)]
-    if left_out := len(points) - len(seen):
-        told = f"{left_out} of {len(points)} places left out: from there the pattern leaves the sensor"
-        if not seen:
-            raise BenchError(f"{told}. Bring the field nearer to the axis.")
-        reasons.append(told)
-    return GridSweep(tuple(seen), tuple(dict.fromkeys(reasons)), tuple(shapes))
+    if dark := [z_um for z_um, count in zip(depths_um, seen, strict=True) if not count]:
+        raise _nothing_seen(bench, dark, len(depths_um))
+    if left_out := planned - len(points):
+        reasons.append(f"{left_out} of {planned} places left out: from there the pattern leaves the sensor")
+    return GridSweep(tuple(points), tuple(dict.fromkeys(reasons)), tuple(shapes), tuple(seen))
 
 
 def _is_seen(bench: Bench, point: Position) -> bool:
-    """Whether at least a tenth of a pattern's width lies on the sensor; True where that is not known."""
+    """Whether at least a tenth of a pattern's width lies in the frame; True where that is not known."""
     geometry, (x_um, y_um, z_um) = bench.geometry, point
     d_mm, pitch_um, aperture_mm = (
         geometry.diffuser_distance_mm,
@@ -239,9 +244,40 @@ def _is_seen(bench: Bench, point: Position) -> bool:
     if d_mm is None or pitch_um is None or aperture_mm is None:
         return True
     per_z = 1e3 * d_mm / z_um
+    opposite = _opposite_um(bench, z_um)
     return all(
-        abs(place) * per_z <= n * pitch_um / 2 + (0.5 - _LEAST_SEEN) * 1e3 * side * (1 + per_z)
-        for place, n, side in zip((y_um, x_um), bench.camera.frame_shape[:2], aperture_mm, strict=True)
+        abs(place - best) * per_z <= n * pitch_um / 2 + (0.5 - _LEAST_SEEN) * 1e3 * side * (1 + per_z)
+        for place, best, n, side in zip(
+            (y_um, x_um), opposite, bench.camera.frame_shape[:2], aperture_mm, strict=True
+        )
+    )
+
+
+def _opposite_um(bench: Bench, z_um: float) -> tuple[float, float]:
+    """Return ``(y, x)`` of the source at a depth whose pattern lies in the middle of the camera's region.
+
+    The pattern moves by ``-(x, y) d / z`` (Kuo 2020, Eq. 3.1). Needs the distance and the pitch.
+    """
+    camera, (d_mm, pitch_um) = (
+        bench.camera,
+        known(bench.geometry, "diffuser_distance_mm", "pixel_pitch_um", what="Where the field lies follows"),
+    )
+    (height, width), roi = camera.sensor_shape, camera.roi
+    per_pixel = pitch_um / camera.binning * z_um / (1e3 * d_mm)
+    beside = (roi.top + roi.height / 2 - height / 2, roi.left + roi.width / 2 - width / 2)
+    return 0.0 - beside[0] * per_pixel, 0.0 - beside[1] * per_pixel  # not -0.0
+
+
+def _nothing_seen(bench: Bench, dark_um: list[float], depths: int) -> BenchError:
+    """Return the refusal of depths without a place from which enough is seen."""
+    near, far = min(dark_um), max(dark_um)
+    where = f"{near / 1e3:.4g}" if near == far else f"{near / 1e3:.4g} to {far / 1e3:.4g}"
+    y_um, x_um = _opposite_um(bench, near)
+    remedy = f"Bring the field nearer to x = {x_um / 1e3:.3g}, y = {y_um / 1e3:.3g} mm"
+    return BenchError(
+        f"At z = {where} mm the pattern leaves the sensor from all places of the field. {remedy}"
+        + (f" (at z = {near / 1e3:.4g} mm)" if near != far else "")
+        + (", or leave such depths out." if len(dark_um) < depths else ".")
     )
 
 

@@ -383,9 +383,12 @@ class _Grid(Taking, _Lateral, _Points):
             y_um=self.y_um,
         )
         sizes = dict.fromkeys(f"{rows} x {columns}" for rows, columns in grid.shapes)
+        words = f"Grid: {' to '.join(sizes)} points (y x x) at each depth"
+        if any(seen < rows * columns for seen, (rows, columns) in zip(grid.seen, grid.shapes, strict=True)):
+            least, most = min(grid.seen), max(grid.seen)
+            words += f", of which {least if least == most else f'{least} to {most}'} seen"
         return PlannedSweep(
-            PointSweep(points_um=grid.points_um, kind=kind, **self._taking()),
-            (*grid.reasons, f"Grid: {' to '.join(sizes)} points (y x x) at each depth"),
+            PointSweep(points_um=grid.points_um, kind=kind, **self._taking()), (*grid.reasons, words)
         )
 
     def _fall_off(self) -> FallOff | None:

@@ -155,7 +155,7 @@ def prepare_target(
     Parameters
     ----------
     pixels : ndarray, (height, width), or (height, width, 3), of which the mean of the channels is taken
-        Intensity; 0 is black, an integer type's greatest value (float: the maximum) is white.
+        Intensity; 0 is black, the greatest value that is shown is white, whatever the type.
     options : HologramOptions
         Its ``fit``, ``srgb``, ``lift`` and ``envelope``.
     share : float
@@ -163,7 +163,7 @@ def prepare_target(
     """
     options = options or HologramOptions()
     image = options.lift + (1 - options.lift) * field_picture(pixels, fit=options.fit, srgb=options.srgb)
-    white = float(image.max())  # phases dim nothing: a dark picture is shown, and judged, as a bright one
+    white = float(image.max())
     window = None if options.mirrors is None else FIRST_ORDER
     if display.near:
         window = near_window(display)
@@ -218,22 +218,23 @@ def field_picture(
 ) -> npt.NDArray[np.float64]:
     """Return a picture as it fills the square field, intensity in 0 to 1; see :class:`HologramOptions`.
 
-    Stretched, it keeps its own number of pixels.
+    Stretched, it keeps its own number of pixels. Its greatest value is 1: phases dim nothing, a dark picture
+    is shown as a bright one.
     """
-    image = np.asarray(pixels, np.float64) / _white(pixels)
-    if srgb:
-        image = np.where(image <= 0.04045, image / 12.92, ((np.abs(image) + 0.055) / 1.055) ** 2.4)
-    if image.ndim == 3:
-        image = image.mean(axis=2)
-    height, width = image.shape
+    image = np.asarray(pixels, np.float64)
+    height, width = image.shape[:2]
     side = min(height, width) if fit == "cover" else max(height, width)
     if fit == "cover":
         top, left = (height - side) // 2, (width - side) // 2
         image = image[top : top + side, left : left + side]
     elif fit == "contain":
         top, left = (side - height) // 2, (side - width) // 2
-        image = np.pad(image, ((top, side - height - top), (left, side - width - left)))
-    return image
+        around = ((top, side - height - top), (left, side - width - left), (0, 0))
+        image = np.pad(image, around[: image.ndim])
+    image = _to_white(image)
+    if srgb:
+        image = np.where(image <= 0.04045, image / 12.92, ((np.abs(image) + 0.055) / 1.055) ** 2.4)
+    return _to_white(image.mean(axis=2)) if image.ndim == 3 else image
 
 
 def crop_words(pixels: npt.NDArray[Any], fit: Fit) -> str:
@@ -248,10 +249,9 @@ def crop_words(pixels: npt.NDArray[Any], fit: Fit) -> str:
     )
 
 
-def _white(pixels: npt.NDArray[Any]) -> float:
-    if pixels.dtype == np.uint8:
-        return 255.0
-    return 65535.0 if pixels.dtype == np.uint16 else max(float(pixels.max()), 1e-30)
+def _to_white(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return an image with 1 as its greatest value; a black one stays black."""
+    return image / max(float(image.max()), 1e-30)
 
 
 def read_weights(path: Path) -> npt.NDArray[np.float64]:

@@ -330,7 +330,8 @@ def test_views_stand_so_that_they_are_largest() -> None:
 def test_the_target_is_shown_as_it_fills_the_field(
     qtbot: QtBot, panel: HologramsPanel, tmp_path: Path
 ) -> None:
-    picture = read_image(tmp_path / "picture.png").pixels / 255
+    pixels = read_image(tmp_path / "picture.png").pixels
+    picture = pixels / pixels.max()
     np.testing.assert_allclose(panel.target.image, picture[:, 20:100])
     panel.form.widgets["fit"].setCurrentText("stretch")
     qtbot.waitUntil(lambda: panel.target.image.shape == picture.shape, timeout=WAIT_MS)

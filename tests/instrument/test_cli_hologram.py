@@ -88,6 +88,17 @@ def test_a_dark_picture_is_judged_by_its_own_white_and_alpha_is_told(capsys):
 
 
 @pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("colour", [False, True])
+def test_lift_and_srgb_are_parts_of_the_pictures_own_white(colour):
+    grey = np.tile(np.linspace(0, 4080, 96).astype(np.uint16), (96, 1))  # 12 bits of 16
+    pixels = np.stack([grey, 0 * grey, 0 * grey], axis=-1) if colour else grey
+    options = HologramOptions(lift=0.2, srgb=True, envelope="ignore")
+    dark, bright = (prepare_target(p, bench(), options) for p in (pixels, pixels / pixels.max()))
+    np.testing.assert_allclose(dark.image, bright.image, atol=1e-12)
+    assert dark.image.min() / dark.image.max() == pytest.approx(0.2, abs=0.01)
+
+
+@pytest.mark.usefixtures("here")
 def test_without_a_lens_the_fields_size_is_said_and_photographs_are_refused(capsys):
     assert main(["hologram", "picture.png", "--iterations", "3", "--distance-mm", "80"]) == 0
     display = replace(bench(), distance_mm=80.0)

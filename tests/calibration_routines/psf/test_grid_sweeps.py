@@ -29,6 +29,8 @@ from calibration_routines import (
 from calibration_routines.psf.analysis import feature_size_px, optical_binning
 from calibration_routines.psf.stage_fit import fit_stage, judge_drift
 from calibration_routines.psf.sweep import Retake, read_retakes
+from calibration_routines.psf.sweep_options import LateralSweep
+from drivers.camera import Roi
 from drivers.simulated.world import Image, Rgb, SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
@@ -336,6 +338,34 @@ def test_no_place_is_planned_from_which_the_pattern_leaves_the_sensor(bench: Ben
     assert any(reason.startswith("86 of 121 places left out") for reason in asked.reasons)
     with pytest.raises(BenchError, match="leaves the sensor"):
         grid_sweep(bench, (Z_UM,), half_field_um=(0.0, 0.0), spacing_um=10e3, x_um=50e3)
+
+
+def test_a_depth_from_which_nothing_is_seen_is_refused(bench: Bench) -> None:
+    with pytest.raises(BenchError, match=r"At z = 60 mm .* nearer to x = 0, y = 0 mm, or leave such depths"):
+        grid_sweep(bench, (60e3, 150e3), half_field_um=(0.0, 10e3), spacing_um=10e3, x_um=40e3)
+
+
+def test_the_size_of_a_grid_says_how_many_places_are_left(bench: Bench) -> None:
+    asked = {"half_field_x_um": 50e3, "half_field_y_um": 50e3, "spacing_um": 10e3}
+    reasons = LateralSweep(z_um=Z_UM, **asked).planned(bench).reasons
+    assert reasons[-1] == "Grid: 11 x 11 points (y x x) at each depth, of which 35 seen"
+    grid = grid_sweep(bench, (Z_UM, 150e3), half_field_um=(50e3, 50e3), spacing_um=10e3)
+    assert (grid.shapes, grid.seen) == (((11, 11), (11, 11)), (35, 63))
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+def test_the_field_is_opposite_to_the_region_that_is_read(bench: Bench, binning: int) -> None:
+    bench.camera.set_binning(binning)
+    bench.camera.set_roi(Roi(0, 240, 240, 80))  # at the right, where patterns of sources at x < 0 fall
+
+    def places(**asked: float) -> set[float]:
+        grid = grid_sweep(bench, (Z_UM,), half_field_um=(0.0, 40e3), spacing_um=10e3, **asked)
+        return {x for x, _, _ in grid.points_um}
+
+    # 120 pixels of 13 um beside the middle, seen from 100 mm: 17.5 mm; 15.6 mm to both sides
+    assert places() == {-30e3, -20e3, -10e3}
+    with pytest.raises(BenchError, match=r"nearer to x = -17\.5, y = 0 mm\.$"):
+        places(x_um=70e3)
 
 
 def test_lateral_spacing_is_the_dissertations() -> None:

@@ -131,3 +131,19 @@ def test_search_light_and_alignment_are_told_where_they_limit():
     assert "0.8 dB" in words[-1]
     settled = hologram(1, 2, 3, 4, 5, 6, reason=HologramStop.CONVERGED)
     assert limited_by(replace(display, lost_db=0.1), [Target(picture())], settled, options, 0.5) == ()
+
+
+@pytest.mark.parametrize(
+    ("psnr_db", "told"), [((34, 34, 34), ["contrast"]), ((36, 36, 36), []), ((1, 12, 20), ["search"])]
+)
+def test_contrast_is_told_neither_of_a_good_hologram_nor_of_one_still_searching(monkeypatch, psnr_db, told):
+    monkeypatch.setattr("recon.holography.limit.gain_of_frames", lambda *_: 1.0)
+    display = Display(SHAPE, random_mask(SHAPE, seed=1))
+    words = limited_by(display, [Target(picture())], hologram(*psnr_db), HologramOptions(), 0.6)
+    assert [line.partition(":")[0] for line in words] == told
+
+
+def test_planes_of_a_volume_have_no_estimate_of_what_frames_gain():
+    display = Display(SHAPE, random_mask(SHAPE, seed=1))
+    planes = [Target(picture()), Target(picture(), 5.0)]
+    assert np.isnan(gain_of_frames(display, planes, HologramOptions()))
