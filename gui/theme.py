@@ -203,6 +203,8 @@ def restyled(part: QWidget) -> Iterator[None]:
     _half.add(part)
     dress(part)
     yield
+    if not isValid(part):  # it may have gone meanwhile
+        return
     for widget in (part, *part.findChildren(QWidget)):
         if isValid(widget) and hasattr(widget, "restyle"):
             try:

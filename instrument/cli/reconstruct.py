@@ -64,9 +64,8 @@ def reconstruct(
 ) -> None:
     """Reconstruct the scene from a PSF and a photograph: TIFF, PNG, JPEG, BMP or NumPy files from anywhere.
 
-    Both come from the same camera with the same region of interest and binning, 8 to 16 bit or float, grey or
-    colour. Ctrl-C ends the work and keeps the picture so far; a second Ctrl-C gives it up. An interrupted
-    video is taken up again by the same command.
+    Both come from one camera with one region of interest and binning, 8 to 16 bit or float, grey or colour.
+    Ctrl-C keeps the picture so far, a second one gives it up; the same command goes on with a video.
     """
     asked = _Asked(source, inputs, options, output, video, given)
     if options.choose is not None and options.choose.precision is not None and "precision" in given:

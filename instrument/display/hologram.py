@@ -231,10 +231,10 @@ def field_picture(
         top, left = (side - height) // 2, (side - width) // 2
         around = ((top, side - height - top), (left, side - width - left), (0, 0))
         image = np.pad(image, around[: image.ndim])
-    image = _to_white(image)
     if srgb:
+        image = image / _full_scale(pixels)
         image = np.where(image <= 0.04045, image / 12.92, ((np.abs(image) + 0.055) / 1.055) ** 2.4)
-    return _to_white(image.mean(axis=2)) if image.ndim == 3 else image
+    return _to_white(image.mean(axis=2) if image.ndim == 3 else image)
 
 
 def crop_words(pixels: npt.NDArray[Any], fit: Fit) -> str:
@@ -247,6 +247,14 @@ def crop_words(pixels: npt.NDArray[Any], fit: Fit) -> str:
         f"The field is square: the middle {side} x {side} of the picture's {height} x {width} pixels are "
         "shown (--fit contain shows all of it, --fit stretch stretches it)."
     )
+
+
+def _full_scale(pixels: npt.NDArray[Any]) -> float:
+    """Return the number of full light: of the fewest bits of any camera or file that hold the picture."""
+    most = float(pixels.max())
+    if pixels.dtype.kind not in "ui":
+        return max(most, 1.0)
+    return next((2.0**bits - 1 for bits in (8, 10, 12, 14, 16) if most < 2**bits), most)
 
 
 def _to_white(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -73,10 +73,10 @@ def test_stop_is_heard_while_a_panel_is_made_and_breaks_off_no_check_for_good(
     began, go_on = threading.Event(), threading.Event()
     outlook = type(panel.procedure()).outlook
 
-    def slow(procedure: Procedure, bench: Bench) -> Outlook:
+    def slow(procedure: Procedure, bench: Bench, folder: Path | None = None) -> Outlook:
         began.set()
         go_on.wait(WAIT_MS / 1e3)
-        return outlook(procedure, bench)
+        return outlook(procedure, bench, folder)
 
     monkeypatch.setattr(type(panel.procedure()), "outlook", slow)
     panel.check()

@@ -14,7 +14,7 @@ import pytest
 from calibration_routines.display.hologram_photograph import display_of_pattern, photograph_hologram
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
-from instrument.display.hologram import Alignment, bench_display, prepare_target
+from instrument.display.hologram import Alignment, bench_display, field_picture, prepare_target
 from instrument.display.limit import limit_lines
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image, write_image
@@ -90,12 +90,14 @@ def test_a_dark_picture_is_judged_by_its_own_white_and_alpha_is_told(capsys):
 @pytest.mark.usefixtures("here")
 @pytest.mark.parametrize("colour", [False, True])
 def test_lift_and_srgb_are_parts_of_the_pictures_own_white(colour):
-    grey = np.tile(np.linspace(0, 4080, 96).astype(np.uint16), (96, 1))  # 12 bits of 16
+    grey = np.tile(np.linspace(0, 4095, 96).astype(np.uint16), (96, 1))  # 12 bits of 16
     pixels = np.stack([grey, 0 * grey, 0 * grey], axis=-1) if colour else grey
     options = HologramOptions(lift=0.2, srgb=True, envelope="ignore")
     dark, bright = (prepare_target(p, bench(), options) for p in (pixels, pixels / pixels.max()))
     np.testing.assert_allclose(dark.image, bright.image, atol=1e-12)
     assert dark.image.min() / dark.image.max() == pytest.approx(0.2, abs=0.01)
+    dim = np.array([[64, 128], [0, 32]], np.uint8)  # decoded as what its file says, then brightened
+    assert field_picture(dim, srgb=True)[0, 0] == pytest.approx(0.05127 / 0.21586, abs=1e-4)
 
 
 @pytest.mark.usefixtures("here")
