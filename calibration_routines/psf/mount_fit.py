@@ -25,6 +25,7 @@ from recon.camera.registration import moved, rescaled
 from recon.types import Geometry
 
 _LEAST_PLANES = 4
+_LEAST_FOR_D = 5  # of four noisy ones the three pairs agree by chance now and then
 _LEAST_RANGE = 1.2  # of depths, farthest over nearest
 _NEAR = 10.0  # apertures: nearer, light falls off otherwise than with the square
 _LEAST_ERROR = 0.002  # of a plane's brightness: what dark frames and the sensor's edge leave
@@ -124,7 +125,7 @@ def fit_mount(
         )
     d_mm, distance = geometry.diffuser_distance_mm, None
     # Where light does not tell the depths there is no d either.
-    told = not unlike_law and bool(np.all(z + farther > 0))
+    told = not unlike_law and bool(np.all(z + farther > 0)) and len(kept) >= _LEAST_FOR_D
     if psfs and told and d_mm is not None and geometry.pixel_pitch_um is not None:
         bent = _bent([planes[i] for i in kept], z + farther, geometry)
         unsure = float(np.hypot(2 * error / np.median(z), (1 - bent) / 2))

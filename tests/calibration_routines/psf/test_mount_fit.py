@@ -94,13 +94,14 @@ def test_a_wrong_distance_is_told_by_the_patterns_growth_whatever_the_pitch() ->
 
 
 def test_where_light_or_noise_does_not_tell_no_distance_is_accused() -> None:
+    rng = np.random.default_rng(11)
     spots = np.zeros((60, 80), np.float32)
-    spots[tuple(RNG.integers(12, n - 12, 25) for n in spots.shape)] = RNG.uniform(1, 3, 25)
+    spots[tuple(rng.integers(12, n - 12, 25) for n in spots.shape)] = rng.uniform(1, 3, 25)
     sharp = rescaled(spots, 0.98)
 
     def patterns(depths: np.ndarray, noise: float) -> list[np.ndarray]:
         grown = [rescaled(sharp, 1 / paraxial_scale(depths[-1], z, 8.9e3)) for z in depths]
-        return [(g + RNG.normal(0, noise, g.shape)).astype(np.float32)[None] for g in grown]
+        return [(g + rng.normal(0, noise, g.shape)).astype(np.float32)[None] for g in grown]
 
     seven = patterns(DEPTHS, 0.002)
     dimmed = light()
@@ -117,11 +118,11 @@ def test_where_light_or_noise_does_not_tell_no_distance_is_accused() -> None:
     assert far is not None
     assert far.distance is None or abs(far.distance[0] - 8.9 / 3) < 3 * far.distance[1]
     for near, farthest in ((100e3, 125e3), (300e3, 400e3)):
-        depths = 1 / np.linspace(1 / near, 1 / farthest, 4)
-        four = [replace(plane, z_um=z) for plane, z in zip(planes(), depths, strict=False)]
+        depths = 1 / np.linspace(1 / near, 1 / farthest, 5)
+        five = [replace(plane, z_um=z) for plane, z in zip(planes(), depths, strict=False)]
         for _ in range(3):
-            shone = 1e9 / depths**2 * (1 + 0.001 * RNG.normal(size=4))
-            found = fit_mount(four, shone, GEOMETRY, psfs=patterns(depths, 0.1 * float(sharp.max())))
+            shone = 1e9 / depths**2 * (1 + 0.001 * rng.normal(size=5))
+            found = fit_mount(five, shone, GEOMETRY, psfs=patterns(depths, 0.1 * float(sharp.max())))
             assert found is not None
             assert not any("grows" in words for words in found.findings)
             assert found.distance is None or found.distance[1] < 0.5 * found.distance[0]

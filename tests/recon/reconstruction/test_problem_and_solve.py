@@ -164,7 +164,7 @@ def test_erasures_and_background_of_patterned_light_are_shaped_as_its_frames(pho
     one = Problem.of(Measurement(frames, background=image, erasures=erased[0], patterns=patterns), psf)
     np.testing.assert_array_equal(one.valid, ~np.stack([erased[0]] * 2))
     assert np.isfinite(solve(each, replace(each.options, **QUICK)).image).all()
-    with pytest.raises(InputError, match="24 x 24 pixels and 3 frames"):
+    with pytest.raises(InputError, match=r"is \(24, 24, 3\), and the frames are \(2, 24, 24\)"):
         Problem.of(Measurement(frames, erasures=np.zeros((3, 24, 24)), patterns=patterns), psf)
 
 
