@@ -69,6 +69,8 @@ class Operation:
         self._dropped: Bench | None = None
         """One whose operation is being ended: once is enough, however many connections break."""
         self._ended: DeviceError | None = None
+        self._dismissed: tuple[str, DeviceError] | None = None
+        """The key of the last operator whose operation was ended, and why, until he has a device again."""
         self._holds: dict[Kind, _Hold] = {}
         self.operator: Operator | None = None
         self.newest_frame: Frame | None = None
@@ -114,6 +116,8 @@ class Operation:
                 self._say(f"Operated by {operator.words}.")
             self._bench, self.operator = bench, present or operator
             self._holds[kind] = _Hold(device, on_end)
+            if self._dismissed is not None and self._dismissed[0] == operator.key:
+                self._dismissed = None
             return device
 
     def let_go(self, kind: Kind, operator: Operator) -> None:
@@ -156,6 +160,7 @@ class Operation:
                 for hold in self._holds.values():
                     hold.on_end(reason)
                 self._say(reason.problem)
+                self._dismissed = (operator.key, reason)
                 self._end(bench)
         if failure is not None:
             self.trouble = str(failure)
@@ -201,13 +206,15 @@ class Operation:
     def device(self, kind: Kind, key: str) -> Device:
         """Return the device that an operator has open.
 
-        Raises DeviceLostError when he has it no more.
+        Raises DeviceLostError when he has it no more, or what it was taken from him for.
         """
         return self._hold(kind, key).device
 
     def _hold(self, kind: Kind, key: str) -> _Hold:
-        hold = self._holds.get(kind)
-        if hold is None or self.operator is None or self.operator.key != key:
+        hold, operator = self._holds.get(kind), self.operator
+        if hold is None or operator is None or operator.key != key:
+            if self._dismissed is not None and self._dismissed[0] == key:  # the call was on its way meanwhile
+                raise self._dismissed[1]
             raise DeviceLostError(kind, "is not open for this program any more.", "Open it again.")
         return hold
 

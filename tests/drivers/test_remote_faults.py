@@ -278,6 +278,32 @@ def test_there_is_one_operator_at_a_time_until_somebody_presses_stop(
     leds.close()
 
 
+def test_a_call_that_comes_after_the_stop_and_before_its_message_is_told_of_the_stop(
+    server: BenchServer, options: RemoteOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leds = RemoteLedArray(options)
+    leds.open()
+    told = threading.Event()
+    parted = serving._part
+
+    async def late(*args: Any) -> None:
+        while not told.is_set():
+            await asyncio.sleep(0.005)
+        await parted(*args)
+
+    monkeypatch.setattr(serving, "_part", late)
+    server.operation.stop("somebody at the page")
+    with pytest.raises(StoppedError, match="STOP was pressed by somebody at the page"):
+        leds.set_pattern(LIT)
+    told.set()
+    leds.close()
+    monkeypatch.undo()
+    leds.open()
+    leds.close()
+    with pytest.raises(DeviceLostError, match="is not open for this program any more"):
+        server.operation.device("led_array", link._OPERATOR)
+
+
 @pytest.mark.parametrize("how", ["let_go", "drop"])
 def test_pieces_that_come_while_their_sender_leaves_are_not_kept(
     how: str, server: BenchServer, options: RemoteOptions, monkeypatch: pytest.MonkeyPatch
