@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,8 @@ import pytest
 from instrument.files.atomic import check_writable, output_folder, require_new
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
-from instrument.runs import inspection
+from instrument.plan import Part, Plan
+from instrument.runs import inspection, writer
 from instrument.runs.frame_array import FrameArray, SyncPool, description_of
 from instrument.runs.inspection import contact_sheet, summary, verify
 from instrument.runs.log import Gap
@@ -186,3 +188,49 @@ def test_an_array_keeps_what_was_written_and_nothing_half_written(
     ):
         with pytest.raises(ValueError, match=words):
             array.write([(index, image)])
+
+
+def test_saturated_pixels_of_a_contact_sheet_are_red() -> None:
+    pixels = np.zeros((4, 1300), np.uint8)
+    pixels[2, 2] = 255
+    run: Any = SimpleNamespace(frame=lambda _: pixels, metadata=lambda _: SimpleNamespace(significant_bits=8))
+    picture = inspection._shown(run, 0)
+    assert picture.shape == (2, 650, 3)
+    assert picture[1, 1].tolist() == [1, 0, 0]
+    assert picture[0, 0].tolist() == [0, 0, 0]
+
+
+def test_frames_that_came_at_one_time_have_no_period() -> None:
+    def period_s(*times_ns: int | None) -> float | None:
+        metadata = [
+            SimpleNamespace(host_time_ns=9 * n, device_time_ns=time) for n, time in enumerate(times_ns)
+        ]
+        records = {3 * n: SimpleNamespace(metadata=one) for n, one in enumerate(metadata)}
+        run: Any = SimpleNamespace(plan=None, records=records)
+        return Run.frame_period_s.fget(run)  # type: ignore[attr-defined]
+
+    assert period_s(7, 7) is None
+    assert period_s(7) is None
+    assert period_s(0, 6_000_000) == pytest.approx(0.002)
+    assert period_s(None, 6_000_000) == pytest.approx(3e-9)
+
+
+def test_a_plan_without_slm_images_makes_no_folder_for_them_and_others_are_copied(tmp_path: Path) -> None:
+    run, image = tmp_path / "run", tmp_path / "a.png"
+    run.mkdir()
+    bare = Plan(label="p", parts=(Part(label="a"),))
+    assert writer.plan_with_copies(bare, run) == bare
+    assert list(run.iterdir()) == []
+    image.write_bytes(b"an image")
+    (copy,) = writer.plan_with_copies(
+        Plan(label="p", parts=(Part.model_validate({"label": "a", "slm_image": str(image)}),)), run
+    ).slm_images
+    assert not copy.is_absolute()
+    assert (run / copy).read_bytes() == b"an image"
+
+
+def test_a_broken_checkout_has_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(writer, "__file__", str(tmp_path / "instrument" / "runs" / "writer.py"))
+    assert writer.git_commit() is None
+    (tmp_path / ".git").mkdir()
+    assert writer.git_commit() is None
