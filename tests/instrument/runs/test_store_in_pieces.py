@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +21,7 @@ from instrument.runs.frame_array import FrameArray, SyncPool, description_of
 from instrument.runs.inspection import contact_sheet, summary, verify
 from instrument.runs.log import Gap
 from instrument.runs.run import FinishReason, Run
+from instrument.runs.run_files import RunError
 from instrument.runs.writer import RunWriter
 from tests.instrument.runs.test_store import BENCH, frame
 
@@ -234,3 +237,33 @@ def test_a_broken_checkout_has_no_commit(tmp_path: Path, monkeypatch: pytest.Mon
     assert writer.git_commit() is None
     (tmp_path / ".git").mkdir()
     assert writer.git_commit() is None
+
+
+def test_a_closed_run_has_no_open_file_and_no_thread(tmp_path: Path) -> None:
+    def left() -> tuple[int, list[str]]:
+        threads = [t.name for t in threading.enumerate() if t.name.startswith("sync")]
+        return len(list(Path("/proc/self/fd").iterdir())), threads
+
+    before = left()
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as opened:
+        opened.start()
+        opened.write([frame(0)])
+        opened.keep_text("more.txt", "what a routine knows")
+        assert left()[0] > before[0]
+    assert left() == before
+    assert (opened.path / "more.txt").read_text() == "what a routine knows"
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.ENOSPC, "diffuserbench resume continues"),
+        (errno.EROFS, "may write to"),
+        (errno.EIO, "[.]$"),
+        (None, "could not be written: None[.]$"),
+    ],
+)
+def test_what_a_disk_refuses_is_said_with_what_to_do(number: int | None, remedy: str) -> None:
+    refusal = OSError() if number is None else OSError(number, "no")
+    with pytest.raises(RunError, match=remedy), writer._disk(Path("r"), "it could not be written"):
+        raise refusal
