@@ -8,6 +8,7 @@ _RUNS = tuple(
         "acquisition_simulated",
         "damage",
         "fault_injection",
+        "finish",
         "frame_metadata",
         "interrupt",
         "recorder",
