@@ -98,6 +98,8 @@ def test_what_a_field_needs_is_asked_for():
         two_part(bare, gaussian_fall_off(13.0))
     for z_um in (-NEAR, 0.0, np.nan, np.inf):
         with pytest.raises(InputError, match="does not say all"):
-            two_part(replace(alone, source_positions_um=np.array([[0.0, 0.0, z_um]])), gaussian_fall_off(13.0))
+            two_part(
+                replace(alone, source_positions_um=np.array([[0.0, 0.0, z_um]])), gaussian_fall_off(13.0)
+            )
     with pytest.raises(InputError, match="1 place a side"):
         two_part(alone, gaussian_fall_off(13.0), points=0)
