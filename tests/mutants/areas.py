@@ -11,6 +11,7 @@ _RUNS = tuple(
         "frame_metadata",
         "interrupt",
         "recorder",
+        "recorder_in_pieces",
         "resume",
         "run_control",
         "runner",
