@@ -55,10 +55,36 @@ STEPS = {
     "etendue": "etendue",
     "hologram": "hologram photo.png --out slm.png --iterations 20",
     "optics": "optics --out optics.png",
-    "stability": "stability --help",
+    "stability": "stability light --out maps",
     "chart": "chart scene sparse-picture --size 32 --time 20 --out chart",
     "test": "test",
+    "table7.1": "table7.1 --iterations 10 --pictures head --expansion 4 --out table71",
+    "plan new": "plan new plan.toml",
+    "plan show": "plan show plan.toml",
+    "run": "run plan.toml --out planned",
+    "resume": "resume SWEEP",
+    "explain": "reconstruct --psf psf.tif --image photo.tif --bin 8 --explain",
+    "volume": "reconstruct --volume SWEEP --image photo.tif --bin 16 --out volume.tif",
+    "lateral": "calibrate lateral --z 200 --half-field-x 10 --half-field-y 10 --spacing 10 --out grids",
+    "volume sweep": "calibrate volume --z-min 150 --z-max 300 --dry-run",
+    "stage": "calibrate stage --out stages",
+    "photograph": "calibrate photograph --out photographs",
+    "angular": "calibrate angular --average 1 --out angles",
+    "beads": "calibrate beads --z 2.5 --binning 8 --images 2 --psfs 3x3 --out slide",
+    "screen bench": "new screen.toml --screen --no-look",
+    "screen": "calibrate screen --bench screen.toml --pictures 4 --average 2 --binning 4 --out screens",
+    "microscope bench": "new microscope.toml --microscope --no-look",
+    "dpc": "calibrate dpc --bench microscope.toml --na 0.1 --magnification 4 --out surfaces",
+    "display bench": "new display.toml --display --no-look",
+    "align mask": "align mask --bench display.toml --out alignment.json",
+    "slm": "calibrate slm --bench display.toml --levels 9 --out slm.json",
+    "display": "calibrate display --bench display.toml --patterns 5 --out display.json",
+    "demo camera": "demo camera --out shown",
+    "demo film": "demo film --out filmed",
+    "demo display": "demo display --out displayed",
+    "activity": "activity RECORD --psf psf.tif --bin 16 --out active",
 }
+"""A command of each kind; what is not here ends at once (completion), or when it is told to (gui, serve)."""
 
 
 @dataclass
@@ -92,8 +118,8 @@ def processor_s(process: int) -> float:
     return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
-def typed(words: list[str], folder: Path) -> Heard:
-    """Type a command in a terminal and listen to it."""
+def typed(words: list[str], folder: Path, most_s: float) -> Heard:
+    """Type a command in a terminal and listen to it; after so long press Ctrl-C."""
     heard = Heard(time.monotonic())
     process, terminal = pty.fork()
     if process == 0:
@@ -102,8 +128,10 @@ def typed(words: list[str], folder: Path) -> Heard:
         code = f"import sys; from instrument.cli import main; sys.exit(main({words!r}))"
         os.execv(sys.executable, [sys.executable, "-c", code])
     ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 80, 200, 0, 0))
-    cpu_s = 0.0
+    cpu_s, pressed = 0.0, False
     while True:
+        if not pressed and time.monotonic() - heard.began_s > most_s:
+            pressed = bool(os.write(terminal, b"\x03"))
         ready, _, _ = select.select([terminal], [], [], 0.2)
         cpu_s = max(cpu_s, processor_s(process))
         if not ready:
@@ -127,6 +155,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--only", nargs="*", choices=STEPS, help="these")
     parser.add_argument("--once", action="store_true", help="not a second time")
+    parser.add_argument("--most", type=float, default=300.0, help="seconds by the clock, then Ctrl-C")
     parser.add_argument("--folder", type=Path, help="kept")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
@@ -142,8 +171,12 @@ def main() -> None:
         for name in options.only or STEPS:
             runs = sorted(folder.glob("sweep/*"))
             words = STEPS[name].replace("SWEEP", str(runs[-1]) if runs else "none").split()
+            records = sorted(folder.glob("records/*"))
+            words = [str(records[-1]) if word == "RECORD" and records else word for word in words]
             for again in range(1 if options.once else 2):
-                heard = typed([*words, "--force"] if again and needs_force(words) else words, folder)
+                heard = typed(
+                    [*words, "--force"] if again and needs_force(words) else words, folder, options.most
+                )
                 silent, untold = heard.stretch(None), heard.stretch(TIME)
                 took = heard.said[-1]
                 rows.append({"name": name, "again": again, "said": heard.said, "status": heard.status})

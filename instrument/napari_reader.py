@@ -14,6 +14,7 @@ from instrument.files.calibration_file import is_calibration, load_calibration
 from instrument.files.errors import FileError
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
+from instrument.files.tiff_pages import open_tiff
 from instrument.files.volumes import is_zarr_name, stem_of
 from instrument.runs.run_files import FRAMES, is_run
 
@@ -113,10 +114,8 @@ def _array(path: Path, name: str = "") -> list[Layer]:
 
 def _result(path: Path) -> list[Layer]:
     """Return a reconstruction on its grid."""
-    import tifffile
-
     record = _record(path)
-    with tifffile.TiffFile(path) as file:
+    with open_tiff(path) as file:
         series = file.series[0]
         data, axes = series.asarray(), [{"s": "c"}.get(a, a) for a in series.axes.lower()]
     grid = record.get("grid") or {}

@@ -72,7 +72,9 @@ def checked(driver: _D) -> _D:
         (mixin, interface) for mixin, interface in _MIXINS.items() if issubclass(driver, interface)
     )
     plain = type(driver.__name__, (mixin, driver), {})
-    made = type(driver.__name__, (plain,), {"__module__": driver.__module__, "__doc__": driver.__doc__})
+    itself = {"__eq__": object.__eq__, "__hash__": object.__hash__}  # a @dataclass is no other device either
+    facts = {"__module__": driver.__module__, "__doc__": driver.__doc__}
+    made = type(driver.__name__, (plain,), itself | facts)
     for name in dir(interface):
         member = inspect.getattr_static(plain, name)
         if name.startswith("_"):

@@ -253,16 +253,16 @@ class ReconstructionsPanel(Panel):
             self._names.make_room(work.outputs.image)
             return reconstruct_job(work, context)
 
-        self.job = job = self.jobs.compute(f"Reconstructing {request.image.name}", do)
+        self.job = job = self.jobs.compute(f"Reconstructing {request.file.name}", do)
         self._begun(job, "Reading …")
         self._close_result()
-        self._show_nothing(f"{request.image.name} is being read …", busy=True)
+        self._show_nothing(f"{request.file.name} is being read …", busy=True)
         self._opening, self._first_picture = None, True
-        self.heading.setText(f"<b>{request.image.name}</b>: in the making")
+        self.heading.setText(f"<b>{request.file.name}</b>: in the making")
         job.progressed.connect(lambda so_far: self._progressed(so_far, volume=volume))
         job.succeeded.connect(self._reconstructed)
         for ended, words in ((job.failed, "failed"), (job.cancelled, "stopped")):
-            ended.connect(lambda _, words=words: self._not_reconstructed(request.image.name, words))
+            ended.connect(lambda _, words=words: self._not_reconstructed(request.file.name, words))
         return job
 
     def refine(self) -> Job | None:
@@ -317,7 +317,7 @@ class ReconstructionsPanel(Panel):
             context.check()
             return choice
 
-        job = self.jobs.compute(f"Explaining {request.image.name}", work)
+        job = self.jobs.compute(f"Explaining {request.file.name}", work)
         self._explaining = job
         self._begun(job, "Looking at PSFs and photograph …")
         job.succeeded.connect(self._explained)

@@ -19,6 +19,7 @@ import tifffile
 from instrument.files import reading
 from instrument.files.errors import FileError
 from instrument.files.named_arrays import is_hdf5, is_matlab, ordered, read_hdf5, read_matlab
+from instrument.files.tiff_pages import open_tiff
 
 READABLE = "TIFF, PNG, JPEG, BMP, .npy, .npz with one array, HDF5, MATLAB, OME-Zarr"
 Decoded = tuple[npt.NDArray[Any], tuple[str, ...]]
@@ -114,7 +115,7 @@ _ORIENTATION = 274
 
 def _decode_tiff(path: Path, data: bytes) -> Decoded:
     try:
-        with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+        with open_tiff(path, data) as tiff:
             if not tiff.series:
                 raise FileError(path, "is a TIFF without an image.")
             series = tiff.series[0]
@@ -206,7 +207,7 @@ def _decode_with_opencv(path: Path, data: bytes) -> Decoded:
 
 def _refuse_odd_bits(path: Path, data: bytes) -> None:
     """OpenCV stretches pixels of 9 to 15 bits to 16 without a word."""
-    with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+    with open_tiff(path, data) as tiff:
         bits = tiff.pages.first.bitspersample
     if bits not in _WHOLE_BYTES:
         raise FileError(

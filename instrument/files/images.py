@@ -24,6 +24,7 @@ from instrument.files.errors import FileError
 from instrument.files.image_folders import images_in, in_order, order_in_words
 from instrument.files.named_arrays import is_zarr, read_zarr
 from instrument.files.seen import as_seen, levels_of, png_bytes
+from instrument.files.tiff_pages import open_tiff
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
 
@@ -186,7 +187,7 @@ def image_metadata(path: Path) -> dict[str, Any]:
     said: dict[str, Any] = {}
     try:
         if path.suffix.lower() in (".tif", ".tiff"):
-            with tifffile.TiffFile(path) as tiff:
+            with open_tiff(path) as tiff:
                 page: Any = tiff.pages.first
                 pattern = bytes(page.tags.valueof(_CFA_PATTERN, b""))
                 if len(pattern) == 4 and max(pattern) < 3:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from instrument.files.atomic import whole_file, whole_folder
 from instrument.files.errors import FileError
 from instrument.files.reading import folder_bytes, require_file, require_plausible
+from instrument.files.tiff_pages import open_tiff
 
 if TYPE_CHECKING:
     from recon.camera.grid import Grid
@@ -496,7 +497,7 @@ def _open_tiff(path: Path) -> VolumeSource:
     tiff = None
     try:
         stored = require_file(path)
-        tiff = tifffile.TiffFile(path)
+        tiff = open_tiff(path)
         series: Any = tiff.series[0]
         require_plausible(path, series.size * series.dtype.itemsize, stored)
     except FileError:

@@ -14,28 +14,32 @@ import numpy as np
 
 from instrument.files import kept_times
 from instrument.files.errors import duration
-from instrument.reconstruction.job import Job, reduced_calibration
-from instrument.reconstruction.preparation import bin_image
-from recon.base.noise import averaged_noise
+from instrument.reconstruction.job import Job
 from recon.base.threads import get_threads
 from recon.reconstruction.course import TOLD_AT
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import reconstruct
+from recon.reconstruction.reduction import on_blocks, reduced_calibration
 from recon.reconstruction.solve import ITERATIONS
 from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.base import IterationRecord, StopReason
 from recon.solvers.memory import MemoryMeter, in_words
 from recon.types import Calibration
 
-TRIED = 6
-"""Iterations that are run to tell what each takes; the first ones are slower and do not count."""
-_UNCOUNTED = 2
+TRIED = 16
+"""Iterations that are run to tell what each takes, and how fast they settle; the first ones are slower, of
+varying PSFs twice, and do not count."""
+_UNCOUNTED = 4
 BLOCK = 2
-"""Side of the blocks of pixels on which a picture is solved to tell when it settles: within 21 % in four of
-four by total variation, in two of four by l1, where dense ones end by their number."""
+"""Side of the blocks of pixels on which a copy is solved to tell when it settles."""
 LEAST_PX = 64
-"""Side of pictures that blocks tell anything of."""
+"""Side of sensors that blocks tell anything of."""
+COPY_SHARE, COPY_S = 0.5, 5.0
+"""Share of the longest that all may take, and seconds, after both of which the copy is given up."""
+STRETCHED = 3.0
+"""A copy settles at most so many times as fast, or as slowly."""
 WORTH_BYTES = 2**20
 """Memory that is told: less was there already."""
 DIFFERS = 1.25
@@ -64,8 +68,8 @@ class Forecast:
     time_s : float or None
         The limit that was asked for.
     settles : int or None
-        After how many iterations it is expected to settle: so many did a copy on blocks of pixels; None where
-        none was made.
+        After how many iterations it is expected to settle, by a copy on blocks of pixels; None where none was
+        made, or it did not settle.
     """
 
     beside_s: float
@@ -91,8 +95,8 @@ class Forecast:
             return f"at most {duration(self.seconds)}{each} ({TRIED} were tried){memory}"
         most = duration(self.beside_s + self.iterations * self.iteration_s)
         return (
-            f"about {duration(self.seconds)}{each}, {self.settles} of them (so many settle a copy on blocks "
-            f"of {BLOCK} x {BLOCK} pixels; {self.iterations} take {most}){memory}"
+            f"about {duration(self.seconds)}{each}, {self.settles} of them (by how a copy on blocks of "
+            f"{BLOCK} x {BLOCK} pixels settles; {self.iterations} take {most}){memory}"
         )
 
 
@@ -238,25 +242,61 @@ def forecast(measurement: Measurement, calibration: Calibration, options: Recons
     if options.iterations is None and options.time_s is not None and each > 0:
         count = int(options.time_s / each)
     beside_s = max(spent - len(records) * each / max(len(runs), 1), 0.0)
-    settles = (
-        _settling(measurement, calibration, options) if count > TRIED and options.time_s is None else None
-    )
+    settles = None
+    if count > TRIED and options.time_s is None:
+        longest = max(runs, key=lambda run: run[-1].unrest)
+        settles = _settling(
+            measurement, calibration, options, longest, max(COPY_SHARE * count * each, COPY_S)
+        )
     return Forecast(beside_s, each, count, memory, options.time_s, settles)
 
 
 def _settling(
-    measurement: Measurement, calibration: Calibration, options: ReconstructionOptions
+    measurement: Measurement,
+    calibration: Calibration,
+    options: ReconstructionOptions,
+    first: Sequence[IterationRecord],
+    time_s: float,
 ) -> int | None:
-    """Return after how many iterations a copy of a picture on blocks of pixels settles; None where none."""
-    known = (measurement.background, measurement.erasures, measurement.patterns)
-    small = min(calibration.psfs.shape[-2:]) < LEAST_PX
-    if len(calibration.psfs) > 1 or small or options.tolerance == 0 or any(k is not None for k in known):
+    """Return after how many iterations all settles, by its first ones and a copy on blocks of pixels.
+
+    None where no copy can be made, or it does not settle in its number of iterations or its time.
+    """
+    if options.tolerance == 0 or options.stop_at_noise or measurement.patterns is not None:
         return None
-    copy = Measurement(
-        bin_image(np.asarray(measurement.image), BLOCK), averaged_noise(measurement.noise, BLOCK**2)
+    problem = Problem.of(measurement, calibration, options)
+    if min(problem.sensor_shape) < LEAST_PX:
+        return None
+    copy = on_blocks(problem.data, problem.valid, 1.0, BLOCK, flat=problem.flat)
+    asked = replace(
+        options,
+        judged=False,
+        refine_psf=False,
+        uncertainty=False,
+        time_s=time_s,
+        iterations=options.iterations or ITERATIONS,
+        estimate_background=None if options.positive_background else problem.smooth,
     )
-    asked = replace(options, judged=False, refine_psf=False, uncertainty=False)
-    found = reconstruct(copy, reduced_calibration(calibration, None, BLOCK), asked)
-    if set(found.stop_reasons) != {StopReason.CONVERGED}:  # its number ended it, which tells nothing
+    found = reconstruct(copy, reduced_calibration(problem.calibration, BLOCK, None), asked)
+    if set(found.stop_reasons) != {StopReason.CONVERGED}:  # its number or time ended it, which tells nothing
         return None
-    return max(len(history) for history in found.histories)
+    slowest = max(found.histories, key=len)
+    most = options.iterations or ITERATIONS
+    return min(round(len(slowest) * _stretch(first, slowest)), most)
+
+
+def _stretch(first: Sequence[IterationRecord], copy: Sequence[IterationRecord]) -> float:
+    """Return how many times as many iterations it takes to come as far as a copy, by the first of them."""
+    reached = np.array([record.unrest for record in first])
+    course = np.array([record.unrest for record in copy])
+    if not ((reached > 0).all() and (course > 0).all()):
+        return 1.0
+    number, differs = np.arange(1, len(first) + 1), []
+    stretches = np.geomspace(1 / STRETCHED, STRETCHED, 120)
+    for stretch in stretches:
+        at = number / stretch
+        told = (number > _UNCOUNTED) & (at >= _UNCOUNTED - 1) & (at <= len(copy))
+        told_by = np.interp(at[told], np.arange(1, len(copy) + 1), np.log(course))
+        many = np.count_nonzero(told) >= _UNCOUNTED
+        differs.append(np.mean((np.log(reached[told]) - told_by) ** 2) if many else np.inf)
+    return float(stretches[int(np.argmin(differs))]) if np.isfinite(differs).any() else 1.0

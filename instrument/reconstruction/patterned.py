@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import tempfile
 import threading
 import zipfile
 from collections.abc import Callable
@@ -175,16 +174,16 @@ class _Lit:
                 run.path, f"lacks {len(run.missing())} frames.", "diffuserbench resume takes the rest."
             )
         jobs = []
-        with tempfile.TemporaryDirectory() as where:
-            dark = Path(where) / "dark.npy"
-            images = run.images(DARK)
-            np.save(dark, images[0] if len(images) == 1 else images.mean(axis=0, dtype=np.float32))
-            for index, step in enumerate(run.steps(PATTERN)):
-                told = {"pixel_format": run.metadata(step.index).pixel_format}
-                frame = ImageFile(Path(f"{run.path} pattern {index}"), run.frame(step), metadata=told)
-                if not (frame.is_colour or pattern_of(inputs.mosaic, frame)):
-                    calibration = replace(calibration, psfs=calibration.psfs.mean(axis=1, keepdims=True))
-                jobs.append(job_with(calibration, folder, frame, replace(inputs, dark=dark)))
+        images = run.images(DARK)
+        dark = ImageFile(
+            Path(f"{run.path} dark"), images[0] if len(images) == 1 else images.mean(axis=0, dtype=np.float32)
+        )
+        for index, step in enumerate(run.steps(PATTERN)):
+            told = {"pixel_format": run.metadata(step.index).pixel_format}
+            frame = ImageFile(Path(f"{run.path} pattern {index}"), run.frame(step), metadata=told)
+            if not (frame.is_colour or pattern_of(inputs.mosaic, frame)):
+                calibration = replace(calibration, psfs=calibration.psfs.mean(axis=1, keepdims=True))
+            jobs.append(job_with(calibration, folder, frame, replace(inputs, dark=dark)))
         frames = np.stack([job.measurement for job in jobs])
         if all(job.valid is None for job in jobs):
             return cls(jobs[0], frames, None)

@@ -24,7 +24,7 @@ FloatImage = npt.NDArray[np.float32]
 
 ErasuresChoice = Literal["none", "saturated"] | float | Path
 """Nothing; saturated pixels; a random share; a mask file, zero where a pixel is erased."""
-DarkChoice = Literal["auto"] | float | Path
+DarkChoice = Literal["auto"] | float | Path | ImageFile
 
 SPREAD = 0.01
 """Share of a PSF's pixels above a fifth of its maximum from which its light is spread out: spots of lenslets
@@ -306,14 +306,14 @@ def dark_level(choice: DarkChoice, psf: ImageFile, image: ImageFile) -> Dark:
     """Return what is subtracted from a PSF and an image: as given, or estimated."""
     if choice == "auto":
         return dark_from_corners(psf, image)
-    if isinstance(choice, Path):
+    if isinstance(choice, (Path, ImageFile)):
         return dark_from_file(read_image(choice), image)
     return dark_from_counts(choice)
 
 
 def calibrated_dark(choice: DarkChoice, image: ImageFile, calibration: Calibration, match: int) -> Dark:
     """Return what to subtract from an image on the calibration's pixels; the PSFs need nothing."""
-    if isinstance(choice, Path):
+    if isinstance(choice, (Path, ImageFile)):
         dark = dark_from_file(read_image(choice), image)
         return replace(dark, image=bin_image(np.asarray(dark.image), match))
     if choice != "auto":

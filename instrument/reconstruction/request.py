@@ -56,11 +56,16 @@ def _require_choice(asked: str, model: ModelName) -> None:
 class _Request:
     """What pictures and volumes have in common."""
 
-    image: Path
+    image: Path | ImageFile
     """The photograph."""
     inputs: InputOptions = field(default_factory=InputOptions)
     """How it becomes a measurement, and what it is explained with a camera."""
     options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
+
+    @property
+    def file(self) -> Path:
+        """Where the photograph lies; of one that is no file what it is called."""
+        return self.image.path if isinstance(self.image, ImageFile) else self.image
 
     def solve(
         self,

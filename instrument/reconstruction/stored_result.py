@@ -19,6 +19,7 @@ from instrument.files.images import read_image, write_image
 from instrument.files.orientation import AS_IT_IS, Orientation
 from instrument.files.reading import parse_json, read_bytes, require_file
 from instrument.files.seen import as_seen
+from instrument.files.tiff_pages import open_tiff
 from instrument.files.volumes import (
     VolumeSource,
     grid_of,
@@ -319,11 +320,9 @@ def _is_volume(path: Path, record: Mapping[str, Any]) -> bool:
     if record:
         return len(record["grid"].get("shape", ())) == 3
     if path.suffix.lower() in (".tif", ".tiff"):
-        import tifffile
-
         try:
             require_file(path)
-            with tifffile.TiffFile(path) as tiff:
+            with open_tiff(path) as tiff:
                 series = tiff.series[0]
                 colours = "S" in series.axes or (series.axes, series.shape[0]) == ("CYX", 3)
                 return len(series.shape) == 4 or (len(series.shape) == 3 and not colours)

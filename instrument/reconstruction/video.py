@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-import tempfile
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -17,7 +16,7 @@ import numpy as np
 from instrument.files.atomic import refuse_input, write_json
 from instrument.files.errors import BenchError, FileError
 from instrument.files.films import as_shown, write_mp4
-from instrument.files.images import write_image
+from instrument.files.images import ImageFile
 from instrument.files.record import plain
 from instrument.files.volumes import is_zarr_name, stem_of
 from instrument.reconstruction.job import Job, Reduction
@@ -260,21 +259,20 @@ def _first_picture(request: VideoRequest, run: Run, index: int) -> Job:
     inputs = request.inputs
     if inputs.erasures == "saturated":
         inputs = replace(inputs, erasures="none")
-    with tempfile.TemporaryDirectory() as folder:
-        image = Path(folder) / f"{run.path.name} frame {index}.tif"
-        write_image(image, run.frame(index), {"pixel_format": run.metadata(index).pixel_format})
-        asked = PictureRequest(
-            image=image,
-            psf=request.psf,
-            calibration=request.calibration,
-            inputs=inputs,
-            options=replace(request.options, iterations=None),
-        )
-        try:
-            job = asked.prepare()
-        except FileError as error:  # of a file that nobody else knows
-            problem = error.problem.replace(str(image), image.stem)
-            raise FileError(run.path if error.path == image else error.path, problem, error.remedy) from error
+    told = {"pixel_format": run.metadata(index).pixel_format}
+    frame = ImageFile(Path(f"{run.path.name} frame {index}"), run.frame(index), metadata=told)
+    asked = PictureRequest(
+        image=frame,
+        psf=request.psf,
+        calibration=request.calibration,
+        inputs=inputs,
+        options=replace(request.options, iterations=None),
+    )
+    try:
+        job = asked.prepare()
+    except FileError as error:  # of a file that is none
+        is_frame = error.path == frame.path
+        raise FileError(run.path if is_frame else error.path, error.problem, error.remedy) from error
     return replace(job, simulated=job.simulated or run.is_simulated)
 
 

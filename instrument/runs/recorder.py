@@ -103,6 +103,9 @@ _FEWEST_BUFFERS, _MOST_BUFFERS = 16, 512
 _BATCH = 32
 """Frames synced to the disk together, at most; at most a quarter of the ring."""
 _DISK_CHECK_S = 1.0
+_FEWEST_FREE_BYTES = SPARE_BYTES // 2
+_LOOK_S = 0.1
+"""How soon a stop is seen while no frame comes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,16 +155,16 @@ class Recorder:
         self._n_frames, self._seconds = options.n_frames, options.seconds
         fitting = _RING_BYTES // _frame_bytes(bench)
         self.n_buffers = options.n_buffers or min(_MOST_BUFFERS, max(_FEWEST_BUFFERS, fitting))
-        self._batch = min(_BATCH, max(1, self.n_buffers // 4))
+        self._batch = min(_BATCH, self.n_buffers // 4)
         self.on_progress = on_progress
         self._stopping = threading.Event()
         self._stream: FrameStream | None = None
         self._surroundings: FrameMetadata | None = None
         self._next = 0
         self._written = self._bytes = self._by_device = self._not_written = 0
-        self._began_s: float | None = None
-        self._disk_checked_s = 0.0
-        self._free_bytes = 0
+        self._began_s = math.inf
+        self._disk_checked_s = -math.inf
+        self._free_bytes: int
 
     @property
     def path(self) -> Path:
@@ -208,13 +211,12 @@ class Recorder:
 
     def _record(self, reader: StreamReader) -> None:
         while not self._is_done():
-            frame = reader.next_frame(0.1)
+            frame = reader.next_frame(_LOOK_S)
             if frame is None:
                 if not reader.is_running:  # STOP, from another thread
                     raise StoppedError(self._bench.camera.name, "its stream was stopped.")
                 continue
-            if self._began_s is None:
-                self._began_s = time.monotonic()
+            self._began_s = min(self._began_s, time.monotonic())
             batch: list[FrameToStore] = []
             gaps: list[Gap] = []
             failure: DeviceError | None = None
@@ -242,6 +244,7 @@ class Recorder:
             self._by_device += by_device
             self._not_written += not_written
             self._next += by_device + not_written
+            self._say_lost(gaps[-1])
         if self._next != self._n_frames:
             batch.append(FrameToStore(self._next, frame.image, self._with_surroundings(frame.metadata)))
             self._next += 1
@@ -255,7 +258,6 @@ class Recorder:
     def _store(self, batch: list[FrameToStore], gaps: list[Gap], reader: StreamReader) -> None:
         for gap in gaps:
             self._writer.gap(gap)
-            self._say_lost(gap)
         self._writer.write(batch)
         self._written += len(batch)
         self._bytes += sum(frame.image.nbytes for frame in batch)
@@ -280,7 +282,7 @@ class Recorder:
             return
         self._disk_checked_s = time.monotonic()
         self._free_bytes = free_bytes(self._writer.path)
-        if self._free_bytes < SPARE_BYTES // 2:
+        if self._free_bytes < _FEWEST_FREE_BYTES:
             raise RunError(
                 self._writer.path,
                 f"the disk is nearly full ({self._free_bytes / 1e6:.0f} MB left); the recording was ended.",
@@ -288,14 +290,12 @@ class Recorder:
             )
 
     def _is_done(self) -> bool:
-        if self._stopping.is_set() or (self._n_frames is not None and self._next >= self._n_frames):
+        if self._stopping.is_set() or self._next == self._n_frames:
             return True
-        if self._seconds is None or self._began_s is None:
-            return False
-        return time.monotonic() - self._began_s >= self._seconds
+        return self._seconds is not None and time.monotonic() - self._began_s >= self._seconds
 
     def _status(self, reader: StreamReader, saturated_fraction: float) -> RecordingStatus:
-        seconds = max(1e-9, time.monotonic() - (self._began_s or 0.0))
+        seconds = max(1e-9, time.monotonic() - self._began_s)
         return RecordingStatus(
             written=self._written,
             numbered=self._next,

@@ -300,13 +300,10 @@ class Runner:
         except Exception as error:
             self._end(FinishReason.STOPPED if self._stopping.is_set() else FinishReason.FAILED, error)
             raise
-        except BaseException as error:
-            self._end(FinishReason.ABORTED, error)
-            raise
         else:
             run = self._end(FinishReason.COMPLETED)
         finally:
-            if not self._finished.is_set():  # a second Ctrl-C came before the ending had begun
+            if not self._finished.is_set():  # Ctrl-C, or a second one before the ending had begun
                 self._end(FinishReason.ABORTED, sys.exception())
         return run
 

@@ -204,9 +204,9 @@ def compare(desk: Desk, options: CompareOptions) -> Done:
         found = compare_calibrations(first, second)
     rows: list[Sequence[str]] = []
     for c in found.changes:
-        turned = "?" if c.rotation_deg is None else f"{c.rotation_deg:+.3f}°"
+        turned = "?" if c.rotation_deg is None else f"{c.rotation_deg:+z.3f}°"
         figures = (f"{c.scale:.5f}", turned, f"{c.as_is:.3f}", f"{c.aligned:.3f}", f"{c.spot:.2f}")
-        moved = f"{c.columns:+.2f}, {c.rows:+.2f}"
+        moved = f"{c.columns:+z.2f}, {c.rows:+z.2f}"
         rows.append((f"{c.z_um / 1e3:.4g}", moved, *figures, f"{c.brightness:.2f}"))
     desk.table(("z, mm", "shift, px (x, y)", "scale", "rotation", "alike", "aligned", "spot", "light"), rows)
     desk.say("RECALIBRATE" if found.due else "No recalibration is due")
@@ -245,8 +245,8 @@ def _compared_page(old: Calibration, new: Calibration, found: Comparison) -> Fig
     ]
     lines = [("due", "recalibrate" if found.due else "no recalibration")]
     for c in found.changes:
-        turned = "" if c.rotation_deg is None else f", turned {c.rotation_deg:+.3f}°"
-        moved = f"{c.columns:+.2f}, {c.rows:+.2f} px{turned}"
+        turned = "" if c.rotation_deg is None else f", turned {c.rotation_deg:+z.3f}°"
+        moved = f"{c.columns:+z.2f}, {c.rows:+z.2f} px{turned}"
         lines += [(depth_in_words(c.z_um), moved), ("", f"alike {c.as_is:.3f}, aligned {c.aligned:.3f}")]
     simulated = any(c.provenance.get("simulated") for c in (old, new))
     return pictures_figure("Two calibrations compared", panels, lines, simulated=bool(simulated))

@@ -397,7 +397,7 @@ class SpatiallyVarying(LinearOperator):
             if self._non_negative:
                 rows = self.forward(np.ones(self.domain_shape, self.dtype)).max()
                 columns = self.adjoint(np.ones(self.range_shape, self.dtype)).max()
-                self._norm = float(np.sqrt(max(float(rows), 0.0) * max(float(columns), 0.0))) * (1 + 1e-5)
+                self._norm = float(np.sqrt(abs(float(rows) * float(columns)))) * (1 + 1e-5)
             else:
                 self._norm = 1.1 * estimate_norm(self)
         return self._norm

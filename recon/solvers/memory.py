@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -212,6 +213,46 @@ def _status_mib(name: str) -> float:
     return float("nan")
 
 
+_PREFIX = ".diffuserbench-scratch-"
+
+
+def _scratch_folder(place: Path) -> tuple[Path, int]:
+    """Make a folder for volumes, locked by the handle that is returned; remove what killed programs left."""
+    with _locked(place):  # nobody looks between a folder and its lock
+        for left in place.glob(f"{_PREFIX}*"):
+            with suppress(OSError):
+                handle = os.open(left, _FOLDER)
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(left)
+                finally:
+                    os.close(handle)
+        folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=place))
+        handle = os.open(folder, _FOLDER)
+        with suppress(OSError):  # disks that have no locks do without
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return folder, handle
+
+
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+@contextmanager
+def _locked(place: Path) -> Iterator[None]:
+    handle = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        with suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _give_up(folder: Path, handle: int) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+    os.close(handle)
+
+
 class Storage:
     """Where a solver's volumes live: in memory, or as files in a scratch folder that the system pages.
 
@@ -233,8 +274,8 @@ class Storage:
         """Bytes and files (None: in memory) taken since the last turn."""
         self._folder: Path | None = None
         if scratch is not None:
-            self._folder = Path(tempfile.mkdtemp(prefix="diffuserbench-", dir=scratch))
-            self._remove = weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+            self._folder, held = _scratch_folder(Path(scratch))
+            self._remove = weakref.finalize(self, _give_up, self._folder, held)
         self._count = 0
 
     def close(self) -> None:

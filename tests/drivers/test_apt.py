@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import struct
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,10 +15,13 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from drivers.apt import stage as apt_stage
+from drivers.apt.drives import InertiaUnit
 from drivers.apt.protocol import (
     CONTROLLERS,
     HW_GET_INFO,
+    HW_STOP_UPDATEMSGS,
     MOT_GET_DCSTATUSUPDATE,
+    PZMOT_GET_STATUSUPDATE,
     SPEED_SCALE,
     AptFramer,
     Message,
@@ -239,6 +243,12 @@ def test_axes_of_several_controllers_move_together(
     assert at_once + b"\x21\x01" in rack.port.received
 
 
+@pytest.mark.usefixtures("stage")
+def test_controllers_are_told_to_say_nothing_unasked(servo: AptController, rack: AptController) -> None:
+    assert short(HW_STOP_UPDATEMSGS, 0x50) in servo.port.received
+    assert short(HW_STOP_UPDATEMSGS, 0x21) in rack.port.received
+
+
 def test_status_is_had_for_as_long_as_one_likes(stage: AptStage) -> None:
     for _ in range(3 * STATUS_WITHOUT_SIGN_OF_LIFE):
         assert stage.position()["x_um"] == 0.0
@@ -362,6 +372,36 @@ def test_channels_of_an_inertia_drive_take_turns(inertia: AptController) -> None
         with pytest.raises(StoppedError):
             stage.wait(10.0)
         assert inertia.axes[1].motion.place == -1000
+
+
+class Told:
+    """A link without a port: it keeps what it is sent, and says what it is told to."""
+
+    device, name, port = "stage (test)", "KIM101", "none"
+
+    def __init__(self, model: str, *replies: bytes) -> None:
+        self.controller, self.replies, self.sent = CONTROLLERS[model], list(replies), bytearray()
+
+    def send_now(self, message: bytes) -> None:
+        self.sent += message
+
+    def ask(self, *_: object) -> Message:
+        return Message(PZMOT_GET_STATUSUPDATE, 0, 0, 0x50, 1, self.replies.pop(0))
+
+
+def test_a_channel_that_has_not_set_out_yet_keeps_its_turn() -> None:
+    resting = struct.pack("<HllL", 1, 0, 0, 0) + struct.pack("<HllL", 2, 0, 0, 0)
+    arrived = struct.pack("<HllL", 1, 500, 0, 0) + resting[14:]
+    link = Told("KIM101", resting, arrived)
+    unit = InertiaUnit(link)  # type: ignore[arg-type]
+    unit.queue(1, 500)
+    unit.queue(2, 70)
+    before = len(link.sent)
+    assert unit.status() == {1: (0, 0), 2: (0, 0)}  # the first is asked before it moves
+    assert (len(link.sent), unit.is_busy(1), unit.is_busy(2)) == (before, True, True)
+    unit.status()
+    assert not unit.is_busy(1)
+    assert link.sent[before:].endswith(struct.pack("<Hl", 2, 70))
 
 
 def test_a_move_that_waited_does_not_begin_after_reconnecting(inertia: AptController) -> None:

@@ -243,6 +243,22 @@ def test_a_stage_that_does_not_move_is_found_out() -> None:
     assert homed.world.calls == ["stage.home"]
 
 
+class Equal(MockStage):
+    """As a ``@dataclass`` is: equal to others, and without a hash."""
+
+    def __eq__(self, other: object) -> bool:
+        return True
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def test_a_device_is_equal_to_no_other_whatever_its_driver_says() -> None:
+    one, other = made(Equal), made(Equal)
+    one.home()
+    assert one != other
+    assert len({one, other}) == 2
+
+
 # Light, SLM ---
 class Dark(MockLedArray):
     def set_pattern(self, pattern: LedPattern) -> LedPattern:

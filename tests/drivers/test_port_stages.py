@@ -81,6 +81,97 @@ class TestAsi(PortStageContract):
     stage_of = staticmethod(asi)
 
 
+class ToldElliptec(ElliptecStage):
+    """A module without a port: it says what it is told to."""
+
+    def __init__(self, about: str, axis: str = "x_um") -> None:
+        super().__init__(ElliptecOptions.model_validate({"port": "none", "axes": {axis: {}}}))
+        self.says = {"in": f"IN{about}", "gs": "GS00", "gp": "PO00000000"}
+
+    def _query(self, address: str, words: str, reply: str) -> str:
+        assert address == "0"
+        return self.says[words]
+
+
+def test_an_elliptec_module_says_its_units() -> None:
+    stage = ToldElliptec("14" + "1140TEST2023" + "1781" + "003C" + "00000400")  # ELL20: 60 mm, 1024 a mm
+    stage._maps["x_um"], x = stage._read_axis("x_um")
+    assert (x.lower_limit, x.upper_limit, x.resolution) == pytest.approx((0, 60_000, 1000 / 1024))
+    assert stage._tolerance(x) == 10.0
+    stage.says["gp"] = "POFFFFFC00"  # 1024 below its zero
+    state = stage._axis_state("x_um")
+    assert (state.place, state.moving, state.homed, state.fault) == (-1024, False, False, "")
+    stage.says["gp"] = "GS0C"  # a move failed between the questions
+    assert "out of its range (status 12)" in stage._axis_state("x_um").fault
+    turning = ToldElliptec("0E" + "1140TEST2023" + "1781" + "0168" + "00023000", "yaw_mrad")
+    yaw = turning._read_axis("yaw_mrad")[1]
+    assert yaw.upper_limit == pytest.approx(2000 * math.pi)
+    assert yaw.resolution == pytest.approx(2000 * math.pi / 143_360)
+    assert turning._tolerance(yaw) == 1.0
+    coarse = ToldElliptec("14" + "1140TEST2023" + "1781" + "003C" + "00000014")  # 20 a mm
+    assert 50.0 < coarse._tolerance(coarse._read_axis("x_um")[1]) < 51.0
+
+
+def test_an_elliptec_module_that_was_away_has_lost_its_home() -> None:
+    stage = ToldElliptec("14" + "1140TEST2023" + "1781" + "003C" + "00000400")
+    stage._homed.add("x_um")
+    stage._maps["x_um"], _ = stage._read_axis("x_um")  # as on opening
+    assert not stage._axis_state("x_um").homed
+
+
+class ToldSmc100(Smc100Stage):
+    """A controller without a port: it says what it is told to."""
+
+    def __init__(self, **says: str) -> None:
+        super().__init__(Smc100Options.model_validate({"port": "none", "axes": {"x_um": {"number": 3}}}))
+        self.says = {"SL": "-1.5", "SR": "25", "VA": "0.4", "SU": "0.0001", "TE": "@", "TS": "000032"} | says
+        self.sent = b""
+        self._link = self  # type: ignore[assignment]
+
+    def send_now(self, message: bytes) -> None:
+        self.sent += message
+
+    def _query(self, name: str, words: str, reply: str, question: str = "") -> str:
+        return self.says[words]
+
+
+def test_an_smc100_says_its_units_and_states() -> None:
+    stage = ToldSmc100(TP="2.5")
+    x = stage._read_axis("x_um")[1]
+    assert (x.lower_limit, x.upper_limit, x.speed_per_s) == pytest.approx((-1500, 25_000, 400))
+    assert x.resolution == pytest.approx(0.1)
+    assert stage._tolerance(x) == 1.0
+    coarse = ToldSmc100(SU="0.01")
+    assert 10.0 < coarse._tolerance(coarse._read_axis("x_um")[1]) < 10.5
+    told = {"000032": (False, True, ""), "000028": (True, True, ""), "00001E": (True, False, "")}
+    told |= {"00000A": (False, False, ""), "010014": (False, False, "DC voltage too low")}
+    told |= {"002032": (False, True, "following error")}
+    for said, expected in told.items():
+        stage.says["TS"] = said
+        state = stage._axis_state("x_um")
+        assert (state.place, state.moving, state.homed, state.fault) == (2.5, *expected)
+
+
+def test_an_smc100_that_refuses_a_command_says_why() -> None:
+    stage = ToldSmc100(TE="G")
+    with pytest.raises(DeviceError, match=r"controller 3 refuses 'PA9.500000': the target is out of its lim"):
+        stage._send_move("x_um", 9.5)
+    assert stage.sent == b"3PA9.500000\r\n"
+
+
+def test_an_axis_that_was_sent_home_is_there_once_it_has_been_seen_to_leave_or_had_the_time_to() -> None:
+    stage = ToldSmc100()
+    assert not stage._came_home("x_um", moving=False)  # nobody sent it
+    stage._homing["x_um"] = time.monotonic() + 1e3
+    assert not stage._came_home("x_um", moving=False)  # it may not have set out yet
+    assert not stage._came_home("x_um", moving=True)
+    assert stage._came_home("x_um", moving=False)
+    assert not stage._came_home("x_um", moving=False)  # once
+    stage._left.clear()
+    stage._homing["x_um"] = time.monotonic() - 1e3
+    assert stage._came_home("x_um", moving=False)  # it stood there already
+
+
 def test_elliptec_is_not_homed_when_its_homing_was_stopped(tmp_path: Path) -> None:
     bus = ElliptecBus(tmp_path)
     with elliptec(bus) as stage:

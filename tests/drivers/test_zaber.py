@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.testing.stage import StageContract
 from drivers.zaber.protocol import Message, command, flag_words, parse
-from drivers.zaber.stage import ZaberAxis, ZaberOptions, ZaberStage
+from drivers.zaber.stage import Chain, ZaberAxis, ZaberOptions, ZaberStage
 from tests.mocks.pty_device import Answer
 from tests.mocks.zaber_chain import ZaberChain
 
@@ -234,6 +234,20 @@ def test_alerts_are_no_replies(stage: ZaberStage, chain: ZaberChain) -> None:
         assert stage.position()["x_um"] == 0.0
 
 
+def test_a_fault_that_is_told_unasked_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    chain = Chain("none", "stage (test)", 115_200)
+    with caplog.at_level(logging.DEBUG):
+        chain._unasked(b"!01 1 IDLE FS")
+        chain._unasked(b"!01 1 IDLE WR")
+        chain._unasked(b"!01 1 IDLE --")
+        chain._unasked(b"garbage")
+    assert [(r.levelno, r.args[-1]) for r in caplog.records] == [  # type: ignore[index]
+        (logging.WARNING, flag_words("FS")),
+        (logging.INFO, flag_words("WR")),
+        (logging.INFO, b"garbage"),
+    ]
+
+
 def test_checksums_are_put_back(chain: ZaberChain) -> None:
     chain.devices[2].settings["comm.checksum"] = "1"
     with stage_on(chain):
@@ -327,6 +341,7 @@ def test_probe_recognises_a_chain(chain: ZaberChain) -> None:
     found = ZaberStage.probe(str(chain.port.link))
     assert found is not None
     assert (found.driver, found.kind, found.description) == ("zaber", "stage", "Zaber device 50419")
+    assert found.options["axes"] == {"x_um": {"device": 1, "axis": 1, "microstep_um": 0.0}}
     assert "microstep_um = 0.0" in found.bench_lines()
     chain.devices.clear()
     assert ZaberStage.probe(str(chain.port.link)) is None

@@ -82,7 +82,7 @@ def trouble(reader: Reader, path: Path) -> str:
     """Read; return what is wrong with how the reader took it, empty where nothing is."""
     began_s = time.process_time()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    signal.setitimer(signal.ITIMER_PROF, MOST_SECONDS + 1)
+    signal.setitimer(signal.ITIMER_PROF, MOST_SECONDS + 1, MOST_SECONDS + 1)  # again: a reader may begin anew
     try:
         reader.read(path)
     except TooSlowError:

@@ -12,14 +12,14 @@ import pytest
 from numba.core import event
 
 from instrument.files import kept_times
-from instrument.reconstruction.forecast import TRIED, Forecast, Foretold, Like, forecast
+from instrument.reconstruction.forecast import TRIED, Forecast, Foretold, Like, _settling, _stretch, forecast
 from instrument.reconstruction.job import Job
 from recon import Calibration, reconstruct
 from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
-from recon.solvers.base import StopReason
+from recon.solvers.base import IterationRecord, StopReason
 
 
 @pytest.fixture(scope="module")
@@ -43,19 +43,54 @@ def test_a_forecast_counts_iterations_of_all_channels_and_stops_at_a_time(
     assert f"({TRIED} were tried)" in str(told)
     short = Forecast(1.0, 0.1, 1000, 2.0**30, time_s=5.0)
     assert short.seconds == 6.0
-    assert str(short) == "at most 6.0 s, 100 ms an iteration (6 were tried); 1.00 GiB of memory"
+    assert str(short) == "at most 6.0 s, 100 ms an iteration (16 were tried); 1.00 GiB of memory"
 
 
-def test_a_picture_is_told_by_when_a_copy_on_blocks_settles() -> None:
+def test_it_is_told_by_how_a_copy_on_blocks_settles() -> None:
     made = make_scene("sparse-picture", size=64)
     asked = ReconstructionOptions(judged=False)
     told = forecast(Measurement(made.measurement), made.calibration, asked)
     took = len(reconstruct(made.measurement, made.calibration, asked).history)
     assert told.settles == pytest.approx(took, rel=0.4)
     assert told.seconds == pytest.approx(told.beside_s + told.settles * told.iteration_s)
-    assert f", {told.settles} of them (so many settle a copy" in str(told)
+    assert f", {told.settles} of them (by how a copy on blocks" in str(told)
     limited = forecast(Measurement(made.measurement), made.calibration, replace(asked, tolerance=0.0))
     assert limited.settles is None, "it takes as many as were asked for"
+
+
+def test_volumes_are_told_so_too() -> None:
+    made = make_scene("beads", size=64, depths=2)
+    asked = ReconstructionOptions(model="convolution", prior="tv", judged=False)
+    told = forecast(Measurement(made.measurement), made.calibration, asked)
+    took = len(reconstruct(made.measurement, made.calibration, asked).history)
+    assert told.settles == pytest.approx(took, rel=0.25)
+
+
+def test_so_are_erased_pixels_and_varying_psfs() -> None:
+    made = make_scene("sparse-picture", size=64, grid=2, aberration=1.0)
+    photograph = Measurement(made.measurement, erasures=np.arange(64)[:, None] % 16 == np.arange(64))
+    asked = ReconstructionOptions(model="lowrank", tolerance=1e-2)
+    first = _records([1 / n for n in range(1, TRIED + 1)])
+    assert _settling(photograph, made.calibration, asked, first, 60.0) is not None
+
+
+def _records(unrest: list[float]) -> list[IterationRecord]:
+    return [IterationRecord(n, float(n), change=u) for n, u in enumerate(unrest, 1)]
+
+
+def test_a_copy_that_settles_twice_as_fast_is_stretched() -> None:
+    copy = _records([1 / n for n in range(1, 100)])
+    assert _stretch(_records([2 / n for n in range(1, TRIED + 1)]), copy) == pytest.approx(2, rel=0.02)
+    assert _stretch(copy[:TRIED], copy) == pytest.approx(1, rel=0.02)
+    assert _stretch(_records([0.0] * TRIED), copy) == 1, "nothing can be told of an empty picture"
+
+
+def test_a_copy_is_given_up_after_its_time(scene: tuple[Measurement, Calibration]) -> None:
+    made = make_scene("sparse-picture", size=64)
+    photograph, asked = Measurement(made.measurement), ReconstructionOptions(model="convolution")
+    first = _records([1 / n for n in range(1, TRIED + 1)])
+    assert _settling(photograph, made.calibration, asked, first, 1e-6) is None
+    assert _settling(*scene, asked, first, 60.0) is None, "too small for blocks"
 
 
 def test_solvers_in_one_step_are_forecast_too(scene: tuple[Measurement, Calibration]) -> None:

@@ -9,10 +9,10 @@
 A mutant is one small mistake in one function: ``<`` for ``<=``, ``+`` for ``-``, a call or a ``raise`` left
 out, a number changed, a condition negated. First each test runs once and is watched: which lines it comes
 to. Then each mutant is put into a process of its own in which everything is loaded already, and tests that
-come to its line, the quickest of each file first, run until one fails (*noticed*), or all pass (*lived*).
-What hangs is noticed. Compiled kernels, module constants and words are not changed; a test that runs the
-program in a process of its own does not see a mutant. Some processes have no mutant in them: tests that fail
-there are failing by themselves, and the figures are worth less.
+come to its line, first those of files named after the module, run until one fails (*noticed*), or all pass
+(*lived*). What hangs is noticed. Compiled kernels, module constants and words are not changed; a test that
+runs the program in a process of its own does not see a mutant. Some processes have no mutant in them: tests
+that fail there are failing by themselves, and the figures are worth less.
 
 Those that cannot be noticed, since they are equal to what was there, stand in tests/mutants/equal.toml with
 the reason. Exit status 1 when less than 95 % of the others were noticed.

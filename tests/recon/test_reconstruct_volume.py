@@ -1,5 +1,7 @@
 """Whole reconstructions of volumes, from measurements not made with the reconstruction's model."""
 
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -298,6 +300,24 @@ def test_scratch_files_hold_their_place_on_the_disk(tmp_path):
     (file,) = tmp_path.glob("*/*.dat")
     assert file.stat().st_blocks * 512 >= file.stat().st_size == 64 * 1024 * 4
     storage.close()
+
+
+def test_what_a_killed_program_left_in_the_scratch_folder_is_removed_by_the_next(tmp_path):
+    code = (
+        "import os, sys, numpy; from recon.solvers.memory import Storage\n"
+        "storage = Storage(sys.argv[1]); storage.zeros((64, 64), numpy.float32); os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], cwd=Path(__file__).parents[2], check=False)
+    (left,) = tmp_path.iterdir()
+    (tmp_path / "diffuserbench-results").mkdir()
+    working = memory.Storage(tmp_path)
+    assert not left.exists()
+    other = memory.Storage(tmp_path)
+    working.zeros((64, 64), np.float32)
+    assert len(list(tmp_path.iterdir())) == 3
+    working.close()
+    other.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["diffuserbench-results"]
 
 
 def test_psfs_of_another_size_are_refused_and_saturation_is_warned_of():

@@ -75,3 +75,15 @@ def test_a_name_that_cannot_be_made_closes_nothing_of_others(tmp_path: Path) -> 
     with pytest.raises(OSError, match="too long"), whole_file(tmp_path / ("a" * 250)):
         raise AssertionError("never begun")
     os.fstat(1)
+
+
+def test_two_names_are_exchanged_exactly_where_it_says_so(tmp_path: Path) -> None:
+    one, other = tmp_path / "one", tmp_path / "other"
+    one.write_text("1")
+    other.write_text("2")
+    assert atomic._exchanged(one, other) == (one.read_text() == "2")
+    assert not atomic._exchanged(one, tmp_path / "none")
+
+
+def test_json_is_indented_by_one_so_that_its_lines_are_short() -> None:
+    assert atomic.json_text({"a": {"b": 1}}).strip() == '{\n "a": {\n  "b": 1\n }\n}'

@@ -155,6 +155,14 @@ def test_values_come_back_by_their_declaration() -> None:
     assert replace(back, **same) == replace(value, **same)
 
 
+def test_arrays_have_their_declared_type_and_what_is_no_record_stays_as_it_is() -> None:
+    data = plain(Outer(Inner(1.0), datetime.now(UTC), Path("a"), Colour.RED, np.eye(2, dtype=np.float64)))
+    assert value_of(Outer, data | {"grid": [1, 2]}).grid.dtype == np.float64
+    thing = object()
+    assert plain(thing) is thing
+    assert plain(Inner) is Inner
+
+
 def test_a_union_is_read_as_its_only_type_and_pairs_by_place() -> None:
     @dataclass(frozen=True)
     class Local:  # readers are kept: a type of before would not show a mistake

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
 from collections.abc import Sequence
@@ -149,7 +150,7 @@ def test_a_recording_for_a_time_ends_then_and_not_before(
     with bench_with(FreeRunningCamera()) as bench:
         recorder = prepare_recording(bench, tmp_path, seconds=5.0)
     ends = []
-    for began_s, now_s in ((None, 90.0), (100.0, 100.0), (100.0, 104.9), (100.0, 105.0), (100.0, 106.0)):
+    for began_s, now_s in ((math.inf, 90.0), (100.0, 100.0), (100.0, 104.9), (100.0, 105.0), (100.0, 106.0)):
         recorder._began_s = began_s
         monkeypatch.setattr("instrument.runs.recorder.time", SimpleNamespace(monotonic=lambda now=now_s: now))
         ends.append(recorder._is_done())

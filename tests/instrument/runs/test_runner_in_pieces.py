@@ -12,9 +12,10 @@ from unittest.mock import Mock
 
 import pytest
 
+from drivers.errors import LimitError, StoppedError
 from instrument.bench.bench import Bench
 from instrument.files.errors import FileError
-from instrument.plan import Plan
+from instrument.plan import Light, Plan
 from instrument.runs import runner as module
 from instrument.runs.acquire import abilities_of, free_bytes
 from instrument.runs.run import FinishReason
@@ -73,7 +74,7 @@ def test_what_is_done_is_counted_and_the_rest_estimated(
     assert stored == [[1], [2], [4]]
     assert [(s.done, s.done_here, s.dropped) for s in seen] == [(3, 1, 1), (4, 2, 2), (5, 3, 3)]
     for s in seen:
-        assert s.seconds > 0
+        assert 0 < s.seconds < 100
         assert s.seconds_left == pytest.approx(s.seconds / s.done_here * (3 - s.done_here))
     assert runner.status.reason is FinishReason.COMPLETED
 
@@ -185,3 +186,105 @@ def test_a_bench_is_read_once_for_what_plans_are_checked_against(bench: Bench, t
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(FileError, match="is a file, not a folder"):
             free_bytes(folder)
+
+
+def in_one_sequence(monkeypatch: pytest.MonkeyPatch, bench: Bench, runner: Runner, answer: Any) -> None:
+    """Have all steps go into one sequence over a wire; what is answered when it is taken."""
+    wire: Any = SimpleNamespace(source=bench.led_array)
+    monkeypatch.setattr(runner._timed, "groups", lambda steps: [(wire, list(steps))])
+    monkeypatch.setattr(module, "take_steps", answer)
+
+
+def refused(*_: object) -> Any:
+    raise LimitError("led_array (mock)", "plays no such sequence.")
+
+
+def test_a_refused_sequence_is_taken_step_by_step_and_the_run_says_so(
+    bench: Bench, ended: list[FinishReason], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[int | None] = []
+    runner, writer = made(bench, plan(3), todo=[1, 2, 3])
+    runner.on_progress = lambda status: shown.append(status.step and status.step.index)
+    in_one_sequence(monkeypatch, bench, runner, refused)
+    runner.execute()
+    assert ended == [FinishReason.COMPLETED]
+    writer.note.assert_called_once_with(
+        "stepped", text="led_array (mock): plays no such sequence.", first=1, steps=3
+    )
+    assert shown == [None, 1, 1, 2, 2, 3, 3, 3, 3]  # each before it is taken and once it is stored
+    assert calls(bench).count("camera.snap") == 3
+
+
+def test_an_abort_between_the_steps_of_a_refused_sequence_is_heeded(
+    bench: Bench, ended: list[FinishReason], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runner, _ = made(bench, plan(3), todo=[1, 2, 3], on_frame=lambda step, _: runner.abort() is not None)
+    in_one_sequence(monkeypatch, bench, runner, refused)
+    runner.execute()
+    assert ended == [FinishReason.ABORTED]
+    assert calls(bench).count("camera.snap") == 1
+
+
+def test_a_refused_sequence_that_must_be_timed_by_hardware_ends_the_run(
+    bench: Bench, ended: list[FinishReason], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runner, _ = made(bench, plan(3, timing="hardware"), todo=[1, 2, 3])
+    in_one_sequence(monkeypatch, bench, runner, refused)
+    with pytest.raises(LimitError, match="no such sequence"):
+        runner.execute()
+    assert ended == [FinishReason.FAILED]
+    assert "camera.snap" not in calls(bench)
+
+
+def test_after_a_sequence_the_light_is_set_anew(
+    bench: Bench, ended: list[FinishReason], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runner, _ = made(bench, plan(1, light="source"), todo=[1])
+    step = list(plan(1).whole_steps())[1]
+    runner._take(step)  # as the step before the sequence left it
+    in_one_sequence(monkeypatch, bench, runner, lambda *_: ([bench.snap()], ()))
+    runner.execute()
+    assert ended == [FinishReason.COMPLETED]
+    lit = calls(bench).count("led_array.set_pattern")
+    runner._take(step)
+    assert calls(bench).count("led_array.set_pattern") == lit + 1
+
+
+def test_a_camera_that_was_stopped_by_nobody_here_fails_the_run(
+    bench: Bench, ended: list[FinishReason], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object) -> None:
+        raise StoppedError("camera (mock)", "its exposure was ended.")
+
+    monkeypatch.setattr(bench, "snap", stopped)
+    runner, _ = made(bench, plan(1))
+    with pytest.raises(StoppedError):
+        runner.execute()
+    assert ended == [FinishReason.FAILED]
+
+
+def test_an_interval_is_slept_through_to_its_end(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s, slept_s = [100.0], list[float]()
+
+    def sleep(_: object, left_s: float) -> None:
+        slept_s.append(left_s)
+        now_s[0] += min(left_s, 0.75)
+
+    runner, _ = made(bench, plan(1))
+    ticks = iter(range(20))
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now_s[0] + 0 * next(ticks)))
+    monkeypatch.setattr(runner._condition, "wait_for", sleep)
+    runner._wait_until(102.0)
+    assert slept_s == [2.0, 1.25, 0.5]
+
+
+def test_a_step_brings_light_and_stage_to_what_it_says(bench: Bench) -> None:
+    settings = StepSettings(bench)
+    assert bench.led_array is not None
+    assert bench.stage is not None
+    settings._set_light(Light(kind="source"))
+    assert not bench.led_array.pattern.is_dark
+    settings._move_stage({"z_um": 20.0})
+    assert bench.stage.position()["z_um"] == 20.0
+    settings._set_light(Light(kind="off"))
+    assert bench.led_array.pattern.is_dark

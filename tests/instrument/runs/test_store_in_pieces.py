@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,11 +15,13 @@ import pytest
 from instrument.files.atomic import check_writable, output_folder, require_new
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
-from instrument.runs import inspection
+from instrument.plan import Part, Plan
+from instrument.runs import inspection, writer
 from instrument.runs.frame_array import FrameArray, SyncPool, description_of
 from instrument.runs.inspection import contact_sheet, summary, verify
 from instrument.runs.log import Gap
 from instrument.runs.run import FinishReason, Run
+from instrument.runs.run_files import RunError
 from instrument.runs.writer import RunWriter
 from tests.instrument.runs.test_store import BENCH, frame
 
@@ -186,3 +191,79 @@ def test_an_array_keeps_what_was_written_and_nothing_half_written(
     ):
         with pytest.raises(ValueError, match=words):
             array.write([(index, image)])
+
+
+def test_saturated_pixels_of_a_contact_sheet_are_red() -> None:
+    pixels = np.zeros((4, 1300), np.uint8)
+    pixels[2, 2] = 255
+    run: Any = SimpleNamespace(frame=lambda _: pixels, metadata=lambda _: SimpleNamespace(significant_bits=8))
+    picture = inspection._shown(run, 0)
+    assert picture.shape == (2, 650, 3)
+    assert picture[1, 1].tolist() == [1, 0, 0]
+    assert picture[0, 0].tolist() == [0, 0, 0]
+
+
+def test_frames_that_came_at_one_time_have_no_period() -> None:
+    def period_s(*times_ns: int | None) -> float | None:
+        metadata = [
+            SimpleNamespace(host_time_ns=9 * n, device_time_ns=time) for n, time in enumerate(times_ns)
+        ]
+        records = {3 * n: SimpleNamespace(metadata=one) for n, one in enumerate(metadata)}
+        run: Any = SimpleNamespace(plan=None, records=records)
+        return Run.frame_period_s.fget(run)  # type: ignore[attr-defined]
+
+    assert period_s(7, 7) is None
+    assert period_s(7) is None
+    assert period_s(0, 6_000_000) == pytest.approx(0.002)
+    assert period_s(None, 6_000_000) == pytest.approx(3e-9)
+
+
+def test_a_plan_without_slm_images_makes_no_folder_for_them_and_others_are_copied(tmp_path: Path) -> None:
+    run, image = tmp_path / "run", tmp_path / "a.png"
+    run.mkdir()
+    bare = Plan(label="p", parts=(Part(label="a"),))
+    assert writer.plan_with_copies(bare, run) == bare
+    assert list(run.iterdir()) == []
+    image.write_bytes(b"an image")
+    (copy,) = writer.plan_with_copies(
+        Plan(label="p", parts=(Part.model_validate({"label": "a", "slm_image": str(image)}),)), run
+    ).slm_images
+    assert not copy.is_absolute()
+    assert (run / copy).read_bytes() == b"an image"
+
+
+def test_a_broken_checkout_has_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(writer, "__file__", str(tmp_path / "instrument" / "runs" / "writer.py"))
+    assert writer.git_commit() is None
+    (tmp_path / ".git").mkdir()
+    assert writer.git_commit() is None
+
+
+def test_a_closed_run_has_no_open_file_and_no_thread(tmp_path: Path) -> None:
+    def left() -> tuple[int, list[str]]:
+        threads = [t.name for t in threading.enumerate() if t.name.startswith("sync")]
+        return len(list(Path("/proc/self/fd").iterdir())), threads
+
+    before = left()
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as opened:
+        opened.start()
+        opened.write([frame(0)])
+        opened.keep_text("more.txt", "what a routine knows")
+        assert left()[0] > before[0]
+    assert left() == before
+    assert (opened.path / "more.txt").read_text() == "what a routine knows"
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.ENOSPC, "diffuserbench resume continues"),
+        (errno.EROFS, "may write to"),
+        (errno.EIO, "[.]$"),
+        (None, "could not be written: None[.]$"),
+    ],
+)
+def test_what_a_disk_refuses_is_said_with_what_to_do(number: int | None, remedy: str) -> None:
+    refusal = OSError() if number is None else OSError(number, "no")
+    with pytest.raises(RunError, match=remedy), writer._disk(Path("r"), "it could not be written"):
+        raise refusal

@@ -83,6 +83,16 @@ def test_places_between_pixels_are_found() -> None:
     np.testing.assert_allclose(left, image - camera.image(found), atol=1e-4)
 
 
+def test_a_point_that_the_sensor_does_not_see_stays_as_it_is() -> None:
+    psfs, functions = one_psf()
+    camera = PointImages(psfs, functions, SENSOR)
+    beyond = Points(np.array([[200.0, 3.0]]), np.array([0.7]))
+    image = slide(np.random.default_rng(1))[0]
+    found, left = refine(camera, image, beyond)
+    assert (found.places.tolist(), found.light.tolist()) == ([[200.0, 3.0]], [0.7])
+    np.testing.assert_array_equal(left, image)
+
+
 def test_beads_that_were_overlooked_are_added_and_ghosts_dropped() -> None:
     image, truth = slide(np.random.default_rng(2))
     psfs, functions = one_psf()

@@ -68,10 +68,38 @@ def test_one_psf_and_the_angular_response_tell_those_of_the_field():
         assert psf[seen].sum() == pytest.approx(truth[seen].sum(), rel=0.03)
 
 
+def test_a_point_that_shines_evenly_lights_a_pixel_by_the_cube_of_the_cosine():
+    """Tilted by arctan sqrt(t_y^2 + t_x^2) it looks smaller, from further away, and falls in at a slant."""
+    alone = _taken(_at(NEAR, [(0.0, 0.0)]))
+    alone = replace(alone, psfs=np.ones_like(alone.psfs))
+    made = two_part(alone, lambda tan_y, tan_x: np.ones(np.broadcast(tan_y, tan_x).shape), points=3)
+    height, width = made.psfs.shape[2:]
+    pitch = WORLD.geometry.pixel_pitch_um
+    across = NEAR + 1e3 * WORLD.geometry.diffuser_distance_mm
+    y, x = (pitch * (np.arange(n) - (n - 1) / 2) for n in (height, width))
+
+    def cube(place):
+        square = (y[:, None] - place[1]) ** 2 + (x - place[0]) ** 2
+        return (1 + square / across**2) ** -1.5
+
+    for psf, place in zip(made.psfs[:, 0], made.source_positions_um, strict=True):
+        lit = psf > 0
+        assert lit.mean() > 0.4
+        row, column = (round(-p / (pitch * NEAR) * 1e3 * WORLD.geometry.diffuser_distance_mm)
+                       for p in (place[1], place[0]))  # fmt: skip
+        before = np.roll(1 / cube((0.0, 0.0)), (row, column), axis=(0, 1)) * cube(place)
+        np.testing.assert_allclose(psf[lit], before[lit], rtol=1e-4)
+
+
 def test_what_a_field_needs_is_asked_for():
     alone = _taken(_at(NEAR, [(0.0, 0.0)]))
     bare = replace(alone, geometry=Geometry(None, 8.9))
     with pytest.raises(InputError, match="does not say all"):
         two_part(bare, gaussian_fall_off(13.0))
+    for z_um in (-NEAR, 0.0, np.nan, np.inf):
+        with pytest.raises(InputError, match="does not say all"):
+            two_part(
+                replace(alone, source_positions_um=np.array([[0.0, 0.0, z_um]])), gaussian_fall_off(13.0)
+            )
     with pytest.raises(InputError, match="1 place a side"):
         two_part(alone, gaussian_fall_off(13.0), points=0)

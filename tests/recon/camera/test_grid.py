@@ -54,6 +54,21 @@ def test_an_even_glow_is_even_and_colours_stay_apart():
     assert metric[0, 0, 0, 0] == 0  # beside what the nearest plane shows
 
 
+def test_the_pixel_on_the_axis_looks_along_it():
+    assert replace(GRID, axis_um=None).place_um(3, 40, 60) == (0.0, 0.0, Z_UM[3])
+    assert replace(GRID, axis_um=None).direction_deg(40, 60) == (0.0, 0.0)
+    assert GRID.place_um(3, 40, 60) == (*GRID.axis_um[3], Z_UM[3])
+
+
+def test_a_deep_voxel_is_the_mean_of_what_lies_about_it():
+    """Light that grows evenly with depth does so on voxels five planes deep, too, and is centred on them."""
+    z = np.arange(40) * 10.0 + 1e5
+    even = Grid((40, 9, 9), (4, 4), z, np.full(40, 50.0), upright=True)
+    ramp = np.broadcast_to(np.arange(40, dtype=np.float32)[:, None, None], even.shape)
+    metric, placed = metric_volume(np.ascontiguousarray(ramp), even, 50.0)
+    np.testing.assert_allclose(metric[2:-2, 4, 4], 5 * (placed.z_um[2:-2] - 1e5) / 10, rtol=1e-5)
+
+
 def test_equal_voxels_stay_as_they_are():
     even = Grid((4, 9, 7), (4, 3), np.arange(4) * 50.0 + 1000, np.full(4, 5.0), upright=True)
     volume = np.random.default_rng(1).random(even.shape, np.float32)

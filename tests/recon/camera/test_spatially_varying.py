@@ -78,6 +78,13 @@ def test_local_convolution_masks_first_then_convolves(points, channels):
     np.testing.assert_allclose(operator.forward(x), brute_force(fields, (9, 11), x), rtol=1e-10)
 
 
+def test_light_that_reaches_no_sensor_has_no_norm():
+    dark = FieldOfPsfs(np.zeros((1, 1, 4, 4)), GRID[:1])
+    assert local_convolution([dark], (5, 5)).norm_bound == 0
+    dim = FieldOfPsfs(np.full((1, 1, 4, 4), 1e-3), GRID[:1])  # rows and columns sum to 0.016
+    assert local_convolution([dim], (5, 5)).norm_bound == pytest.approx(0.016, rel=1e-3)
+
+
 @PLACES
 def test_full_rank_equals_the_local_model(points):
     fields = [field(points)]
@@ -113,12 +120,14 @@ def test_adjoint_and_norm(points, build, dtype, rtol):
 
 
 @PLACES
-def test_support_leaves_out_what_is_not_needed(points):
+@pytest.mark.parametrize("build", [local_convolution, lambda f, s, **o: low_rank(f, s, error=1e-9, **o)])
+def test_support_leaves_out_what_is_not_needed(points, build):
     fields = [field(points), field(points, seed=1)]
-    whole = local_convolution(fields, (9, 11), dtype=np.float64)
+    whole = build(fields, (9, 11), dtype=np.float64)
     support = np.zeros(whole.domain_shape[1:], bool)
-    support[1, 3:6, 4:8] = True
-    part = local_convolution(fields, (9, 11), support=support, dtype=np.float64)
+    support[1, 3:6, 4:11] = True
+    support[1, 4, 5] = False
+    part = build(fields, (9, 11), support=support, dtype=np.float64)
     x = np.random.default_rng(6).random(whole.domain_shape) * support
     np.testing.assert_allclose(part.forward(x), whole.forward(x), atol=1e-10)
     y = np.random.default_rng(7).random(whole.range_shape)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.camera.transformed import Transformation, geometric_centre, transformed
+from recon.camera.transformed import Transformation, geometric_centre, resampled, transformed
 from recon.errors import InputError
 
 Image = npt.NDArray[np.float64]
@@ -48,6 +48,16 @@ def test_mirrored_is_flipped_and_turned_goes_from_right_to_bottom() -> None:
     right = spots([0, 12], 2)
     bottom = transformed(right, Transformation(rotation_deg=90))
     assert np.unravel_index(bottom.argmax(), SHAPE) == np.unravel_index(spots([12, 0], 2).argmax(), SHAPE)
+
+
+def test_zeros_come_in_and_no_negative_value_that_was_not_there() -> None:
+    block = np.zeros((30, 30), np.float32)
+    block[10:20, 10:20] = 1  # splines ring beside its edges
+    for level, lowest in ((0.0, 0.0), (-1.0, -1.0)):
+        moved = resampled(block + level, [1.0, 1.0], [0.5, 0.5])
+        assert moved[2:-2, 2:-2].min() == lowest
+    bright = resampled(block + 5, [1.0, 1.0], [4.0, 0.0])
+    assert (bright[-3:] == 0).all()
 
 
 def test_what_the_new_pixels_cannot_hold_is_taken_out() -> None:

@@ -1,0 +1,57 @@
+"""Opening TIFFs whose pages end: a file may say that its last page is followed by an earlier one."""
+
+from __future__ import annotations
+
+import io
+import struct
+from pathlib import Path
+from typing import IO, TYPE_CHECKING
+
+from instrument.files.errors import FileError
+
+if TYPE_CHECKING:
+    import tifffile
+
+_ORDERS = {b"II": "<", b"MM": ">"}
+_CLASSIC, _BIG = 42, 43
+
+
+def open_tiff(path: Path, data: bytes | None = None) -> tifffile.TiffFile:
+    """Open a TIFF, or what was read of it.
+
+    Raises FileError when its pages never end; as ``tifffile.TiffFile`` when it is damaged otherwise.
+    """
+    import tifffile
+
+    with path.open("rb") if data is None else io.BytesIO(data) as file:
+        if _goes_round(file):
+            raise FileError(path, "is a damaged TIFF: its pages follow one another in a circle.")
+    return tifffile.TiffFile(path if data is None else io.BytesIO(data))
+
+
+def _goes_round(file: IO[bytes]) -> bool:
+    """Whether a page is followed by one before it (TIFF 6.0, section 2); False where the chain breaks."""
+    seen: set[int] = set()
+    try:
+        order = _ORDERS[file.read(2)]
+        (version,) = struct.unpack(f"{order}H", file.read(2))
+        is_big = version == _BIG
+        count, entry, offset = ("Q", 20, "Q") if is_big else ("H", 12, "I")
+        if is_big:
+            file.seek(8)
+        elif version != _CLASSIC:
+            return False
+        while place := _number(file, order + offset):
+            if place in seen:
+                return True
+            seen.add(place)
+            file.seek(place)
+            file.seek(_number(file, order + count) * entry, io.SEEK_CUR)
+    except (KeyError, struct.error, OSError, OverflowError, ValueError):
+        pass  # what is wrong there is found by who reads it
+    return False
+
+
+def _number(file: IO[bytes], kind: str) -> int:
+    (number,) = struct.unpack(kind, file.read(struct.calcsize(kind)))
+    return int(number)
