@@ -16,8 +16,7 @@ from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
 from instrument.files.tiff_pages import open_tiff
 from instrument.files.volumes import is_zarr_name, stem_of
-from instrument.runs.run import is_run
-from instrument.runs.run_files import FRAMES
+from instrument.runs.run_files import FRAMES, is_run
 
 Layer = tuple[Any, dict[str, Any], str]
 """napari's: what is shown, the arguments of its layer, and the layer's kind."""

@@ -26,7 +26,7 @@ from instrument.bench.config import (
     Table,
 )
 from instrument.bench.config_mistakes import Mistakes, key_lines, nearest, nearest_name
-from instrument.files.atomic import write_text
+from instrument.files.atomic import protect, write_text
 from instrument.files.errors import BenchError, ConfigError, ConfigProblem, FileError
 from instrument.files.reading import parse_toml, read_bytes
 
@@ -147,7 +147,10 @@ def load_config(path: Path | str | None = None) -> BenchConfig:
         raise FileError(path, "there is no such file.", f"Write one with: diffuserbench new {path}") from None
     except UnicodeDecodeError as error:
         raise FileError(path, f"is not UTF-8 text (byte {error.start}); a bench.toml is expected.") from None
-    return parse_config(text, path)
+    config = parse_config(text, path)
+    mask = config.display.mask_file
+    protect(path, *([path.parent / mask] if mask else []))
+    return config
 
 
 def parse_config(text: str, path: Path | None) -> BenchConfig:

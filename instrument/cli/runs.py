@@ -29,7 +29,10 @@ def list_runs(
     ] = None,
     bench: BenchOption = None,
 ) -> None:
-    """List the runs in a folder, the newest last: what became of each, its frames, its label."""
+    """List the runs in a folder, the newest last: what became of each, its frames, its label.
+
+    Images are looked at by their sizes, and read where an earlier reading found damage; verify reads all.
+    """
     if folder is not None and not folder.is_dir():
         raise FileError(folder, "is no folder.", "Name the folder that holds the runs.")
     folder = folder or load_config(bench).data_folder
@@ -52,6 +55,7 @@ def list_runs(
         mark = "SIMULATED" if found.is_simulated else ""
         table.add_row(path.name, found.became, f"{found.stored} of {found.frames}", kind, mark)
     Console(width=None if Console().is_terminal else 160).print(table, markup=False)
+    typer.echo("Images are known by their sizes and what was found before; verify reads them.", err=True)
 
 
 @run_app.command(

@@ -355,7 +355,8 @@ def _show_run(run: Path, picture: Path | None) -> None:
     from instrument.runs.run import Run
 
     found = Run.open(run)
-    looked = verify(found, read=False)
+    with one_task("Reading every frame") as advance:
+        looked = verify(found, advance)
     for name, value in [*_facts(found), *(("DAMAGED", line) for line in looked.lines())]:
         typer.echo(f"{name + ':':<14}{value}")
     if remedy := looked.remedy():

@@ -26,17 +26,28 @@ _LEFT = re.compile(r"\..+\.[0-9a-f]{8}\.part(\.[^.]+)?")
 _EXCHANGE, _HERE = 2, -100
 """``RENAME_EXCHANGE`` and ``AT_FDCWD`` of Linux."""
 _cleared: set[Path] = set()
-_inputs: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
+_inputs: ContextVar[tuple[Path, ...] | None] = ContextVar("inputs", default=None)
+"""What the work at hand reads; None where no work was begun."""
 
 
 @contextlib.contextmanager
 def protecting(inputs: Iterable[Path]) -> Iterator[None]:
     """Refuse, in this thread and while the block runs, to write over any of ``inputs``."""
-    before = _inputs.set((*_inputs.get(), *(path for path in inputs if path.exists())))
+    before = _inputs.set(_inputs.get() or ())
     try:
+        protect(*inputs)
         yield
     finally:
         _inputs.reset(before)
+
+
+def protect(*inputs: Path) -> None:
+    """Add what an input names in its turn (a bench's mask, a plan's images) to the work's inputs.
+
+    Nothing where no work was begun: what is read is then nobody's input.
+    """
+    if (before := _inputs.get()) is not None:
+        _inputs.set((*before, *(path for path in inputs if path.exists())))
 
 
 def refuse_input(path: Path) -> None:
@@ -47,7 +58,7 @@ def refuse_input(path: Path) -> None:
 
     Raises FileError.
     """
-    for held in _inputs.get():
+    for held in _inputs.get() or ():
         if path.exists() and path.samefile(held):
             found = "is an input itself"
         elif path.is_dir() and held.resolve().is_relative_to(path.resolve()):

@@ -25,7 +25,8 @@ from instrument.notebook.result import Result
 from instrument.reconstruction.job import Job, find_calibration, job_from_files, job_with
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import refocused, volume_job
-from instrument.runs.run import Run, is_run
+from instrument.runs.run import Run
+from instrument.runs.run_files import is_run
 from recon.base.checks import as_channels
 from recon.base.declare import options_of, require, require_known, with_overrides
 from recon.reconstruction import reconstruct as one_door

@@ -17,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from instrument.files.atomic import write_text
+from instrument.files.atomic import protect, write_text
 from instrument.files.errors import BenchError, FileError
 from instrument.files.reading import parse_json, parse_toml, read_bytes
 from instrument.plan.led_shapes import LedPlaces
@@ -348,7 +348,9 @@ def load_plan(path: Path | str) -> Plan:
         raise FileError(path, "is no text file.", "A plan is a TOML or JSON file.") from None
     except ValueError as error:  # of tomllib and json alike; both name the line
         raise PlanError(path, [str(error)]) from None
-    return Plan.checked(data, path).with_slm_images(lambda image: path.parent / image)
+    plan = Plan.checked(data, path).with_slm_images(lambda image: path.parent / image)
+    protect(path, *plan.slm_images)
+    return plan
 
 
 def save_plan(plan: Plan, path: Path | str) -> None:

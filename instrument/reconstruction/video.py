@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from instrument.files.atomic import write_json
+from instrument.files.atomic import refuse_input, write_json
 from instrument.files.errors import BenchError, FileError
 from instrument.files.films import as_shown, write_mp4
 from instrument.files.images import ImageFile
@@ -33,7 +33,8 @@ from instrument.reconstruction.video_files import (
 )
 from instrument.reconstruction.video_job import VideoJob, VideoPlan
 from instrument.reconstruction.video_work import BlockReport, CancelledError, cluster, in_process, on_cluster
-from instrument.runs.run import Run, is_run
+from instrument.runs.run import Run
+from instrument.runs.run_files import is_run
 from recon.base.declare import inapplicable
 from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.measurement import Floats, Measurement
@@ -349,6 +350,7 @@ def _require_spared(request: VideoRequest) -> None:
 
     A video may lie in the folder of its run; a record beside it tells it from the run's own frames.
     """
+    refuse_input(request.out)
     out = request.out.resolve()
     ours = request.record_path.exists() or VideoJob.folder_of(request.out).exists()
     for read in (request.run, request.psf, request.calibration):

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
+from instrument.files.atomic import refuse_input
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import FileError
 from instrument.files.volumes import grid_facts, ome_attributes, voxel_um
@@ -108,6 +109,7 @@ def create_output(
     """
     import zarr
 
+    refuse_input(path)
     deep = grid is not None and grid.shape[0] > 1
     colour = len(picture_shape) == 3 + deep
     shape = (picture_shape[-1], *picture_shape[:-1]) if colour else picture_shape

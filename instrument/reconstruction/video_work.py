@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -27,8 +27,8 @@ import numpy as np
 from instrument.files.errors import BenchError
 from instrument.reconstruction.video_files import VideoPictures
 from instrument.reconstruction.video_job import VideoJob
-from instrument.runs.frame_array import FrameArray
-from instrument.runs.run_files import FRAMES
+from instrument.runs.run import Run
+from instrument.runs.run_files import log_size
 from recon.base.threads import get_threads, set_threads
 from recon.reconstruction.measurement import Floats
 from recon.streams.joint import solve_together
@@ -51,6 +51,12 @@ class BlockReport:
     written: int
     seconds: float
     unlit: int = 0
+
+
+@lru_cache(maxsize=1)
+def _opened(path: Path, _log_bytes: int) -> Run:
+    """Return a run, read once as long as its log does not grow."""
+    return Run.open(path)
 
 
 class CancelledError(Exception):
@@ -90,7 +96,7 @@ def solve_block(
     if job.is_done(number):
         return BlockReport(number, 0, 0, time.perf_counter() - began_s)
     pictures = VideoPictures(Path(output), write=True)
-    frames = FrameArray(Path(plan.run) / FRAMES)
+    run = _opened(Path(plan.run), log_size(plan.run))
     block = job.blocks[number]
     together_in = None if len(block) == 1 else plan.over_time
     written = 0
@@ -100,7 +106,7 @@ def solve_block(
         nonlocal unlit
         reduction, deviation = job.reduction, job.problem.noise
         for index in block:
-            frame = reduction.apply(frames.read(index))
+            frame = reduction.apply(run.frame(index))
             unlit += not has_light(frame, deviation)
             yield frame
 

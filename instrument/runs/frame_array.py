@@ -203,8 +203,8 @@ class FrameArray:
         self._sync.folders(folders)
         return [draft.chunk for draft in drafts]
 
-    def read(self, index: int) -> Image:
-        """Return one frame as it was written.
+    def read(self, index: int) -> tuple[Image, int]:
+        """Return one frame as it is on the disk, and the CRC-32 of its file.
 
         Raises FileNotFoundError when the frame is not there; FileError when its file has the wrong size.
         """
@@ -217,11 +217,12 @@ class FrameArray:
                 f"has {path.stat().st_size} bytes; frame {index} takes {right}: it is damaged.",
                 "diffuserbench verify RUN names every damaged frame.",
             )
+        crc32 = zlib.crc32(flat.data)
         flat = flat.astype(self.dtype, copy=False)
         if self.is_colour:
             height, width, channels = self.frame_shape
-            return np.moveaxis(flat.reshape(channels, height, width), 0, -1)
-        return flat.reshape(self.frame_shape)
+            return np.moveaxis(flat.reshape(channels, height, width), 0, -1), crc32
+        return flat.reshape(self.frame_shape), crc32
 
     def resize(self, n_frames: int) -> None:
         """Change the number of frames that the array says it has."""

@@ -15,8 +15,8 @@ from instrument.files.figures import save_figure
 from instrument.files.images import image_metadata
 from instrument.files.seen import as_seen
 from instrument.runs.repair import file_problems
-from instrument.runs.run import DamagedFrame, FinishReason, Run, RunCondition, is_run
-from instrument.runs.run_files import LOG, FileProblem, RunError
+from instrument.runs.run import DamagedFrame, FinishReason, Run, RunCondition
+from instrument.runs.run_files import LOG, FileProblem, RunError, is_run
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ def verify(run: Run, on_progress: Progress | None = None, *, read: bool = True) 
     """Read every frame of a run and hold it, its metadata, files and image array against the log.
 
     ``on_progress`` is called with frames read and frames to read. ``read``: False looks at the images' sizes
-    only, which is quick.
+    only, which is quick, and reads again those that were damaged when the run was last read.
     """
     damaged = run.damaged(on_progress, read=read)
     again = {frame.index for frame in damaged}
@@ -207,8 +207,8 @@ class RunSummary:
     is_simulated: bool = False
     problem: str = ""
     is_damaged: bool = False
-    """Whether a small file is not as it was written, or an image is gone or of another size; only ``verify``
-    reads the images."""
+    """Whether a small file is not as it was written, or an image is gone, of another size, or was found
+    damaged when the run was last read and still is."""
 
     @property
     def kind(self) -> str:

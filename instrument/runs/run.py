@@ -17,7 +17,6 @@ import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
 from drivers.registry.claim import is_locked
-from instrument.files.calibration_file import CALIBRATION_FILES, is_calibration
 from instrument.files.errors import FileError
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import value_of
@@ -27,18 +26,18 @@ from instrument.runs.log import UNREAD, FrameLine, FrameRecord, FrameRecords, Ga
 from instrument.runs.run_files import (
     BENCH,
     FRAMES,
-    KEPT,
     LOCK,
     LOG,
     PLAN,
     PROVENANCE,
     RUN_STATE,
-    SLM_IMAGES,
     STATE,
-    UNCHANGING,
     RunError,
     RunFiles,
+    is_run,
     log_size,
+    note_damage,
+    noted_damage,
 )
 
 if TYPE_CHECKING:
@@ -351,13 +350,20 @@ class Run:
     def frame(self, index: int | Step) -> npt.NDArray[Any]:
         """Return one stored frame, ``(height, width)`` or ``(height, width, 3)``.
 
-        Raises RunError when it was not stored.
+        Raises RunError when it was not stored, or its checksum is not that of what was stored.
         """
         index = index.index if isinstance(index, Step) else index
         if index not in self.records and index not in self.unlisted:
             why = f"is lost: {self.lost[index].why}" if index in self.lost else "was not stored"
             raise RunError(self.path, f"frame {index} {why} ({self.condition}).")
-        return self.array.read(index)
+        image, crc32 = self.array.read(index)
+        if crc32 != (written := self._written(index)[1]):
+            raise RunError(
+                self.path,
+                f"frame {index} is damaged: its file has the CRC-32 {crc32:08x}; written was {written:08x}.",
+                "diffuserbench resume RUN takes it again; a recording's it marks as lost.",
+            )
+        return image
 
     def metadata(self, index: int | Step) -> FrameMetadata:
         """Return what is known about one stored frame."""
@@ -408,17 +414,22 @@ class Run:
         """Return the frames that are not as they were written.
 
         ``on_progress`` is called with frames read and frames to read. ``read``: False only looks at the
-        files' sizes.
+        files' sizes, and reads those that an earlier reading noted as damaged. What reading finds is noted.
         """
-        found = []
+        checked = []
         listed = sorted({*self.records, *self.unlisted})
+        noted = set() if read else noted_damage(self.path)
         for count, index in enumerate(listed, start=1):
-            if not read and self.has_frames and self.array.n_bytes(index) == self._written(index)[0]:
+            unread = not read and index not in noted and self.has_frames
+            if unread and self.array.n_bytes(index) == self._written(index)[0]:
                 continue
-            found.append(self.verify(index))
+            checked.append(self.verify(index))
             if on_progress is not None:
                 on_progress(count, len(listed))
-        return tuple(frame for frame in found if frame is not None)
+        found = tuple(frame for frame in checked if frame is not None)
+        if (read or (noted and not found)) and not self.is_being_written:
+            note_damage(self.path, [frame.index for frame in found])
+        return found
 
     def without_a_line(self) -> list[int]:
         """Return the images on the disk that no line of the log is about, in order."""
@@ -431,30 +442,6 @@ class Run:
 
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r}, {self.condition}, {len(self.records)} of {self.n_frames} frames)"
-
-
-def is_run(path: Path) -> bool:
-    """Whether a folder is a run's, even where one of its files is gone."""
-    return (path / STATE).is_file() or ((path / LOG).is_file() and (path / PROVENANCE).is_file())
-
-
-_RUN_FILES = (*UNCHANGING, STATE, LOG, LOCK, FRAMES, SLM_IMAGES, KEPT)
-
-
-def refuse_own_files(path: Path) -> None:
-    """Refuse to have something else written to what a run or a calibration consists of; beside it may be.
-
-    Raises FileError naming the run or calibration.
-    """
-    for folder in path.resolve().parents:
-        own = path.resolve().relative_to(folder).parts[0]
-        for kind, names in (("run", _RUN_FILES), ("calibration", CALIBRATION_FILES)):
-            if own in names and (is_run(folder) if kind == "run" else is_calibration(folder)):
-                raise FileError(
-                    folder,
-                    f"is a {kind}, and {own} is part of it; no output replaces it.",
-                    "Choose another name.",
-                )
 
 
 def _fields(line: Mapping[str, Any]) -> dict[str, Any]:

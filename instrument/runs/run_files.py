@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import contextlib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from instrument.files.calibration_file import CALIBRATION_FILES, is_calibration
 from instrument.files.errors import FileError
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import RecordFormat
 
 PLAN, BENCH, PROVENANCE, STATE = "plan.json", "bench.json", "provenance.json", "state.json"
 BENCH_TOML, LOG, FRAMES, LOCK = "bench.toml", "log.jsonl", "frames.ome.zarr", "lock"
-SLM_IMAGES, KEPT = "slm", "kept"
+SLM_IMAGES, KEPT, DAMAGED = "slm", "kept", "damaged.json"
 UNCHANGING = (PLAN, BENCH, BENCH_TOML, PROVENANCE)
 """Files that are as they were written; a routine's own record may be put right by hand."""
 
@@ -31,6 +33,9 @@ class RunError(FileError):
 
 RUN_STATE = RecordFormat("diffuserbench run", "run's state", error=RunError, numbered_before=True)
 """``state.json``; its version is that of the whole folder."""
+
+NOTED = RecordFormat("diffuserbench damaged frames", "note of damaged frames", error=RunError)
+"""``damaged.json``: the frames that reading a run found damaged, for who looks at sizes only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,3 +170,44 @@ def log_size(path: Path | str) -> int:
         return (Path(path) / LOG).stat().st_size
     except OSError:
         return 0
+
+
+def noted_damage(folder: Path) -> set[int]:
+    """Return the frames that were damaged when a run was last read: to be read again."""
+    try:
+        return set(NOTED.read(folder / DAMAGED)["frames"])
+    except (OSError, FileError, LookupError, TypeError):
+        return set()
+
+
+def note_damage(folder: Path, frames: Sequence[int]) -> None:
+    """Note, where one may write there, which frames of a run are damaged; without any there is no note."""
+    with contextlib.suppress(OSError, FileError):
+        if frames:
+            NOTED.write(folder / DAMAGED, {"frames": frames})
+        else:
+            (folder / DAMAGED).unlink(missing_ok=True)
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder is a run's, even where one of its files is gone."""
+    return (path / STATE).is_file() or ((path / LOG).is_file() and (path / PROVENANCE).is_file())
+
+
+_RUN_FILES = (*UNCHANGING, STATE, LOG, LOCK, FRAMES, SLM_IMAGES, KEPT, DAMAGED)
+
+
+def refuse_own_files(path: Path) -> None:
+    """Refuse to have something else written to what a run or a calibration consists of; beside it may be.
+
+    Raises FileError naming the run or calibration.
+    """
+    for folder in path.resolve().parents:
+        own = path.resolve().relative_to(folder).parts[0]
+        for kind, names in (("run", _RUN_FILES), ("calibration", CALIBRATION_FILES)):
+            if own in names and (is_run(folder) if kind == "run" else is_calibration(folder)):
+                raise FileError(
+                    folder,
+                    f"is a {kind}, and {own} is part of it; no output replaces it.",
+                    "Choose another name.",
+                )

@@ -25,9 +25,10 @@ class VerifyOptions:
 
 @task("diffuserbench verify runs/2026-11-21_14-03-22_axial-sweep", "diffuserbench verify runs/*")
 def verify(desk: Desk, options: VerifyOptions) -> Done:
-    """Read every frame and its metadata and hold them against the log's checksums. Changes nothing.
+    """Read every frame and its metadata and hold them against the log's checksums. Changes no data.
 
     Exit status 1 when anything is not as it was written. A run that ended early is sound, only not complete.
+    Which images are damaged is noted in the run (damaged.json), so that list and the window tell it, too.
     """
     sound = True
     for path in options.runs:

@@ -265,7 +265,7 @@ def guarded(values: Mapping[str, object]) -> Iterator[None]:
     """
     paths = list(_paths(values))
     if outputs := [path for name, path in paths if name in WRITTEN]:
-        from instrument.runs.run import refuse_own_files
+        from instrument.runs.run_files import refuse_own_files
 
         for output in outputs:
             refuse_own_files(output)

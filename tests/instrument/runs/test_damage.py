@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from instrument.cli import main
 from instrument.plan import Part, Plan
 from instrument.runs.acquire import look, prepare, prepare_resume, settle
 from instrument.runs.inspection import verify
@@ -139,8 +140,51 @@ def test_each_damage_of_each_file_is_said_and_mended(
     assert Run.open(path).plan == Run.open(runs[0]).plan
     if name != "log.jsonl":  # whose whole lines stay in it
         kept = [p.read_bytes() for p in path.rglob("*") if p.is_file()]
-        rewritten = path / "state.json", path / "log.jsonl"
+        rewritten = path / "state.json", path / "log.jsonl", path / "damaged.json"
         assert all(data in kept for file, data in files.items() if file not in rewritten)
+
+
+def test_no_two_commands_contradict_each_other_about_a_changed_pixel(
+    tmp_path: Path, runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "runs" / "run"
+    shutil.copytree(runs[0], path)
+    chunk = path / f"{FRAMES}/0/c/1/0/0"
+    whole = chunk.read_bytes()
+    (path / "damaged.json").write_text("no note at all")
+    one_bit(chunk, path)
+
+    def said(*words: str) -> tuple[int, str]:
+        status = main([*words, str(path.parent if words == ("list",) else path)])
+        return status, "".join(capsys.readouterr())
+
+    assert said("list")[1].count("DAMAGED") == 0  # by its size, and the list says so
+    assert "by their sizes" in said("list")[1]
+    with pytest.raises(RunError, match="frame 1 is damaged: its file has the CRC-32"):
+        Run.open(path).frame(1)
+    assert main(["export", str(path), str(tmp_path / "frames.npy")]) == 2
+    assert "frame 1 is damaged" in capsys.readouterr().err
+    words = "\n".join(look(path).lines())
+    assert words.startswith("frame 1: its file has the CRC-32")
+    status, verified = said("verify")
+    assert status == 1
+    assert words in verified
+    assert f"DAMAGED:      {words}" in said("show")[1]
+    assert "DAMAGED" in said("list")[1]
+    window = pytest.importorskip("gui.run_looks")
+    opened = window.look_into(path)
+    assert f"DAMAGED: {words}" in opened.about
+    assert "frame 1 is damaged" in window.read_frame(opened, 1)
+    chunk.write_bytes(whole)  # from a backup: no note outlives what it tells of
+    assert "DAMAGED" not in said("list")[1]
+    assert not (path / "damaged.json").exists()
+    one_bit(chunk, path)
+    assert said("verify")[0] == 1
+    (path / "damaged.json").write_text('{"frames": [7]}')
+    assert said("list")[0] == 0
+    chunk.write_bytes(whole)
+    assert said("verify")[0] == 0
+    assert not (path / "damaged.json").exists()
 
 
 def test_a_bad_byte_in_a_log_costs_its_line_at_most(tmp_path: Path) -> None:

@@ -180,7 +180,7 @@ def test_an_array_keeps_what_was_written_and_nothing_half_written(
     array.remove_half_written()
     assert not half.exists()
     for index, image in images.items():
-        assert np.array_equal(array.read(index), image)
+        assert np.array_equal(array.read(index)[0], image)
         assert array.n_bytes(index) == 96
     array.chunk_path(2).write_bytes(bytes(40))
     with pytest.raises(FileError, match="has 40 bytes; frame 2 takes 96: it is damaged"):
