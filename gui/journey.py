@@ -21,6 +21,8 @@ _SATURATED = 1e-3
 """Share of saturated pixels from which a photograph is spoilt."""
 EXPOSE = "expose"
 """What the live view is asked to do: to find an exposure for what is lit."""
+EXPOSING = "Auto exposure"
+"""The job that does it, and the button that asks for it."""
 _STRIDE = 4
 """Of the pixels that are looked at, along both sides: the state of the light shows in a sixteenth."""
 
@@ -203,7 +205,7 @@ def _exposed(facts: Facts, *, later: bool) -> Step:
         "saturated": "The picture is saturated: expose shorter.",
     }.get(facts.light, "")
     what = "" if facts.light == "unknown" else EXPOSE
-    answer = "Auto exposure" if what else "Look at it"
+    answer = EXPOSING if what else "Look at it"
     return Step("Expose", later or facts.light == "good", words, answer, "live", what)
 
 

@@ -78,7 +78,7 @@ class MainWindow(QMainWindow):
         self.maker = PanelMaker(session, self._places, self)
         self._panels = self.maker.panels
         self._docks: dict[str, QDockWidget] = {}
-        self._restyling: Generator[None] | None = None
+        self._restyling: Generator[str | None] | None = None
         self._may_close = False
         self.question: Question | None = None
         """The question that was asked last, while it is open."""
@@ -313,7 +313,7 @@ class MainWindow(QMainWindow):
         """Whether parts of the window still have the looks of the theme before."""
         return self._restyling is not None
 
-    def _restyle(self, parts: Generator[None]) -> None:
+    def _restyle(self, parts: Generator[str | None]) -> None:
         if parts is not self._restyling:
             return  # another theme was chosen meanwhile
         try:

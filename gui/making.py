@@ -13,7 +13,7 @@ from gui.jobs import JobContext, words_for
 from gui.panel import Panel
 from gui.panels import PANELS
 from gui.session import BenchSession
-from gui.theme import restyled
+from gui.theme import TURN, restyled
 from gui.widgets.building import PanelPlace, label, text_view
 
 _SLICE_S = 0.008
@@ -22,12 +22,14 @@ REST_MS = 1
 """Between two slices: what was made is laid out and painted, and clicks are taken, in turns of their own."""
 
 
-def take_slice(parts: Iterator[None]) -> None:
-    """Make parts for as long as a slice may take. Raises StopIteration after the last of them."""
+def take_slice(parts: Iterator[object]) -> None:
+    """Make parts for as long as a slice may take, or until one says that it ends here (`TURN`).
+
+    Raises StopIteration after the last of them.
+    """
     end_s = time.thread_time() + _SLICE_S
-    next(parts)
-    while time.thread_time() <= end_s:
-        next(parts)
+    while next(parts) is not TURN and time.thread_time() <= end_s:
+        pass
 
 
 class PanelMaker(QObject):
@@ -57,7 +59,7 @@ class PanelMaker(QObject):
         self._session = session
         self._places = places
         self.panels: dict[str, Panel] = {}
-        self._slices: dict[str, Generator[None, None, Panel]] = {}
+        self._slices: dict[str, Generator[str | None, None, Panel]] = {}
         self._then: dict[str, list[Callable[[Panel], object]]] = {}
         """What is done with each panel that was asked for, once it is made."""
 

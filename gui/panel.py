@@ -17,6 +17,7 @@ from gui.session_news import name_of
 from gui.way_on import ReconnectButton
 from gui.widgets.building import after_rest, button, every, fill, in_row, label, mark
 from gui.widgets.dialogues import elided
+from gui.widgets.entry import Refusing
 from instrument.bench.config import Kind
 from instrument.files.errors import BenchError
 from recon.base.declare import Imports
@@ -117,6 +118,9 @@ class Panel(QWidget):
 
     def accepted(self, field: QWidget | None = None) -> None:
         """Clear what ``refused`` showed: the line, the field, and all buttons, which hold nothing to mend."""
+        if isinstance(field, Refusing):  # which may have marked itself, and knows its own tip
+            field.accept()
+            self._tips.pop(field, None)
         for each in [w for w in self._tips if w is field or isinstance(w, QAbstractButton)]:
             mark(each, "refused", False)
             each.setToolTip(self._tips.pop(each))

@@ -124,6 +124,9 @@ _now = [DARK]
 
 
 _log = logging.getLogger(__name__)
+
+TURN = "turn"
+"""Yielded by what makes or dresses widgets a part at a time: what it did is painted before it goes on."""
 _half: WeakSet[QWidget] = WeakSet()
 """Parts that have a theme's sheet and, as another was chosen meanwhile, not all of its colours."""
 
@@ -153,7 +156,7 @@ def apply_theme(app: QApplication, name: str) -> None:
     app.setStyleSheet(sheet())
 
 
-def change_theme(name: str, window: QWidget, wholes: Sequence[QWidget]) -> Generator[None]:
+def change_theme(name: str, window: QWidget, wholes: Sequence[QWidget]) -> Generator[str | None]:
     """Give a window the looks of another theme, one of :data:`THEMES`, with a ``yield`` after each part.
 
     A sheet at the window, or the program, would go to all of two thousand widgets at once.
@@ -184,14 +187,14 @@ def change_theme(name: str, window: QWidget, wholes: Sequence[QWidget]) -> Gener
             holder.style().polish(holder)
             children = [child for child in holder.children() if isinstance(child, QWidget)]
             parts += [child for child in children if child not in holding and child not in parts]
-        yield
+        yield None
         for part in parts:
             if isValid(part) and part.isVisible():
                 yield from restyled(part)
     finally:
         if isValid(window):
             window.setUpdatesEnabled(True)
-    yield
+    yield TURN
     for part in parts:
         yield from restyled(part)
 

@@ -158,7 +158,7 @@ class Surroundings(SharedPart):
     def check_plugged(self, kind: str, name: str) -> None:
         """Raise :class:`DeviceError` when the device is unplugged."""
         if not self.is_plugged(kind):
-            raise DeviceError(name, "was unplugged.", "Plug it in and open the bench again.")
+            raise DeviceError(name, "was unplugged.", "Plug it in, then open it again.")
 
 
 class SimulatedDevice(Device):

@@ -12,7 +12,7 @@ from shiboken6 import isValid
 from gui.panel import Panel
 from gui.panels.unserved import UnservedPanel, why_not
 from gui.session import BenchSession
-from gui.theme import dress
+from gui.theme import TURN, dress
 
 Area = Literal["centre", "top right", "right", "bottom"]
 
@@ -45,7 +45,7 @@ class PanelEntry(NamedTuple):
         """Import and compile all that the panel needs; in any thread."""
         self.kind.prepare()
 
-    def slices(self, session: BenchSession) -> Generator[None, None, Panel]:
+    def slices(self, session: BenchSession) -> Generator[str | None, None, Panel]:
         """Make the panel, with a ``yield`` after each of its parts, and return it."""
         panel: Panel
         if why := why_not(session, self.title, self.needs, self.tried_on):
@@ -55,14 +55,15 @@ class PanelEntry(NamedTuple):
         panel.title = self.title
         dress(panel)
         try:
-            yield
+            yield None
             yield from panel.parts()
             parts = panel.findChildren(QWidget)
             for part in parts:  # what showing it first would do in one go
                 part.ensurePolished()
-                yield
+                yield None
             for part in reversed(parts):  # layouts have measured fields that had not their looks yet
                 part.updateGeometry()
+            yield TURN  # to take its place is the work of a turn
         except BaseException:  # or not wanted any more
             if isValid(panel):  # its window may be gone
                 Panel.shutdown(panel)  # its timers: a subclass may lack yet what it would end

@@ -46,7 +46,8 @@ class ChartsPanel(Panel):
         self.stability = StabilityView()
         yield
         make = partial(session.handed_on.emit, "tasks", ("chart photograph", {}))
-        self.chart = ChartView(Hint(_NO_CHART, "Make one…", make, ("Open…", self._choose)))
+        self.chart = ChartView()
+        yield from self.chart.parts(Hint(_NO_CHART, "Make one…", make, ("Open…", self._choose)))
         yield
         tip = "A stability.json or chart.json, made in Files (a chart, a map) or in the terminal"
         self.open_button = button("Open…", tip, self._choose)
@@ -149,22 +150,23 @@ _SHORT = {"seconds": "seconds", "peak_mib": "MiB", "images": "photographs"}
 class ChartView(QWidget):
     """A plot of scored points and a table of settings; pointing at either names the other.
 
-    Parameters
-    ----------
-    empty : QWidget
-        Stands here until there are points.
+    It is there once its ``parts`` are made.
     """
 
-    def __init__(self, empty: QWidget, parent: QWidget | None = None) -> None:
+    def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self._points: Sequence[Point] = ()
         self._kind = KINDS["reconstruction"]
+
+    def parts(self, empty: QWidget) -> Iterator[None]:
+        """Make the widgets; ``empty`` stands here until there are points."""
         self.measure = choice((), "What is compared", lambda _: self._draw())
         self.cost = choice((), "What it is compared against", lambda _: self._draw())
         self.group = choice((), "Only these settings compete with each other", lambda _: self._draw())
         self.plot: Any = plot_widget("")
         self.plot.setLogMode(x=True)
         self.plot.scene().sigMouseMoved.connect(self._moved)
+        yield
         tip = "Settings by their best score; one that is chosen is drawn bold"
         self.table = table(["", "", ""], tip, wide=0, row_px=30)
         self.table.verticalHeader().hide()
@@ -172,6 +174,7 @@ class ChartView(QWidget):
         words = "The bold line is the front: no setting is both cheaper and better."
         self.place = label(words, "dim", selectable=True)
         self.front: list[Point] = []
+        yield
         chosen = in_row(label("Compare"), self.measure, label("against"), self.cost, self.group, None)
         drawn = split(self.plot, self.table, sizes=[620, 330])
         self.stack = QStackedWidget()

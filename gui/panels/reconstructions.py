@@ -85,7 +85,10 @@ class ReconstructionsPanel(Panel):
         tip = "Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)"
         self.export_button = button("Export…", tip, lambda: self.export.choose(), enabled=False)
         buttons = in_row(self.open_button, self.refresh_button)
-        self.tabs.addTab(fill(QWidget(), (self.list, 1), buttons, margins=(0, 6, 0, 0)), "Results")
+        self.none = label("No reconstruction is in the data folder yet.", "dim", wraps=True)
+        self.none.hide()
+        listed = fill(QWidget(), self.none, (self.list, 1), buttons, margins=(0, 6, 0, 0))
+        self.tabs.addTab(listed, "Results")
         yield
         tip = "The PSF is turned or of another size for this photograph: fit it first, then reconstruct again"
         self.refine_button = button("Fit the PSF, and again", tip, self.refine)
@@ -156,6 +159,7 @@ class ReconstructionsPanel(Panel):
 
     def _list(self, records: list[tuple[Path, str]]) -> None:
         self.list.clear()
+        self.none.setVisible(not records)
         for record, changed in records:
             item = QListWidgetItem(f"{record.stem}\n    {changed}  {record.parent.name}")
             item.setToolTip(str(record))

@@ -194,7 +194,7 @@ class RunsPanel(Panel):
         self.slider.setAccessibleName("Frame of the run")
         self.slider.valueChanged.connect(self._show_frame)
         self.frame_words = label(role="dim", yields=True)
-        self.about = text_view("Click a run to open it.")
+        self.about = text_view(empty="What is in a run stands here, once it is clicked.")
         self.about.setAccessibleName("About the run")
         self.bar = RunBar(self.run, "Resume")
         self.bar.set_startable("No run is open.")

@@ -97,7 +97,7 @@ class TasksPanel(Panel):
         self._chosen()
 
     def _make_results(self) -> QWidget:
-        self.words = text_view("What it finds stands here.", "Can be copied")
+        self.words = text_view(tip="Can be copied", empty="What is found stands here.")
         self.words.setFont(QFontDatabase.systemFont(QFontDatabase.SystemFont.FixedFont))
         self.tables = QWidget()
         self._tables = QVBoxLayout(self.tables)

@@ -262,9 +262,10 @@ def share_bar(most: int = 1000) -> QProgressBar:
     return made
 
 
-def text_view(text: str = "", tip: str = "") -> QPlainTextEdit:
-    """Return a text of several lines, to be read and copied."""
+def text_view(text: str = "", tip: str = "", *, empty: str = "") -> QPlainTextEdit:
+    """Return a text of several lines, to be read and copied; ``empty`` stands there while there is none."""
     made = QPlainTextEdit(text)
+    made.setPlaceholderText(empty)
     made.setReadOnly(True)
     made.setToolTip(tip)
     made.setAccessibleName(tip or "Text")

@@ -18,6 +18,7 @@ from gui.background import NewestOnly
 from gui.forms.fields import Behaviour, ChoiceField, NumberField
 from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobContext
+from gui.journey import EXPOSING
 from gui.panel import Panel
 from gui.widgets.building import button, every, fill, in_row, label
 from gui.widgets.device_settings import DeviceSettings
@@ -115,7 +116,7 @@ class CameraForm(QWidget):
         def work(camera: Camera) -> tuple[AutoExposure, CameraState]:
             return auto_expose(camera), read_camera(camera)
 
-        start = partial(self._session.camera_job, "Auto exposure", work, idle=True)
+        start = partial(self._session.camera_job, EXPOSING, work, idle=True)
         job = self._panel.begin(start, self.auto_button)
         if job is not None:
             self.auto_button.setEnabled(False)

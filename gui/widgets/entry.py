@@ -16,7 +16,7 @@ from gui.widgets.dialogues import Browse, choose_path
 from instrument.files.errors import BenchError
 
 
-class _Refusing(QLineEdit):
+class Refusing(QLineEdit):
     """A field that is marked, with the reason as its tool tip, where its content is refused.
 
     Signals
@@ -36,12 +36,17 @@ class _Refusing(QLineEdit):
         self._mark(why)
         self.refused.emit(why)
 
+    def accept(self) -> None:
+        """Take back what was shown: the content is used after all."""
+        if self.property("refused"):
+            self._mark("")
+
     def _mark(self, why: str) -> None:
         mark(self, "refused", bool(why))
         self.setToolTip(why or self._tip_now())
 
 
-class Entry(_Refusing):
+class Entry(Refusing):
     """A text and the value that it stands for.
 
     Parameters
@@ -173,7 +178,7 @@ def _factor(typed: str, unit: str) -> float | None:
     return None
 
 
-class NumberEdit(_Refusing):
+class NumberEdit(Refusing):
     """A field for one number: ``12.5 ms``. Enter or leaving it submits; Up and Down step by a tenth.
 
     Lengths and times may be typed in another unit than the field's: ``2 s`` where it has milliseconds. One

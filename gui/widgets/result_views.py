@@ -32,6 +32,7 @@ class FactsView(QTextBrowser):
         super().__init__(parent)
         self.setOpenLinks(False)
         self.setMinimumSize(120, 60)
+        self.setPlaceholderText("What is known of a result stands here.")
         self._shown: tuple[Sequence[tuple[str, str]], Sequence[str], bool] = ((), (), False)
 
     def restyle(self) -> None:
@@ -54,7 +55,7 @@ class FactsView(QTextBrowser):
             f"<td>{escape(value)}</td></tr>"
             for name, value in facts
         )
-        self.setHtml("".join([*parts, f"<table>{rows}</table>"]))
+        self.setHtml("".join([*parts, f"<table>{rows}</table>" if rows else ""]))
 
 
 class PictureView(QWidget):
@@ -170,6 +171,7 @@ class ConvergenceView(QWidget):
         self._histories: Histories = ()
         self._noise_norm: float | None = None
         fill(self, in_row((self.legend, 1), self.against_time), (self.plot, 1), spacing=0)
+        self._draw()
 
     def show_histories(self, histories: Histories, noise_norm: float | None) -> None:
         """Draw histories; ``noise_norm`` is the expected norm of the noise in the residuals' units."""
@@ -191,7 +193,9 @@ class ConvergenceView(QWidget):
             suffix = "" if len(self._histories) == 1 else f", channel {channel}"
             self._add(f"residual / noise{suffix}", x, [r.data_residual / norm for r in history], 2 * channel)
             self._add(f"change{suffix}", x, [r.change for r in history], 2 * channel + 1)
-        self.legend.setText(legend(self._numbers))
+        self.legend.setText(legend(self._numbers) or "How it was solved is drawn here.")
+        for part in (self.plot, self.against_time):  # an empty plot's numbers would mean nothing
+            part.setVisible(bool(self.curves))
         if self._noise_norm is not None and self._histories:
             pen = pg.mkPen(colours().dim, style=Qt.PenStyle.DashLine)
             self.plot.addItem(pg.InfiniteLine(0.0, angle=0, pen=pen))  # log10 of 1

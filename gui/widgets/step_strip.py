@@ -7,7 +7,7 @@ from PySide6.QtWidgets import QFrame, QSizePolicy, QWidget
 
 from gui.background import NewestOnly
 from gui.jobs import Job
-from gui.journey import Facts, Made, Step, after_all, facts_of, made_in, next_of, steps_of
+from gui.journey import EXPOSING, Facts, Made, Step, after_all, facts_of, made_in, next_of, steps_of
 from gui.session import BenchSession
 from gui.theme import colours
 from gui.widgets.building import after_rest, button, every, fill, label
@@ -99,7 +99,7 @@ class StepStrip(QFrame):
 
 
 def _is_run(job: Job) -> bool:
-    return not job.quiet and (job.exclusive or not job.lanes)
+    return not job.quiet and (job.exclusive or not job.lanes or job.title == EXPOSING)
 
 
 def _mark(step: Step, is_next: bool) -> str:

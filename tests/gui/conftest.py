@@ -22,6 +22,8 @@ except ImportError as error:
 else:
     WITHOUT_QT = ""
     from gui.main_window import MainWindow
+    from gui.panel import whole
+    from gui.panels.reconstructions import ReconstructionsPanel
     from gui.session import BenchSession
     from gui.theme import apply_theme
 from instrument.bench.config_file import parse_config
@@ -118,6 +120,16 @@ def session(qtbot: QtBot, make_session: Callable[[], BenchSession]) -> BenchSess
         session.open()
     qtbot.waitUntil(lambda: session.live.newest() is not None, timeout=WAIT_MS)
     return session
+
+
+@pytest.fixture
+def panel(qtbot: QtBot, make_session: Callable[[], BenchSession]) -> ReconstructionsPanel:
+    """The panel of reconstructions of a session whose devices stay closed: none is needed."""
+    panel = whole(ReconstructionsPanel(make_session()))
+    panel.resize(1000, 700)
+    qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
+    panel.show()
+    return panel
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
-from gui.journey import Facts, Made, after_all, light_of, made_in, next_of, steps_of
+from gui.journey import EXPOSING, Facts, Made, after_all, light_of, made_in, next_of, steps_of
 from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.panels.sweeps import SweepsPanel
@@ -98,6 +98,12 @@ def test_the_strip_names_the_next_step_and_leads_there(qtbot: QtBot, window: Mai
     job = window.session.exclusive_job("A run", lambda context: context.cancel.wait(WAIT_MS / 1000))
     strip.look()
     assert strip.words.toolTip() == "A run is under way …"
+    assert not strip.button.isVisible()
+    job.cancel()
+    qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
+    job = window.session.jobs.device(EXPOSING, lambda context: context.cancel.wait(WAIT_MS / 1000), set())
+    strip.look()
+    assert strip.words.toolTip() == "Auto exposure is under way …"
     assert not strip.button.isVisible()
     job.cancel()
     qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)

@@ -11,26 +11,16 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QApplication, QFileDialog
 from pytestqt.qtbot import QtBot
 
-from gui.panel import whole
+from gui.making import take_slice
 from gui.panels.reconstructions import ReconstructionsPanel
-from gui.session import BenchSession
-from gui.theme import apply_theme, change_theme
+from gui.theme import TURN, apply_theme, change_theme
 from gui.widgets.dialogues import Question
+from gui.widgets.entry import Refusing
 from instrument.files.images import read_image, write_image
 from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.stored_result import open_result
 
 WAIT_MS = 60_000
-
-
-@pytest.fixture
-def panel(qtbot: QtBot, make_session) -> ReconstructionsPanel:
-    session: BenchSession = make_session()  # its devices stay closed: none is needed
-    panel = whole(ReconstructionsPanel(session))
-    panel.resize(1000, 700)
-    qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
-    panel.show()
-    return panel
 
 
 def test_export_writes_values_and_views(qtbot: QtBot, panel: ReconstructionsPanel, tmp_path) -> None:
@@ -199,3 +189,28 @@ def test_the_red_theme_shows_nothing_but_red(
         assert middle.red() >= middle.green() == middle.blue() == 0
     finally:
         apply_theme(qapp, "dark")
+
+
+def test_what_is_empty_says_what_will_stand_there(qtbot: QtBot, panel: ReconstructionsPanel) -> None:
+    qtbot.waitUntil(panel.none.isVisible, timeout=WAIT_MS)
+    assert not panel.convergence.plot.isVisible()  # an empty plot's numbers would mean nothing
+    assert panel.convergence.legend.text() == "How it was solved is drawn here."
+    assert not panel.facts.toPlainText()
+    assert panel.facts.placeholderText()
+
+
+def test_a_field_that_marked_itself_is_unmarked_by_the_panel(panel: ReconstructionsPanel) -> None:
+    entry = panel.form.options.widgets["image"]
+    assert isinstance(entry, Refusing)
+    tip = entry.toolTip()
+    entry.refuse("There is no such file.")
+    panel.refused(entry, "There is no such file.")
+    panel.accepted(entry)
+    assert not entry.property("refused")
+    assert entry.toolTip() == tip
+
+
+def test_a_slice_ends_where_a_part_says_so() -> None:
+    parts = iter((None, TURN, None))
+    take_slice(parts)
+    assert list(parts) == [None]

@@ -12,9 +12,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QFileDialog
 from pytestqt.qtbot import QtBot
 
-from gui.panel import whole
 from gui.panels.reconstructions import ReconstructionsPanel
-from gui.session import BenchSession
 from gui.widgets.entry import PathEntry
 from instrument.files.calibration_file import (
     CalibrationFileError,
@@ -35,16 +33,6 @@ def _calibration(folder: Path, depths_um: tuple[float, ...]) -> Path:
         psf[0, rng.integers(8, 24, 9), rng.integers(8, 24, 9)] = 100
     places = np.array([(0.0, 0.0, z) for z in depths_um])
     return save_calibration(Calibration(psfs, places), folder)
-
-
-@pytest.fixture
-def panel(qtbot: QtBot, make_session) -> ReconstructionsPanel:
-    session: BenchSession = make_session()
-    panel = whole(ReconstructionsPanel(session))
-    panel.resize(1000, 800)
-    qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
-    panel.show()
-    return panel
 
 
 @pytest.fixture

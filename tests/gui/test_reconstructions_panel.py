@@ -15,9 +15,7 @@ from pytestqt.qtbot import QtBot
 
 from gui.forms.reconstruct import PSF, VOLUME
 from gui.jobs import JobState
-from gui.panel import whole
 from gui.panels.reconstructions import ReconstructionsPanel
-from gui.session import BenchSession
 from gui.widgets.entry import NumberEdit
 from instrument.files.calibration_file import load_calibration, newest_calibration, save_calibration
 from instrument.files.images import read_image, write_image
@@ -52,16 +50,6 @@ def files(tmp_path: Path) -> Path:
     tifffile.imwrite(folder / "photo.tif", photograph.astype(np.uint16))
     write_image(folder / "psf.tif", (psf(2) + 100).astype(np.uint16))
     return folder
-
-
-@pytest.fixture
-def panel(qtbot: QtBot, make_session) -> ReconstructionsPanel:
-    session: BenchSession = make_session()  # its devices stay closed: none is needed
-    panel = whole(ReconstructionsPanel(session))
-    panel.resize(1000, 700)
-    qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
-    panel.show()
-    return panel
 
 
 def fill(panel: ReconstructionsPanel, kind: str, files: Path, psfs: str) -> None:
