@@ -267,3 +267,11 @@ def test_what_a_disk_refuses_is_said_with_what_to_do(number: int | None, remedy:
     refusal = OSError() if number is None else OSError(number, "no")
     with pytest.raises(RunError, match=remedy), writer._disk(Path("r"), "it could not be written"):
         raise refusal
+
+
+def test_a_recording_that_ends_before_its_first_frame_has_none(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as opened:
+        opened.start()
+        run = opened.finish(FinishReason.COMPLETED)
+    assert run.n_frames == 0
+    assert run.missing() == []
