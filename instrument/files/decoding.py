@@ -56,7 +56,7 @@ def decode(path: Path, inside: str = "") -> Decoded:
     except FileNotFoundError:
         raise FileError(path, "there is no such file.") from None
     if is_hdf5(beginning):
-        return read_hdf5(path, inside, matlab=beginning.startswith(b"MATLAB"))
+        return read_hdf5(path, inside, of_matlab=beginning.startswith(b"MATLAB"))
     if is_matlab(beginning):
         return read_matlab(path, inside)
     if inside:
@@ -121,6 +121,7 @@ def _decode_tiff(path: Path, data: bytes) -> Decoded:
             series = tiff.series[0]
             reading.require_plausible(path, series.size * series.dtype.itemsize, len(data))
             page: Any = series.keyframe
+            _require_parts(path, series)
             notes = []
             if page.photometric == tifffile.PHOTOMETRIC.PALETTE:
                 return _decode_with_opencv(path, data)
@@ -146,6 +147,17 @@ def _decode_tiff(path: Path, data: bytes) -> Decoded:
         if "imagecodecs" in str(error):  # a compression that only OpenCV knows here
             return _decode_with_opencv(path, data)
         raise FileError(path, f"is a damaged or unusual TIFF: {error}.") from None
+
+
+def _require_parts(path: Path, series: Any) -> None:
+    """Refuse pages that name fewer strips or tiles than they have: the others would be read as dark."""
+    needed = math.prod(series.keyframe.chunked)
+    for page in series.pages:
+        if page is not None and not page.is_contiguous and len(page.dataoffsets) < needed:
+            raise FileError(
+                path,
+                f"is a damaged TIFF: a page has {needed} strips or tiles and names {len(page.dataoffsets)}.",
+            )
 
 
 def _unpacked(path: Path, series: Any, data: bytes) -> npt.NDArray[np.uint16]:

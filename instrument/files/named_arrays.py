@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import math
+import struct
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files import reading
+from instrument.files import matlab, reading
 from instrument.files.errors import FileError
 
 Read = tuple[npt.NDArray[Any], tuple[str, ...]]
@@ -62,10 +63,10 @@ def is_matlab(beginning: bytes) -> bool:
     return beginning.startswith(b"MATLAB 5.0 MAT-file") and beginning[126:128] in (b"IM", b"MI")
 
 
-def read_hdf5(path: Path, inside: str, *, matlab: bool = False) -> Read:
+def read_hdf5(path: Path, inside: str, *, of_matlab: bool = False) -> Read:
     """Read an array of an HDF5 file: the only one with two axes or more, or the one called ``inside``.
 
-    ``matlab``: its axes are in MATLAB's order, the last first.
+    ``of_matlab``: its axes are in MATLAB's order, the last first.
 
     Raises FileError when it is damaged, none or several arrays could be meant, its numbers are elsewhere, or
     h5py is not installed.
@@ -98,25 +99,18 @@ def read_hdf5(path: Path, inside: str, *, matlab: bool = False) -> Read:
         raise
     except Exception as error:  # noqa: BLE001 - a damaged file raises nearly anything
         raise FileError(path, f"is a damaged or unusual HDF5 file: {error!s:.200}.") from None
-    return _of_matlab(name, array.T) if matlab else (array, (f"the array {name} taken",))
+    return _of_matlab(name, array.T) if of_matlab else (array, (f"the array {name} taken",))
 
 
 def read_matlab(path: Path, inside: str) -> Read:
     """Read an array of a MATLAB file of version 5 to 7; as :func:`read_hdf5`."""
-    from scipy.io import loadmat, whosmat
-
-    numbers = ("double", "single", "logical", *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)))
-
-    def read(name: str) -> npt.NDArray[Any]:
-        reading.require_plausible(path, 8 * math.prod(found[name]), path.stat().st_size)
-        return np.asarray(loadmat(path, variable_names=[name])[name])
-
     try:
-        found = {name: shape for name, shape, kind in whosmat(path) if kind in numbers}
-        name, array = _chosen(path, found, inside, read)
+        found = matlab.arrays_in(path)
+        shapes = {name: array.shape for name, array in found.items()}
+        name, array = _chosen(path, shapes, inside, lambda name: matlab.read_array(path, found[name]))
     except FileError:
         raise
-    except Exception as error:  # noqa: BLE001 - a damaged file raises nearly anything
+    except (OSError, ValueError, EOFError, MemoryError, struct.error, zlib.error) as error:
         raise FileError(path, f"is a damaged or unusual MATLAB file: {error!s:.200}.") from None
     return _of_matlab(name, array)
 
