@@ -61,6 +61,9 @@ def decode(path: Path, inside: str = "") -> Decoded:
         return read_matlab(path, inside)
     if inside:
         raise FileError(path, f"is no HDF5 or MATLAB file, so that nothing in it is called {inside}.")
+    known = (b"\x93NUMPY", b"PK", *_TIFF_MAGIC, *_OPENCV_MAGIC)
+    if beginning and not beginning.startswith(known):  # before its size, which may be huge, is read
+        raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
     data = read_bytes(path)
     if data.startswith(b"\x93NUMPY"):
         return _decode_npy(path, data)
@@ -68,8 +71,6 @@ def decode(path: Path, inside: str = "") -> Decoded:
         return _decode_npz(path, data)
     if data[:4] in _TIFF_MAGIC:
         return _decode_tiff(path, data)
-    if not data.startswith(_OPENCV_MAGIC):
-        raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
     return _decode_with_opencv(path, data)
 
 

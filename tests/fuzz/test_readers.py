@@ -46,6 +46,10 @@ def test_what_claims_more_than_it_holds_is_refused_before_memory_is_taken(tmp_pa
         )
     with pytest.raises(BenchError, match="more bytes than it has"):
         read_image(claims)
+    with (sparse := tmp_path / "nothing.tif").open("wb") as file:
+        file.truncate(20 << 30)
+    with pytest.raises(BenchError, match="no image that can be read"):
+        read_image(sparse)
     bomb = tmp_path / "bomb.npz"
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.npy", "w") as member:
         for _ in range(600):
