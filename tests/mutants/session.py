@@ -25,6 +25,7 @@ from typing import Any, Literal
 
 import pytest
 
+from tests.mutants.areas import AREAS
 from tests.mutants.mutations import Mutant
 
 MOST_TESTS_S = 60.0
@@ -45,6 +46,23 @@ class Watched:
     seconds: float
     passed: bool
     lines: frozenset[Line]
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """What the tests of a file came to; the same again, as long as none of these files changes."""
+
+    files: dict[str, str]
+    """The tests' own and the modules that they reached, with their checksums; empty: not to be believed."""
+    tests: dict[str, Watched]
+
+    def holds(self) -> bool:
+        """Whether none of the files has changed."""
+        return bool(self.files) and all(_digest(file) == digest for file, digest in self.files.items())
+
+
+def _digest(file: str) -> str:
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if Path(file).is_file() else ""
 
 
 @dataclass
@@ -119,35 +137,34 @@ class Trials:
 
     # Watching ----------------------------------------------------------------------------------
     def _watch(self, session: pytest.Session) -> dict[str, Watched]:
-        kept = pickle.loads(_KEPT.read_bytes()) if _KEPT.is_file() else {}
-        changed = b"".join((self._root / module).read_bytes() for module in self._modules)
-        watched: dict[str, Watched] = {}
-        children: list[tuple[_Child, str]] = []
-        for path, group in groupby(session.items, key=lambda item: item.path):
-            items = list(group)
-            key = hashlib.sha256(changed + path.read_bytes()).hexdigest()
-            if key not in kept:
+        """Watch each test, but those of files that were watched and where nothing that they reach has changed."""
+        kept: dict[Path, _Kept] = pickle.loads(_KEPT.read_bytes()) if _KEPT.is_file() else {}
+        children: list[tuple[_Child, Path]] = []
+        groups = {path: list(items) for path, items in groupby(session.items, key=lambda item: item.path)}
+        for path, items in groups.items():
+            if path not in kept or not kept[path].holds():
                 self._wait_for(children, self._jobs - 1, kept)
-                children.append((self._fork(lambda items=items: self._watched(items), _WATCH_LIMIT_S), key))
+                children.append((self._fork(lambda items=items: self._watched(items), _WATCH_LIMIT_S), path))
         self._wait_for(children, 0, kept)
-        for path, _ in groupby(session.items, key=lambda item: item.path):
-            watched |= kept.get(hashlib.sha256(changed + path.read_bytes()).hexdigest(), {})
-        _KEPT.parent.mkdir(exist_ok=True)
-        _KEPT.write_bytes(pickle.dumps(kept))
-        return watched
+        return {name: test for path in groups for name, test in kept[path].tests.items()}
 
-    def _wait_for(self, children: list[tuple[_Child, str]], most: int, kept: dict[str, Any]) -> None:
+    def _wait_for(self, children: list[tuple[_Child, Path]], most: int, kept: dict[Path, _Kept]) -> None:
         while len(children) > most:
-            for child, key in list(children):
+            for child, path in list(children):
                 done, answer = self._done(child)
                 if done:
-                    children.remove((child, key))
-                    kept[key] = answer or {}
+                    children.remove((child, path))
+                    tests: dict[str, Watched] = answer or {}
+                    reached = {file for test in tests.values() for file, _ in test.lines}
+                    files = {str(path), *reached} if tests else set()
+                    kept[path] = _Kept({file: _digest(file) for file in files}, tests)
+                    _KEPT.parent.mkdir(exist_ok=True)  # at once: who stops this loses none of it
+                    _KEPT.write_bytes(pickle.dumps(kept))
             time.sleep(0.02)
 
     def _watched(self, items: list[pytest.Item]) -> dict[str, Watched]:
-        """Run tests one after another, and note the lines of the changed modules that each comes to."""
-        files = {str(self._root / module) for module in self._modules}
+        """Run tests one after another, and note the lines of all areas' modules that each comes to."""
+        files = {str(self._root / module) for modules, _ in AREAS.values() for module in modules}
         lines: set[Line] = set()
 
         def local(frame: FrameType, event: str, _: object) -> Any:
