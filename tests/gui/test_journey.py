@@ -101,7 +101,8 @@ def test_the_strip_names_the_next_step_and_leads_there(qtbot: QtBot, window: Mai
     assert not strip.button.isVisible()
     job.cancel()
     qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
-    job = window.session.jobs.device(EXPOSING, lambda context: context.cancel.wait(WAIT_MS / 1000), set())
+    lanes = {"camera"}
+    job = window.session.jobs.device(EXPOSING, lambda context: context.cancel.wait(WAIT_MS / 1000), lanes)
     strip.look()
     assert strip.words.toolTip() == "Auto exposure is under way …"
     assert not strip.button.isVisible()

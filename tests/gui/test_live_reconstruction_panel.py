@@ -70,10 +70,9 @@ def test_it_follows_a_stream_that_was_interrupted(
     qtbot: QtBot, window: MainWindow, panel: LiveReconstructionPanel
 ) -> None:
     qtbot.waitUntil(lambda: panel._shown is not None, timeout=WAIT_MS)
-    shown = panel._shown
+    shown, stream = panel._shown, panel.follower._stream
     job = window.session.exclusive_job("A run", lambda _: window.session.bench.snap())
     qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
-    stream = panel.follower._stream
     qtbot.waitUntil(lambda: panel.follower._stream is not stream, timeout=WAIT_MS)
     qtbot.waitUntil(lambda: panel._shown is not shown, timeout=WAIT_MS)
 
