@@ -137,7 +137,7 @@ class Trials:
 
     # Watching ----------------------------------------------------------------------------------
     def _watch(self, session: pytest.Session) -> dict[str, Watched]:
-        """Watch each test, but those of files that were watched and where nothing that they reach has changed."""
+        """Watch each test, but those whose file, and all that it reaches, is as when it was watched."""
         kept: dict[Path, _Kept] = pickle.loads(_KEPT.read_bytes()) if _KEPT.is_file() else {}
         children: list[tuple[_Child, Path]] = []
         groups = {path: list(items) for path, items in groupby(session.items, key=lambda item: item.path)}
