@@ -13,6 +13,7 @@ from drivers.frame import FrameMetadata
 from instrument.files.volumes import EVEN
 from instrument.runs.frame_array import description_of, group_of
 from instrument.runs.run import Run
+from instrument.runs.run_files import PROVENANCE, RunError
 
 TOLD = ("pixel_format", "significant_bits", "black_level", "exposure_ms", "gain", "binning", "roi")
 """Of the camera: as one value where it is that of all frames."""
@@ -67,7 +68,10 @@ def descriptions(run: Run, n_frames: int) -> tuple[dict[str, Any], dict[str, Any
         step = float(np.median(sizes)) if np.ptp(sizes) <= EVEN * sizes.min() else None
         if step is not None and steps[0] > 0 and min(run.records) == 0:  # a scale is positive
             start = first.stage_position["z_um"]
-    pitch_um = float(run.provenance["pixel_pitch_um"])
+    try:
+        pitch_um = float(run.provenance["pixel_pitch_um"])
+    except (LookupError, TypeError, ValueError):  # no log has a copy of an older run's
+        raise RunError(run.path / PROVENANCE, "is damaged: pixel_pitch_um is gone or no number.") from None
     return described, group_of(described["dimension_names"], pitch_um, run.label, step, start, more)
 
 
