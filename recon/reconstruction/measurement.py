@@ -131,12 +131,12 @@ class Measurement:
             if self.patterns is not None:
                 shape = np.shape(self.image)
                 raise InputError(
-                    f"The shape of the {name} is {np.shape(image)}, and the frames are {shape}: give a "
-                    f"number, one image {shape[1:3]} for all frames, or one for each, patterns first."
+                    f"The {name} is {np.shape(image)}, and the frames are {shape}: give a number, one image "
+                    f"{shape[1:3]} for all frames, or one for each, patterns first."
                 )
             raise InputError(
-                f"The size of the {name} is {_size(channels)} pixels and {len(channels)} channels; the "
-                f"measurement has {_size(data)} and {len(data)}."
+                f"The {name} has {_size(channels)} pixels and {len(channels)} channels; the measurement has "
+                f"{_size(data)} and {len(data)}."
             )
         return np.broadcast_to(channels, data.shape)
 

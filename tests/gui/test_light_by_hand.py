@@ -73,7 +73,10 @@ def test_a_pattern_is_not_lit_with_an_aperture_that_makes_no_sense(
     qtbot.keyClicks(leds.na, "7")
     qtbot.mouseClick(leds.pattern_buttons["Bright field"], LEFT)
     assert leds.na.property("refused")
-    assert not window.session.jobs.is_busy("led_array")
+    array = window.session.bench.led_array
+    assert array is not None
+    qtbot.waitUntil(lambda: not window.session.jobs.is_busy("led_array"), timeout=WAIT_MS)
+    assert array.pattern.is_dark
 
 
 def test_the_light_goes_off_whatever_stands_in_the_field_of_the_aperture(

