@@ -213,8 +213,9 @@ class Operation:
     def _hold(self, kind: Kind, key: str) -> _Hold:
         hold, operator = self._holds.get(kind), self.operator
         if hold is None or operator is None or operator.key != key:
-            if self._dismissed is not None and self._dismissed[0] == key:  # the call was on its way meanwhile
-                raise self._dismissed[1]
+            dismissed = self._dismissed  # which another thread may forget meanwhile
+            if dismissed is not None and dismissed[0] == key:  # the call was on its way meanwhile
+                raise dismissed[1].with_traceback(None)  # else every such call would be kept with it
             raise DeviceLostError(kind, "is not open for this program any more.", "Open it again.")
         return hold
 

@@ -218,34 +218,25 @@ _PREFIX = ".diffuserbench-scratch-"
 
 def _scratch_folder(place: Path) -> tuple[Path, int]:
     """Make a folder for volumes, locked by the handle that is returned; remove what killed programs left."""
-    with _locked(place):  # nobody looks between a folder and its lock
-        for left in place.glob(f"{_PREFIX}*"):
-            with suppress(OSError):
-                handle = os.open(left, _FOLDER)
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    shutil.rmtree(left)
-                finally:
-                    os.close(handle)
-        folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=place))
-        handle = os.open(folder, _FOLDER)
-        with suppress(OSError):  # disks that have no locks do without
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return folder, handle
-
-
-_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-
-
-@contextmanager
-def _locked(place: Path) -> Iterator[None]:
-    handle = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
+    for left in place.glob(f"{_PREFIX}*"):
         with suppress(OSError):
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
+            handle = os.open(left, _FOLDER)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(left)
+            finally:
+                os.close(handle)
+    made = Path(tempfile.mkdtemp(prefix=_UNLOCKED, dir=place))
+    handle = os.open(made, _FOLDER)
+    with suppress(OSError):  # disks that have no locks do without
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    folder = made.with_name(_PREFIX + made.name.removeprefix(_UNLOCKED))
+    return made.rename(folder), handle
+
+
+_UNLOCKED = ".diffuserbench-new-"
+"""What has no lock yet has a name that nobody looks for."""
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def _give_up(folder: Path, handle: int) -> None:

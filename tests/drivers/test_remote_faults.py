@@ -7,6 +7,7 @@ import base64
 import io
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import pairwise
@@ -32,6 +33,7 @@ from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.files.errors import BenchError
 from instrument.serve import server as serving
+from instrument.serve.operation import Operation, Operator
 from instrument.serve.server import BenchServer, Serving
 from tests.drivers.test_remote import BENCH, TOKEN
 from tests.mocks.bad_network import BadNetwork
@@ -304,6 +306,19 @@ def test_a_call_that_comes_after_the_stop_and_before_its_message_is_told_of_the_
     leds.close()
     with pytest.raises(DeviceLostError, match="is not open for this program any more"):
         server.operation.device("led_array", link._OPERATOR)
+
+
+def test_calls_that_come_after_the_stop_are_not_kept() -> None:
+    operation = Operation(parse_config(BENCH, None), lambda _: None)
+    operator = Operator("key", "somebody")
+    operation.take("led_array", operator, lambda _: None)
+    operation.stop("a hand")
+    depths = []
+    for _ in range(3):
+        with pytest.raises(StoppedError, match="STOP was pressed by a hand") as refused:
+            operation.device("led_array", "key")
+        depths.append(len(list(traceback.walk_tb(refused.value.__traceback__))))
+    assert depths == depths[:1] * 3, "what was raised again holds the calls before"
 
 
 @pytest.mark.parametrize("how", ["let_go", "drop"])

@@ -1,5 +1,7 @@
 """Whole reconstructions of volumes, from measurements not made with the reconstruction's model."""
 
+import fcntl
+import os
 import subprocess
 import sys
 import threading
@@ -318,6 +320,28 @@ def test_what_a_killed_program_left_in_the_scratch_folder_is_removed_by_the_next
     working.close()
     other.close()
     assert [path.name for path in tmp_path.iterdir()] == ["diffuserbench-results"]
+
+
+def test_a_scratch_folder_that_another_program_has_locked_is_not_waited_for(tmp_path, monkeypatch):
+    asked, flock = [], fcntl.flock
+
+    def at_once(handle, operation):
+        asked.append(operation)
+        flock(handle, operation | fcntl.LOCK_NB)
+
+    monkeypatch.setattr(memory.fcntl, "flock", at_once)
+    held = os.open(tmp_path, os.O_RDONLY)  # as a run is while it is written
+    flock(held, fcntl.LOCK_EX)
+    storage = memory.Storage(tmp_path)
+    os.close(held)
+    assert asked
+    assert all(operation & fcntl.LOCK_NB for operation in asked)
+    (left,) = tmp_path.iterdir()
+    other = memory.Storage(tmp_path)
+    assert left.exists(), "its lock is its own"
+    storage.close()
+    other.close()
+    assert not list(tmp_path.iterdir())
 
 
 def test_psfs_of_another_size_are_refused_and_saturation_is_warned_of():
