@@ -84,7 +84,8 @@ STEPS = {
     "demo display": "demo display --out displayed",
     "activity": "activity RECORD --psf psf.tif --bin 16 --out active",
 }
-"""A command of each kind; what is not here ends at once (completion), or when it is told to (gui, serve)."""
+"""Of the others completion ends at once, gui and serve when they are told to; further charts and plans are as
+those here."""
 
 
 @dataclass

@@ -125,8 +125,11 @@ def test_microsteps_are_exact(stage: ZaberStage, chain: ZaberChain) -> None:
 
 
 def test_axes_of_several_devices_move_together(stage: ZaberStage, chain: ZaberChain) -> None:
-    stage.move_to({"x_um": 6000.0, "z_um": -4000.0, "pitch_mrad": 200.0}, wait=False)
     axes = [*chain.devices[1].axes, *chain.devices[2].axes]
+    for axis in axes:
+        axis.halt()  # it stands there whatever its speed was
+        axis.speed_per_s = 600.0  # none arrives before it is looked at, however busy the machine
+    stage.move_to({"x_um": 6000.0, "z_um": -4000.0, "pitch_mrad": 200.0}, wait=False)
     assert [axis.moving for axis in axes] == [True, True, True]
     stage.stop()
     assert [axis.moving for axis in axes] == [False, False, False]

@@ -11,7 +11,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QApplication, QFileDialog
 from pytestqt.qtbot import QtBot
 
-from gui.making import take_slice
+from gui import making
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.theme import TURN, apply_theme, change_theme
 from gui.widgets.dialogues import Question
@@ -210,7 +210,8 @@ def test_a_field_that_marked_itself_is_unmarked_by_the_panel(panel: Reconstructi
     assert entry.toolTip() == tip
 
 
-def test_a_slice_ends_where_a_part_says_so() -> None:
+def test_a_slice_ends_where_a_part_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(making, "_SLICE_S", 1e6)  # no time ends it before
     parts = iter((None, TURN, None))
-    take_slice(parts)
+    making.take_slice(parts)
     assert list(parts) == [None]

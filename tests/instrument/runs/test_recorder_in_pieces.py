@@ -193,6 +193,7 @@ def test_the_newest_frame_is_had_while_the_camera_records_and_options_may_be_giv
         run = recorder.execute()
         assert recorder.newest() is None
     assert run.n_frames == 4
+    assert seen
     assert None not in seen
     with bench_with(FreeRunningCamera()) as bench:
         assert record(bench, tmp_path, RecordingOptions(n_frames=3)).n_frames == 3
