@@ -164,9 +164,10 @@ class SmoothField:
     rest : ndarray, float64, (rows, columns, 2)
         What is left of it, on the nodes of :meth:`Pose.displacement`, mask pixels.
     modes : ndarray, float64, (modes, rows, columns, 2)
-        One standard deviation of each independent error of the field (rest and all).
+        One standard deviation of each independent error of the field (rest and all); times the misfit where
+        that is above 1.
     error : ndarray, float64, (8,)
-        Standard uncertainty of ``change``.
+        Standard uncertainty of ``change``, with the sections' misfit.
     misfit : float
         Rms of the sections' shifts about the field over their uncertainties; about 1 where it is smooth.
     """
@@ -220,9 +221,12 @@ def fit_field(
             mode[..., axis] = np.tensordot(np.sqrt(max(value, 0)) * vector, at_nodes, 1)
             modes.append(mode)
     free = max(2 * int(known.sum()) - 2 * len(POWERS), 1)
+    misfit = float(np.sqrt(chi / free))
+    # Sections that lie farther from a smooth field than their noise explains are as uncertain as they lie.
+    unsure = np.array(modes) * max(misfit, 1.0)
     change, rest = split_field(field, mask_shape)
-    error = np.sqrt(np.sum([split_field(mode, mask_shape)[0] ** 2 for mode in modes], axis=0))
-    return SmoothField(change, rest, np.array(modes), error, float(np.sqrt(chi / free)))
+    error = np.sqrt(np.sum([split_field(mode, mask_shape)[0] ** 2 for mode in unsure], axis=0))
+    return SmoothField(change, rest, unsure, error, misfit)
 
 
 def split_field(

@@ -121,6 +121,20 @@ def test_a_dark_section_is_not_found_and_too_many_of_them_are_an_error():
         fit_field(SectionShifts(found.shift, error, found.amplitude), SECTIONS, MASK_SHAPE)
 
 
+def test_sections_that_scatter_more_than_their_noise_are_stated_as_uncertain():
+    """Also of shifts four times as far off as is stated, 68 % lie within one uncertainty (and not 20 %)."""
+    generator, pulls = np.random.default_rng(4), []
+    stated = np.full((len(SECTIONS), 2), 0.02)
+    for size in (1.0, 4.0):
+        of = []
+        for _ in range(200):
+            shift = generator.normal(0, size * stated)
+            field = fit_field(SectionShifts(shift, stated, np.ones(len(SECTIONS))), SECTIONS, MASK_SHAPE)
+            of.append(field.change[:2] / field.error[:2])
+        pulls.append(np.mean(np.abs(of) < 1))
+    assert pulls == pytest.approx([0.68, 0.68], abs=0.1)
+
+
 def test_shift_rotation_and_scale_leave_no_rest():
     pose = Pose(shift_x=0.5, shift_y=-0.7, roll_mrad=0.8, scale=-0.0006)
     change, rest = split_field(pose.displacement(MASK_SHAPE), MASK_SHAPE)
