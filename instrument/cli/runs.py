@@ -113,7 +113,7 @@ def resume(
     if found.todo:
         if bench is None and any(problem.name == BENCH_TOML for problem in found.files):
             with RunWriter.reopen(run, log_bytes=found.log_bytes) as writer:
-                for words in writer.mended or ():
+                for words in writer.mended:
                     typer.echo(words)
             found = look(run)
         with open_and_say(bench or run / BENCH_TOML) as opened:

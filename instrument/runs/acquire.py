@@ -173,7 +173,7 @@ def prepare_resume(
         _require_slm_images(found, plan)
         restore_camera(bench.camera, run.provenance["camera"])
         check(plan, abilities_of(bench, run.path), todo=found.todo, start=run.start)
-        writer.note("found", text="\n  ".join([str(found), *(writer.mended or ())]))
+        writer.note("found", text="\n  ".join([str(found), *writer.mended]))
     except BaseException:
         writer.close()
         raise
@@ -204,7 +204,7 @@ def settle(path: Path | str, found: Verification | None = None) -> list[str]:
     if found.is_sound and ended:
         return []
     with RunWriter.reopen(path, log_bytes=found.log_bytes) as writer:
-        words = [*(writer.mended or ()), *writer.settle({f.index: f.problem for f in found.damaged})]
+        words = [*writer.mended, *writer.settle({f.index: f.problem for f in found.damaged})]
         reason, error = FinishReason.COMPLETED, ""
         if found.is_recording and ended:
             run = Run.open(path)

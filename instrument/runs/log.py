@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import re
 import zlib
@@ -16,6 +17,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from drivers.frame import FrameMetadata
 from instrument.files.atomic import sync_folder
@@ -45,11 +48,10 @@ class FrameRecord:
         Raises ValueError when its size is no such image's.
         """
         height, width = (side // self.metadata.binning for side in self.metadata.roi[2:])
-        kinds = {1: "uint8", 2: "uint16", 4: "float32"}
-        for channels in (1, 3):
-            item, rest = divmod(self.n_bytes, max(1, height * width * channels))
-            if rest == 0 and item in kinds:
-                return (height, width) if channels == 1 else (height, width, 3), kinds[item]
+        for shape in ((height, width), (height, width, 3)):
+            for kind in ("uint8", "uint16", "float32"):
+                if 0 < self.n_bytes == math.prod(shape) * np.dtype(kind).itemsize:
+                    return shape, kind
         raise ValueError(f"{self.n_bytes} bytes are no image of {height} x {width} pixels")
 
     def to_json(self) -> dict[str, Any]:

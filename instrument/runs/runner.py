@@ -224,7 +224,7 @@ class Runner:
     @property
     def mended(self) -> tuple[str, ...]:
         """What was done to the files of a run that goes on, in words."""
-        return self._writer.mended or ()
+        return self._writer.mended
 
     @property
     def is_pausing(self) -> bool:

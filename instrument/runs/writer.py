@@ -152,12 +152,13 @@ class RunWriter:
     Attributes
     ----------
     mended : tuple of str
-        What :meth:`reopen` did to the run's files, in words; None in a new run.
+        What :meth:`reopen` did to the run's files, in words.
     """
 
     def __init__(self, path: Path, held: contextlib.ExitStack) -> None:
         self.path = path
-        self.mended: tuple[str, ...] | None = None
+        self.mended: tuple[str, ...] = ()
+        self._is_continued = False
         self._held = held
         try:
             run = Run.open(path)
@@ -241,7 +242,7 @@ class RunWriter:
                 held.close()
                 raise
             writer = cls(path, held)
-            writer.mended = tuple(mended)
+            writer.mended, writer._is_continued = tuple(mended), True
         return writer
 
     def start(self, **fields: Any) -> None:
@@ -263,7 +264,7 @@ class RunWriter:
                 array = self._array or self._make_array(frames)
                 if self._is_recording and (last := max(f.index for f in frames)) >= array.n_frames:
                     array.resize(max(last + 1, 2 * array.n_frames))
-                if self.mended is not None:
+                if self._is_continued:
                     self._keep_images(array, frames)
                 images = [(f.index, f.image.astype(np.float32) if self._float else f.image) for f in frames]
                 stored = array.write(images)

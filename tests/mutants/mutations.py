@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import ast
 import copy
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import CodeType
 
@@ -52,6 +53,7 @@ class Mutant:
     """Number of the changed node in ``ast.walk``, and of the change among those that it has."""
     choice: int
     what: str
+    """In words; with a number behind from the second of the same words in one function on."""
 
     @property
     def name(self) -> str:
@@ -73,7 +75,13 @@ def mutants_of(path: Path, root: Path) -> list[Mutant]:
     """Return every mutant of a module, in the order of its text."""
     tree = ast.parse((root / path).read_bytes())
     numbers = {id(node): number for number, node in enumerate(ast.walk(tree))}
-    return list(_walk(tree, _Place(path, numbers)))
+    times: Counter[str] = Counter()
+    found = []
+    for mutant in _walk(tree, _Place(path, numbers)):
+        times[mutant.name] += 1
+        time = times[mutant.name]
+        found.append(mutant if time == 1 else replace(mutant, what=f"{mutant.what} (time {time})"))
+    return found
 
 
 @dataclass(frozen=True)
@@ -180,12 +188,13 @@ def _changes(node: ast.AST) -> list[ast.AST]:
 def _in_words(node: ast.AST, change: ast.AST, parent: ast.AST | None) -> str:
     """Return ``was -> becomes`` with a little of what is around."""
     before, after = node, change
+    keyword = f"{parent.arg}=" if isinstance(parent, ast.keyword) else ""
     if isinstance(node, ast.If | ast.While):
         return f"if {ast.unparse(node.test)} -> if not ..."
     if isinstance(node, ast.Constant | ast.Name) and isinstance(parent, ast.expr | ast.Return | ast.Assign):
         before, after = parent, _Put(node, change).visit(_shallow(parent))
     was, becomes = (" ".join(ast.unparse(ast.fix_missing_locations(n)).split()) for n in (before, after))
-    return f"{was} -> {becomes}"
+    return f"{keyword}{was} -> {keyword}{becomes}"
 
 
 def _shallow(node: ast.AST) -> ast.AST:

@@ -24,12 +24,18 @@ class A:
 def least(values):
     assert values, 1 + 1
     return min(values) - 1.0
+
+
+def twice(values):
+    print(min(values), min(values), end=True)
 '''
 
 
 def test_mutants_of_a_text_are_the_code_that_they_say(tmp_path: Path) -> None:
     (tmp_path / "a.py").write_text(TEXT)
-    found = {mutant.what: mutant for mutant in mutants_of(Path("a.py"), tmp_path)}
+    every = mutants_of(Path("a.py"), tmp_path)
+    assert len({mutant.name for mutant in every}) == len(every)  # each can be listed as equal by itself
+    found = {mutant.what: mutant for mutant in reversed(every)}
     assert set(found) == {
         "not self.there -> self.there",
         "raise ValueError(f'{1 + 1} things') -> pass",
@@ -40,6 +46,9 @@ def test_mutants_of_a_text_are_the_code_that_they_say(tmp_path: Path) -> None:
         "min(values) - 1.0 -> min(values) + 1.0",
         "min(values) - 1.0 -> min(values) - 2.0",
         "min(values) -> max(values)",
+        "print(min(values), min(values), end=True) -> pass",
+        "min(values) -> max(values) (time 2)",
+        "end=True -> end=False",
     }
 
     def least(values: list[int]) -> float:
