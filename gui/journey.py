@@ -8,7 +8,7 @@ from pathlib import Path
 
 from drivers.frame import Frame
 from gui.session import BenchSession
-from gui.session_news import OwnFiles, name_of
+from gui.session_news import OwnFiles, names_of
 from instrument.bench.config import BenchConfig
 from instrument.bench.photograph import PHOTOGRAPHS
 from instrument.files.atomic import DOUBTFUL
@@ -81,7 +81,8 @@ class Step:
     answer : str
         On the button that leads there.
     panel : str
-        Where it is taken, of the table of panels; ``"reconnect"``: nowhere, the device is opened again.
+        Where it is taken, of the table of panels; ``"reconnect"``: nowhere, the devices in
+        ``what`` are opened again.
     what : object
         What that panel is to work with; empty: nothing.
     """
@@ -145,9 +146,11 @@ def steps_of(config: BenchConfig, facts: Facts) -> tuple[Step, ...]:
     steps = _WAYS[_way_of(config)](facts)
     if not config.devices:
         return steps
-    failed = facts.failed[0] if facts.failed else ""
-    words = f"The {name_of(failed)} failed; its chip says why." if failed else "The devices are being opened."
-    connect = Step("Connect", not failed and not facts.opening, words, "Reconnect", "reconnect", failed)
+    failed = facts.failed
+    whose = "its chip says" if len(failed) == 1 else "their chips say"
+    words = f"The {names_of(failed)} failed; {whose} why." if failed else "The devices are being opened."
+    answer = "Reconnect all" if len(failed) > 1 else "Reconnect"
+    connect = Step("Connect", not failed and not facts.opening, words, answer, "reconnect", failed)
     return (connect, *steps)
 
 

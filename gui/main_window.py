@@ -126,7 +126,8 @@ class MainWindow(QMainWindow):
     def _take_step(self, panel: str, what: object) -> None:
         """Go where the next step is taken."""
         if panel == "reconnect":
-            self.session.reconnect(what)  # type: ignore[arg-type]
+            for kind in cast(tuple[Kind, ...], what):
+                self.session.reconnect(kind)
         else:
             self._hand_on(panel, what)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeVar
 
@@ -14,8 +15,7 @@ from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobRunner, Work
 from gui.session import BenchSession
 from gui.session_news import name_of
-from gui.way_on import ReconnectButton
-from gui.widgets.building import after_rest, button, every, fill, in_row, label, mark
+from gui.widgets.building import Hint, after_rest, button, every, fill, in_row, label, mark
 from gui.widgets.dialogues import elided
 from gui.widgets.entry import Refusing
 from instrument.bench.config import Kind
@@ -89,11 +89,11 @@ class Panel(QWidget):
         for timer in self.findChildren(QTimer):
             timer.stop()
 
-    def offer_reconnect(self, kind: Kind) -> None:
-        """Have a button in the panel that opens a device again, while it has failed."""
+    def put_below(self, widget: QWidget, stretch: int = 0) -> None:
+        """Put something between ``body`` and the panel's last line."""
         own = self.layout()
         assert isinstance(own, QBoxLayout)
-        own.insertWidget(1, ReconnectButton(self.session, kind, self))
+        own.insertWidget(1, widget, stretch)
 
     # Telling the user ----------------------------------------------------------------------------
     @property
@@ -175,11 +175,17 @@ class DevicePanel(Panel):
     kind: ClassVar[Kind]
     look_ms: ClassVar[int]
 
-    def watch_device(self, state: QLabel) -> None:
-        """Begin to look at the device; while it is not open, ``state`` has why."""
+    def watch_device(self, state: QLabel, other: tuple[str, Callable[[], object]] | None = None) -> None:
+        """Begin to look at the device; while it is not open, there is only why, and the way on.
+
+        ``state`` says the same. ``other``: another way on than to reconnect, its words and what it does.
+        """
         self._state_label = state
+        again = partial(self.session.reconnect, self.kind)
+        self.closed = Hint("", f"Reconnect the {name_of(self.kind)}", again, other)
+        """In the place of ``body`` while the device is not open."""
+        self.put_below(self.closed, 1)
         self.session.device_changed.connect(self._device_changed)
-        self.offer_reconnect(self.kind)
         every(self, self.look_ms, self.look)
         self._device_changed(self.kind)
 
@@ -212,12 +218,16 @@ class DevicePanel(Panel):
             return
         is_open = self.session.is_open(kind)
         self.show_device(is_open)
+        self.body.setVisible(is_open)
+        self.closed.setVisible(not is_open)
         if not is_open:
             state, name = self.session.state(kind), name_of(kind)
             has_one = kind in self.session.kinds
-            elided(
-                self._state_label, state.text or state.condition if has_one else f"This bench has no {name}."
+            why = (
+                state.text or f"The {name} is {state.condition}." if has_one else f"This bench has no {name}."
             )
+            elided(self._state_label, why)
+            self.closed.say(why, busy=state.condition != "failed")
 
 
 def on_bench(bench: Path | None, lines: Sequence[str], imports: Imports, before: Sequence[str] = ()) -> str:

@@ -179,7 +179,7 @@ class BenchSession(QObject):
         except BusyError as error:
             self.log("warning", str(error))
             return
-        self._set_state(kind, DeviceState("opening"))
+        self._set_state(kind, DeviceState("opening", simulated=self.state(kind).simulated))
         job.ended.connect(lambda: self._tried(kind))
 
     def _open_one(self, kind: Kind) -> None:
@@ -194,7 +194,7 @@ class BenchSession(QObject):
             self._in_window(self._set_state, kind, state)
 
     def _not_opened(self, kind: str, why: str) -> None:
-        self._set_state(kind, DeviceState("failed", why))
+        self._set_state(kind, DeviceState("failed", why, self.state(kind).simulated))
         self.log("error", why)
 
     def _all_tried(self) -> None:

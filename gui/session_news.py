@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -73,6 +73,12 @@ class DeviceState:
 def name_of(kind: str) -> str:
     """Return what people call a kind of device: ``"led_array"`` is an LED array."""
     return kind.replace("_", " ").replace("led", "LED").replace("slm", "SLM")
+
+
+def names_of(kinds: Sequence[str]) -> str:
+    """Return kinds of devices as they are listed in a sentence."""
+    *others, last = [name_of(kind) for kind in kinds] or [""]
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def is_gone(device: Device, error: DeviceError) -> bool:

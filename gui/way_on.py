@@ -2,46 +2,56 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 
 from PySide6.QtCore import Signal
 from PySide6.QtWidgets import QPushButton, QWidget
 
 from gui.session import BenchSession
-from gui.session_news import name_of
+from gui.session_news import names_of
 from gui.widgets.building import button, fill
 from instrument.bench.config import Kind
 
 
 class ReconnectButton(QPushButton):
-    """Opens a device again; there while the device has failed.
+    """Opens devices again; there while one of them has failed.
 
     Parameters
     ----------
     session : BenchSession
-    kind : str
-        Of device.
+    kinds : sequence of str
+        Of devices.
     parent : QWidget
     words : str, optional
-        On it; default: with the device's name.
+        On it; default: with the names of those that failed.
     """
 
-    def __init__(self, session: BenchSession, kind: Kind, parent: QWidget, words: str = "") -> None:
-        super().__init__(words or f"Reconnect the {name_of(kind)}", parent)
-        self.setToolTip(f"Open the {name_of(kind)} again")
-        self._session, self._kind = session, kind
-        self.clicked.connect(partial(session.reconnect, kind))
+    def __init__(
+        self, session: BenchSession, kinds: Sequence[Kind], parent: QWidget, words: str = ""
+    ) -> None:
+        super().__init__(words, parent)
+        self._session, self._kinds, self._words = session, kinds, words
+        self._failed: list[Kind] = []
+        self.clicked.connect(self._reconnect)
         session.device_changed.connect(self._changed)
-        self._changed(kind)
+        self._changed()
 
-    def _changed(self, kind: str) -> None:
-        if kind == self._kind:
-            self.setVisible(self._session.state(kind).condition == "failed")
+    def _reconnect(self) -> None:
+        for kind in self._failed.copy():
+            self._session.reconnect(kind)
+
+    def _changed(self, _kind: str = "") -> None:
+        failed = [kind for kind in self._kinds if self._session.state(kind).condition == "failed"]
+        if failed and failed != self._failed:
+            self.setText(self._words or f"Reconnect the {names_of(failed)}")
+            self.setToolTip(f"Open the {names_of(failed)} again")
+        self._failed = failed
+        self.setVisible(bool(failed))
 
 
 class WayOn(QWidget):
-    """A button for each device that has failed, and one for a run that did not end.
+    """A button for the devices that have failed, and one for a run that did not end.
 
     Signals
     -------
@@ -55,9 +65,9 @@ class WayOn(QWidget):
         super().__init__(parent)
         self.run: Path | None = None
         """The run that is offered."""
-        self.reconnect = {kind: ReconnectButton(session, kind, self) for kind in session.kinds}
+        self.reconnect = ReconnectButton(session, session.kinds, self)
         self.go_on_button = button("Go on with it", clicked=lambda: self.go_on.emit(self.run))
-        fill(self, *self.reconnect.values(), self.go_on_button)
+        fill(self, self.reconnect, self.go_on_button)
         self.offer(None)
 
     def offer(self, run: Path | None, words: str = "Go on with it") -> None:

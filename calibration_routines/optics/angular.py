@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration_routines.optics.angular_response import (
     EMISSIONS,
@@ -36,12 +35,10 @@ from calibration_routines.procedure import (
     home_if_needed,
     outlook_of,
 )
-from calibration_routines.psf.analysis import DarkModel, ambient_findings, dark_model, drift_of, light_of
+from calibration_routines.psf.analysis import ambient_findings, dark_model, drift_of, images_of
 from calibration_routines.psf.sampling import Position, known, source_limits
-from calibration_routines.psf.stage_fit import Drift
 from calibration_routines.psf.sweep_options import PointSweep
-from calibration_routines.psf.sweep_plan import PSF, REFERENCE, check_sweep, expose_sweep, sweep_plan
-from calibration_routines.scatter import Scatter, pooled
+from calibration_routines.psf.sweep_plan import PSF, check_sweep, expose_sweep, sweep_plan
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, SettingsError
 from instrument.files.figures import save_figure
@@ -245,7 +242,7 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     points, dark = record.sweep.points(), dark_model(run)
     pitch_um, distance_mm = _optics(record.geometry)
     drift = drift_of(run, points, dark)
-    images, scatter = _images(run, points, dark, drift)
+    images, scatter = images_of(run, points, dark, drift)
     ambient = dark.brightening_per_ms * run.metadata(run.steps(PSF)[0]).exposure_ms / float(images[0].mean())
     findings = (*scatter.findings("picture"), *ambient_findings(ambient))
     response = analyse_angular(
@@ -273,29 +270,6 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
 def _optics(geometry: Geometry) -> list[float]:
     """Return pixel pitch and the diffuser's distance; BenchError where they are not known."""
     return known(geometry, "pixel_pitch_um", "diffuser_distance_mm", what="The angles on the sensor follow")
-
-
-# Frames to light ---------------------------------------------------------------------------------------
-def _images(
-    run: Run, points: PointSweep, dark: DarkModel, drift: Drift | None
-) -> tuple[list[npt.NDArray[np.float32]], Scatter]:
-    """Return the light of every point at the first point's exposure, drift taken out, and frames' scatter."""
-    began = run.metadata(run.steps(REFERENCE)[0]).utc if drift is not None else None
-    taken: dict[Position, list[int]] = {}
-    for step in run.steps(PSF):
-        if step.source_um is not None:
-            taken.setdefault(step.source_um, []).append(step.index)
-    reference_ms = run.metadata(taken[points.points_um[0]][0]).exposure_ms
-    images, scatters = [], []
-    for point in points.points_um:
-        exposure_ms = run.metadata(taken[point][0]).exposure_ms
-        brightness = 1.0
-        if drift is not None and began is not None:
-            brightness = drift.brightness_at((run.metadata(taken[point][0]).utc - began).total_seconds())
-        steady = light_of(run, taken[point], dark)
-        images.append(steady.mean * np.float32(reference_ms / exposure_ms / brightness))
-        scatters.append(steady.scatter)
-    return images, pooled(scatters)
 
 
 # Procedure ---------------------------------------------------------------------------------------------

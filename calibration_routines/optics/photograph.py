@@ -30,19 +30,22 @@ from calibration_routines.psf.analysis import (
     ambient_findings,
     channels_first,
     dark_model,
+    drift_of,
     full_scale,
+    images_of,
     light_frames,
-    light_of,
 )
 from calibration_routines.psf.exposure import expose_scene
 from calibration_routines.psf.psf_quality import MAX_CLIPPED, measure_psf
-from calibration_routines.psf.sweep_plan import DARK, PSF
+from calibration_routines.psf.sampling import Position
+from calibration_routines.psf.sweep_options import PointSweep
+from calibration_routines.psf.sweep_plan import DARK, sweep_plan
 from calibration_routines.scatter import STEADY, Scatter, pooled
 from instrument.bench.bench import Bench
 from instrument.files.atomic import named_by_worth
 from instrument.files.errors import SettingsError
 from instrument.files.images import write_image
-from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints, check
+from instrument.plan import OFF, Part, Plan, check
 from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
@@ -236,6 +239,8 @@ def measure_field_response(
 ) -> FieldResponse:
     """Move the source to the middle of the field's four edges and to its centre, and fit the light received.
 
+    The centre is visited before and after: light that changes evenly meanwhile is taken out.
+
     Parameters
     ----------
     bench : Bench
@@ -250,8 +255,8 @@ def measure_field_response(
         Frames a place.
 
     Raises PlanError when a place is out of reach (nothing moved); CalibrationError when the sensor's edge
-    cuts the pattern at one of the places, the light flickers too much for what was averaged, or the run ended
-    early.
+    cuts the pattern at one of the places, the light flickers too much for what was averaged, other
+    light comes, the last visit to the centre disagrees with the first, or the run ended early.
     """
     half_y, half_x = half_field_um
     places = (
@@ -261,39 +266,29 @@ def measure_field_response(
         (-half_x, 0.0, z_um),
         (0.0, -half_y, z_um),
     )
-    plan = Plan(
-        label="field response",
-        parts=(
-            Part(label=DARK, light=(OFF,), exposures_ms=(exposure_ms,), repeats=average),
-            Part(
-                label=PSF,
-                positions=SourcePoints(points_um=places),
-                light=(SOURCE,),
-                exposures_ms=(exposure_ms,),
-                repeats=average,
-                order=("position", "slm", "light", "exposure", "repeat"),
-            ),
-        ),
-    )
+    sweep = PointSweep(points_um=places, kind="field response", average=average, dark_frames=2 * average)
+    plan = sweep_plan(sweep, [exposure_ms] * len(places))
     run = completed(acquire(bench, plan, folder, on_progress=None if listener is None else listener.frame))
-    light, scatters = zip(*(_light(run, place) for place in places), strict=True)
-    steady_place = replace(pooled(scatters), motion_px=0.0)  # all light is summed, wherever it falls
-    if findings := steady_place.findings("place"):
+    dark = dark_model(run)
+    drift = drift_of(run, sweep, dark)
+    images, scatter = images_of(run, sweep, dark, drift)
+    for place, image in zip(places, images, strict=True):
+        _require_whole(image, place)
+    steady_place = replace(scatter, motion_px=0.0)  # all light is summed, wherever it falls
+    ambient = dark.brightening_per_ms * exposure_ms / max(float(images[0].mean()), 1e-9)
+    moved = () if drift is None else drift.findings
+    if findings := (*steady_place.findings("place"), *ambient_findings(ambient), *moved):
         raise CalibrationError(f"The response over the field cannot be measured: {' '.join(findings)}")
-    return fit_field_response(places, light)
+    return fit_field_response(places, [float(image.sum(dtype=np.float64)) for image in images])
 
 
-def _light(run: Run, place: tuple[float, float, float]) -> tuple[float, Scatter]:
-    indices = [step.index for step in run.steps(PSF) if step.source_um == place]
-    steady = light_of(run, indices, dark_model(run))
-    light = steady.mean
+def _require_whole(light: npt.NDArray[np.float32], place: Position) -> None:
     clipped = measure_psf(light[np.newaxis], z_um=place[2], noise=0.0).clipped
     if clipped > MAX_CLIPPED:
         raise CalibrationError(
             f"With the source at x = {place[0] / 1e3:g}, y = {place[1] / 1e3:g} mm the pattern reaches over "
             f"{clipped:.0%} of the sensor's edge, so its light cannot be measured: choose a smaller field."
         )
-    return float(light.sum(dtype=np.float64)), steady.scatter
 
 
 # Procedure -------------------------------------------------------------------------------------------

@@ -18,9 +18,10 @@ from calibration_routines.psf.psf_quality import (
     remove_low_frequencies,
     temporal_noise,
 )
+from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.stage_fit import Drift, StageFit, judge_drift, judge_points
 from calibration_routines.psf.sweep_options import PointSweep
-from calibration_routines.psf.sweep_plan import DARK, FEATURE_PX, REFERENCE
+from calibration_routines.psf.sweep_plan import DARK, FEATURE_PX, PSF, REFERENCE
 from calibration_routines.scatter import STEADY, TOLERATED, Scatter, Steadied, pooled, steadied
 from instrument.runs.run import Run
 from recon.base.blocks import block_mean
@@ -371,3 +372,25 @@ def drift_of(run: Run, sweep: PointSweep, dark: DarkModel) -> Drift | None:
         [(time - times[0]).total_seconds() for time in times],
         pooled([one.scatter for one in steady]),
     )
+
+
+def images_of(
+    run: Run, sweep: PointSweep, dark: DarkModel, drift: Drift | None
+) -> tuple[list[Float], Scatter]:
+    """Return the light of every point at the first one's exposure, without drift, and frames' scatter."""
+    began = run.metadata(run.steps(REFERENCE)[0]).utc if drift is not None else None
+    taken: dict[Position, list[int]] = {}
+    for step in run.steps(PSF):
+        if step.source_um is not None:
+            taken.setdefault(step.source_um, []).append(step.index)
+    reference_ms = run.metadata(taken[sweep.points_um[0]][0]).exposure_ms
+    images, scatters = [], []
+    for point in sweep.points_um:
+        first = run.metadata(taken[point][0])
+        brightness = 1.0
+        if drift is not None and began is not None:
+            brightness = drift.brightness_at((first.utc - began).total_seconds())
+        steady = light_of(run, taken[point], dark)
+        images.append(steady.mean * np.float32(reference_ms / first.exposure_ms / brightness))
+        scatters.append(steady.scatter)
+    return images, pooled(scatters)

@@ -16,6 +16,7 @@ from gui.jobs import Job, JobContext
 from gui.journey import EXPOSE
 from gui.panel import Panel, on_bench
 from gui.session import BenchSession
+from gui.way_on import ReconnectButton
 from gui.widgets.building import button, every, fill, in_row, label, split
 from gui.widgets.camera_controls import CameraForm, RecordBar
 from gui.widgets.entry import NumberEdit
@@ -105,7 +106,7 @@ class LivePanel(Panel):
         )
         yield
         session.device_changed.connect(self._device_changed)
-        self.offer_reconnect("camera")
+        self.put_below(ReconnectButton(session, ("camera",), self))
         every(self, _LOOK_MS, self.look).setTimerType(Qt.TimerType.PreciseTimer)
         every(self, _STATISTICS_MS, self.count)
 

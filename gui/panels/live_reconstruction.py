@@ -302,6 +302,7 @@ class LiveReconstructionPanel(Panel):
         """Show the newest picture, if it is another than the one shown."""
         self.hint.setVisible(self.loaded is None)
         self.view.setVisible(self.loaded is not None)
+        self.status.setVisible(self.loaded is not None or self._reader.is_reading)  # else the hint says it
         runs = self.run_button.isChecked() and self._refining is None and self._loading is None
         if runs and self.isVisible():
             self.follower.follow()

@@ -91,7 +91,8 @@ class LogPanel(Panel):
         cursor.insertText(f"{line.when:%H:%M:%S}  ", style)
         colour = {"error": now.error, "warning": now.warning, "debug": now.dim}.get(line.level, now.text)
         style.setForeground(QColor(colour))
-        cursor.insertText(line.text, style)
+        word = f"{line.level.upper()}: " if line.level in ("warning", "error") else ""
+        cursor.insertText(f"{word}{line.text}", style)
         if at_end:
             bar.setValue(bar.maximum())
 

@@ -119,7 +119,7 @@ class StagePanel(DevicePanel):
             pad,
             None,
         )
-        self.watch_device(self.state)
+        self.watch_device(self.state, ("Home …", self.ask_home))
 
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:

@@ -160,9 +160,9 @@ class Hint(QWidget):
         self.button = button(answer, "", lambda: clicked())
         parts: list[Part] = [self.words, in_row(None, self.button, None)]
         if other is not None:
-            quiet = button(other[0], "", lambda: other[1]())
-            quiet.setFlat(True)
-            parts.append(in_row(None, quiet, None))
+            self.other = button(other[0], "", lambda: other[1]())
+            self.other.setFlat(True)
+            parts.append(in_row(None, self.other, None))
         fill(self, None, *parts, None, margins=(16, 8, 16, 8), spacing=10)
 
     def say(self, words: str, *, busy: bool = False) -> None:

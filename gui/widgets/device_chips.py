@@ -27,7 +27,7 @@ class DeviceChips(QWidget):
             chip.setObjectName("device")
             chip.setAutoRaise(True)
             chip.clicked.connect(partial(self._show_all, kind))
-            again = ReconnectButton(session, kind, self, "Reconnect")
+            again = ReconnectButton(session, (kind,), self, "Reconnect")
             self.chips[kind], self.reconnect_buttons[kind] = chip, again
             self.show_state(kind)
         pairs = zip(self.chips.values(), self.reconnect_buttons.values(), strict=True)

@@ -172,7 +172,10 @@ class PsfTable(QWidget):
         self._least: Any = pg.InfiniteLine(angle=0, pos=MIN_SNR)
         self.plot.addItem(self._least)
         self._qualities: list[PsfQuality | None] = []
-        fill(self, split(self.table, self.plot, sizes=[220, 140], down=True))
+        self.nothing = label("No PSF yet: each is judged here as it arrives.", "hint", wraps=True)
+        self.nothing.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self._both = split(self.table, self.plot, sizes=[220, 140], down=True)
+        fill(self, (self._both, 1), (self.nothing, 1))
         self.restyle()
 
     @property
@@ -222,6 +225,8 @@ class PsfTable(QWidget):
         # A single frame without noise has no figure.
         known = [(row + 1, q) for row, q in enumerate(self._qualities) if q is not None and isfinite(q.snr)]
         self.plot.setVisible(bool(known))
+        self._both.setVisible(bool(self._qualities))
+        self.nothing.setVisible(not self._qualities)
         brushes = [pg.mkBrush(colours().warning if q.findings else colours().ok) for _, q in known]
         self._points.setData(
             [number for number, _ in known],

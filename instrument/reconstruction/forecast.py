@@ -244,9 +244,13 @@ def forecast(measurement: Measurement, calibration: Calibration, options: Recons
     beside_s = max(spent - len(records) * each / max(len(runs), 1), 0.0)
     settles = None
     if count > TRIED and options.time_s is None:
-        longest = max(runs, key=lambda run: run[-1].unrest)
+        longest, smooth = max(runs, key=lambda run: run[-1].unrest), found.background is not None
         settles = _settling(
-            measurement, calibration, options, longest, max(COPY_SHARE * count * each, COPY_S)
+            measurement,
+            calibration,
+            options if options.positive_background else replace(options, estimate_background=smooth),
+            longest,
+            max(COPY_SHARE * count * each, COPY_S),
         )
     return Forecast(beside_s, each, count, memory, options.time_s, settles)
 
@@ -275,7 +279,6 @@ def _settling(
         uncertainty=False,
         time_s=time_s,
         iterations=options.iterations or ITERATIONS,
-        estimate_background=None if options.positive_background else problem.smooth,
     )
     found = reconstruct(copy, reduced_calibration(problem.calibration, BLOCK, None), asked)
     if set(found.stop_reasons) != {StopReason.CONVERGED}:  # its number or time ended it, which tells nothing

@@ -240,7 +240,7 @@ def test_after_a_fault_the_way_on_is_a_button_where_it_happened(
     assert panel.verdict.property("refused")
     assert "left" not in panel.run_bar.words.text()
     qtbot.waitUntil(lambda: not panel.run_bar.start_button.isEnabled(), timeout=WAIT_MS)
-    again = panel.way_on.reconnect["camera"]
+    again = panel.way_on.reconnect
     qtbot.waitUntil(again.isVisible, timeout=WAIT_MS)
     world.plug_in("camera")
     press(qtbot, again)

@@ -87,3 +87,23 @@ def test_the_simulated_sensors_response_is_measured(tmp_path: Path) -> None:
             measure_field_response(bench, (7e3, 900e3), 100e3, 2.0, tmp_path)
         with pytest.raises(CalibrationError, match="choose a smaller field"):
             measure_field_response(bench, (10e3, 28e3), 100e3, 2.0, tmp_path)
+
+
+def test_a_source_that_dims_evenly_is_taken_out_of_the_response(tmp_path: Path) -> None:
+    found = []
+    for name, drift in (("steady", 0.0), ("dims", -0.6)):
+        with open_bench(parse_config(BENCH + f"drift_per_min = {drift}\n", None)) as bench:
+            assert bench.stage is not None
+            bench.stage.home()
+            response = measure_field_response(bench, (7e3, 10e3), 100e3, 2.0, tmp_path / name)
+            found.append(float(response(np.zeros(1), np.array([0.1]))[0]))
+    assert found[1] == pytest.approx(found[0], rel=0.01)
+
+
+def test_other_light_that_comes_in_meanwhile_is_refused(tmp_path: Path) -> None:
+    text = BENCH + "ambient_e_per_s = 3e5\nambient_period_s = 120\n"
+    with open_bench(parse_config(text, None)) as bench:
+        assert bench.stage is not None
+        bench.stage.home()
+        with pytest.raises(CalibrationError, match="other light"):
+            measure_field_response(bench, (7e3, 10e3), 100e3, 2.0, tmp_path)

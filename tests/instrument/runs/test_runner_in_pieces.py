@@ -45,7 +45,7 @@ def ended(monkeypatch: pytest.MonkeyPatch) -> list[FinishReason]:
 
 
 def made(bench: Bench, plan: Plan, **kind: Any) -> tuple[Runner, Any]:
-    writer = Mock(path=Path("runs/one"), mended=None)
+    writer = Mock(path=Path("runs/one"), mended=())
     return Runner(bench, plan, writer, **kind), writer
 
 
