@@ -171,7 +171,7 @@ def _read_array(folder: Path, name: str, checksums: Mapping[str, str]) -> npt.ND
 
     try:
         stored = zarr.open_array(folder / name / "0", mode="r")
-        require_plausible(folder / name, stored.nbytes, folder_bytes(folder / name))
+        require_plausible(folder / name, stored.nbytes, folder_bytes(folder / name, stored.nbytes))
         array = np.ascontiguousarray(stored[...])
     except FileError:
         raise

@@ -9,7 +9,7 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ import numpy.typing as npt
 import tifffile
 
 from instrument.files import reading
-from instrument.files.errors import FileError
+from instrument.files.errors import FileError, size
 from instrument.files.named_arrays import is_hdf5, is_matlab, ordered, read_hdf5, read_matlab
 from instrument.files.tiff_pages import open_tiff
 
@@ -28,18 +28,10 @@ _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _OPENCV_MAGIC = (_PNG_MAGIC, b"\xff\xd8", b"BM")
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
-MOST_IMAGE_BYTES = 1 << 35
-
-
-def read_bytes(path: Path) -> bytes:
-    """Return a file's content; every failure is a FileError that says what is wrong."""
-    try:
-        data = reading.read_bytes(path, MOST_IMAGE_BYTES)
-    except FileNotFoundError:
-        raise FileError(path, "there is no such file.") from None
-    if not data:
-        raise FileError(path, "is empty (0 bytes).")
-    return data
+_MOST_BYTES = 1 << 35
+_MOST_PICTURE_BYTES = 1 << 28
+"""Of a PNG, JPEG or BMP."""
+_MOST_HEADER, _MOST_LISTING = 1 << 16, 1 << 20
 
 
 def decode(path: Path, inside: str = "") -> Decoded:
@@ -50,11 +42,13 @@ def decode(path: Path, inside: str = "") -> Decoded:
     Raises FileError.
     """
     try:
-        reading.require_file(path, MOST_IMAGE_BYTES)
+        n_bytes = reading.require_file(path, _MOST_BYTES)
         with path.open("rb") as file:
             beginning = file.read(1024)
     except FileNotFoundError:
         raise FileError(path, "there is no such file.") from None
+    if not n_bytes:
+        raise FileError(path, "is empty (0 bytes).")
     if is_hdf5(beginning):
         return read_hdf5(path, inside, of_matlab=beginning.startswith(b"MATLAB"))
     if is_matlab(beginning):
@@ -64,46 +58,88 @@ def decode(path: Path, inside: str = "") -> Decoded:
     known = (b"\x93NUMPY", b"PK", *_TIFF_MAGIC, *_OPENCV_MAGIC)
     if beginning and not beginning.startswith(known):  # before its size, which may be huge, is read
         raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
-    data = read_bytes(path)
-    if data.startswith(b"\x93NUMPY"):
-        return _decode_npy(path, data)
-    if data.startswith(b"PK"):
-        return _decode_npz(path, data)
-    if data[:4] in _TIFF_MAGIC:
-        return _decode_tiff(path, data)
-    return _decode_with_opencv(path, data)
+    if beginning.startswith(b"\x93NUMPY"):
+        require_npy(path)
+        with path.open("rb") as file:
+            return _decode_npy(path, file, n_bytes)
+    if beginning.startswith(b"PK"):
+        return _decode_npz(path)
+    if beginning[:4] in _TIFF_MAGIC:
+        return _decode_tiff(path)
+    return _decode_with_opencv(path, reading.read_bytes(path, _MOST_PICTURE_BYTES))
 
 
-def _decode_npy(path: Path, data: bytes) -> Decoded:
+def require_npy(path: Path) -> None:
+    """Refuse an array of NumPy's that is damaged, or says to be far more than its file holds.
+
+    Raises FileError.
+    """
+    n_bytes = reading.require_file(path)
+    with path.open("rb") as file:
+        promised = _npy_bytes(path, file, n_bytes)
+    reading.require_plausible(path, promised, reading.stored_bytes(path))
+
+
+def _npy_bytes(path: Path, file: IO[bytes], n_bytes: int) -> int:
+    """Read a .npy header; return the bytes of the numbers that it says follow in the file's ``n_bytes``."""
     try:
-        file = io.BytesIO(data)
         version = np.lib.format.read_magic(file)
+        length = file.read(2 if version == (1, 0) else 4)
+        if int.from_bytes(length, "little") > _MOST_HEADER:
+            raise ValueError("its header has no end")
+        header = io.BytesIO(length + file.read(int.from_bytes(length, "little")))
         read = (
             np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         )
-        shape, _, dtype = read(file)
-        if math.prod(shape) * dtype.itemsize > len(data) - file.tell():
+        shape, _, dtype = read(header)
+        promised = int(math.prod(shape) * dtype.itemsize)
+        if promised > n_bytes - 8 - header.tell():
             raise ValueError(f"it says {dtype} {shape}, which are more bytes than it has")
-        array: npt.NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
     except Exception as error:  # noqa: BLE001 - the header is Python text, whose parser raises nearly anything
+        raise FileError(path, f"is damaged or no plain .npy array: {error!s:.200}.") from None
+    return promised
+
+
+def _decode_npy(path: Path, file: IO[bytes], n_bytes: int) -> Decoded:
+    _npy_bytes(path, file, n_bytes)
+    file.seek(0)
+    try:
+        array: npt.NDArray[Any] = np.load(file, allow_pickle=False)
+    except Exception as error:  # noqa: BLE001 - as above
         raise FileError(path, f"is damaged or no plain .npy array: {error!s:.200}.") from None
     return array, ()
 
 
-def _decode_npz(path: Path, data: bytes) -> Decoded:
+def _require_listing(path: Path) -> None:
+    """Refuse an archive whose list of members, which is read as a whole, is no list of one."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - (1 << 16) - 200))
+        tail = file.read()
+    places = ((tail.rfind(b"PK\5\6"), 12, 4), (tail.rfind(b"PK\6\6"), 40, 8))
+    for at, field, width in places:
+        listed = int.from_bytes(tail[at + field : at + field + width], "little")
+        if at >= 0 and _MOST_LISTING < listed != 0xFFFFFFFF:
+            raise FileError(path, f"is a damaged .npz: its list of members has {size(listed)}.")
+
+
+def _decode_npz(path: Path) -> Decoded:
+    _require_listing(path)
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
             if len(members) != 1:
                 listed = ", ".join(member.filename.removesuffix(".npy") for member in members[:8]) or "none"
                 raise FileError(path, f"holds {len(members)} arrays ({listed}); one image is expected.")
             said = members[0].file_size
-            reading.require_plausible(path, said, len(data))
+            reading.require_plausible(path, said, reading.stored_bytes(path))
+            with archive.open(members[0]) as member:
+                if _npy_bytes(path, member, said) + _MOST_HEADER < said:
+                    raise FileError(path, f"is damaged: its array has not the {size(said)} that it says.")
             with archive.open(members[0]) as member:
                 content = member.read(said + 1)
             if len(content) > said:
                 raise FileError(path, "is damaged: it holds more than it says.")
-            return _decode_npy(path, content)
+            return _decode_npy(path, io.BytesIO(content), said)
     except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise FileError(path, f"is no .npz with one plain array: {error}.") from None
     except (NotImplementedError, RuntimeError) as error:  # another compression, a password
@@ -114,22 +150,22 @@ _WHOLE_BYTES = (1, 8, 16, 32, 64)
 _ORIENTATION = 274
 
 
-def _decode_tiff(path: Path, data: bytes) -> Decoded:
+def _decode_tiff(path: Path) -> Decoded:
     try:
-        with open_tiff(path, data) as tiff:
+        with open_tiff(path) as tiff:
             if not tiff.series:
                 raise FileError(path, "is a TIFF without an image.")
             series = tiff.series[0]
-            reading.require_plausible(path, series.size * series.dtype.itemsize, len(data))
+            reading.require_plausible(path, series.size * series.dtype.itemsize, reading.stored_bytes(path))
             page: Any = series.keyframe
             _require_parts(path, series)
             notes = []
             if page.photometric == tifffile.PHOTOMETRIC.PALETTE:
-                return _decode_with_opencv(path, data)
+                return _decode_with_opencv(path, reading.read_bytes(path, _MOST_PICTURE_BYTES))
             if page.bitspersample in _WHOLE_BYTES:
                 array = series.asarray()
             else:
-                array = _unpacked(path, series, data)
+                array = _unpacked(path, series, tiff.filehandle)
                 notes.append(f"{page.bitspersample}-bit pixels unpacked")
             if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE and array.dtype.kind == "u":
                 array = (1 << page.bitspersample) - 1 - array if page.bitspersample < 16 else ~array
@@ -146,7 +182,7 @@ def _decode_tiff(path: Path, data: bytes) -> Decoded:
         raise
     except Exception as error:  # noqa: BLE001 - a damaged TIFF raises nearly anything
         if "imagecodecs" in str(error):  # a compression that only OpenCV knows here
-            return _decode_with_opencv(path, data)
+            return _decode_with_opencv(path, reading.read_bytes(path, _MOST_PICTURE_BYTES))
         raise FileError(path, f"is a damaged or unusual TIFF: {error}.") from None
 
 
@@ -161,7 +197,7 @@ def _require_parts(path: Path, series: Any) -> None:
             )
 
 
-def _unpacked(path: Path, series: Any, data: bytes) -> npt.NDArray[np.uint16]:
+def _unpacked(path: Path, series: Any, file: Any) -> npt.NDArray[np.uint16]:
     """Return pixels of 2 to 15 bits that stand without gaps, the highest bit first, rows at whole bytes."""
     page = series.keyframe
     bits, fill = int(page.bitspersample), page.tags.valueof("FillOrder", 1)
@@ -175,8 +211,10 @@ def _unpacked(path: Path, series: Any, data: bytes) -> npt.NDArray[np.uint16]:
     row_bytes = -(-values * bits // 8)
     pages = []
     for one in series.pages:
-        parts = zip(one.dataoffsets, one.databytecounts, strict=True)
-        packed = b"".join(data[offset : offset + count] for offset, count in parts)
+        packed = b""
+        for offset, count in zip(one.dataoffsets, one.databytecounts, strict=True):
+            file.seek(offset)
+            packed += file.read(min(count, page.imagelength * row_bytes))
         rows = np.frombuffer(packed, np.uint8, page.imagelength * row_bytes).reshape(-1, row_bytes)
         pixels = np.unpackbits(rows, axis=1)[:, : values * bits].reshape(len(rows), values, bits)
         filled = np.pad(pixels, ((0, 0), (0, 0), (16 - bits, 0)))
@@ -196,7 +234,7 @@ def _upright(array: npt.NDArray[Any], orientation: int, axes: str) -> npt.NDArra
 
 def _decode_with_opencv(path: Path, data: bytes) -> Decoded:
     if data[:4] in _TIFF_MAGIC:
-        _refuse_odd_bits(path, data)
+        _refuse_odd_bits(path)
     if data.startswith(_PNG_MAGIC) and not _png_is_whole(data):
         raise FileError(path, "is a damaged PNG: its parts are longer than the file, or out of order.")
     shape = _shape_by_header(data)
@@ -218,9 +256,9 @@ def _decode_with_opencv(path: Path, data: bytes) -> Decoded:
     return array, lossy
 
 
-def _refuse_odd_bits(path: Path, data: bytes) -> None:
+def _refuse_odd_bits(path: Path) -> None:
     """OpenCV stretches pixels of 9 to 15 bits to 16 without a word."""
-    with open_tiff(path, data) as tiff:
+    with open_tiff(path) as tiff:
         bits = tiff.pages.first.bitspersample
     if bits not in _WHOLE_BYTES:
         raise FileError(

@@ -27,6 +27,8 @@ _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8
 _NUMBERS = range(6, 16)
 """Classes of arrays that are numbers: double, single, and integers of 8 to 64 bits."""
 _COMPLEX = 0x800
+_PIECE = 1 << 20
+_MOST_PARTS = 10_000
 _DESCRIPTION = 1 << 16
 """Bytes of a compressed array in which its shape and name stand."""
 
@@ -77,7 +79,7 @@ def read_array(path: Path, array: MatlabArray) -> npt.NDArray[Any]:
     """
     parts = 2 if array.is_complex else 1
     most = parts * 8 * math.prod(array.shape)
-    reading.require_plausible(path, most, path.stat().st_size)
+    reading.require_plausible(path, most, reading.stored_bytes(path))
     with path.open("rb") as file:
         order = _order(file)
         with _matrix(file, order, array.element, _DESCRIPTION + most) as content:
@@ -105,12 +107,15 @@ def _order(file: IO[bytes]) -> str:
 
 
 def _elements(file: IO[bytes], order: str, at: int, end: int) -> Iterator[_Element]:
-    while at + 8 <= end:
+    for _ in range(_MOST_PARTS):
+        if at + 8 > end:
+            return
         element = _element(file, order, at)
         if element.at + element.n_bytes > end:
             raise EOFError(f"it ends within a part of {element.n_bytes} bytes")
         yield element
         at = element.after
+    raise ValueError(f"it has more than {_MOST_PARTS} parts")
 
 
 def _element(file: IO[bytes], order: str, at: int) -> _Element:
@@ -140,7 +145,11 @@ def _matrix(file: IO[bytes], order: str, element: _Element, most: int) -> IO[byt
     """Return what an array consists of, or the first ``most`` bytes of it; empty when it is none."""
     if element.kind == _MATRIX:
         return io.BytesIO(_data(file, element._replace(n_bytes=min(element.n_bytes, most))))
-    content = zlib.decompressobj().decompress(_data(file, element), most)
+    packed, content, left = zlib.decompressobj(), b"", element.n_bytes
+    file.seek(element.at)
+    while len(content) < most and left > 0 and not packed.eof and (piece := file.read(min(left, _PIECE))):
+        content += packed.decompress(piece, most - len(content))
+        left -= len(piece)
     inner = _element(io.BytesIO(content), order, 0)
     return io.BytesIO(content[inner.at :] if inner.kind == _MATRIX else b"")
 

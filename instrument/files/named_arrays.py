@@ -88,7 +88,7 @@ def read_hdf5(path: Path, inside: str, *, of_matlab: bool = False) -> Read:
             raise FileError(
                 path, f"keeps the numbers of {name} in other files.", "Copy them into one file (h5repack)."
             )
-        reading.require_plausible(path, file[name].nbytes, path.stat().st_size)
+        reading.require_plausible(path, file[name].nbytes, reading.stored_bytes(path))
         return np.asarray(file[name][()])
 
     try:
@@ -164,7 +164,7 @@ def read_zarr(folder: Path) -> Read:
                 z = axes.index("z")
                 notes.append(f"planes every {scales[z]:g} {units[z] or 'of no unit'} as it says")
             group = group[facts["datasets"][0]["path"]]
-        reading.require_plausible(folder, group.nbytes, reading.folder_bytes(folder))
+        reading.require_plausible(folder, group.nbytes, reading.folder_bytes(folder, group.nbytes))
         array = np.asarray(group[...])
     except FileError:
         raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import stat
 import tomllib
 from pathlib import Path
@@ -10,9 +11,12 @@ from typing import Any
 
 from instrument.files.errors import FileError, os_reason, size
 
-MOST_TEXT_BYTES = 1 << 27
+MOST_TEXT_BYTES = 48 << 20
 """Records, plans, configurations: a plan of 100,000 named positions has 20 MB."""
-
+_MOST_JSON_VALUES = 3_000_000
+_MOST_TOML_BYTES = 3 << 19
+"""Read at a megabyte a second."""
+_MOST_KEY_PARTS = 64
 
 _GROWTH_BYTES = 1 << 22
 """A file may grow while it is read, and those of /proc have no size before."""
@@ -59,7 +63,7 @@ def _too_large(n_bytes: int, most: int) -> str:
     return f"has {size(n_bytes)}; a file of this kind has at most {size(most)}."
 
 
-_SMALL_BYTES = 1 << 29
+_SMALL_BYTES = 1 << 27
 _MOST_EXPANSION = 200
 """No photograph shrinks so much when it is compressed; a bomb or a damaged header does."""
 
@@ -84,13 +88,38 @@ def require_plausible(
         )
 
 
-def folder_bytes(folder: Path) -> int:
-    """Return the size of all files in a folder and below."""
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+def stored_bytes(path: Path) -> int:
+    """Return the bytes that a file has on its disk, as far as that tells: a hollow one has few."""
+    found = path.stat()
+    return min(found.st_size, 512 * (getattr(found, "st_blocks", 0) or found.st_size))
+
+
+def folder_bytes(folder: Path, n_bytes: int | None = None, *, error: type[FileError] = FileError) -> int:
+    """Return the stored bytes of all files in a folder and below.
+
+    With ``n_bytes``, those of its array's numbers, a file that is larger than they could be is refused.
+    """
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    for file in files if n_bytes is not None else ():
+        if file.stat().st_size > 2 * (n_bytes or 0) + MOST_TEXT_BYTES:
+            raise error(
+                file, f"has {size(file.stat().st_size)}, for numbers of {size(n_bytes or 0)}: damaged."
+            )
+    return sum(map(stored_bytes, files))
+
+
+_PART = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
+_LONG_KEY = re.compile(rf"(?:\.[ \t]*{_PART}[ \t]*){{{_MOST_KEY_PARTS}}}")
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return what TOML says; raises ValueError for all that is none, nested without end too."""
+    """Return what TOML says; raises ValueError for all that is none, nested without end or huge too."""
+    if len(text) > _MOST_TOML_BYTES:
+        raise ValueError(
+            f"it has {size(len(text))}; TOML has at most {size(_MOST_TOML_BYTES)}, JSON may have more"
+        )
+    if _LONG_KEY.search(text):  # the time and memory for a key grow with the square of its parts
+        raise ValueError(f"it has a key of more than {_MOST_KEY_PARTS} parts")
     try:
         return tomllib.loads(text)
     except RecursionError:
@@ -98,7 +127,11 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return what JSON text says; raises ValueError for all that is none, nested without end too."""
+    """Return what JSON text says; raises ValueError for all that is none, nested without end or huge too."""
+    if len(text) > _MOST_JSON_VALUES:
+        marks = text.count if isinstance(text, str) else lambda mark: text.count(mark.encode())
+        if sum(map(marks, ",[{")) > _MOST_JSON_VALUES:
+            raise ValueError(f"it has more than {_MOST_JSON_VALUES} values")
     try:
         return json.loads(text)
     except RecursionError:

@@ -16,17 +16,24 @@ _ORDERS = {b"II": "<", b"MM": ">"}
 _CLASSIC, _BIG = 42, 43
 
 
-def open_tiff(path: Path, data: bytes | None = None) -> tifffile.TiffFile:
-    """Open a TIFF, or what was read of it.
+_MOST_PAGES = 30_000
 
-    Raises FileError when its pages never end; as ``tifffile.TiffFile`` when it is damaged otherwise.
+
+def open_tiff(path: Path) -> tifffile.TiffFile:
+    """Open a TIFF.
+
+    Raises FileError when its pages never end, or are beyond counting; as ``tifffile.TiffFile`` when it is
+    damaged otherwise.
     """
     import tifffile
 
-    with path.open("rb") if data is None else io.BytesIO(data) as file:
+    with path.open("rb") as file:
         if _goes_round(file):
-            raise FileError(path, "is a damaged TIFF: its pages follow one another in a circle.")
-    return tifffile.TiffFile(path if data is None else io.BytesIO(data))
+            raise FileError(
+                path,
+                f"is a damaged TIFF: its pages follow one another in a circle, or are over {_MOST_PAGES}.",
+            )
+    return tifffile.TiffFile(path)
 
 
 def _goes_round(file: IO[bytes]) -> bool:
@@ -42,7 +49,7 @@ def _goes_round(file: IO[bytes]) -> bool:
         elif version != _CLASSIC:
             return False
         while place := _number(file, order + offset):
-            if place in seen:
+            if place in seen or len(seen) > _MOST_PAGES:
                 return True
             seen.add(place)
             file.seek(place)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import whole_file, whole_folder
 from instrument.files.errors import FileError
-from instrument.files.reading import folder_bytes, require_file, require_plausible
+from instrument.files.reading import folder_bytes, require_file, require_plausible, stored_bytes
 from instrument.files.tiff_pages import open_tiff
 
 if TYPE_CHECKING:
@@ -461,9 +461,11 @@ def _open_zarr(path: Path) -> VolumeSource:
         facts = group.attrs.get("diffuserbench")
         arrays = [group[dataset["path"]] for dataset in multiscale["datasets"]]
         for array in arrays:
-            require_plausible(path, array.nbytes, folder_bytes(path), small=_SPARSE_BYTES)
+            stored = folder_bytes(path, arrays[0].nbytes)
+            require_plausible(path, array.nbytes, stored, small=_SPARSE_BYTES)
             if len(array.shape) != len(names) or 0 in array.shape:
                 raise FileError(path, f"holds an array of shape {array.shape} for {len(names)} axes.")
+            require_plausible(path, array.nbytes // array.shape[-3], stored)  # a plane
     except FileError:
         raise
     except Exception as error:
@@ -483,10 +485,14 @@ def _open_zarr(path: Path) -> VolumeSource:
 
 
 def _open_npy(path: Path) -> VolumeSource:
+    from instrument.files.decoding import require_npy
+
     try:
-        require_file(path)
+        require_npy(path)
         return volume_in_memory(np.load(path, mmap_mode="r", allow_pickle=False), path)
     except Exception as error:
+        if isinstance(error, FileError):
+            raise
         raise FileError(path, f"is no plain .npy array: {error}.") from error
 
 
@@ -496,10 +502,10 @@ def _open_tiff(path: Path) -> VolumeSource:
 
     tiff = None
     try:
-        stored = require_file(path)
+        require_file(path)
         tiff = open_tiff(path)
         series: Any = tiff.series[0]
-        require_plausible(path, series.size * series.dtype.itemsize, stored)
+        require_plausible(path, series.size * series.dtype.itemsize, stored_bytes(path))
     except FileError:
         if tiff is not None:
             tiff.close()

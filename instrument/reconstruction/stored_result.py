@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import refuse_input, whole_file
 from instrument.files.calibration_file import load_calibration, save_calibration
+from instrument.files.decoding import require_npy
 from instrument.files.errors import FileError, size
 from instrument.files.images import read_image, write_image
 from instrument.files.orientation import AS_IT_IS, Orientation
@@ -330,7 +331,7 @@ def _is_volume(path: Path, record: Mapping[str, Any]) -> bool:
             return False  # reading it as an image then says what is wrong
     if path.suffix.lower() == ".npy":
         try:
-            require_file(path)
+            require_npy(path)
             shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
         except Exception:  # noqa: BLE001 - a damaged header raises nearly anything
             return False

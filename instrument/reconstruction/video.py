@@ -206,6 +206,7 @@ def finish_video(prepared: PreparedVideo) -> list[Path]:
     """
     request, plan = prepared.request, prepared.job.plan
     pictures = VideoPictures(request.out)
+    pictures.remove_litter()
     written = [request.out]
     if request.video.film:
         chosen = np.unique(np.linspace(0, len(plan.frames) - 1, SAMPLES).round().astype(int))

@@ -181,6 +181,11 @@ class VideoPictures:
         with self._file(index).open("rb") as written:
             os.fsync(written.fileno())
 
+    def remove_litter(self) -> None:
+        """Remove what killed programs had begun to write; nobody may be writing now."""
+        for begun in self.path.rglob("*.partial"):  # zarr's own name for it
+            begun.unlink(missing_ok=True)
+
     def _file(self, index: int) -> Path:
         return self.path / "0" / "c" / "/".join(map(str, (index, *(0,) * (self.array.ndim - 1))))
 

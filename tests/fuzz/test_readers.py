@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import os
+import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -12,7 +15,7 @@ import pytest
 from instrument.bench.config_file import load_config
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image, write_image
-from instrument.files.volumes import open_volume
+from instrument.files.volumes import ome_attributes, open_volume
 from instrument.plan.model import load_plan
 from instrument.reconstruction.stored_result import open_result
 from tests.fuzz.__main__ import CORPUS, fuzz
@@ -66,3 +69,112 @@ def test_what_claims_more_than_it_holds_is_refused_before_memory_is_taken(tmp_pa
     (tmp_path / "a.png").write_bytes(png)
     with pytest.raises(BenchError, match="made to fill the memory"):
         read_image(tmp_path / "a.png")
+
+
+def hollow(path: Path, beginning: bytes, n_bytes: int = 20 << 30) -> Path:
+    """Write a file that begins as told and goes on with zeros that take no room on the disk."""
+    with path.open("wb") as file:
+        file.write(beginning)
+        file.truncate(n_bytes)
+    return path
+
+
+def npy_header(*shape: int) -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<u2", "fortran_order": False, "shape": shape})
+    return file.getvalue()
+
+
+MATLAB = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H2s", 0x100, b"IM")
+STORED = struct.pack("<10I", 6, 8, 6, 0, 5, 8, 31000, 31000, 0x10001, 97) + struct.pack(
+    "<II", 4, 2 * 31000**2
+)
+GIANTS = {
+    "a.npy": npy_header(100_000, 100_000),
+    "long.npy": b"\x93NUMPY\2\0\xff\xff\xff\xee",
+    "a.tif": b"II*\0",
+    "a.png": b"\x89PNG\r\n\x1a\n",
+    "a.jpg": b"\xff\xd8\xff",
+    "a.bmp": b"BM",
+    "a.npz": b"PK\3\4",
+    "listing.npz": b"PK\3\4",
+    "stored.mat": MATLAB + struct.pack("<II", 14, len(STORED) + 2 * 31000**2) + STORED,
+    "packed.mat": MATLAB + struct.pack("<II", 15, 4_000_000_000),
+}
+
+
+@pytest.mark.parametrize("name", GIANTS)
+def test_a_file_of_gigabytes_with_a_right_beginning_is_refused_unread(tmp_path: Path, name: str) -> None:
+    path = hollow(tmp_path / name, GIANTS[name])
+    if name == "listing.npz":
+        with path.open("ab") as file:
+            file.write(struct.pack("<IHHHHIIH", 0x06054B50, 0, 0, 1, 1, 4_000_000_000, 0, 0))
+    tracemalloc.start()
+    try:
+        with pytest.raises(BenchError) as caught:
+            read_image(path)
+        assert tracemalloc.get_traced_memory()[1] < 16 << 20
+    finally:
+        tracemalloc.stop()
+    assert "\n" not in str(caught.value)
+    if name.endswith((".npy", ".tif")):
+        with pytest.raises(BenchError):
+            open_volume(path)
+
+
+def test_what_follows_an_image_is_not_read(tmp_path: Path) -> None:
+    for suffix in (".tif", ".npy"):
+        path = tmp_path / f"a{suffix}"
+        write_image(path, np.arange(12, dtype=np.uint16).reshape(3, 4))
+        with path.open("r+b") as file:
+            file.truncate(20 << 30)
+        assert read_image(path).pixels.sum() == 66
+
+
+def test_volumes_of_nothing_and_chunks_of_gigabytes_are_refused(tmp_path: Path) -> None:
+    import zarr
+
+    for name, side in (("empty", 44_000), ("large", 10)):
+        folder = tmp_path / f"{name}.ome.zarr"
+        group = zarr.open_group(folder, mode="w", zarr_format=3)
+        group.create_array("0", shape=(1, side, side), dtype="float32", chunks=(1, side, side))
+        group.attrs["ome"] = ome_attributes(name, "zyx", {})
+    (tmp_path / "large.ome.zarr/0/c/0/0").mkdir(parents=True)
+    hollow(tmp_path / "large.ome.zarr/0/c/0/0/0", b"")
+    for name, words in (("empty", "made to fill the memory"), ("large", "for numbers of 400 bytes: damaged")):
+        for read in (open_volume, read_image):
+            with pytest.raises(BenchError, match=words):
+                read(tmp_path / f"{name}.ome.zarr")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (".".join(["a"] * 5000) + " = 1", "a key of more than 64 parts"),
+        ("[" + " . ".join(['"a"'] * 5000) + "]", "a key of more than 64 parts"),
+        ("#\n" * 1_000_000, "TOML has at most 1.57 MB"),
+    ],
+)
+def test_toml_that_would_take_minutes_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text(text)
+    for read in (load_config, load_plan):
+        with pytest.raises(BenchError, match=words):
+            read(path)
+
+
+def test_json_of_more_values_than_memory_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text("[" + "[]," * 2_000_000 + "0]")
+    with pytest.raises(BenchError, match="more than 3000000 values"):
+        load_plan(path)
+    with pytest.raises(BenchError, match="at most 50"):
+        load_plan(hollow(tmp_path / "b.json", b"{"))
+
+
+def test_a_log_of_gigabytes_of_nothing_is_refused(tmp_path: Path) -> None:
+    run = READERS["run"].make(tmp_path)
+    with (run / "log.jsonl").open("r+b") as file:
+        file.truncate(20 << 30)
+    with pytest.raises(BenchError, match=r"log.jsonl: says that it holds 21.5 GB"):
+        READERS["run"].read(run)

@@ -123,6 +123,54 @@ def test_programs_know_of_each_other_whatever_folder_for_temporary_files_they_ha
     Claim(resource, "stage").release()  # what a killed program leaves keeps nobody out
 
 
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root can become another user")
+@pytest.mark.parametrize("first_is_other", [True, False])
+def test_two_users_exclude_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first_is_other: bool
+) -> None:
+    """In the machine's own folder of locks, each with its own ``TMPDIR``, whoever made the lock's file."""
+    monkeypatch.delenv(PLACE_VARIABLE)
+    resource = f"port of two users {secrets.token_hex(8)}"
+    nobody = 65534
+    code = f"import sys; sys.path.insert(0, {str(ROOT)!r})\nimport os, encodings.idna, socket\n" + (
+        "from drivers.registry.claim import Claim, DeviceBusyError\n"
+        f"os.setgid({nobody}); os.setuid({nobody})\n"
+        "try:\n    claim = Claim(sys.argv[1], 'stage')\nexcept DeviceBusyError as error:\n"
+        "    print(error, flush=True)\nelse:\n    print('held', flush=True)\n    sys.stdin.read()\n"
+    )
+
+    def other() -> tuple[subprocess.Popen[str], str]:
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, resource],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "TMPDIR": str(tmp_path)},
+        )
+        assert process.stdout is not None
+        return process, process.stdout.readline()
+
+    if first_is_other:
+        holder, said = other()
+        try:
+            assert said == "held\n"
+            with pytest.raises(DeviceBusyError, match=f"process {holder.pid}"):
+                Claim(resource, "stage")
+        finally:
+            holder.kill()
+            holder.communicate()
+        Claim(resource, "stage").release()  # what a killed program of somebody else leaves keeps nobody out
+    else:
+        claim = Claim(resource, "stage")
+        process, said = other()
+        process.communicate()
+        assert f"process {os.getpid()}" in said
+        claim.release()
+        process, said = other()  # the file is still the first one's
+        process.communicate()
+        assert said == "held\n"
+
+
 def test_who_holds_a_device_is_said_when_it_is_a_child_of_a_program_that_ended_or_elsewhere(
     tmp_path: Path,
 ) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import threading
+from concurrent.futures import Future, wait
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +18,7 @@ from instrument.files.atomic import check_writable, output_folder, require_new
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
 from instrument.plan import Part, Plan
-from instrument.runs import inspection, writer
+from instrument.runs import frame_array, inspection, writer
 from instrument.runs.frame_array import FrameArray, SyncPool, description_of
 from instrument.runs.inspection import contact_sheet, summary, verify
 from instrument.runs.log import Gap
@@ -62,6 +63,25 @@ def test_every_file_is_synced_and_the_first_failure_is_raised(tmp_path: Path) ->
     finally:
         file.close()
         pool.close()
+
+
+def test_after_ctrl_c_too_every_file_has_been_tried_before_it_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[int] = []
+
+    def interrupted(tasks: list[Future[None]]) -> None:
+        waits.append(len(tasks))
+        if len(waits) == 1:
+            raise KeyboardInterrupt
+        wait(tasks)
+
+    monkeypatch.setattr(frame_array, "wait", interrupted)
+    pool = SyncPool(2)
+    with pytest.raises(KeyboardInterrupt):
+        pool.folders([tmp_path] * 3)
+    pool.close()
+    assert waits == [3, 3]
 
 
 @pytest.mark.parametrize(

@@ -188,9 +188,13 @@ def test_a_kill_between_pictures_and_mark_loses_nothing(
         patch.setattr("instrument.reconstruction.video_job.VideoJob.mark_done", die)
         with pytest.raises(KilledError):
             block_module.solve_block(str(prepared.job.folder), str(wanted.out), 1)
+    frame = next(path for path in (wanted.out / "0/c").rglob("0") if path.is_file())
+    begun = frame.with_name("0.1234.partial")  # as zarr leaves it when it is killed within a picture
+    begun.touch()
     reports = solved(wanted)
     assert sorted((r.block, r.solved, r.written) for r in reports) == [(0, 4, 4), (1, 3, 0), (2, 3, 3)]
     assert_same(pictures(tmp_path), pictures(video))
+    assert not begun.exists()
 
 
 def test_other_settings_do_not_go_on_and_finished_videos_stay(
