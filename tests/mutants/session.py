@@ -16,7 +16,7 @@ import tempfile
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -56,9 +56,10 @@ class _Kept:
     """The tests' own and the modules that they reached, with their checksums; empty: not to be believed."""
     tests: dict[str, Watched]
 
-    def holds(self) -> bool:
-        """Whether none of the files has changed."""
-        return bool(self.files) and all(_digest(file) == digest for file, digest in self.files.items())
+    def holds(self, names: Collection[str]) -> bool:
+        """Whether none of the files has changed, and these tests are those that were watched."""
+        same = all(_digest(file) == digest for file, digest in self.files.items())
+        return bool(self.files) and same and set(names) == set(self.tests)
 
 
 def _digest(file: str) -> str:
@@ -142,7 +143,7 @@ class Trials:
         children: list[tuple[_Child, Path]] = []
         groups = {path: list(items) for path, items in groupby(session.items, key=lambda item: item.path)}
         for path, items in groups.items():
-            if path not in kept or not kept[path].holds():
+            if path not in kept or not kept[path].holds([item.nodeid for item in items]):
                 self._wait_for(children, self._jobs - 1, kept)
                 children.append((self._fork(lambda items=items: self._watched(items), _WATCH_LIMIT_S), path))
         self._wait_for(children, 0, kept)

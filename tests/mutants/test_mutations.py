@@ -7,6 +7,7 @@ from pathlib import Path
 from tests.mutants.__main__ import known_equal
 from tests.mutants.areas import AREAS
 from tests.mutants.mutations import mutants_of
+from tests.mutants.session import Watched, _digest, _Kept
 
 TEXT = '''
 class A:
@@ -63,3 +64,14 @@ def test_what_is_said_to_be_equal_is_still_in_the_program() -> None:
     root = Path(__file__).parents[2]
     names = {m.name for paths, _ in AREAS.values() for path in paths for m in mutants_of(Path(path), root)}
     assert not set(known_equal()) - names
+
+
+def test_tests_are_watched_again_once_their_file_or_their_names_changed(tmp_path: Path) -> None:
+    file = tmp_path / "test_a.py"
+    file.write_text("1")
+    kept = _Kept({str(file): _digest(str(file))}, {"a[1]": Watched(0.1, True, frozenset())})
+    assert kept.holds(["a[1]"])
+    assert not kept.holds(["a[1]", "a[2]"])  # a case that a folder or another module gave
+    assert not kept.holds([])
+    file.write_text("2")
+    assert not kept.holds(["a[1]"])

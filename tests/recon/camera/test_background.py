@@ -114,3 +114,8 @@ def test_a_volume_with_a_restrained_background_is_that_of_a_plain_method():
     found = splitting.run(StoppingRules(iterations=200)).history[-1].objective
     plain = Fista(removal @ camera, removal.forward(data), prior).run(StoppingRules(iterations=800))
     assert found == pytest.approx(plain.history[-1].objective, rel=2e-3)
+
+
+def test_the_cosines_are_orthonormal():
+    for cosines in BackgroundRemoval((1, 13, 10), (4, 3)).basis(0)[:2]:
+        np.testing.assert_allclose(cosines @ cosines.T, np.eye(len(cosines)), atol=1e-12)

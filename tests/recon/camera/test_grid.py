@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.camera.grid import Grid, metric_grid, metric_volume
+from recon.camera.grid import Grid, _between, metric_grid, metric_volume
 from recon.errors import InputError
 
 Z_UM = 1 / np.linspace(1 / 9000, 1 / 15000, 7)
@@ -90,3 +90,16 @@ def test_equal_voxels_stay_as_they_are():
 def test_what_cannot_be_brought_to_equal_voxels_is_refused(grid, voxel_um, words):
     with pytest.raises(InputError, match=words):
         metric_grid(grid, voxel_um)
+
+
+@pytest.mark.parametrize(("z_um", "deep"), [((10, 12), 2), ((10, 12, 15), 3), ((10, 12, 15, 19, 24, 30), 5)])
+def test_a_voxel_is_as_deep_as_the_step_beside_the_middle_plane(z_um, deep):
+    n = len(z_um)
+    metric = metric_grid(Grid((n, 9, 9), (4, 4), np.array(z_um, float), np.ones(n)))
+    np.testing.assert_allclose(np.diff(metric.z_um), deep)
+
+
+def test_the_mean_over_a_deep_voxel_is_that_of_eighths_of_its_triangle():
+    """By hand: a voxel two planes deep looks at 0, +-1/2, +-1 and +-3/2 planes with weights 4, 3, 2 and 1."""
+    weights = _between(np.arange(5.0), np.array([2.0]), 2.0)
+    np.testing.assert_allclose(weights, np.array([[1, 8, 14, 8, 1]]) / 32)
