@@ -251,12 +251,17 @@ class Steadied:
     """(n_frames, height, width) or (n_frames, height, width, 3): as bright as their mean, and put onto one
     another."""
     scatter: Scatter
+    levels: tuple[float, ...] = ()
+    """How bright each frame was, where the light flickered."""
 
     @property
     def mean(self) -> Float:
-        """Their mean."""
-        mean: Float = self.frames.mean(axis=0, dtype=np.float32)
-        return mean
+        """Their mean; a frame counts by the light it had, as a dim one was brightened with its noise."""
+        if not self.levels:
+            mean: Float = self.frames.mean(axis=0, dtype=np.float32)
+            return mean
+        shares = np.maximum(self.levels, 0.0) / np.maximum(self.levels, 0.0).sum()
+        return np.tensordot(shares.astype(np.float32), self.frames, axes=1).astype(np.float32)
 
 
 def steadied(frames: Float) -> Steadied:
@@ -268,12 +273,13 @@ def steadied(frames: Float) -> Steadied:
         Of the same thing, dark frames taken off, hot pixels replaced.
     """
     scatter, changes = scatter_of(frames if frames.ndim == 3 else frames.mean(axis=-1))
+    levels = np.empty(0, np.float32)
     if scatter.flicker > 0:
         levels = np.array([change.brightness for change in changes], np.float32)
         frames = frames * (levels.mean() / levels).reshape(-1, *(1,) * (frames.ndim - 1))
     if scatter.motion_px > _SHAKEN_PX:
         frames = np.stack([_put_back(frame, change) for frame, change in zip(frames, changes, strict=True)])
-    return Steadied(frames, scatter)
+    return Steadied(frames, scatter, tuple(levels.tolist()))
 
 
 def _put_back(frame: Float, change: Change) -> Float:

@@ -351,7 +351,7 @@ def light_of(run: Run, indices: Sequence[int], dark: DarkModel) -> Steadied:
     """Return the light of some frames of one exposure and place, colours averaged."""
     frames = np.stack([run.frame(index) for index in indices])
     steady = light_frames(frames, dark.at(run.metadata(indices[0]).exposure_ms), dark.hot)
-    return Steadied(steady.frames.mean(axis=-1), steady.scatter) if steady.frames.ndim == 4 else steady
+    return replace(steady, frames=steady.frames.mean(axis=-1)) if steady.frames.ndim == 4 else steady
 
 
 def drift_of(run: Run, sweep: PointSweep, dark: DarkModel) -> Drift | None:

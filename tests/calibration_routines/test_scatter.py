@@ -54,6 +54,13 @@ def test_shaken_frames_are_put_onto_one_another_and_flickering_ones_made_alike()
     assert levels.std() < 0.01 * levels.mean()
 
 
+def test_a_dim_frame_counts_by_its_light_as_it_was_brightened_with_its_noise() -> None:
+    rng = np.random.default_rng(7)
+    levels = np.array([1.0, 1.1, 0.08, 0.9])[:, None, None]
+    taken = (levels * PATTERN + rng.normal(size=(4, *PATTERN.shape)) * 1.5).astype(np.float32)
+    assert _unlike(steadied(taken).mean) < 1.1 * _unlike(taken.mean(axis=0))
+
+
 def _unlike(image: Frames) -> float:
     """Relative difference to the pattern, once this is brought to the image's place and brightness."""
     change = compare(image.astype(np.float32), PATTERN.astype(np.float32))
