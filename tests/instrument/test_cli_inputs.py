@@ -192,8 +192,8 @@ _IN_A_FOLDER_OF_ITS_OWN = """
 checkpointing: CheckpointFolder.remove|demo_display: run_display_demo|frame_array: FrameArray._write_draft
 frame_array: FrameArray.create|frame_array: FrameArray.remove_half_written|frame_array: FrameArray.write
 log: AppendOnlyLog.__init__|run_files: note_damage|screen_bench: _written
-stability_file: CellLog.add|video_files: VideoPictures.__init__|video_job: VideoJob.mark_done
-video_job: VideoJob.remove|writer: lock_run|serve: _token"""
+stability_file: CellLog.add|video_files: VideoPictures.__init__|video_files: VideoPictures.remove_litter
+video_job: VideoJob.mark_done|video_job: VideoJob.remove|writer: lock_run|serve: _token"""
 _REFUSED_BEFORE = """
 film: _write_zarr|result_file: _take_away_others|video: _job|video_files: create_output"""
 
