@@ -55,7 +55,6 @@ class Playback:
 
     name = "playback"
     trigger_mode = "free_run"
-    frames_in_flight = 0
     exposure_ms = 5.0
     longest_wait_s = 0.1
 

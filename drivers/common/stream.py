@@ -117,7 +117,6 @@ class FrameStream:
         self._running = False
         self._thread: threading.Thread | None = None
         self._subscriptions: list[Subscription] = []
-        self._clock_offset_ns: int | None = None
         self._asked_s: float | None = None
         self._answer_limit_s = 0.0
 
@@ -230,51 +229,6 @@ class FrameStream:
         self.require_answer()
         return None
 
-    def fresh(self, since_ns: int | None = None, timeout_s: float | None = None) -> Frame:
-        """Return a frame that was exposed wholly after a moment: after a move, a change of light.
-
-        Parameters
-        ----------
-        since_ns : int, optional
-            The moment, by ``time.monotonic_ns()``; None means now.
-        timeout_s : float, optional
-            None means what the exposure needs, with a margin.
-
-        Raises DeviceTimeoutError when no such frame came in time.
-
-        Notes
-        -----
-        Frames on their way to the host (the camera's ``frames_in_flight``) and the one being exposed are let
-        go. Frames that lay in the driver's buffers are told by the device's clock: the host time of an
-        exposure's end is the device's time plus the smallest difference between arrival and device time seen
-        so far, which is late by the fastest frame's way to the host. Without a device clock, as many frames
-        are let go as the driver's buffers can hold.
-        """
-        since_ns = time.monotonic_ns() if since_ns is None else since_ns
-        if timeout_s is None:
-            timeout_s = self.camera.longest_wait_s + (self.n_buffers + 1) * self.camera.exposure_ms / 1e3
-        deadline_s = time.monotonic() + timeout_s
-        reader = self.reader()
-        to_skip = self.camera.frames_in_flight + 1
-        previous: Frame | None = None
-        while (left_s := deadline_s - time.monotonic()) > 0:
-            frame = reader.next_frame(left_s)
-            if frame is None:
-                break
-            if previous is None and frame.metadata.device_time_ns is None:
-                to_skip += self.n_buffers
-            to_skip -= 1 + frame.metadata.dropped_before
-            if to_skip < 0 and self._began_after(frame, previous, since_ns):
-                return frame
-            previous = frame
-        if not self._running:
-            raise StoppedError(self.camera.name, "the stream ended while a fresh frame was waited for.")
-        raise DeviceTimeoutError(
-            self.camera.name,
-            f"no frame exposed wholly after the change came within {timeout_s:g} s.",
-            f"Exposure is {self.camera.exposure_ms:g} ms.",
-        )
-
     def subscribe(self, callback: Callable[[Frame], None], *, newest_only: bool = False) -> Subscription:
         """Have ``callback`` called with frames in a thread of its own, until the stream ends.
 
@@ -310,7 +264,6 @@ class FrameStream:
                         ) from error
                     continue
                 silent_s, self._asked_s = 0.0, None
-                self._note_clock(metadata.device_time_ns, metadata.host_time_ns)
                 with self.changed:
                     self.dropped += metadata.dropped_before
                     if buffer is not None:
@@ -340,25 +293,6 @@ class FrameStream:
                     return None
                 self.ring.popleft()
         return buffer
-
-    def _note_clock(self, device_ns: int | None, host_ns: int) -> None:
-        if device_ns is not None:
-            offset = host_ns - device_ns
-            if self._clock_offset_ns is None or offset < self._clock_offset_ns:
-                self._clock_offset_ns = offset
-
-    def _began_after(self, frame: Frame, previous: Frame | None, since_ns: int) -> bool:
-        """Whether a frame's exposure began after a moment, by the device's clock (see ``fresh``)."""
-        ended_ns = frame.metadata.device_time_ns
-        if ended_ns is None or self._clock_offset_ns is None:
-            return True
-        before_ns = None if previous is None else previous.metadata.device_time_ns
-        if before_ns is None:
-            return False
-        exposure_ns = int(frame.metadata.exposure_ms * 1e6)
-        period_ns = (ended_ns - before_ns) // (1 + frame.metadata.dropped_before)
-        on_its_way_ns = self.camera.frames_in_flight * max(period_ns, exposure_ns)
-        return ended_ns + self._clock_offset_ns - on_its_way_ns - exposure_ns >= since_ns
 
     def _end(self) -> None:
         with self.changed:

@@ -11,13 +11,13 @@ import numpy.typing as npt
 import pytest
 
 from drivers.common.stream import BufferPool, FrameStream
-from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
+from drivers.errors import DeviceError, DeviceTimeoutError
 from drivers.frame import Frame, FrameMetadata
 from tests.mocks.free_running import FreeRunningCamera
 
 
 def number_of(frame: Frame) -> int:
-    return int(frame.image[0, 0]) % 1000
+    return int(frame.image[0, 0])
 
 
 def finite(n: int, **options: object) -> FreeRunningCamera:
@@ -271,35 +271,6 @@ def test_stopping_the_camera_from_elsewhere_ends_the_stream_without_error() -> N
         while reader.next_frame(5) is not None:
             pass
         assert not stream.is_running
-        with pytest.raises(StoppedError):
-            stream.fresh()
-
-
-@pytest.mark.parametrize("device_clock", [True, False])
-@pytest.mark.parametrize("in_flight", [0, 1, 2])
-def test_a_frame_asked_for_after_a_change_was_exposed_wholly_after_it(
-    device_clock: bool, in_flight: int
-) -> None:
-    camera = FreeRunningCamera(device_clock=device_clock, in_flight=in_flight)
-    with FrameStream(camera, 4) as stream:
-        for lit in (False, True) * 6:
-            camera.light(lit)
-            frame = stream.fresh()
-            assert (int(frame.image[0, 0]) >= 1000) == lit
-
-
-def test_the_newest_frame_alone_would_be_stale() -> None:
-    """The test above can fail: without waiting, a free-running camera does show the light as it was."""
-    camera = FreeRunningCamera(in_flight=2)
-    stale = 0
-    with FrameStream(camera, 4) as stream:
-        for lit in (False, True) * 6:
-            camera.light(lit)
-            frame = stream.wait_newer(stream.newest(), 5)
-            assert frame is not None
-            stale += (int(frame.image[0, 0]) >= 1000) != lit
-            time.sleep(0.02)
-    assert stale > 0
 
 
 def test_a_drivers_mistake_reaches_those_who_read(monkeypatch: pytest.MonkeyPatch) -> None:

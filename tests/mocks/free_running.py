@@ -15,36 +15,26 @@ from tests.mocks.devices import MockCamera, MockOptions, MockWorld
 
 
 class FreeRunningCamera(MockCamera):
-    """Frame ``i`` is full of ``1000 + i``, or of ``i`` if it was dark at any time of its exposure.
+    """Frame ``i`` is full of ``i``.
 
-    ``drop`` is the set of frames that the device loses; ``in_flight`` the number of frames on their way to
-    the host while the next is exposed; ``deep_ring`` a size of the driver's ring that nobody asked for, so
-    that only the stream's own ring overflows.
+    ``drop`` is the set of frames that the device loses; ``deep_ring`` a size of the driver's ring that nobody
+    asked for, so that only the stream's own ring overflows.
     """
 
-    def __init__(self, period_s: float = 0.002, *, device_clock: bool = True, in_flight: int = 0) -> None:
+    def __init__(self, period_s: float = 0.002) -> None:
         super().__init__(MockOptions(), MockWorld(MockWorld.Options()))
         self._open = True
         self.exposure_ms = period_s * 1e3
-        self.device_clock = device_clock
         self.drop: set[int] = set()
         self.n_frames: int | None = None
         self.fail_at: int | None = None
         self.deep_ring: int | None = None
-        self._in_flight = in_flight
-        self._lit = True
-        self._dark_during = False
         self._ring: deque[Frame] = deque()
         self._arrived = threading.Condition()
         self._thread: threading.Thread | None = None
         self._running = False
         self._failure: DeviceError | None = None
         self._lost = 0
-
-    def light(self, on: bool) -> None:
-        with self._arrived:
-            self._lit = on
-            self._dark_during = self._dark_during or not on
 
     def start_sequence(self, n_buffers: int = 8) -> None:
         self._ring = deque(maxlen=self.deep_ring or n_buffers)
@@ -77,7 +67,6 @@ class FreeRunningCamera(MockCamera):
             self._thread = None
 
     def _expose(self) -> None:
-        pipeline: deque[Frame] = deque()
         number = 0
         while self._running and number != self.n_frames:
             if number == self.fail_at:
@@ -85,21 +74,10 @@ class FreeRunningCamera(MockCamera):
                     self._failure = DeviceError(self.name, "was unplugged.")
                     self._arrived.notify_all()
                 return
-            with self._arrived:
-                self._dark_during = not self._lit
             time.sleep(self.exposure_ms / 1e3)
-            with self._arrived:
-                lit = not self._dark_during
-                now = time.monotonic_ns()
-            template = self.snap_metadata(number)
-            metadata = replace(template, device_time_ns=now - 10**15 if self.device_clock else None)
-            value = number + (1000 if lit else 0)
-            pipeline.append(Frame(np.full(self.image_shape, value, np.uint16), metadata))
+            image = np.full(self.image_shape, number, np.uint16)
+            self._deliver(Frame(image, self.snap_metadata(number)))
             number += 1
-            if len(pipeline) > self._in_flight:
-                self._deliver(pipeline.popleft())
-        while pipeline and self._running:
-            self._deliver(pipeline.popleft())
 
     def _deliver(self, frame: Frame) -> None:
         with self._arrived:
