@@ -175,7 +175,7 @@ def _decode_tiff(path: Path) -> Decoded:
             turned = int(page.tags.valueof(_ORIENTATION, 1))
             if 2 <= turned <= 8:
                 array = _upright(array, turned, series.axes)
-                notes.append(f"turned upright as its orientation ({turned}) says")
+                notes.append(_turned(turned))
             array, said = ordered(path, array, series.axes)
             return array, (*notes, *said)
     except FileError:
@@ -252,8 +252,33 @@ def _decode_with_opencv(path: Path, data: bytes) -> Decoded:
         raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
     if array.ndim == 3 and array.shape[-1] >= 3:
         array = array[..., [2, 1, 0, *range(3, array.shape[-1])]]
-    lossy = ("JPEG is lossy and usually gamma-coded: prefer raw frames",) if data[:2] == b"\xff\xd8" else ()
-    return array, lossy
+    notes = []
+    if data[:2] == b"\xff\xd8":
+        notes.append("JPEG is lossy and usually gamma-coded: prefer raw frames")
+    if 2 <= (turned := _exif_orientation(data)) <= 8:
+        array = _upright(array, turned, "YXS")
+        notes.append(_turned(turned))
+    return array, tuple(notes)
+
+
+def _turned(orientation: int) -> str:
+    return f"turned upright as its orientation ({orientation}) says"
+
+
+def _exif_orientation(data: bytes) -> int:
+    """Return how a JPEG or PNG says that it stands, as a TIFF's tag 274; 1 where it says nothing."""
+    mark = b"Exif\0\0" if data[:2] == b"\xff\xd8" else b"eXIf"
+    place = data.find(mark)
+    if place < 0:
+        return 1
+    from PIL import Image  # of Matplotlib's own needs; OpenCV turns only what it also changes otherwise
+
+    exif = Image.Exif()
+    try:
+        exif.load(b"Exif\0\0" + data[place + len(mark) : place + len(mark) + _MOST_HEADER])
+        return int(exif.get(_ORIENTATION, 1))
+    except Exception:  # noqa: BLE001 - a damaged note beside a whole picture raises nearly anything
+        return 1
 
 
 def _refuse_odd_bits(path: Path) -> None:

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 import pytest
 import scipy.io
 import tifffile
 import zarr
+from PIL import Image
 
 from instrument.files.errors import FileError
 from instrument.files.images import read, read_image, read_stack, write_image
@@ -102,20 +104,39 @@ def test_colour_of_floats_is_imagejs_and_comes_back(tmp_path: Path) -> None:
         assert (tiff.is_imagej, tiff.series[0].axes) == (False, "YXS")
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_tiffs_orientation_is_followed(tmp_path: Path, orientation: int) -> None:
-    upright = RNG.integers(0, 255, (5, 7, 3)).astype(np.uint8)
-    # Row and column of the stored image by those of the upright one (TIFF 6.0, page 36).
+def _lying(upright: npt.NDArray[np.uint8], orientation: int) -> npt.NDArray[np.uint8]:
+    """Return an image of 5 x 7 as one of this orientation is stored (TIFF 6.0, page 36)."""
     rows, columns = np.mgrid[:5, :7]
     down, right = 4 - rows, 6 - columns
     stored = {1: (rows, columns), 2: (rows, right), 3: (down, right), 4: (down, columns),
               5: (columns, rows), 6: (right, rows), 7: (right, down), 8: (columns, down)}  # fmt: skip
     image = np.empty((7, 5, 3) if orientation > 4 else (5, 7, 3), np.uint8)
     image[stored[orientation]] = upright
-    tifffile.imwrite(tmp_path / "a.tif", image, extratags=[(274, "H", 1, orientation, True)])
-    read = read_image(tmp_path / "a.tif")
-    np.testing.assert_array_equal(read.pixels, upright)
+    return image
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("suffix", ["tif", "png", "jpg"])
+def test_an_orientation_is_followed(tmp_path: Path, suffix: str, orientation: int) -> None:
+    upright = RNG.integers(0, 255, (5, 7, 3)).astype(np.uint8)
+    image, path = _lying(upright, orientation), tmp_path / f"a.{suffix}"
+    if suffix == "tif":
+        tifffile.imwrite(path, image, extratags=[(274, "H", 1, orientation, True)])
+    else:
+        exif = Image.Exif()
+        exif[274] = orientation
+        Image.fromarray(image).save(path, exif=exif, quality=100, subsampling=0)
+    read = read_image(path)
+    np.testing.assert_allclose(read.pixels.astype(float), upright, atol=8 if suffix == "jpg" else 0)
     assert any("orientation" in note for note in read.notes) == (orientation > 1)
+
+
+def test_a_damaged_note_beside_a_whole_picture_costs_the_picture_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    Image.fromarray(np.full((8, 8), 100, np.uint8)).save(path, exif=b"Exif\0\0MM\0*\xff\xff\xff\xff")
+    read = read_image(path)
+    assert read.pixels.shape == (8, 8)
+    assert not any("orientation" in note for note in read.notes)
 
 
 def test_packed_pixels_keep_their_values(tmp_path: Path) -> None:
