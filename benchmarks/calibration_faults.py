@@ -158,6 +158,8 @@ def _of_psfs(found: Array, usual: Array) -> float:
     """Return the largest change of shape, relative brightness and relative place (0.1 pixels: 1 %)."""
     first, second = (psfs.mean(axis=1).astype(np.float32) for psfs in (found, usual))
     changes = [compare(one, other) for one, other in zip(first, second, strict=True)]
+    if not all(np.isfinite((c.rows, c.columns, c.brightness)).all() for c in changes):
+        return float("inf")
     levels = np.array([change.brightness for change in changes])
     places = np.array([(change.rows, change.columns) for change in changes])
     back = [moved(one, -c.rows, -c.columns) / c.brightness for one, c in zip(first, changes, strict=True)]

@@ -190,6 +190,10 @@ def judge_visit(
 
 MAX_GAIN_ERROR = 0.03
 """Relative departure of the measured shift per micrometre from d/z that is called wrong."""
+_LEAST_GAIN = 0.002
+"""Less than that is not told as a distance that is off: registration and the law itself are not better."""
+_LEAST_RESIDUAL_PX = 0.02  # of a registration, a coordinate
+_LAW = 5e-4  # of a shift: what the simulated bench's light departs from d/z by
 MAX_ROTATION_MRAD = 35.0
 """Rotation of the stage's axes against the sensor's that is called wrong (2 degrees)."""
 _OUTLIER_PX = 0.3  # residuals beyond this count less and less in the fit
@@ -215,6 +219,25 @@ class StageFit:
     residual_95_px: float
     """Of the points about the linear map."""
     findings: tuple[str, ...] = ()
+    gain_error_std: float = 0.0
+    """Standard deviation of ``gain_error``, by the points' residuals."""
+
+    def distance_words(self, d_mm: float | None) -> str:
+        """Return what a measured shift that is surely not ``d / z`` means; nothing where it may be.
+
+        One depth does not tell d from z, and no more than what is beyond :data:`MAX_GAIN_ERROR` is called
+        wrong: rulers are not better.
+        """
+        error = self.gain_error
+        if error is None or d_mm is None or abs(error) <= max(_SURE * self.gain_error_std, _LEAST_GAIN):
+            return ""
+        off_um = self.z_um * error / (1 + error)
+        return (
+            f"Distance: that is as if the mount held the source {abs(off_um) / 1e3:.2f} mm "
+            f"{'nearer' if off_um > 0 else 'farther'} than recorded, or as if d were "
+            f"{d_mm * (1 + error):.3f} mm, not {d_mm:.4g} (known to {self.gain_error_std:.2%}). The PSFs are "
+            "right where they were taken; lengths across are off by this share."
+        )
 
 
 def judge_points(
@@ -383,7 +406,15 @@ def _held_against_stage(
         float(np.median(residuals)),
         float(np.quantile(residuals, 0.95)),
         tuple(findings),
+        _gain_error_std(residuals, places, nominal),
     )
+
+
+def _gain_error_std(residuals_px: Floats, places_um: Floats, nominal: float | None) -> float:
+    if nominal is None:
+        return 0.0
+    a_coordinate_px = max(float(np.sqrt(np.mean(residuals_px**2) / 2)), _LEAST_RESIDUAL_PX)
+    return float(np.hypot(_LAW, a_coordinate_px / (nominal * np.sqrt((places_um**2).sum()))))
 
 
 def find_pattern(

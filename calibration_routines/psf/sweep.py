@@ -46,6 +46,7 @@ from calibration_routines.psf.sweep_plan import (
     plan_lines,
     retake_plan,
     size_findings,
+    source_width_px,
     sweep_plan,
 )
 from calibration_routines.psf.sweep_watch import SweepWatch, TakeAgain, retake_dimming
@@ -89,6 +90,8 @@ class SweepCalibration:
     """What is wrong with light, place and dark frames, whatever the point."""
     late_hot: int = 0
     """Pixels that turned hot during the sweep; they were replaced like the others."""
+    source_width_px: float = 0.0
+    """Of the source's image from the nearest depth; 0 where its size is not known."""
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -331,6 +334,7 @@ class _TakenSweep:
             analysis.scatter,
             analysis.findings,
             self.dark.late_hot,
+            source_width_px(record.source_size_um, calibration.geometry, sweep.depths_um[0]),
         )
 
     def _provenance(self, exposures: SweepExposures, reference_ms: float) -> dict[str, Any]:

@@ -270,17 +270,22 @@ class SweepRecord:
 
 def size_findings(size_um: float | None, geometry: Geometry, z_um: float) -> tuple[str, ...]:
     """Return what is to be said of a source too large for the resolution, seen from the nearest depth."""
-    d_mm, pitch_um = geometry.diffuser_distance_mm, geometry.pixel_pitch_um
-    if size_um is None or d_mm is None or pitch_um is None:
-        return ()
-    image_px = 1e3 * d_mm / z_um * size_um / pitch_um
-    if image_px <= FEATURE_PX:
+    image_px = source_width_px(size_um, geometry, z_um)
+    if size_um is None or image_px <= FEATURE_PX:
         return ()
     return (
         f"the source is too large: its {size_um:g} um ([source] size_um) are {image_px:.1f} pixels wide on "
         f"the sensor at z = {z_um / 1e3:.4g} mm, and the PSF is blurred (at most {FEATURE_PX:g}): take "
-        f"a pinhole of {FEATURE_PX * pitch_um * z_um / (1e3 * d_mm):.2g} um or less, or go farther away.",
+        f"a pinhole of {size_um * FEATURE_PX / image_px:.2g} um or less, or go farther away.",
     )
+
+
+def source_width_px(size_um: float | None, geometry: Geometry, z_um: float) -> float:
+    """Return how wide the image of a source of this size at this depth is on the sensor; 0 where unknown."""
+    d_mm, pitch_um = geometry.diffuser_distance_mm, geometry.pixel_pitch_um
+    if size_um is None or d_mm is None or pitch_um is None:
+        return 0.0
+    return 1e3 * d_mm / z_um * size_um / pitch_um
 
 
 def _with_points(old: dict[str, Any]) -> dict[str, Any]:

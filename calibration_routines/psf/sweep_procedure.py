@@ -13,6 +13,7 @@ from calibration_routines.psf.sampling import reachable_depths_um
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep, finish_sweep, watch_sweep
 from calibration_routines.psf.sweep_options import AskedSweep, AxialSweep, LateralSweep, VolumeSweep
 from calibration_routines.psf.sweep_plan import (
+    FEATURE_PX,
     SWEEP,
     SweepExposures,
     check_sweep,
@@ -73,6 +74,7 @@ def sweep_outcome(done: SweepCalibration) -> Outcome:
     )
 
 
+_SEEN_WIDTH_PX = 0.5  # of a source's image: less blurs a PSF by less than a pixel does
 _MOST_LINES = 12  # findings in words; all of them are in calibration.json
 
 
@@ -128,6 +130,8 @@ def quality_lines(done: SweepCalibration) -> list[str]:
             f"turned by {stage.rotation_mrad:+.1f} mrad; single points are off by "
             f"{stage.residual_median_px:.3f} (median) and {stage.residual_95_px:.3f} (95 %) pixels."
         )
+        if words := stage.distance_words(done.calibration.geometry.diffuser_distance_mm):
+            lines.append(words)
     if done.drift is not None and not done.drift.findings:
         known = done.drift.brightness_error
         taken = f"each known to {known:.1%}" if known > TOLERATED else "taken out of the PSFs"
@@ -135,6 +139,11 @@ def quality_lines(done: SweepCalibration) -> list[str]:
             f"Source: {len(done.drift.brightness)} visits to the reference; brightness within "
             f"{max(abs(b - 1) for b in done.drift.brightness):.1%} ({taken}), place within "
             f"{max(done.drift.shift_px):.2f} pixels."
+        )
+    if FEATURE_PX >= done.source_width_px > _SEEN_WIDTH_PX:
+        lines.append(
+            f"Pinhole: its image is {done.source_width_px:.1f} pixels wide from the nearest depth, by "
+            "[source] size_um: the PSFs are blurred by that."
         )
     if done.scatter.averages and not done.scatter.findings():
         lines.append(

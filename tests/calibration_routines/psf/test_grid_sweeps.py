@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -27,9 +28,10 @@ from calibration_routines import (
     watch_sweep,
 )
 from calibration_routines.psf.analysis import feature_size_px, optical_binning
-from calibration_routines.psf.stage_fit import fit_stage, judge_drift
+from calibration_routines.psf.stage_fit import MAX_GAIN_ERROR, fit_stage, judge_drift
 from calibration_routines.psf.sweep import Retake, read_retakes
 from calibration_routines.psf.sweep_options import LateralSweep
+from calibration_routines.psf.sweep_procedure import quality_lines
 from drivers.camera import Roi
 from drivers.simulated.world import Image, Rgb, SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
@@ -94,6 +96,7 @@ def test_a_lateral_sweep_is_good_and_agrees_with_the_stage(bench: Bench, tmp_pat
     assert stage.gain_error == pytest.approx(0, abs=2e-3)
     assert stage.rotation_mrad == pytest.approx(0, abs=2)
     assert stage.residual_95_px < 0.2
+    assert not any(line.startswith(("Distance:", "Pinhole:")) for line in quality_lines(done))
     assert done.drift is not None
     assert done.drift.before_point == (0, 4, 8, 9)
     assert max(done.drift.shift_px) < 0.1
@@ -104,6 +107,23 @@ def test_a_lateral_sweep_is_good_and_agrees_with_the_stage(bench: Bench, tmp_pat
     # not normalised: the sensor's response dims what comes from the side
     light = loaded.psfs.sum(axis=(1, 2, 3))
     assert light[3] < 0.9 * light[4]
+
+
+@pytest.mark.parametrize(("off_um", "words"), [(600.0, "0.6. mm farther"), (-900.0, "0.[89]. mm nearer")])
+def test_a_mount_that_is_off_along_the_axis_is_told_by_shifts(
+    tmp_path: Path, off_um: float, words: str
+) -> None:
+    """By less than what is called wrong: one depth does not tell it from d."""
+    text = TINY.replace("[stage]", f"[stage]\nmount_offset_um = [0.0, 0.0, {off_um}]")
+    with open_bench(parse_config(text, None)) as bench:
+        assert bench.stage is not None
+        bench.stage.home()
+        done = calibrate_sweep(bench, SWEEP, tmp_path)
+    (stage,) = done.stages
+    assert not stage.findings
+    assert abs(stage.gain_error or 0) < MAX_GAIN_ERROR
+    (told,) = [line for line in quality_lines(done) if line.startswith("Distance:")]
+    assert re.search(words, told), told
 
 
 @pytest.mark.slow
