@@ -378,8 +378,8 @@ _add("hologram-dc-fill", adapter.hologram, shown, SLM, dc=(0.1, 0.5), mask_fill=
 _add("hologram-bent-mask", adapter.hologram, shown, SLM, bent=0.7, within=CHAOTIC)
 _add("hologram-complex-slm", adapter.hologram, shown, SLM, complex_slm=True, within=CHAOTIC)
 _add("hologram-levels", adapter.hologram, shown, SLM, phase_levels=16, within=CHAOTIC)
-# Its start is rounded to float32, whose last bit is the processor's: turned at random it moves this by 0.9e-6 to
-# 1.8e-6 (six seeds), and from an Intel Xeon to an AMD EPYC it moved by 1.5e-6.
+# Its start is rounded to float32, whose last bit is the processor's: turned at random it moves this by
+# 0.9e-6 to 1.8e-6 (six seeds), and from an Intel Xeon to an AMD EPYC it moved by 1.5e-6.
 _add("hologram-double", adapter.hologram, shown, SLM, precise=True, within=1e-5)
 
 # A chart and a map ---------------------------------------------------------------------------------------
