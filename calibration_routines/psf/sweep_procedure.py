@@ -21,7 +21,7 @@ from calibration_routines.psf.sweep_plan import (
     size_findings,
 )
 from calibration_routines.psf.sweep_watch import SourceVisit, SweepEvent
-from calibration_routines.scatter import TOLERATED
+from calibration_routines.scatter import TOLERATED, Scatter
 from instrument.bench.bench import Bench
 from instrument.files.errors import count
 from instrument.runs.run import Run
@@ -75,6 +75,7 @@ def sweep_outcome(done: SweepCalibration) -> Outcome:
 
 
 _SEEN_WIDTH_PX = 0.5  # of a source's image: less blurs a PSF by less than a pixel does
+_SEEN_MOTION_PX = 0.05  # of a PSF's place: a tenth of what a pixel tells
 _MOST_LINES = 12  # findings in words; all of them are in calibration.json
 
 
@@ -146,10 +147,7 @@ def quality_lines(done: SweepCalibration) -> list[str]:
             "[source] size_um: the PSFs are blurred by that."
         )
     if done.scatter.averages and not done.scatter.findings():
-        lines.append(
-            f"Frames: brightness steady within {done.scatter.flicker:.1%}, place within "
-            f"{done.scatter.motion_px:.2f} pixels from frame to frame, noise taken off."
-        )
+        lines.append(_frames_line(done.scatter))
     central = [q for q in done.quality if q.similarity is None]
     if words := off_middle(central, done.calibration.geometry):
         lines.append(words)
@@ -159,6 +157,16 @@ def quality_lines(done: SweepCalibration) -> list[str]:
             "neighbours' median, like the others): let the camera warm up."
         )
     return lines
+
+
+def _frames_line(scatter: Scatter) -> str:
+    steady = f"Frames: brightness steady within {scatter.flicker:.1%}"
+    if scatter.place_error_px <= _SEEN_MOTION_PX:
+        return f"{steady}, place within {scatter.motion_px:.2f} pixels from frame to frame, noise taken off."
+    return (
+        f"{steady}; the picture shakes by {scatter.motion_px:.2f} pixels from frame to frame: frames were "
+        f"put onto one another, and the place of a PSF is known to {scatter.place_error_px:.2f} pixels."
+    )
 
 
 def _verdict(done: SweepCalibration) -> str:
