@@ -22,7 +22,7 @@ from instrument.files.errors import BenchError, FileError, SettingsError
 from instrument.files.record import RecordFormat, plain
 from instrument.plan import Plan, PlanEstimate, Step, estimate
 from instrument.runs.acquire import abilities_of, prepare
-from instrument.runs.pace import pace_of
+from instrument.runs.pace import keep_pace, pace_of
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Runner, RunStatus, discarded
@@ -233,6 +233,8 @@ class Procedure(ABC):
             outcome = self.perform(bench, folder, control, listener or Listener())
             if control.ending is None and outcome.whole:
                 took(self, bench, outlook, time.monotonic() - began_s)
+                for run in outcome.runs[:1]:
+                    keep_pace(run, abilities_of(bench), bench.config.text)
             return outcome
 
     @abstractmethod

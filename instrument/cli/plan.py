@@ -114,9 +114,12 @@ def show(
     with open_and_say(bench) as opened:
         abilities = abilities_of(opened, opened.config.data_folder)
         pace = pace_of(plan, abilities, opened.config.data_folder, opened.config.text)
+        simulated = bool(opened.simulated_kinds)
     _describe(plan, abilities)
     if pace is not None:
         typer.echo(pace.words(plan, abilities))
+    elif simulated:
+        typer.echo("Computing the simulated light comes on top, most of it at new places: known after a run.")
     if steps:
         for step in plan.steps():
             typer.echo(f"  {step}")

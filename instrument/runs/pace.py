@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from zlib import crc32
 
 from drivers.errors import DeviceError
+from instrument.files import kept_times
 from instrument.files.errors import BenchError, duration
 from instrument.plan.abilities import BenchAbilities, estimate
 from instrument.plan.model import Plan
@@ -36,13 +38,14 @@ class Pace:
         """Say how long a plan will take with it."""
         cost = estimate(plan, abilities)
         whole_s = cost.seconds + cost.frames * self.frame_s
-        return f"With read-out and writing, as in {self.run}: about {duration(whole_s)} in all."
+        return f"Its frames, with read-out and writing as in {self.run}: about {duration(whole_s)}."
 
 
 def pace_of(plan: Plan, abilities: BenchAbilities, folder: Path, toml: str) -> Pace | None:
     """Return the pace of the newest completed run in ``folder`` that is like a plan, on the same bench.
 
-    Like it is a run whose plan has the same label; else any. None where there is none, or none tells.
+    Like it is a run whose plan has the same label; else any. Where none tells, what was kept of the newest on
+    that bench, wherever it lies. None without one.
     """
     others: list[Pace] = []
     for path in islice(reversed(run_paths(folder)), LOOKED_AT):
@@ -54,7 +57,31 @@ def pace_of(plan: Plan, abilities: BenchAbilities, folder: Path, toml: str) -> P
         if found is not None and run.plan is not None and run.plan.label == plan.label:
             return found
         others += [] if found is None else [found]
-    return others[0] if others else None
+    return others[0] if others else _kept(toml)
+
+
+def keep_pace(path: Path, abilities: BenchAbilities, toml: str) -> None:
+    """Keep the pace of a run that has just ended, unless nobody sees what is foretold or it tells none."""
+    if not kept_times.seen():
+        return
+    try:
+        found = _measured(Run.open(path), abilities, toml)
+    except (BenchError, DeviceError, OSError, LookupError, ValueError):
+        return
+    if found is not None:
+        kept_times.remember(_key(toml), [round(found.frame_s, 4), found.run])
+
+
+def _kept(toml: str) -> Pace | None:
+    try:
+        frame_s, run = kept_times.recall(_key(toml))
+        return Pace(kept_times.sane(frame_s), str(run))
+    except (LookupError, TypeError, ValueError):
+        return None
+
+
+def _key(toml: str) -> str:
+    return f"a frame of {crc32(toml.encode()):08x}"
 
 
 def _measured(run: Run, abilities: BenchAbilities, toml: str) -> Pace | None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
+from instrument.files import kept_times
 from instrument.plan import Part, Plan
 from instrument.runs.acquire import abilities_of, acquire
-from instrument.runs.pace import Pace, pace_of
+from instrument.runs.pace import Pace, keep_pace, pace_of
 
 TOML = """
 [camera]
@@ -44,4 +47,23 @@ def test_the_pace_of_a_run_before(tmp_path: Path) -> None:
     assert unlike is not None
     assert unlike.run == other.path.name
     assert pace_of(plan_of("a", 9), abilities, tmp_path, toml + "# changed\n") is None
-    assert "as in r: about 10.2 s in all" in Pace(1.0, "r").words(plan_of("a", 10), abilities)
+    assert "as in r: about 10.2 s." in Pace(1.0, "r").words(plan_of("a", 10), abilities)
+
+
+def test_a_pace_is_kept_of_runs_that_lie_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(kept_times, "seen", lambda: True)
+    with open_bench(parse_config(TOML, None)) as bench:
+        abilities, toml = abilities_of(bench, tmp_path), bench.config.text
+        run = acquire(bench, plan_of("a", 5), tmp_path / "there")
+        keep_pace(run.path, abilities, toml)
+        keep_pace(
+            acquire(bench, plan_of("b", 2), tmp_path / "there").path, abilities, toml
+        )  # too short to tell
+    found = pace_of(plan_of("a", 9), abilities, tmp_path / "here", toml)
+    assert found is not None
+    assert found.run == run.path.name
+    assert found.frame_s > 0
+    assert pace_of(plan_of("a", 9), abilities, tmp_path / "here", toml + "# changed\n") is None
+    kept_times.place().write_text('{"a frame of": 3')
+    assert pace_of(plan_of("a", 9), abilities, tmp_path / "here", toml) is None
