@@ -143,7 +143,7 @@ def quality_lines(done: SweepCalibration) -> list[str]:
         )
     if FEATURE_PX >= done.source_width_px > _SEEN_WIDTH_PX:
         lines.append(
-            f"Pinhole: its image is {done.source_width_px:.1f} pixels wide from the nearest depth, by "
+            f"Source: the pinhole's image is {done.source_width_px:.1f} pixels wide from the nearest depth, by "
             "[source] size_um: the PSFs are blurred by that."
         )
     if done.scatter.averages and not done.scatter.findings():

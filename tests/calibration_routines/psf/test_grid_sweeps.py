@@ -96,7 +96,7 @@ def test_a_lateral_sweep_is_good_and_agrees_with_the_stage(bench: Bench, tmp_pat
     assert stage.gain_error == pytest.approx(0, abs=2e-3)
     assert stage.rotation_mrad == pytest.approx(0, abs=2)
     assert stage.residual_95_px < 0.2
-    assert not any(re.match("Distance:|Pinhole:|.*shakes", line) for line in quality_lines(done))
+    assert not any(re.search("Distance:|pinhole|shakes", line) for line in quality_lines(done))
     shaken = replace(done, scatter=replace(done.scatter, motion_px=0.25), source_width_px=0.7)
     assert not shaken.findings
     assert any("the picture shakes by 0.25 pixels" in line for line in quality_lines(shaken))
