@@ -143,8 +143,8 @@ def quality_lines(done: SweepCalibration) -> list[str]:
         )
     if FEATURE_PX >= done.source_width_px > _SEEN_WIDTH_PX:
         lines.append(
-            f"Source: the pinhole's image is {done.source_width_px:.1f} pixels wide from the nearest depth, by "
-            "[source] size_um: the PSFs are blurred by that."
+            f"Source: the pinhole's image is {done.source_width_px:.1f} pixels wide from the nearest depth "
+            "([source] size_um): the PSFs are blurred by that."
         )
     if done.scatter.averages and not done.scatter.findings():
         lines.append(_frames_line(done.scatter))
