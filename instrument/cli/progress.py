@@ -36,6 +36,13 @@ from instrument.files import kept_times
 from instrument.files.errors import duration
 from instrument.tasks.task import Advance
 
+_WIDE = 120  # characters of a terminal that has room for a long bar
+
+
+def _whole() -> Column:
+    """Return what a column is whose text is shown whole: in a narrow terminal the note gives way."""
+    return Column(no_wrap=True)
+
 
 class _Count(MofNCompleteColumn):
     """How much is done of how much; nothing where nobody can say."""
@@ -65,7 +72,7 @@ class _Note(ProgressColumn):
     """The task's note, or what is being compiled; asked often, it hears of numba when that is there."""
 
     def __init__(self) -> None:
-        super().__init__(Column(no_wrap=True, overflow="ellipsis"))
+        super().__init__(Column(no_wrap=True, overflow="ellipsis", ratio=1))
 
     def render(self, task: Task) -> Text:
         _listen()
@@ -102,14 +109,15 @@ def progress_bar() -> Progress:
     """
     console = Console(stderr=True)
     return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        _Count(),
-        TimeElapsedColumn(),
-        _Left(),
+        TextColumn("{task.description}", table_column=_whole()),
+        BarColumn(40 if console.width >= _WIDE else 12),
+        _Count(table_column=_whole()),
+        TimeElapsedColumn(table_column=_whole()),
+        _Left(table_column=_whole()),
         _Note(),
         console=console,
         transient=True,
+        expand=True,
         disable=not console.is_terminal,
     )
 

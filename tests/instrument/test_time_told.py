@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import io
+import re
 import sys
 import time
 from pathlib import Path
+from typing import cast
 
 import pytest
+from rich.console import Console
 from rich.progress import Progress
 
-from instrument.cli import main
+from instrument.cli import main, progress
 from instrument.cli.progress import _Left, _Note
 from instrument.files import kept_times
 
@@ -92,3 +96,19 @@ def test_a_bar_says_what_is_left_and_what_is_compiled() -> None:
     with event.trigger_event("numba:compile", data={"dispatcher": Kernel}):
         assert str(column.render(task)) == "compiling py_func (once)"
     assert not str(column.render(task))
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_times_are_whole_in_a_narrow_terminal_and_the_note_gives_way(
+    width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = Console(file=io.StringIO(), width=width, force_terminal=True, color_system=None)
+    monkeypatch.setattr(progress, "Console", lambda **_: shown)
+    with progress.progress_bar() as bar:
+        task = bar.add_task("picture", total=100, note="iteration 12, change 2.7e-02; " * 4)
+        bar.update(task, advance=57)
+        page = Console(file=io.StringIO(), width=width, color_system=None)
+        page.print(bar.get_renderable())
+    line = cast(io.StringIO, page.file).getvalue().rstrip("\n")
+    assert "\n" not in line
+    assert re.search(r"picture .+ 57/100 0:00:00 left about \S+ s +iter.*…", line), line
