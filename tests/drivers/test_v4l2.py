@@ -159,6 +159,10 @@ def test_a_camera_that_does_not_number_its_frames_is_refused_in_words() -> None:
             camera.next_frame(5)
         with pytest.raises(DeviceError, match="does not number its frames"):
             camera.next_frame(5)
+        assert not kernel.streaming
+        kernel.numbered = True
+        camera.start_sequence(4)
+        assert camera.next_frame(5).metadata.dropped_before == 0
 
 
 def test_device_times_are_ends_of_exposures() -> None:

@@ -104,6 +104,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/drivers/test_basler.py",
             "tests/drivers/test_micromanager.py",
             "tests/drivers/test_simulated_contracts.py",
+            "tests/drivers/test_v4l2.py",
             "tests/recon/video",
             "tests/recon/live",
             "tests/instrument/live",

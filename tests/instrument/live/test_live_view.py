@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from drivers.common.stream import FrameStream
+from drivers.common.stream_reader import StreamReader
 from drivers.errors import DeviceError
+from drivers.frame import Frame
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
 from instrument.live.live import LiveView, live_view
@@ -118,6 +120,22 @@ def test_a_picture_is_refined_while_no_newer_frame_comes_then_the_view_rests() -
     assert results[-1].refined
     assert results[-1].picture.total_iterations == 3
     assert slow.refined == 4
+
+
+def test_before_the_first_frame_the_view_waits_and_does_not_spin(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = FreeRunningCamera(0.3)
+    camera.n_frames = 1
+    waits: list[float] = []
+    take = StreamReader.next_frame
+
+    def next_frame(self: StreamReader, timeout_s: float) -> Frame | None:
+        waits.append(timeout_s)
+        return take(self, timeout_s)
+
+    monkeypatch.setattr(StreamReader, "next_frame", next_frame)
+    with LiveView(FrameStream(camera, 3), Slow(0.0)) as view:
+        assert view.wait_newer(None, 5.0) is not None
+    assert waits[0] > 0
 
 
 def test_iterating_shows_every_picture_and_ends_with_the_view() -> None:

@@ -61,6 +61,14 @@ def taking(reconstructor: LiveReconstructor, fixed_ms: float, step_ms: float) ->
         reconstructor._pace.note(fixed, step, 1)
 
 
+def test_a_frame_gets_the_iterations_that_its_time_allows() -> None:
+    reconstructor = live(budget_ms=AMPLE_MS, average=1)
+    iterated(reconstructor, photograph(0, 1))
+    taking(reconstructor, 1.0, AMPLE_MS / 20)
+    moved = [reconstructor.feed(photograph(0.7 * k, k)) for k in (1, 2)]
+    assert moved[-1].iterations > 5, [str(picture.scene) for picture in moved]
+
+
 def test_a_still_scene_converges_to_the_reconstruction() -> None:
     reconstructor = live(average=1)
     frame = photograph(0, 1)
@@ -453,6 +461,16 @@ def test_pace_keeps_a_coarser_level_that_helped_though_not_enough() -> None:
     tell(pace, 1, 5, waiting_ms=60)
     assert pace.next_level(33) == 2
     assert turns(pace, 33) == (0, 2)  # it is not work that takes the time: no coarser
+
+
+@pytest.mark.parametrize(("took_ms", "level"), [(89, 10), (92, 9)])
+def test_pace_asks_of_a_small_step_half_of_what_it_can_save(took_ms: float, level: float) -> None:
+    """Pixels a tenth larger are 19 % fewer: 9.5 % less time is what helps."""
+    pace = Pace([9, 10])
+    tell(pace, 20, 40)
+    pace.enter(10)
+    tell(pace, 20, (took_ms - 20) / 2)
+    assert pace.next_level(33) == level
 
 
 def test_pace_waits_longer_for_a_finer_level_that_failed() -> None:

@@ -50,6 +50,15 @@ def test_a_still_video_becomes_what_a_photograph_becomes(name: str, erased: bool
     assert np.linalg.norm(picture - alone) < 0.12 * np.linalg.norm(alone)
 
 
+@pytest.mark.parametrize("solver", ["admm", "admm-sensor"])
+def test_where_no_depth_was_left_out_nothing_takes_part_again(solver: str) -> None:
+    scene = make_scene("sparse-picture", size=24, grid=3, photons=2000.0)
+    problem = stream_problem(scene.measurement, scene.calibration, solver=solver)
+    video = VideoSolver(problem, cold_iterations=5, warm_iterations=2)
+    video.next(scene.measurement)
+    assert video.confirm()
+
+
 def test_a_frame_goes_on_from_the_one_before_whatever_the_camera() -> None:
     scene = make_scene("sparse-picture", size=24, grid=3, photons=2000.0)
     problem = stream_problem(scene.measurement, scene.calibration, model="local")
