@@ -52,6 +52,7 @@ from recon.types import Geometry
 MOST_STEPS = 300
 """More angles to one side of an axis are a mistake."""
 _REACH_MARGIN = 0.98  # of the stage's travel
+_WIDE = 0.25  # of a step: a source that smooths the response
 
 
 @dataclass(frozen=True)
@@ -217,6 +218,7 @@ class AngularRecord:
     geometry: Geometry
     bench: str
     simulated: bool
+    source_size_um: float | None = None
 
 
 ANGULAR = Purpose(
@@ -259,11 +261,24 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     picture = file.with_suffix(".png")
     save_figure(response_figure(response), picture)
     return Outcome(
-        verdict=tuple(response_lines(response)),
+        verdict=(*response_lines(response), *_width_words(record)),
         good=not response.findings,
         runs=(run.path,),
         files=(file, picture),
         result=response,
+    )
+
+
+def _width_words(record: AngularRecord) -> tuple[str, ...]:
+    """Return what is to be said of a source that is wide in angle; nothing of another, or an unknown one."""
+    sweep = record.sweep
+    width_deg = float(np.rad2deg(np.arctan((record.source_size_um or 0.0) / sweep.distance_um)))
+    if width_deg <= _WIDE * sweep.step_deg:
+        return ()
+    return (
+        f"Source: the pinhole is {width_deg:.2g} degrees wide from z = {sweep.distance_um / 1e3:.4g} mm "
+        f"([source] size_um), steps are {sweep.step_deg:g}: the response is a mean over that width. Take a "
+        "smaller one, or go farther away.",
     )
 
 
@@ -303,7 +318,9 @@ class AngularProcedure(Procedure):
         listener.step("moving the source")
         exposures = expose_sweep(bench, points, control=control)
         listener.exposures(exposures)
-        record = AngularRecord(sweep, bench.geometry, bench.label, bool(bench.simulated_kinds))
+        record = AngularRecord(
+            sweep, bench.geometry, bench.label, bool(bench.simulated_kinds), bench.config.source.size_um
+        )
         plan = sweep_plan(points, exposures.exposures_ms)
         runner = ANGULAR.prepare(bench, plan, folder, record, control, listener)
         return _finish(completed(runner.execute()), bench, control, listener)

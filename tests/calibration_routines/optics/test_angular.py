@@ -52,6 +52,14 @@ def bench() -> Iterator[Bench]:
         yield opened
 
 
+@pytest.mark.parametrize("size_um", [100.0, 3000.0])
+def test_a_source_that_is_wide_in_angle_is_said(tmp_path: Path, size_um: float) -> None:
+    text = TINY.replace("[source]", f"[source]\nsize_um = {size_um}") + f"source_diameter_um = {size_um}\n"
+    with open_bench(parse_config(text, None)) as bench:
+        done = AngularProcedure(AngularSweep(80e3, 6.0, 3.0, average=1)).carry_out(bench, tmp_path)
+    assert any("pinhole is 2.1 degrees wide" in line for line in done.verdict) == (size_um > 1000)
+
+
 def test_the_response_and_its_cut_offs_are_the_sensors(bench: Bench, tmp_path: Path) -> None:
     done = AngularProcedure(AngularSweep(150e3, 14.0, 2.0, average=2)).carry_out(bench, tmp_path)
     response, file = done.result, done.files[0]
