@@ -115,6 +115,43 @@ def test_a_frame_that_is_held_never_changes_and_starves_only_the_stream() -> Non
     assert status.overwritten == 40 - len(held)
 
 
+def test_frames_that_are_held_take_old_ones_from_the_ring_not_new_ones() -> None:
+    camera = _Paced()
+    stream = FrameStream(camera, 4)
+    reader = stream.reader()
+    with stream:
+        held = [frame for frame in (reader.next_frame(60.0) for _ in range(4)) if frame is not None]
+        for _ in range(40):
+            camera.ahead.release()
+        seen = held[-1]
+        while number_of(seen) < 45:
+            newer = stream.wait_newer(seen, 10.0)
+            assert newer is not None
+            seen = newer
+    assert [number_of(frame) for frame in held] == sorted({number_of(frame) for frame in held})
+
+
+def test_the_ring_holds_as_many_frames_as_it_was_asked_to() -> None:
+    camera = finite(10)
+    stream = FrameStream(camera, 4)
+    with stream:
+        while stream.acquired < 10:
+            time.sleep(0.001)
+        assert len(stream.ring) == 4
+
+
+def test_a_stream_is_started_once() -> None:
+    with FrameStream(finite(3)) as stream, pytest.raises(DeviceError, match="started before"):
+        stream.start()
+
+
+def test_a_newer_frame_is_not_waited_for_longer_than_it_takes() -> None:
+    with FrameStream(finite(2)) as stream:
+        began_s = time.monotonic()
+        assert stream.wait_newer(None, 60.0) is not None
+        assert time.monotonic() - began_s < 50
+
+
 def test_part_of_a_frame_keeps_its_buffer() -> None:
     pool = BufferPool(1, (4, 4), np.uint16)
     image = pool.take()

@@ -108,6 +108,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/recon/video",
             "tests/recon/live",
             "tests/instrument/live",
+            "tests/instrument/video/test_video.py",
         ),
     ),
     "units": (

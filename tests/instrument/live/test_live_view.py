@@ -152,10 +152,21 @@ def test_iterating_shows_every_picture_and_ends_with_the_view() -> None:
     assert not worker.is_alive()
 
 
+def test_closing_waits_for_the_picture_in_progress() -> None:
+    slow = Slow(0.3)
+    view = LiveView(FrameStream(FreeRunningCamera(0.002), 3), slow).start()
+    while not slow.fed:
+        time.sleep(0.001)
+    worker = view._thread
+    view.close()
+    assert worker is not None
+    assert not worker.is_alive()
+
+
 def test_the_status_is_of_the_last_pictures() -> None:
     view = LiveView(FrameStream(FreeRunningCamera(), 3), Slow(0.0))
     assert np.isnan(view.status.pictures_per_s)
-    view._done.extend((0.5 * n, float(n)) for n in range(101))
+    view._done.extend((7 + 0.5 * n, float(n)) for n in range(101))
     status = view.status
     assert (status.pictures_per_s, status.latency_median_ms, status.latency_p99_ms) == (2.0, 50.0, 99.0)
 

@@ -475,6 +475,7 @@ def test_light_is_told_from_noise_however_faint(photons: float) -> None:
     light *= photons / light.max()
     deviation = np.array([np.sqrt(light.mean() + 1)])
     assert has_light(rng.poisson(light) + rng.normal(0, 1, SHAPE), deviation)
+    assert not has_light(rng.normal(0, deviation[0], (24, 24)), deviation), "few blocks still tell"
     assert not has_light(rng.normal(0, deviation[0], SHAPE), deviation)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -352,6 +354,12 @@ def test_unusable_settings_are_refused(settings: dict[str, float]) -> None:
         live(**settings)
 
 
+def test_what_has_seen_nothing_can_be_restarted() -> None:
+    reconstructor = live()
+    reconstructor.restart()
+    assert iterated(reconstructor, photograph(0, 1)).iterations > 0
+
+
 def test_a_change_of_format_needs_a_restart() -> None:
     reconstructor = live()
     reconstructor.feed(photograph(0, 0))
@@ -548,3 +556,4 @@ def test_a_calibration_that_does_not_fit_is_said_of_every_picture(psf: np.ndarra
     picture = reconstructor.feed(photograph(0, 2))
     assert says in picture.doubt
     assert bool(says) == bool(picture.doubt)
+    assert not says or re.match("(The|This|What|It|A) ", picture.doubt), picture.doubt

@@ -153,6 +153,9 @@ def test_time_helps_where_frames_are_alike() -> None:
     assert error("lowrank", 1.0) < 1.2 * alone  # it takes some of the background's light
     assert error("lowrank", 100.0) > 2 * alone
     assert solve_together(camera, frames, "tv", ended=lambda: True) is None
+    two = solve_together(camera, frames[:2], "tv")
+    assert two is not None
+    assert two.shape == (2, 24, 28)
 
 
 def test_colour_and_single_frames_are_refused() -> None:
