@@ -387,11 +387,15 @@ def gui(
             show_default=False,
         ),
     ] = None,
+    named: BenchOption = None,
 ) -> None:
     """Open the desktop program: live view, stage, light, sweeps, reconstructions, holograms.
 
     Closing the window, Ctrl-C and SIGTERM end it safely: light off, motion stopped, runs closed.
     """
+    if bench is not None and named is not None:
+        raise BenchError(f"Two benches are named, {bench} and {named}: give one.")
+    bench = named if bench is None else bench
     from instrument.bench.config_file import DEFAULT_NAME
 
     try:

@@ -78,6 +78,8 @@ class GroupedCommand(TyperCommand):
             named = [flag for flag in flags if flag[2:] in file.name.lower() and flag != "--out"]
             if (file / "calibration.json").exists() and "--calibration" in flags:
                 named = ["--calibration"]
+            if file.suffix == ".toml" and "--bench" in flags:
+                named = ["--bench"]
             if not file.exists():
                 named = ["--out"]
             flag = named[0] if named else "--image"

@@ -415,15 +415,18 @@ def reduce_valid(valid: npt.NDArray[np.bool_], crop: Crop | None, binning: int) 
 def _saturated(image: ImageFile, psf: npt.NDArray[Any] | None) -> Erased:
     saturated = saturated_pixels(image.pixels)
     left_out = saturated if psf is None else saturated | defective_pixels(image.pixels, psf)
+    unknown = np.count_nonzero(np.isnan(image.pixels))
+    nan = f"{unknown} pixels that are NaN" if unknown else ""
     if not left_out.any():
-        return Erased(None, "none (no pixel is saturated)")
+        return Erased(None, nan or "none (no pixel is saturated)")
     said = []
     if count := np.count_nonzero(saturated):
         tops = ", ".join(f"{top:g}" for top in np.unique(image.pixels[saturated]))
         said += [f"{count} saturated pixels ({count / image.pixels.size:.2%}, at {tops})"]
     if count := np.count_nonzero(left_out & ~saturated):
         said += [f"{count} hot or dead ones" if said else f"{count} hot or dead pixels"]
-    return Erased(~left_out, f"{' and '.join(said)}; --erasures none uses them")
+    words = f"{' and '.join(said)}; --erasures none uses them"
+    return Erased(~left_out, f"{nan}; {words}" if nan else words)
 
 
 def _from_mask(path: Path, image: ImageFile) -> Erased:

@@ -60,6 +60,8 @@ MISTAKES: list[tuple[list[str], str]] = [
     ([*RECONSTRUCT, "--volume", "plain", "--image", "photo.tif", "--z-mm", "30"], "do not apply: --z-mm"),
     ([*RECONSTRUCT, "--volume", "plain", "--image", "photo.tif", "--prior", "tv-haar"], "not for volumes"),
     (["snap", "photo2.tif"], "Did you mean --out photo2.tif?"),
+    (["check", "other.toml"], "Did you mean --bench other.toml?"),
+    (["gui", "bench.toml", "--bench", "bench.toml"], "Two benches are named"),
     (["snap", "--out", "a.png", "--figure", "a.png"], "the photograph itself has that name"),
     (["snap", "--out", "/proc/photo.tif"], "Choose another place"),
     (["analyze", "plain"], "--volume FOLDER"),
@@ -104,6 +106,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_calibration(Calibration(scene.calibration.psfs[:1], np.array([[0, 0, 2e4]])), folder / "near")
     (folder / "text.tif").write_text("psf")
     (folder / "empty.tif").touch()
+    (folder / "other.toml").touch()
     return folder
 
 

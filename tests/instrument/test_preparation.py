@@ -269,6 +269,8 @@ def test_hot_and_dead_pixels_are_erased_unless_the_psf_has_spots_as_narrow() -> 
         "saturated", file(np.nan_to_num(planted, nan=image[50, 50]).clip(0).astype(np.uint16)), psf
     )
     assert erased.reason == "4 hot or dead pixels; --erasures none uses them"
+    holes = erasures_of("saturated", file(np.where(np.arange(160) == 5, np.nan, image).astype(np.float32)))
+    assert holes.reason == "120 pixels that are NaN"
 
 
 def test_a_share_is_erased_at_random_and_the_same_every_time() -> None:
