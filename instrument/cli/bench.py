@@ -387,7 +387,12 @@ def gui(
             show_default=False,
         ),
     ] = None,
-    named: BenchOption = None,
+    named: Annotated[
+        Path | None,
+        typer.Option(
+            "--bench", "-b", metavar="FILE", help="The same, as all commands take it.", show_default=False
+        ),
+    ] = None,
 ) -> None:
     """Open the desktop program: live view, stage, light, sweeps, reconstructions, holograms.
 

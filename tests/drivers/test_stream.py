@@ -140,6 +140,17 @@ def test_the_ring_holds_as_many_frames_as_it_was_asked_to() -> None:
         assert len(stream.ring) == 4
 
 
+def test_going_through_a_streams_frames_starts_and_ends_it() -> None:
+    camera = finite(5)
+    seen = []
+    for frame in FrameStream(camera, 8):
+        seen.append(number_of(frame))
+        if len(seen) == 3:
+            break
+    assert seen == [0, 1, 2]
+    assert not camera.is_streaming
+
+
 def test_a_stream_is_started_once() -> None:
     with FrameStream(finite(3)) as stream, pytest.raises(DeviceError, match="started before"):
         stream.start()

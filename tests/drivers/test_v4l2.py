@@ -150,6 +150,15 @@ def test_frames_damaged_before_the_first_whole_one_are_counted() -> None:
             assert [m.frame_id for m in frames] == [first + 3, first + 4]
 
 
+def test_a_trigger_that_nobody_waits_for_is_refused() -> None:
+    with camera_on(FakeKernel()) as camera:
+        with pytest.raises(DeviceError, match="no software trigger now"):
+            camera.trigger()
+        camera.start_sequence(4)
+        with pytest.raises(DeviceError, match="no software trigger now"):
+            camera.trigger()
+
+
 def test_a_camera_that_does_not_number_its_frames_is_refused_in_words() -> None:
     kernel = FakeKernel()
     kernel.numbered = False

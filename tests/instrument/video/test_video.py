@@ -491,6 +491,7 @@ def test_a_dim_frame_after_a_bright_one_has_light() -> None:
     deviation = np.array([np.sqrt(10_000 * light.mean() + 4)])
     assert has_light(photographed(20), deviation)
     assert not has_light(photographed(0), deviation)
+    assert has_light(photographed(20) / 4095, deviation / 4095), "of frames whose white is 1, too"
     two = np.stack([photographed(0), photographed(20)], axis=2)
     assert has_light(two, deviation.repeat(2))
     told = [has_light(np.round(photographed(0)), deviation) for _ in range(50)]

@@ -261,6 +261,20 @@ def test_stray_light_that_a_photograph_would_have_a_background_for_is_said(stray
     assert not picture.doubt
 
 
+def test_what_is_erased_in_one_colour_changes_no_picture() -> None:
+    scene = make_scene("sparse-picture", size=SIZE, grid=3, photons=3000.0)
+    psf = np.stack([scene.calibration.psfs[0, 0]] * 3, axis=-1)
+    frame = np.stack([scene.measurement * share for share in (1.0, 0.7, 0.5)], axis=-1).astype(np.float32)
+    gone = np.zeros(frame.shape, bool)
+    gone[3:6, 4:9, 0] = gone[20, 21, 2] = True
+    pictures = []
+    for value in (0.0, 4 * float(frame.max())):
+        reconstructor = LiveReconstructor(psf, erasures=gone, **PACE)
+        pictures.append(reconstructor.feed(np.where(gone, np.float32(value), frame)).image)
+    assert pictures[0].shape[2] == 3
+    np.testing.assert_array_equal(*pictures)
+
+
 @pytest.mark.parametrize("shown", [0, 1, 4, 6, 7])
 def test_the_first_the_last_and_the_depth_shown_are_never_left_out(shown: int) -> None:
     base = np.random.default_rng(0).random((24, 24)).astype(np.float32)
