@@ -147,6 +147,13 @@ def test_an_unapplied_camera_setting_is_an_error_and_the_camera_is_closed() -> N
     assert calls(bench)[-1] == "camera.close"
 
 
+def test_a_source_of_leds_that_the_array_lacks_is_refused() -> None:
+    bench = bench_with(extra="[source]\nleds = [0, 90000]\n")
+    with pytest.raises(LimitError, match=r"LEDs 0 to \d+, but .* names 90000\."):
+        bench.open()
+    assert not bench.camera.is_open
+
+
 def test_all_settings_that_the_camera_refuses_are_named_at_once() -> None:
     camera = '[camera]\ndriver = "simulated"\nexposure_ms = 1e9\nbinning = 3\ngain = 100\n'
     bench = Bench(parse_config(camera + '[simulated]\npreset = "tiny"\n', None))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+import stat
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
@@ -16,12 +18,13 @@ import pytest
 
 from instrument.cli import main
 from instrument.plan import Part, Plan
+from instrument.runs import writer
 from instrument.runs.acquire import look, prepare, prepare_resume, settle
 from instrument.runs.inspection import verify
 from instrument.runs.log import AppendOnlyLog
 from instrument.runs.run import FinishReason, Run, RunCondition
-from instrument.runs.run_files import RunError
-from instrument.runs.writer import FrameToStore, RunWriter
+from instrument.runs.run_files import UNCHANGING, RunError
+from instrument.runs.writer import FrameToStore, RunWriter, lock_run
 from tests.instrument.runs.test_resume import open_mock_bench
 from tests.instrument.runs.test_store import BENCH, frame, new_run
 
@@ -227,8 +230,62 @@ def test_an_older_runs_log_without_sums_and_copies_gets_them(tmp_path: Path, run
     (path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in old))
     assert verify(Run.open(path)).is_sound
     RunWriter.reopen(path).close()
+    mended = (path / "log.jsonl").read_text().count('"kind": "file"')
+    assert mended == len(UNCHANGING)
+    RunWriter.reopen(path).close()
+    assert (path / "log.jsonl").read_text().count('"kind": "file"') == mended, "once"
     (path / "plan.json").unlink()
     assert Run.open(path).plan == Run.open(runs[0]).plan
+
+
+def test_the_first_image_beyond_a_plan_is_kept_beside(tmp_path: Path, runs: tuple[Path, Path]) -> None:
+    path = tmp_path / "run"
+    shutil.copytree(runs[0], path)
+    run = Run.open(path)
+    assert run.plan is not None
+    last, beyond = (run.array.chunk_path(index) for index in (len(run.plan) - 1, len(run.plan)))
+    shutil.copytree(last.parents[1], beyond.parents[1])
+    RunWriter.reopen(path).close()
+    assert not beyond.is_file()
+    assert [kept.read_bytes() for kept in (path / "kept").rglob("*") if kept.is_file()] == [last.read_bytes()]
+    assert last.is_file()
+
+
+def test_a_resumed_runs_log_says_what_was_found(tmp_path: Path) -> None:
+    plan = Plan(label="p", parts=(Part(label="a", repeats=3),))
+    with open_mock_bench() as bench:
+        path = prepare(bench, plan, tmp_path).execute().path
+        Run.open(path).array.chunk_path(1).unlink()
+        prepare_resume(bench, path).execute()
+    (found,) = [event["text"] for event in Run.open(path).events if event["kind"] == "found"]
+    assert "file is gone" in found
+
+
+def test_a_label_that_no_step_has_is_named(runs: tuple[Path, Path]) -> None:
+    with pytest.raises(RunError, match="no steps labelled 'psf2'"):
+        Run.open(runs[0]).images("psf2")
+
+
+@pytest.mark.parametrize("unlockable", ["folder", "file"])
+def test_where_folders_cannot_be_locked_the_file_is(
+    tmp_path: Path, runs: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, unlockable: str
+) -> None:
+    path = tmp_path / "run"
+    shutil.copytree(runs[0], path)
+    lock = writer.lock
+
+    def sometimes(handle: int) -> bool:
+        if stat.S_ISDIR(os.fstat(handle).st_mode) == (unlockable == "folder"):
+            raise OSError("no locks here")
+        return lock(handle)
+
+    monkeypatch.setattr(writer, "lock", sometimes)
+    if unlockable == "file":
+        with pytest.raises(OSError, match="no locks here"):
+            lock_run(path)
+    else:
+        with lock_run(path), pytest.raises(RunError, match="another program"):
+            lock_run(path)
 
 
 def test_what_verify_says_that_resume_does_is_what_it_does(runs: tuple[Path, Path], tmp_path: Path) -> None:
