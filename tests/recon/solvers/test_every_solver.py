@@ -3,6 +3,7 @@
 import itertools
 import threading
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import pytest
@@ -207,3 +208,18 @@ def test_history_tells_all_that_is_known(case):
         assert np.isfinite([getattr(record, field) for record in history]).all(), field
     assert [r.iteration for r in history] == list(range(1, 21))
     assert all(a.seconds < b.seconds for a, b in itertools.pairwise(history))
+
+
+@pytest.mark.parametrize(
+    ("rules", "says"),
+    [
+        ({"iterations": None, "tolerance": 0}, "needs an end"),
+        ({"iterations": 0}, "1 or more, not 0"),
+        ({"time_s": 0}, "above 0, not 0"),
+        ({"time_s": float("nan")}, "above 0, not nan"),
+        ({"tolerance": -1e-9}, "must not be negative"),
+    ],
+)
+def test_rules_by_which_no_run_ends_well_are_refused(rules: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        StoppingRules(**rules)
