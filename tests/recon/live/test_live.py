@@ -12,7 +12,7 @@ from recon.base.metrics import psnr
 from recon.streams.live import LiveReconstructor
 from recon.streams.live_picture import NOISE_ONLY, Level, LivePicture
 from recon.streams.pace import HOLD, Pace, Spent
-from recon.streams.stillness import SceneState, SceneWatch
+from recon.streams.stillness import SceneState, SceneWatch, has_light
 
 SHAPE = (64, 96)
 AMPLE_MS = 5000.0
@@ -370,6 +370,33 @@ def test_a_change_of_format_needs_a_restart() -> None:
     assert reconstructor.feed(fine).scene is SceneState.NEW
 
 
+def test_a_restart_gives_up_what_solvers_hold_and_before_the_first_frame_does_nothing() -> None:
+    reconstructor = live(budget_ms=AMPLE_MS)
+    reconstructor.restart()
+    iterated(reconstructor, photograph(0, 0))
+    assert reconstructor._level is not None
+    solver = reconstructor._level.solver
+    assert solver is not None
+    assert solver.solvers != [None]
+    reconstructor.restart()
+    assert solver.solvers == [None]
+
+
+def test_a_depth_that_there_is_not_is_refused() -> None:
+    live(plane=0)
+    with pytest.raises(InputError, match="plane 1 is none of the 1 depths, counted from 0"):
+        live(plane=1)
+
+
+def test_one_frame_is_not_called_an_average() -> None:
+    reconstructor = live(budget_ms=AMPLE_MS, average=1)
+    iterated(reconstructor, photograph(0, 0))
+    still = reconstructor.feed(photograph(0, 1))
+    assert (still.scene, still.frames) == (SceneState.STILL, 1)
+    assert ", still" in still.quality
+    assert "averaged" not in still.quality
+
+
 # Whether the scene stands still ----------------------------------------------------------------------
 @pytest.mark.parametrize("photons", [0.3, 30, 3000])
 def test_noise_alone_is_still_whatever_its_size(photons: float) -> None:
@@ -532,6 +559,14 @@ def test_a_frame_of_noise_is_called_so_and_one_with_light_is_not() -> None:
     assert psnr(picture.image, reference.image) > 40
     for frame in dark[4:]:
         assert reconstructor.feed(frame).doubt == NOISE_ONLY
+
+
+@pytest.mark.parametrize("side", [16, 24])
+def test_small_frames_of_noise_are_told_from_small_frames_with_light(side: int) -> None:
+    noise = np.random.default_rng(0).normal(0, 2, (side, side)).astype(np.float32)
+    lit = noise + np.where(np.arange(side) < side // 2, 20, 0).astype(np.float32)
+    assert not has_light(noise, np.array([2.0]))
+    assert has_light(lit, np.array([2.0]))
 
 
 def test_erased_pixels_are_no_light() -> None:
