@@ -11,6 +11,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -234,7 +235,7 @@ class Procedure(ABC):
             if control.ending is None and outcome.whole:
                 took(self, bench, outlook, time.monotonic() - began_s)
                 for run in outcome.runs[:1]:
-                    keep_pace(run, abilities_of(bench), bench.config.text)
+                    keep_pace(run, partial(abilities_of, bench), bench.config.text)
             return outcome
 
     @abstractmethod

@@ -379,7 +379,7 @@ def _device_line(device: FoundDevice) -> str:
     epilog=examples("diffuserbench gui", "diffuserbench gui bench.toml"),
 )
 def gui(
-    bench: Annotated[
+    file: Annotated[
         Path | None,
         typer.Argument(
             metavar="[BENCH.TOML]",
@@ -387,7 +387,7 @@ def gui(
             show_default=False,
         ),
     ] = None,
-    named: Annotated[
+    bench: Annotated[
         Path | None,
         typer.Option(
             "--bench", "-b", metavar="FILE", help="The same, as all commands take it.", show_default=False
@@ -398,9 +398,9 @@ def gui(
 
     Closing the window, Ctrl-C and SIGTERM end it safely: light off, motion stopped, runs closed.
     """
-    if bench is not None and named is not None:
-        raise BenchError(f"Two benches are named, {bench} and {named}: give one.")
-    bench = named if bench is None else bench
+    if file is not None and bench is not None:
+        raise BenchError(f"Two benches are named, {file} and {bench}: give one.")
+    bench = file if bench is None else bench
     from instrument.bench.config_file import DEFAULT_NAME
 
     try:

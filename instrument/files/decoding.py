@@ -268,7 +268,7 @@ def _turned(orientation: int) -> str:
 def _exif_orientation(data: bytes) -> int:
     """Return how a JPEG or PNG says that it stands, as a TIFF's tag 274; 1 where it says nothing."""
     mark = b"Exif\0\0" if data[:2] == b"\xff\xd8" else b"eXIf"
-    place = data.find(mark)
+    place = data.find(mark) if data.startswith((b"\xff\xd8", _PNG_MAGIC)) else -1
     if place < 0:
         return 1
     from PIL import Image  # of Matplotlib's own needs; OpenCV turns only what it also changes otherwise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -60,12 +61,15 @@ def pace_of(plan: Plan, abilities: BenchAbilities, folder: Path, toml: str) -> P
     return others[0] if others else _kept(toml)
 
 
-def keep_pace(path: Path, abilities: BenchAbilities, toml: str) -> None:
-    """Keep the pace of a run that has just ended, unless nobody sees what is foretold or it tells none."""
+def keep_pace(path: Path, abilities: Callable[[], BenchAbilities], toml: str) -> None:
+    """Keep the pace of a run that has just ended, unless nobody sees what is foretold or it tells none.
+
+    A device that fails when its ``abilities`` are asked for spoils nothing: the run is over.
+    """
     if not kept_times.seen():
         return
     try:
-        found = _measured(Run.open(path), abilities, toml)
+        found = _measured(Run.open(path), abilities(), toml)
     except (BenchError, DeviceError, OSError, LookupError, ValueError):
         return
     if found is not None:

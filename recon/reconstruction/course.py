@@ -157,6 +157,8 @@ def expected_iterations(
     number = np.array([r.iteration for r in counted], float)
     unrest = np.array([r.unrest for r in counted])
     if tolerance > 0 and len(counted) > 2 and np.isfinite(unrest).all() and (unrest > 0).all():
+        if unrest[-1] <= tolerance:  # whether it still falls is rounding
+            return last.iteration
         ends = []
         for bent, back in ((np.log, np.exp), (np.sqrt, np.square)):
             slope, start = np.polyfit(bent(number), np.log(unrest), 1)

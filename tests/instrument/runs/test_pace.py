@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from drivers.errors import DeviceError
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files import kept_times
-from instrument.plan import Part, Plan
+from instrument.plan import BenchAbilities, Part, Plan
 from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.pace import Pace, keep_pace, pace_of
 
@@ -50,16 +51,20 @@ def test_the_pace_of_a_run_before(tmp_path: Path) -> None:
     assert "as in r: about 10.2 s." in Pace(1.0, "r").words(plan_of("a", 10), abilities)
 
 
+def unplugged() -> BenchAbilities:
+    raise DeviceError("stage", "does not answer")
+
+
 def test_a_pace_is_kept_of_runs_that_lie_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(kept_times, "seen", lambda: True)
     with open_bench(parse_config(TOML, None)) as bench:
         abilities, toml = abilities_of(bench, tmp_path), bench.config.text
         run = acquire(bench, plan_of("a", 5), tmp_path / "there")
-        keep_pace(run.path, abilities, toml)
-        keep_pace(
-            acquire(bench, plan_of("b", 2), tmp_path / "there").path, abilities, toml
-        )  # too short to tell
+        keep_pace(run.path, lambda: abilities, toml)
+        short = acquire(bench, plan_of("b", 2), tmp_path / "there")
+        keep_pace(short.path, lambda: abilities, toml)  # tells nothing
+    keep_pace(run.path, unplugged, toml)  # after the run, whose end it does not spoil
     found = pace_of(plan_of("a", 9), abilities, tmp_path / "here", toml)
     assert found is not None
     assert found.run == run.path.name

@@ -145,8 +145,10 @@ def test_the_psnr_asked_for_and_levels_are_of_what_the_display_shows():
     found = compute_hologram(model, iterations=200, psnr_db=24)
     assert found.stop_reason is HologramStop.QUALITY
     assert model.evaluate(found.slm).seen_psnr_db >= 24
-    rounded = compute_hologram(model, iterations=100, phase_levels=256)
-    assert rounded.history[-1].psnr_db > 24
+    smooth, rounded = (compute_hologram(model, iterations=60, phase_levels=n) for n in (None, 256))
+    # Less than 0.01 dB with four starts. Both reach 23.8 to 26.4 dB, by start and processor.
+    assert abs(rounded.history[-1].psnr_db - smooth.history[-1].psnr_db) < 0.1
+    assert smooth.history[-1].psnr_db > 20
     assert (
         np.abs(rounded.phase_rad * 256 / (2 * np.pi) - np.rint(rounded.phase_rad * 256 / (2 * np.pi))).max()
         < 1e-3
