@@ -317,6 +317,9 @@ class Camera(Device):
         """What a snap, or a free-running sequence's next frame, may take before the camera has failed."""
         return self.longest_silence_s + 3e-3 * self.exposure_ms
 
+    frames_in_flight: ClassVar[int] = 2
+    """Frames that can be between the sensor and the host while the next one is exposed, at most."""
+
     @abstractmethod
     def stop_sequence(self) -> None:
         """End the running sequence (or a pending ``snap``) at once. Without one it does nothing."""

@@ -229,6 +229,29 @@ class FrameStream:
         self.require_answer()
         return None
 
+    def fresh(self) -> Frame:
+        """Return a frame that was exposed wholly after now: after a move, a change of light.
+
+        As many frames are let go as can have been on their way: in the driver's buffers, between sensor and
+        host (the camera's ``frames_in_flight``), and the one being exposed. Frames that were lost do not
+        count: they may have been lost before. No clock is asked: where every frame lies in a buffer for a
+        while, clocks call an old one new.
+
+        Raises DeviceTimeoutError when the camera falls silent; StoppedError when the stream ends meanwhile.
+        """
+        reader = self.reader()
+        for _ in range(self.n_buffers + self.camera.frames_in_flight + 1):
+            self._next_of(reader)
+        return self._next_of(reader)
+
+    def _next_of(self, reader: StreamReader) -> Frame:
+        frame = reader.next_frame(self.camera.longest_wait_s)
+        if frame is None and self._running:
+            raise DeviceTimeoutError(self.camera.name, "sent no frame while a fresh one was waited for.")
+        if frame is None:
+            raise StoppedError(self.camera.name, "the stream ended while a fresh frame was waited for.")
+        return frame
+
     def subscribe(self, callback: Callable[[Frame], None], *, newest_only: bool = False) -> Subscription:
         """Have ``callback`` called with frames in a thread of its own, until the stream ends.
 

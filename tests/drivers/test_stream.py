@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 
 from drivers.common.stream import BufferPool, FrameStream
-from drivers.errors import DeviceError, DeviceTimeoutError
+from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from tests.mocks.free_running import FreeRunningCamera
 
@@ -319,6 +319,35 @@ def test_stopping_the_camera_from_elsewhere_ends_the_stream_without_error() -> N
         while reader.next_frame(5) is not None:
             pass
         assert not stream.is_running
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.01])
+def test_a_fresh_frame_was_exposed_wholly_after_it_was_asked_for(
+    late_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the host is slow, so that every frame lay in the driver's buffers, and many were lost."""
+    camera = FreeRunningCamera()
+    take = camera.next_frame
+
+    def slow(timeout_s: float) -> Frame:
+        time.sleep(late_s)
+        return take(timeout_s)
+
+    monkeypatch.setattr(camera, "next_frame", slow)
+    with FrameStream(camera, 4) as stream:
+        for _ in range(8):
+            exposing = camera.exposing
+            assert number_of(stream.fresh()) > exposing
+    with pytest.raises(StoppedError):
+        stream.fresh()
+
+
+def test_a_fresh_frame_of_a_silent_camera_is_not_waited_for_forever(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("drivers.camera.Camera.longest_silence_s", 0.05)
+    with FrameStream(finite(6)) as stream, pytest.raises(DeviceTimeoutError):
+        stream.fresh()
 
 
 def test_a_drivers_mistake_reaches_those_who_read(monkeypatch: pytest.MonkeyPatch) -> None:

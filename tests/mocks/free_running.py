@@ -29,6 +29,7 @@ class FreeRunningCamera(MockCamera):
         self.n_frames: int | None = None
         self.fail_at: int | None = None
         self.deep_ring: int | None = None
+        self.exposing = 0
         self._ring: deque[Frame] = deque()
         self._arrived = threading.Condition()
         self._thread: threading.Thread | None = None
@@ -74,6 +75,7 @@ class FreeRunningCamera(MockCamera):
                     self._failure = DeviceError(self.name, "was unplugged.")
                     self._arrived.notify_all()
                 return
+            self.exposing = number
             time.sleep(self.exposure_ms / 1e3)
             image = np.full(self.image_shape, number, np.uint16)
             self._deliver(Frame(image, self.snap_metadata(number)))
