@@ -175,6 +175,32 @@ def test_the_travel_lies_where_homing_puts_it(
     assert ControllerSettings(BASE | settings, info).travel(0) == travel
 
 
+def test_settings_are_looked_up_by_axis_and_in_seconds() -> None:
+    values = {
+        100: 250.0,
+        101: 80.0,
+        110: 600.0,
+        111: 90.0,
+        120: 10.0,
+        121: 7.0,
+        130: -50.0,
+        131: 40.0,
+        160: 0.25,
+    }
+    hal = ControllerSettings(values | {161: 0.5}, {"VER": "1.1f", "FIRMWARE": "grblHAL"})
+    assert [hal.steps_per_unit(n) for n in (0, 1)] == [250.0, 80.0]
+    assert [hal.rate_per_s(n) for n in (0, 1)] == [10.0, 1.5]
+    assert [hal.acceleration_per_s2(n) for n in (0, 1)] == [10.0, 7.0]
+    assert [hal.backlash(n) for n in (0, 1, 2)] == [0.25, 0.5, None]
+    assert [hal.travel(n) for n in (0, 1)] == [(-50.0, 0.0), (-40.0, 0.0)]
+    assert ControllerSettings(values, {}).backlash(0) is None
+    assert ControllerSettings(values, {"AXS": "3:X2Z"}).letters == "XYZABCUVW"
+    assert not ControllerSettings({21: 2, 22: 2}, {}).hard_limits
+    assert not ControllerSettings({21: 2, 22: 2}, {}).homing
+    with pytest.raises(DeviceError, match=r"\$101 \(steps per mm of axis Y\) is 0\."):
+        ControllerSettings(values | {101: 0.0}, {}).check("stage (test)", 2)
+
+
 def test_without_a_pull_off_nothing_is_left_out_of_the_travel() -> None:
     values = {number: value for number, value in BASE.items() if number != 27}
     assert ControllerSettings(values | {21: 1, 22: 1}, {}).travel(0) == (-100.0, 0.0)

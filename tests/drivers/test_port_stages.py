@@ -112,6 +112,41 @@ def test_an_elliptec_module_says_its_units() -> None:
     assert 50.0 < coarse._tolerance(coarse._read_axis("x_um")[1]) < 51.0
 
 
+def test_an_elliptec_module_is_taken_for_what_it_says_that_it_is() -> None:
+    for axis, kind, pulses in (("x_um", "0E", "400"), ("yaw_mrad", "14", "400"), ("x_um", "14", "000")):
+        told = ToldElliptec(f"{kind}1140TEST20231781003C00000{pulses}", axis)
+        with pytest.raises(DeviceError, match=f"is an ELL{int(kind, 16)}, .*cannot be {axis}"):
+            told._read_axis(axis)
+    assert ToldElliptec("141140TEST20231781000100000001")._read_axis("x_um")[0].scale == 1000.0
+    damaged = ToldElliptec("141140TEST20231781003CZZZZZZZZ")
+    with pytest.raises(DeviceError, match="module 0 describes itself as 'IN14"):
+        damaged._read_axis("x_um")
+    assert ToldElliptec("141140TEST20231781003C00000400")._identify() == ("ELL20", "1140TEST", "17")
+
+
+def test_an_elliptec_module_that_tells_no_place_is_where_it_was_sent() -> None:
+    stage = ToldElliptec("14" + "1140TEST2023" + "1781" + "003C" + "00000400")
+    stage._maps["x_um"], _ = stage._read_axis("x_um")
+    stage.says |= {"gs": "GS09", "gp": "GS09"}
+    state = stage._axis_state("x_um")
+    assert (state.place, state.moving, state.homed, state.fault) == (0.0, True, False, "")
+    stage._commanded = {"x_um": 2000.0}
+    stage._homed.add("x_um")
+    assert stage._axis_state("x_um") == (state := stage._axis_state("x_um"))
+    assert (state.place, state.moving, state.homed) == (2048.0, True, True)
+    stage._unasked(b"0GS12")
+    assert stage._axis_state("x_um").fault == "unknown status (status 18)"
+    assert ElliptecStage.probed_axis == {"address": "0"}
+
+
+def test_ports_are_opened_at_the_speed_of_their_controllers() -> None:
+    assert ToldElliptec("")._link._baud_rate == 9600
+    options = Smc100Options.model_validate({"port": "none", "axes": {"x_um": {"number": 3}}})
+    assert Smc100Stage(options)._link._baud_rate == 57_600
+    with pytest.raises(ValidationError, match="are both controller 1"):
+        Smc100Options.model_validate({"port": "p", "axes": {"x_um": {}, "y_um": {}}})
+
+
 def test_an_elliptec_module_that_was_away_has_lost_its_home() -> None:
     stage = ToldElliptec("14" + "1140TEST2023" + "1781" + "003C" + "00000400")
     stage._homed.add("x_um")
@@ -221,6 +256,7 @@ def test_smc100_failures_are_said_and_a_disabled_axis_is_enabled(tmp_path: Path)
     chain = Smc100Chain(tmp_path)
     with smc100(chain) as stage:
         assert "LTA-HS" in stage.identity.model
+        assert not stage.identity.simulated
         stage.home()
         chain.states[1] = 0x3C
         assert stage.move_to({"x_um": 123.4})["x_um"] == pytest.approx(123.4)

@@ -49,6 +49,21 @@ def test_soft_limits_that_are_none_are_refused(options: AxisOptions, words: str)
     assert "x_um (device 3 axis 1)" in str(caught.value)
 
 
+def test_soft_limits_may_be_a_step_beyond_and_a_range_is_more_than_a_place() -> None:
+    axis = AxisMap("x_um", "axis X", 0.5)
+
+    def made(**limits: float) -> StageAxis:
+        return axis.stage_axis(
+            "stage (test)", AxisOptions(**limits), ends=(4000, 0), speed_per_s=-3, resolution=-2
+        )
+
+    assert made(lower_limit=-1.0, upper_limit=2001.0) == StageAxis("x_um", 0.0, 2000.0, 1.5, 1.0)
+    assert made(lower_limit=5.0) == StageAxis("x_um", 5.0, 2000.0, 1.5, 1.0)
+    for limits in ({"lower_limit": 2000.0}, {"upper_limit": 0.0}, {"upper_limit": -1.0}):
+        with pytest.raises(LimitError, match="no range is left"):
+            made(**limits)
+
+
 @pytest.mark.parametrize("upper", [500.0, 100.0, math.nan])
 def test_an_upper_limit_not_above_the_lower_is_a_mistake_of_the_configuration(upper: float) -> None:
     with pytest.raises(ValidationError, match="must be above lower_limit = 500") as caught:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
+from drivers.stage import StageAxis
 from drivers.testing.stage import StageContract
 from drivers.zaber.protocol import Message, command, flag_words, parse
 from drivers.zaber.stage import Chain, ZaberAxis, ZaberOptions, ZaberStage
@@ -109,12 +110,58 @@ def test_identity_names_every_device(stage: ZaberStage) -> None:
     assert stage.identity.model == "device 50419 + 50081"
     assert stage.identity.serial_number == "123456 + 777"
     assert not stage.identity.simulated
+    assert (stage.identity.kind, stage.identity.vendor) == ("stage", "Zaber")
 
 
 def test_limits_are_the_devices_narrowed_and_reversed(stage: ZaberStage) -> None:
     assert stage.limits["x_um"] == (0.0, 6000.0)
     assert stage.limits["z_um"] == (-4000.0, 1500.0)  # -3000 to 9000 microsteps against the direction
     assert stage.limits["pitch_mrad"] == pytest.approx((0.0, 209.4395))
+
+
+def test_an_axis_rests_within_a_microstep_or_what_a_direct_drive_needs(stage: ZaberStage) -> None:
+    assert [axis.resolution for axis in stage.axes] == pytest.approx([0.5, 0.5, 0.0174533], rel=1e-5)
+    for name, resolution, tolerance in (
+        ("x_um", 0.5, 1.0),
+        ("x_um", 50.0, 50.5),
+        ("pitch_mrad", 0.001, 0.02),
+        ("pitch_mrad", 1.0, 1.01),
+    ):
+        assert stage._tolerance(StageAxis(name, 0.0, 1.0, 1.0, resolution)) == pytest.approx(tolerance)
+
+
+def test_an_axis_without_the_size_of_its_microstep_is_no_axis() -> None:
+    for name in ("x_um", "yaw_mrad"):
+        with pytest.raises(ValueError, match="is no scale"):
+            ZaberAxis(device=1).axis_map(name)
+    assert ZaberAxis(microstep_um=0.25, reverse=True).axis_map("x_um").scale == -0.25
+
+
+@pytest.mark.usefixtures("stage")
+def test_homing_clears_the_warnings_of_each_axis_first(chain: ZaberChain) -> None:
+    for place in (b"/1 1 ", b"/1 2 ", b"/2 1 "):
+        told = [line for line in chain.port.received if line.startswith(place)]
+        assert [b"home" in line for line in told if b"home" in line or b"warnings clear" in line] == [
+            False,
+            True,
+        ]
+
+
+def test_what_a_rejection_says_and_that_it_is_of_this_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    chain = Chain("none", "stage (test)", 115_200)
+    told = {
+        "--": r"is out of its range \(BADDATA 7\)\.$",
+        "FS": r"\(BADDATA 7\); stalled and stopped \(FS\)\.$",
+    }
+    for flag, words in told.items():
+        reply = Message("@", 1, 2, 5, False, False, flag, "BADDATA 7")
+        monkeypatch.setattr(chain, "_ask_once", lambda *_, reply=reply: reply)
+        with pytest.raises(DeviceError, match=f"device 1 axis 2 rejects 'move abs 9': .*{words}"):
+            chain.ask("move abs 9", 1, 2)
+    chain._checksummed.add(1)
+    with pytest.raises(DeviceError, match="no port"):
+        chain.open()
+    assert not chain._checksummed  # whatever is plugged in now was told nothing yet
 
 
 def test_microsteps_are_exact(stage: ZaberStage, chain: ZaberChain) -> None:

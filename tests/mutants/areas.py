@@ -126,6 +126,8 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "recon/base/noise.py",
         ),
         (
+            "tests/drivers/test_camera_settings.py",
+            "tests/drivers/test_drives.py",
             "tests/drivers/test_stage_axes.py",
             "tests/drivers/test_port_stages.py",
             "tests/drivers/test_pixels.py",
