@@ -193,9 +193,16 @@ def test_the_zero_of_an_inertia_drive_is_believed_where_it_stands_as_it_stood(
 
 def test_an_inertia_drive_that_was_never_zeroed_is_not_homed() -> None:
     (two,), link = inertia(2)
+    link.answers = [status((0, 0), (4, 0))]
+    assert not two.state().homed
     two.prepare()
     link.answers = [status((0, 0), (4, 0))]
     assert not two.state().homed
+    (three,), link = inertia(3)
+    three.home()
+    three.prepare()  # where it stands was never asked
+    link.answers = [status((0, 0), (0, 0), (1, 0))]
+    assert not three.state().homed
 
 
 def test_an_inertia_channels_step_rate_is_set_and_the_rest_kept() -> None:

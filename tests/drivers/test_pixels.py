@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from drivers.common.camera_settings import GainScale
-from drivers.common.pixels import Packing, PixelFormat, genicam_format, unpack
+from drivers.common.pixels import Packing, PixelFormat, compile_kernels, genicam_format, unpack
+from drivers.common.unpacking import KERNELS
 
 
 def _bits(value: int, n: int) -> list[int]:
@@ -108,6 +109,18 @@ def test_arbitrary_bytes_are_unpacked_or_refused(
     for pitch in (None, 1, len(data)):
         if unpack(np.frombuffer(data, np.uint8), packing, out, pitch):
             assert out.max() < 1 << PACKINGS[packing]
+
+
+def test_pixels_of_more_than_eight_bits_are_words() -> None:
+    assert [PixelFormat("x", bits, "words").dtype for bits in (7, 8, 9)] == [np.uint8, np.uint8, np.uint16]
+
+
+def test_what_is_packed_is_compiled_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled: list[str] = []
+    for packing in PACKINGS:
+        monkeypatch.setitem(KERNELS, packing, lambda *_, packing=packing: compiled.append(packing))
+        compile_kernels(packing)
+    assert compiled == [packing for packing in PACKINGS if packing not in ("bytes", "words", "big words")]
 
 
 def test_a_line_pitch_below_the_line_is_refused() -> None:

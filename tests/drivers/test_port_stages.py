@@ -207,6 +207,24 @@ def test_an_axis_that_was_sent_home_is_there_once_it_has_been_seen_to_leave_or_h
     assert stage._came_home("x_um", moving=False)  # it stood there already
 
 
+def test_homing_begins_anew_and_is_not_going_on_where_it_could_not_be_begun(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stage = ToldSmc100()
+    stage._left.add("x_um")
+    stage._homed.add("x_um")
+    stage._start_homing()
+    assert (stage._left, stage._homed) == (set(), set())
+    assert time.monotonic() - 60 < stage._homing["x_um"] <= time.monotonic()
+    stage.says["TE"] = "D"
+    with pytest.raises(DeviceError, match="it cannot be done now"):
+        stage._start_homing()
+    assert stage._homing == {}
+    monkeypatch.setattr(stage, "_send_home", lambda _: stage._homing.clear())  # STOP came just then
+    stage._start_homing()
+    assert stage._homing == {}
+
+
 def test_elliptec_is_not_homed_when_its_homing_was_stopped(tmp_path: Path) -> None:
     bus = ElliptecBus(tmp_path)
     with elliptec(bus) as stage:

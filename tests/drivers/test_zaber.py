@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from drivers.device import FoundDevice
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.stage import StageAxis
 from drivers.testing.stage import StageContract
@@ -135,6 +136,45 @@ def test_an_axis_without_the_size_of_its_microstep_is_no_axis() -> None:
         with pytest.raises(ValueError, match="is no scale"):
             ZaberAxis(device=1).axis_map(name)
     assert ZaberAxis(microstep_um=0.25, reverse=True).axis_map("x_um").scale == -0.25
+
+
+def test_what_is_no_number_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = ZaberStage(ZaberOptions(port="none", axes={"x_um": ZaberAxis(microstep_um=1.0)}))
+    reply = Message("@", 1, 1, 5, True, False, "--", "1O")
+    monkeypatch.setattr(stage._chain, "_ask_once", lambda *_: reply)
+    with pytest.raises(DeviceError, match="device 1 axis 1 says it is at '1O'"):
+        stage._state()
+    with pytest.raises(DeviceError, match="answers '1O' to 'get maxspeed'; a number is expected"):
+        stage._chain.number("get maxspeed", 1)
+
+
+def test_a_silent_device_is_asked_three_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    chain, asked = Chain("none", "stage (test)", 115_200), []
+
+    def silent(*words: object) -> Message:
+        asked.append(words)
+        raise DeviceTimeoutError("stage (test)", "silence")
+
+    monkeypatch.setattr(chain, "_ask_once", silent)
+    with pytest.raises(DeviceTimeoutError, match="device 1 did not answer 'get pos' on none"):
+        chain.ask("get pos", 1)
+    assert asked == [("get pos", 1, 0, number) for number in range(3)]
+
+
+def test_zabers_are_discovered_by_who_made_them_and_probed_at_their_speed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ports = [
+        FoundDevice("serial", f"/dev/ttyUSB{n}", "port", vendor=who)
+        for n, who in enumerate(("Zaber", "FTDI"))
+    ]
+    monkeypatch.setattr("drivers.zaber.stage.serial_ports", lambda: ports)
+    assert [found.address for found in ZaberStage.discover()] == ["/dev/ttyUSB0"]
+    opened: list[int] = []
+    monkeypatch.setattr(Chain, "open", lambda self: opened.append(self._baud_rate))
+    monkeypatch.setattr(Chain, "number", lambda *_: 50419.0)
+    assert ZaberStage.probe("none") is not None
+    assert opened == [115_200]
 
 
 @pytest.mark.usefixtures("stage")

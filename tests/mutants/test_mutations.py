@@ -24,6 +24,8 @@ class A:
 
 def least(values):
     assert values, 1 + 1
+    if not values:
+        raise AssertionError("unreachable")
     return min(values) - 1.0
 
 
@@ -44,6 +46,7 @@ def test_mutants_of_a_text_are_the_code_that_they_say(tmp_path: Path) -> None:
         "self.size > 3 -> self.size >= 3",
         "self.size > 3 -> self.size <= 3",
         "self.size > 3 -> self.size > 4",
+        "not values -> values",
         "min(values) - 1.0 -> min(values) + 1.0",
         "min(values) - 1.0 -> min(values) - 2.0",
         "min(values) -> max(values)",

@@ -188,6 +188,16 @@ def test_the_estimate_is_to_rounding_what_it_was(height, width, kept, bright_noi
     assert estimate_deviation(frame, valid) == pytest.approx(told, rel=1e-7)
 
 
+def test_brightness_is_looked_at_from_forty_tiles_on():
+    light = np.broadcast_to(5 * np.exp(np.arange(130) / 26), (82, 130))
+    frame = np.random.default_rng(3).poisson(light).astype(float)
+    stencil = np.abs(np.diff(np.diff(frame, 2, axis=0), 2, axis=1)) / 6
+    assert estimate_deviation(frame) == pytest.approx(np.sqrt(light.mean()), rel=0.15)
+    assert np.median(stencil) / 0.6745 < 0.8 * np.sqrt(light.mean())  # as all of it together would say
+    stencil = np.abs(np.diff(np.diff(frame[:, :114], 2, axis=0), 2, axis=1)) / 6
+    assert estimate_deviation(frame[:, :114]) == pytest.approx(np.median(stencil) / 0.6745)  # 35 tiles
+
+
 def test_noise_of_nothing_is_nothing():
     assert estimate_deviation(np.ones((1, 1))) == 0
     assert estimate_deviation(np.ones((50, 50))) == 0
