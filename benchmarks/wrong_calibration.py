@@ -74,7 +74,7 @@ def optics_of(seed: int, rng: np.random.Generator) -> WavePropagator:
     aperture = (0.7 * SHAPE[0] * PITCH_UM, 0.7 * SHAPE[1] * PITCH_UM)
     features_um, slope = float(rng.uniform(80, 220)), float(rng.uniform(0.5, 1.2))
     diffuser = smooth_diffuser(aperture, 5.0, feature_size_um=features_um, mean_slope_deg=slope, seed=seed)
-    return WavePropagator(diffuser, D_UM, workers=1)
+    return WavePropagator(diffuser, D_UM)
 
 
 def psf_of(optics: WavePropagator, z_um: float, rng: np.random.Generator) -> np.ndarray:

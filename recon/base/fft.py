@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.namespace import namespace_of
-from recon.base.threads import get_threads, in_blocks
+from recon.base.threads import in_blocks, threads_here
 
 RealArray = npt.NDArray[Any]
 ComplexArray = npt.NDArray[Any]
@@ -75,7 +75,7 @@ def rfft(x: RealArray, *, axes: int = 2, out: ComplexArray | None = None) -> Com
     if out is None:
         out = np.empty(spectrum_shape(x.shape), complex_dtype(x.dtype))
     _check(out, spectrum_shape(x.shape), complex_dtype(x.dtype))
-    _kernels().forward(_batched(x, axes), _batched(out, axes), _axes(axes), get_threads())
+    _kernels().forward(_batched(x, axes), _batched(out, axes), _axes(axes), threads_here())
     return out
 
 
@@ -104,7 +104,7 @@ def irfft(X: ComplexArray, last: int, *, axes: int = 2, out: RealArray | None = 
         out = np.empty(shape, dtype)
     _check(out, shape, dtype)
     scale = 1.0 / float(np.prod(shape[-axes:], dtype=float))
-    _kernels().inverse(_batched(X, axes), _batched(out, axes), _axes(axes), scale, get_threads())
+    _kernels().inverse(_batched(X, axes), _batched(out, axes), _axes(axes), scale, threads_here())
     return out
 
 
@@ -123,7 +123,7 @@ def rfft_strip(x: RealArray, start: int, out: ComplexArray) -> ComplexArray:
         whole = xp.zeros((len(x), out.shape[1], x.shape[2]), x.dtype)
         whole[:, start : start + x.shape[1]] = x
         return rfft(whole, out=out)
-    _kernels().forward_strip(np.ascontiguousarray(x), out, start, get_threads())
+    _kernels().forward_strip(np.ascontiguousarray(x), out, start, threads_here())
     return out
 
 
@@ -135,7 +135,7 @@ def irfft_strip(X: ComplexArray, start: int, out: RealArray) -> RealArray:
     if namespace_of(X) is not np:
         return _onto(irfft(X, out.shape[2])[:, start : start + out.shape[1]], out)
     scale = 1.0 / (float(X.shape[1]) * out.shape[2])
-    _kernels().inverse_strip(X, out, start, scale, get_threads())
+    _kernels().inverse_strip(X, out, start, scale, threads_here())
     return out
 
 
@@ -176,7 +176,7 @@ def _cosine(x: RealArray, out: RealArray, kind: int) -> RealArray:
     shape = [n for n in x.shape if n > 1] or [1]  # an axis of one element is copied element by element
     scale = float(np.prod(2.0 * np.array(shape))) ** -0.5
     kernel = _kernels().cosine
-    kernel(x.reshape(shape), out.reshape(shape), np.arange(len(shape)), kind, scale, get_threads())
+    kernel(x.reshape(shape), out.reshape(shape), np.arange(len(shape)), kind, scale, threads_here())
     return out
 
 

@@ -39,11 +39,17 @@ def set_threads(threads: int) -> None:
 
 @lru_cache(maxsize=1)
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="recon", initializer=_mark_worker)
+    return ThreadPoolExecutor(threads, thread_name_prefix="recon", initializer=stay_alone)
 
 
-def _mark_worker() -> None:
+def stay_alone() -> None:
+    """Have this thread share nothing from now on: it is one of several that work already."""
     _inside.pool = True
+
+
+def threads_here() -> int:
+    """Return how many threads a transform may use that is asked for by this one."""
+    return 1 if getattr(_inside, "pool", False) else _threads
 
 
 if hasattr(os, "register_at_fork"):  # a forked child has the pool but not its threads

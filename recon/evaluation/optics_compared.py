@@ -111,7 +111,7 @@ def compare_optics(
     total, done = len(OPTICS) * (len(options.photons) + 1), 0
     found = {}
     for name in OPTICS:
-        light = WavePropagator(_diffuser(name, options.seed), DISTANCE_UM, workers=1)
+        light = WavePropagator(_diffuser(name, options.seed), DISTANCE_UM)
         grid = PixelGrid(SHAPE, PITCH_UM)
         psfs = [light.psf((0.0, 0.0, z), grid, GREEN.samples(1), emission="isotropic") for z in DEPTHS_UM]
         calibration = _calibration(np.stack(psfs))

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
 
-from recon.base.threads import get_threads
+from recon.base.fft import fast_shape, irfft_strip, multiply, rfft_strip, spectrum_shape
+from recon.base.threads import get_threads, stay_alone
 from recon.optics.fall_off import FallOff, response_on
 from recon.optics.grid import FloatArray, PixelGrid, mixed_spectrum
 from recon.optics.scene import Layer, Scene
@@ -96,7 +96,7 @@ def render(
         light *= response_on(grid, source, propagator.distance_um, fall_off)
         return light
 
-    with ThreadPoolExecutor(get_threads(), "render") as pool:
+    with ThreadPoolExecutor(get_threads(), "render", stay_alone) as pool:
         for light in pool.map(bead, scene.points()):
             if light is not None:
                 image += np.float32(bead_photons) * light
@@ -166,7 +166,7 @@ class _LayerRenderer:
             nodes_y, nodes_x = self._nodes()
             self.flux *= self._vignetting_ratio(nodes_y, nodes_x)
             indices = itertools.product(range(len(nodes_y)), range(len(nodes_x)))
-            with ThreadPoolExecutor(get_threads(), "render") as pool:
+            with ThreadPoolExecutor(get_threads(), "render", stay_alone) as pool:
                 # Added up in their order, whoever is done first: the sum is the same to the last bit.
                 for part in pool.map(lambda at: self._node(nodes_y, at[0], nodes_x, at[1]), indices):
                     if part is not None:
@@ -245,10 +245,17 @@ class _LayerRenderer:
             return None
         kernel = self._kernel(nodes_y[j], nodes_x[i])
         used = tuple(a + b - 1 for a, b in zip(patch.shape, kernel.shape, strict=True))
-        shape = tuple(fft.next_fast_len(side, real=True) for side in used)
-        spectrum = fft.rfft2(kernel, shape)
-        spectrum *= fft.rfft2(patch, shape)
-        light = fft.irfft2(spectrum, shape, overwrite_x=True)[: used[0], : used[1]]
+        shape = fast_shape(used)
+        light = np.zeros(shape, np.float32)
+        spectra = []
+        for part in (kernel, patch):
+            strip = light[: part.shape[0]]
+            strip[:, : part.shape[1]] = part
+            spectra.append(rfft_strip(strip[None], 0, np.empty((1, *spectrum_shape(shape)), np.complex64)))
+            strip[...] = 0
+        multiply(*spectra)
+        irfft_strip(spectra[0], 0, light[None, : used[0]])
+        light = light[: used[0], : used[1]]
         # Kernel pixel k lies at (k - (n - 1) / 2) from the straight ray, fine pixel p at (p - (N - 1) / 2)
         # from the centre: n and N are both even or both odd.
         top = first_y + (self.fine.shape[0] - kernel.shape[0]) // 2

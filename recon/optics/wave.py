@@ -27,9 +27,17 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
+from recon.base.threads import in_blocks, over_rows
 from recon.optics.diffuser import Diffuser
 from recon.optics.grid import FloatArray, PixelGrid, Spectrum, resample_energy
-from recon.optics.wave_kernels import add_intensity, modulate, propagate
+from recon.optics.wave_kernels import (
+    COLUMNS,
+    ComplexArray,
+    add_intensity,
+    modulate,
+    propagate,
+    transform_rows,
+)
 
 Emission = Literal["lambertian", "isotropic"]
 Source = tuple[float, float, float]
@@ -98,11 +106,9 @@ class WavePropagator:
     diffuser : Diffuser
     distance_um : float
         From the diffuser's relief to the sensor.
-    workers : int
-        Threads for the transforms.
     """
 
-    def __init__(self, diffuser: Diffuser, distance_um: float, *, workers: int = 2) -> None:
+    def __init__(self, diffuser: Diffuser, distance_um: float) -> None:
         if not 0 < distance_um < np.inf:
             raise ValueError(f"The sensor lies behind the diffuser: distance_um > 0, not {distance_um}.")
         self.diffuser = diffuser
@@ -110,7 +116,6 @@ class WavePropagator:
         slope = np.hypot(*diffuser.slopes())
         self._typical_slope = float(np.sqrt((slope**2).mean()))
         self._steepest = float(np.quantile(slope, 0.9995))
-        self.workers = workers
         self._kept: OrderedDict[Any, npt.NDArray[np.float32]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -219,8 +224,7 @@ class WavePropagator:
         energy = np.zeros((len(rows), len(columns)), np.float32)
         for tile in self._tiles(rows, columns, source_um):
             part = energy[_within(tile.rows, rows), _within(tile.columns, columns)]
-            for wavelength_nm, weight in spectrum:
-                self._add_tile(part, tile, source_um, margin, rho, wavelength_nm, weight, emission)
+            self._add_tile(part, tile, source_um, margin, rho, spectrum, emission)
         if blur > 0.5 and energy.size:  # empty: the pattern lies wholly off the sensor
             energy = np.asarray(cv2.filter2D(energy, -1, disc_kernel(blur), borderType=cv2.BORDER_CONSTANT))
         y_edges = (np.arange(rows.start, rows.stop + 1) - n_rows / 2) * pitch * scale - magnification * y
@@ -272,8 +276,7 @@ class WavePropagator:
         source_um: Source,
         margin: int,
         rho_um: float,
-        wavelength_nm: float,
-        weight: float,
+        spectrum: Spectrum,
         emission: Emission,
     ) -> None:
         diffuser = self.diffuser
@@ -286,37 +289,50 @@ class WavePropagator:
         first_row, row_window, height = along_y
         first_column, column_window, width = along_x
         field = np.zeros((height, width), np.complex64)
-        wavelength_um = wavelength_nm * 1e-3
-        modulate(
-            field.view(np.float32),
-            diffuser.heights_um,
-            row_window,
-            column_window,
-            first_row,
-            first_column,
-            pitch,
-            source_um[0],
-            source_um[1],
-            source_um[2],
-            2 * np.pi / wavelength_um,
-            diffuser.glass.at(wavelength_nm) ** 2,
-            diffuser.ambient.at(wavelength_nm) ** 2,
-            emission == "lambertian",
-        )
-        spectrum = fft.fft2(field, overwrite_x=True, workers=self.workers)
-        propagate(
-            spectrum.view(np.float32),
-            fft.fftfreq(height, pitch),
-            fft.fftfreq(width, pitch),
-            np.pi * wavelength_um * rho_um / tile.cos,
-            tile.tan_squared,
-            tile.direction[0],
-            tile.direction[1],
-        )
-        field = fft.ifft2(spectrum, overwrite_x=True, workers=self.workers)
+        pairs = field.view(np.float32)
         top, left = tile.rows.start - first_row, tile.columns.start - first_column
-        inner = field[top : top + len(tile.rows), left : left + len(tile.columns)]
-        add_intensity(energy, inner.view(np.float32), weight)
+        wanted = field[top : top + len(tile.rows)]
+        inner = wanted[:, left : left + len(tile.columns)].view(np.float32)
+        for number, (wavelength_nm, weight) in enumerate(spectrum):
+            if number:
+                field[...] = 0
+            wavelength_um = wavelength_nm * 1e-3
+            modulate(
+                pairs,
+                diffuser.heights_um,
+                row_window,
+                column_window,
+                first_row,
+                first_column,
+                pitch,
+                source_um[0],
+                source_um[1],
+                source_um[2],
+                2 * np.pi / wavelength_um,
+                diffuser.glass.at(wavelength_nm) ** 2,
+                diffuser.ambient.at(wavelength_nm) ** 2,
+                emission == "lambertian",
+            )
+            over_rows(_transform, field[: len(row_window)], True, 1.0)
+            _propagate(field, tile, pitch, np.pi * wavelength_um * rho_um / tile.cos)
+            over_rows(_transform, wanted, False, 1 / field.size)
+            add_intensity(energy, inner, weight)
+
+
+def _transform(start: int, stop: int, field: ComplexArray, forward: bool, scale: float) -> None:
+    transform_rows(field[start:stop], forward, scale)
+
+
+def _propagate(field: ComplexArray, tile: _Tile, pitch: float, strength: float) -> None:
+    """Take a field whose rows are transformed through a distance, columns shared among threads."""
+    height, width = field.shape
+    rows, columns = fft.fftfreq(height, pitch), fft.fftfreq(width, pitch)
+    pairs = field.view(np.float32)
+
+    def some(start: int, stop: int) -> None:
+        propagate(field, pairs, start, stop, rows, columns, strength, tile.tan_squared, *tile.direction)
+
+    in_blocks(some, -(-width // COLUMNS))
 
 
 def disc_kernel(diameter: float) -> npt.NDArray[np.float32]:

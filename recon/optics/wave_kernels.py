@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from rocket_fft import c2c
 
 from recon.optics.jit import compiled
 
 FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex64]
 Pairs = npt.NDArray[np.float32]
 """Complex numbers as ``.view(np.float32)``: (h, 2 w), real and imaginary parts in turn."""
 
 # The direction of incidence varies so slowly over the diffuser that it is evaluated every so many samples and
 # interpolated between.
 BLOCK = 16
+COLUMNS = 64
+"""That are transformed at a time: they fit into a core's own memory."""
 
 
 @compiled
@@ -111,8 +115,17 @@ def _turned(
 
 
 @compiled
+def transform_rows(field: ComplexArray, forward: bool, scale: float) -> None:
+    """Transform rows in place, one by one."""
+    c2c(field, field, np.array([1]), forward, scale, 1)
+
+
+@compiled
 def propagate(
-    spectrum: Pairs,
+    field: ComplexArray,
+    pairs: Pairs,
+    start: int,
+    stop: int,
     row_frequencies: FloatArray,
     column_frequencies: FloatArray,
     strength: float,
@@ -120,44 +133,51 @@ def propagate(
     direction_y: float,
     direction_x: float,
 ) -> None:
-    """Multiply by the transfer function of the stretched distance, in place.
+    """Take blocks ``start`` to ``stop`` of columns through a stretched distance, their rows transformed.
 
-    ``exp(-i strength (f . f + tan_squared (f . direction)^2))``, frequencies in the order of the FFT.
+    A block has ``COLUMNS`` of them, so that results do not depend on threads. They are transformed,
+    multiplied by ``exp(-i strength (f . f + tan_squared (f . direction)^2))`` and transformed back (not
+    scaled) while they are near; ``pairs`` is the field as floats.
     """
-    columns = column_frequencies.size
-    column_phases = np.empty(columns)
-    for j in range(columns):
-        column_phases[j] = -strength * column_frequencies[j] ** 2 * (1 + tan_squared * direction_x**2)
-    column_real = np.cos(column_phases).astype(np.float32)
-    column_imaginary = np.sin(column_phases).astype(np.float32)
-    mixed = -2 * strength * tan_squared * direction_y * direction_x
+    rows, columns = field.shape
+    along, across = np.empty(rows), np.array([0])
+    column_real, column_imaginary = np.empty(COLUMNS, np.float32), np.empty(COLUMNS, np.float32)
     # The mixed term turns by the same angle from one column to the next, but for the step down in the middle.
+    mixed = -2 * strength * tan_squared * direction_y * direction_x
     step_frequency = column_frequencies[1] if columns > 1 else 0.0
     middle = (columns + 1) // 2
-    within_real, within_imaginary = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    for i in range(row_frequencies.size):
+    within_real = np.empty((rows, COLUMNS), np.float32)
+    within_imaginary = np.empty((rows, COLUMNS), np.float32)
+    for i in range(rows):
         fy = row_frequencies[i]
-        phase = -strength * fy**2 * (1 + tan_squared * direction_y**2)
-        for k in range(BLOCK):
-            within_real[k] = np.cos(mixed * fy * step_frequency * k)
-            within_imaginary[k] = np.sin(mixed * fy * step_frequency * k)
-        first = 0
-        while first < columns:
-            count = min(BLOCK, (middle if first < middle else columns) - first)
-            angle = phase + mixed * fy * column_frequencies[first]
-            real, imaginary = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-            values = spectrum[i, 2 * first : 2 * (first + count)]
-            along_real = column_real[first : first + count]
-            along_imaginary = column_imaginary[first : first + count]
-            for k in range(count):
-                turn_real = real * within_real[k] - imaginary * within_imaginary[k]
-                turn_imaginary = real * within_imaginary[k] + imaginary * within_real[k]
-                both_real = turn_real * along_real[k] - turn_imaginary * along_imaginary[k]
-                both_imaginary = turn_real * along_imaginary[k] + turn_imaginary * along_real[k]
+        along[i] = -strength * fy**2 * (1 + tan_squared * direction_y**2)
+        cosine, sine = np.cos(mixed * fy * step_frequency), np.sin(mixed * fy * step_frequency)
+        real, imaginary = 1.0, 0.0
+        for k in range(COLUMNS):
+            within_real[i, k], within_imaginary[i, k] = real, imaginary
+            real, imaginary = real * cosine - imaginary * sine, real * sine + imaginary * cosine
+    first = COLUMNS * start
+    while first < min(COLUMNS * stop, columns):
+        last = min(COLUMNS * (first // COLUMNS + 1), middle if first < middle else columns)
+        part = field[:, first:last]
+        c2c(part, part, across, True, 1.0, 1)
+        for k in range(last - first):
+            phase = -strength * column_frequencies[first + k] ** 2 * (1 + tan_squared * direction_x**2)
+            column_real[k], column_imaginary[k] = np.cos(phase), np.sin(phase)
+        for i in range(rows):
+            angle = along[i] + mixed * row_frequencies[i] * column_frequencies[first]
+            real32, imaginary32 = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+            values = pairs[i, 2 * first : 2 * last]
+            for k in range(last - first):
+                turn_real = real32 * within_real[i, k] - imaginary32 * within_imaginary[i, k]
+                turn_imaginary = real32 * within_imaginary[i, k] + imaginary32 * within_real[i, k]
+                both_real = turn_real * column_real[k] - turn_imaginary * column_imaginary[k]
+                both_imaginary = turn_real * column_imaginary[k] + turn_imaginary * column_real[k]
                 value_real, value_imaginary = values[2 * k], values[2 * k + 1]
                 values[2 * k] = value_real * both_real - value_imaginary * both_imaginary
                 values[2 * k + 1] = value_real * both_imaginary + value_imaginary * both_real
-            first += count
+        c2c(part, part, across, False, 1.0, 1)
+        first = last
 
 
 @compiled

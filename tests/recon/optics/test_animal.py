@@ -43,7 +43,7 @@ def test_flashes_fade_flow_and_sway() -> None:
 def test_light_between_nodes_is_wave_optics_there() -> None:
     """Between nodes 0.2 mm apart the light is that of a source there, angular response included."""
     diffuser = microlens_diffuser((400.0, 400.0), 1.25, lenslet_um=130.0, focal_length_um=1500.0, seed=1)
-    optics = WavePropagator(diffuser, 3800.0, workers=1)
+    optics = WavePropagator(diffuser, 3800.0)
     fall_off, grid = gaussian_fall_off(13.0), PixelGrid((96, 128), 23.2)
     spectrum = mixed_spectrum(GREEN, 1)
     nodes = (np.array([0.0, 200.0]), np.array([100.0]), np.array([2450.0, 2550.0]))
