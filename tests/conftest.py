@@ -7,6 +7,7 @@ change is about that change. Everywhere else they look for new ones.
 from __future__ import annotations
 
 import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -15,6 +16,11 @@ from collections.abc import Iterator
 os.environ["MPLBACKEND"] = "agg"
 # Several test processes share the cores. It is read when NumPy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# A process that a script starts in the background (`make test &`) ignores Ctrl-C, as does all that it starts.
+# What is tested here is the program as a terminal starts it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import pytest
 from hypothesis import HealthCheck, settings
