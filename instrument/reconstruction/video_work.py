@@ -242,7 +242,10 @@ def cluster(
             "Workers need keys that keep others out, and the package cryptography, which makes them, is not "
             "installed: pip install 'diffuserbench[cluster]'."
         ) from error
+    # Their HTTP servers ask nobody who they are: they show nothing.
+    no_pages: dict[str, list[str]] = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "worker")}
     with (
+        importlib.import_module("dask.config").set(no_pages),
         distributed.LocalCluster(
             n_workers=workers,
             threads_per_worker=1,

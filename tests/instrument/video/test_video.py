@@ -329,6 +329,13 @@ def test_a_cluster_here_takes_work_from_its_owner_only() -> None:
             address = addresses[0].replace("tls", scheme)
             with pytest.raises(OSError):  # noqa: PT011 # which, is Dask's
                 distributed.Client(address, security=security, timeout=1)
+        known = client.scheduler_info()
+        ports = [port for one in (known, *known["workers"].values()) for port in one["services"].values()]
+        assert ports
+        for port in ports:
+            with socket.create_connection(("127.0.0.1", port), timeout=10) as page:
+                page.sendall(b"GET /info/main/workers.html HTTP/1.0\r\n\r\n")
+                assert b" 404 " in page.recv(100)
 
 
 @pytest.mark.slow
