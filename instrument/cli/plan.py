@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import pairwise
@@ -11,7 +12,9 @@ from typing import Annotated
 
 import typer
 
+from drivers.errors import DeviceError
 from instrument.cli.app import App, BenchOption, examples, open_and_say
+from instrument.cli.progress import one_task
 from instrument.files.atomic import require_new, write_text
 from instrument.files.errors import BenchError, FileError, duration, size
 from instrument.plan import BenchAbilities, Light, Plan, check, estimate
@@ -26,6 +29,7 @@ from instrument.plan.patterns import (
 )
 from instrument.runs.acquire import abilities_of
 from instrument.runs.pace import pace_of
+from instrument.runs.rehearsal import rehearse
 from recon.base.declare import option
 
 Point = tuple[float, float]
@@ -108,14 +112,21 @@ def show(
     """Say what a plan does and costs, draw its path, and hold it against the bench: nothing moves.
 
     Exit status 2 when the plan leaves the stage's limits, the disk or the devices' abilities; every
-    offending step is named.
+    offending step is named. Before the first run on a simulated bench some frames are computed to tell
+    the time.
     """
     plan = load_plan(file)
     with open_and_say(bench) as opened:
         abilities = abilities_of(opened, opened.config.data_folder)
         pace = pace_of(plan, abilities, opened.config.data_folder, opened.config.text)
+        wanted = replace(abilities, stage_homed=True)  # homing is the run's own first move
+        _describe(plan, abilities)
         simulated = bool(opened.simulated_kinds)
-    _describe(plan, abilities)
+        if pace is None and simulated:
+            with suppress(BenchError, DeviceError):  # what the bench cannot do is said below
+                check(plan, wanted)
+                with one_task("Rehearsing on a simulated bench of its own") as advance:
+                    pace = rehearse(plan, opened, advance)
     if pace is not None:
         typer.echo(pace.words(plan, abilities))
     elif simulated:
@@ -123,7 +134,7 @@ def show(
     if steps:
         for step in plan.steps():
             typer.echo(f"  {step}")
-    check(plan, replace(abilities, stage_homed=True))  # homing is the run's own first move
+    check(plan, wanted)
     typer.echo("The bench can do it. Nothing has moved.")
 
 

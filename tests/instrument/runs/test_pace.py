@@ -10,9 +10,13 @@ from drivers.errors import DeviceError
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files import kept_times
-from instrument.plan import BenchAbilities, Part, Plan
+from instrument.plan import SOURCE, BenchAbilities, Part, Plan, SourceGrid, estimate
+from instrument.runs import rehearsal
 from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.pace import Pace, keep_pace, pace_of
+from instrument.runs.rehearsal import rehearse
+from instrument.runs.run import Run
+from instrument.runs.runner import Runner, RunState, RunStatus
 
 TOML = """
 [camera]
@@ -49,6 +53,75 @@ def test_the_pace_of_a_run_before(tmp_path: Path) -> None:
     assert unlike.run == other.path.name
     assert pace_of(plan_of("a", 9), abilities, tmp_path, toml + "# changed\n") is None
     assert "as in r: about 10.2 s." in Pace(1.0, "r").words(plan_of("a", 10), abilities)
+
+
+def sweep_and_scene() -> Plan:
+    return Plan(
+        label="sweep",
+        parts=(
+            Part(label="dark", exposures_ms=(20.0,)),
+            Part(
+                label="psf",
+                light=SOURCE,
+                positions=SourceGrid(z_um=(1e5, 1.5e5, 2e5, 2.5e5, 2.9e5)),
+                exposures_ms=(5.0, 10.0),
+            ),
+            Part(label="scene", scene_lit=True, repeats=9, interval_s=3600.0),
+        ),
+    )
+
+
+class SlowRunner(Runner):
+    """A runner whose frames take 4 s in a new place, 1 s elsewhere, and 20 s for the scene's first."""
+
+    def execute(self) -> Run:
+        done = 0
+        moved, scenes = set(), 0
+        for step in self._plan.steps():
+            if step.index not in self._todo:
+                continue
+            took_s = 1.0
+            if step.source_um is not None and step.source_um not in moved:
+                moved.add(step.source_um)
+                took_s = 4.0
+            elif step.scene_lit:
+                took_s = 1.0 if scenes else 20.0
+                scenes += 1
+            SlowRunner.now_s += took_s
+            done += 1
+            assert self.on_progress is not None
+            self.on_progress(RunStatus(RunState.RUNNING, done, len(self._plan), done))
+        self._writer.close()
+        return Run.open(self.path)
+
+    now_s = 0.0
+
+
+def test_a_first_plan_is_rehearsed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each kind of frame by its first and its later ones; the open bench does nothing."""
+    plan = sweep_and_scene()
+    monkeypatch.setattr(rehearsal, "Runner", SlowRunner)
+    monkeypatch.setattr("instrument.runs.rehearsal.time.perf_counter", lambda: SlowRunner.now_s)
+    seen: list[tuple[int, int]] = []
+    with open_bench(parse_config(f'bench.data_folder = "{tmp_path}"\n' + TOML, None)) as bench:
+        found = rehearse(plan, bench, lambda done, total: seen.append((done, total)))
+        assert bench.stage is not None
+        assert not bench.stage.is_homed
+        abilities = abilities_of(bench)
+    assert found is not None
+    cost = estimate(plan, abilities)
+    assert found.frame_s * cost.frames == pytest.approx(1 + 5 * 4 + 5 * 1 + 20 + 8 * 1)
+    assert seen[-1] == (10, 10)  # of 20: one dark, three of each kind of PSF, three of the scene
+    assert "a rehearsal of 10 of them" in found.words(plan, abilities)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_rehearsal_takes_frames() -> None:
+    """It waits neither for the plan's own intervals, of an hour, nor for the stage."""
+    with open_bench(parse_config(TOML, None)) as bench:
+        found = rehearse(sweep_and_scene(), bench)
+    assert found is not None
+    assert "a rehearsal of 10 of them" in found.run
 
 
 def unplugged() -> BenchAbilities:

@@ -1,0 +1,102 @@
+"""What the frames of a plan take on a simulated bench before any run on it: some are taken on one like it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config import BenchConfig, SharedConfig
+from instrument.plan import Plan, Step, estimate
+from instrument.runs.acquire import abilities_of, record_of
+from instrument.runs.pace import Pace
+from instrument.runs.runner import Runner, RunStatus
+from instrument.runs.writer import RunWriter
+
+OF_EACH = 3
+"""So many frames of a kind are taken: the first of a kind may load and compute what later ones find."""
+
+
+@dataclass(slots=True)
+class _Kind:
+    """Frames that take equally long: under the same light, at a new place or not."""
+
+    steps: list[int]
+    seconds: list[float]
+
+    @property
+    def all_s(self) -> float:
+        """What all of them take: the first, the others as those after it."""
+        first, *others = self.seconds
+        later = sum(others) / len(others) if others else first
+        return first + (len(self.steps) - 1) * later
+
+
+def rehearse(
+    plan: Plan, bench: Bench, on_progress: Callable[[int, int], object] | None = None
+) -> Pace | None:
+    """Take some frames of every kind that a plan has, on a simulated bench like an open one.
+
+    That bench waits for nothing, and all it writes is removed: nothing of the open bench is asked to move or
+    to light. ``on_progress`` gets frames taken and to take. None where a device is not simulated, or there is
+    no plan for it to say about. Exceptions are those of a run.
+    """
+    config = _at_once(bench.config)
+    if config is None or len(bench.simulated_kinds) < len(bench.devices):
+        return None
+    kinds = _kinds(plan)
+    todo = sorted(index for kind in kinds for index in kind.steps[:OF_EACH])
+    ends: list[float] = []
+
+    def taken(status: RunStatus) -> None:
+        if status.done_here > len(ends):
+            ends.append(time.perf_counter())
+            if on_progress is not None:
+                on_progress(len(ends), len(todo))
+
+    with TemporaryDirectory(prefix="diffuserbench-rehearsal-") as folder, open_bench(config) as twin:
+        if twin.stage is not None:
+            twin.stage.home()
+        rehearsed = plan.model_copy(
+            update={"parts": tuple(p.model_copy(update={"interval_s": 0.0}) for p in plan.parts)}
+        ).on(twin.led_array)
+        writer = RunWriter.create(Path(folder), label=plan.label, bench=record_of(twin), plan=rehearsed)
+        begun = time.perf_counter()
+        Runner(twin, rehearsed, writer, todo=todo, on_progress=taken).execute()
+    took = dict(
+        zip(todo, (after - before for before, after in zip([begun, *ends], ends, strict=False)), strict=True)
+    )
+    for kind in kinds:
+        kind.seconds.extend(took[index] for index in kind.steps[:OF_EACH])
+    cost = estimate(plan, abilities_of(bench))
+    scale = max(getattr(shared.options, "time_scale", 1.0) for shared in bench.config.shared.values())
+    whole_s = sum(kind.all_s for kind in kinds) + (scale - 1) * cost.seconds
+    return Pace(whole_s / cost.frames, f"a rehearsal of {len(todo)} of them")
+
+
+def _at_once(config: BenchConfig) -> BenchConfig | None:
+    """Return a bench whose simulated worlds wait for nothing; None without such a world."""
+    shared = {
+        name: SharedConfig(each.part, each.options.model_copy(update={"time_scale": 0.0}))
+        for name, each in config.shared.items()
+        if "time_scale" in type(each.options).model_fields
+    }
+    return replace(config, shared={**config.shared, **shared}) if shared else None
+
+
+def _kinds(plan: Plan) -> list[_Kind]:
+    """Sort a plan's steps by what takes equally long."""
+    found: dict[tuple[Any, ...], _Kind] = {}
+    before: Step | None = None
+    for step in plan.whole_steps(None):
+        moved = before is None or (step.source_um, step.stage) != (before.source_um, before.stage)
+        decade = round(math.log2(step.average))
+        key = (step.part, str(step.light), step.scene_lit, moved, step.slm_image is not None, decade)
+        found.setdefault(key, _Kind([], [])).steps.append(step.index)
+        before = step
+    return list(found.values())
