@@ -104,7 +104,9 @@ class MainWindow(QMainWindow):
         session.handed_on.connect(self._hand_on)
         session.bench_wanted.connect(self.change_bench)
         session.closed.connect(self._close_now)
-        session.opened.connect(lambda: QTimer.singleShot(_PREPARE_MS, self, self.maker.prepare))
+        session.opened.connect(
+            lambda: QTimer.singleShot(_PREPARE_MS if session.kinds else 0, self, self.maker.prepare)
+        )
         session.jobs.job_started.connect(self._job_started)
         session.jobs.job_ended.connect(self._job_ended)
         self.resize(size)

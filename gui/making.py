@@ -15,6 +15,8 @@ from gui.panels import PANELS
 from gui.session import BenchSession
 from gui.theme import TURN, restyled
 from gui.widgets.building import PanelPlace, label, text_view
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import parse_config, template
 
 _SLICE_S = 0.008
 """Of the window's thread at once; a part that takes longer is the only one of its slice."""
@@ -97,6 +99,8 @@ class PanelMaker(QObject):
         """Import and compile in a job what the panels need, before they are asked for."""
 
         def work(context: JobContext) -> None:
+            if not self._session.kinds:  # from the start page a simulated bench is tried next
+                Bench(parse_config(template(), None))
             for entry in PANELS.values():
                 context.check()
                 with contextlib.suppress(Exception):  # the panel says so when it is asked for

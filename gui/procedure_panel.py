@@ -309,7 +309,7 @@ class ProcedurePanel(Panel):
         self.way_on.offer(None)
         self._left.forget()
         self._said_at_end = ""
-        self._say(f"{title} goes on.", wrong=False)
+        self._say(f"{title} has begun.", wrong=False)
         self.run_bar.set_running(True)
         self.views.setEnabled(False)
         self.choice.setEnabled(False)

@@ -408,6 +408,19 @@ def reachable_depths_um(bench: Bench) -> tuple[float, float]:
     return max(_rounded_down(far_um / 3), math.ceil(max(low, 1.0))), far_um
 
 
+def standing_depth_um(bench: Bench) -> float | None:
+    """Return the depth at which the point source stands, by the stage's word, in whole micrometres.
+
+    None where no stage moves it along z, or what an unhomed one says is out of its reach.
+    """
+    limits = source_limits(bench)
+    if "z_um" not in limits:
+        return None
+    low, high = limits["z_um"]
+    z_um = float(round(bench.source_position_um[2]))
+    return z_um if max(low, 1.0) <= z_um <= high else None
+
+
 def _rounded_down(length_um: float) -> float:
     """Return a length with two digits, not longer."""
     unit = 10.0 ** (math.floor(math.log10(length_um)) - 1)

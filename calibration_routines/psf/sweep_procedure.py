@@ -9,7 +9,7 @@ from pathlib import Path
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine, outlook_of
 from calibration_routines.psf.mount_fit import off_middle
 from calibration_routines.psf.psf_quality import place_of
-from calibration_routines.psf.sampling import reachable_depths_um
+from calibration_routines.psf.sampling import reachable_depths_um, standing_depth_um
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep, finish_sweep, watch_sweep
 from calibration_routines.psf.sweep_options import AskedSweep, AxialSweep, LateralSweep, VolumeSweep
 from calibration_routines.psf.sweep_plan import (
@@ -188,8 +188,10 @@ def _verdict(done: SweepCalibration) -> str:
 
 
 def _depths(bench: Bench) -> dict[str, float]:
+    """Return what depths a form begins with: one PSF is asked for where the source stands."""
     near_um, far_um = reachable_depths_um(bench)
-    return {"z_min_um": near_um, "z_max_um": far_um, "z_um": far_um}
+    here_um = standing_depth_um(bench)
+    return {"z_min_um": here_um or near_um, "z_max_um": far_um, "z_um": here_um or far_um}
 
 
 _sweep = partial(

@@ -29,6 +29,7 @@ from recon.base.declare import Imports, expression
 from recon.evaluation.scored import KINDS, Axis, Point, is_known, pareto
 from recon.verdict.cases import SHIPPED
 
+_TO_THE_MINUTE = len("2026-01-01T00:00")
 _NO_CHART = "No chart is open: one shows which settings are fast, and which are accurate, on your photograph."
 
 
@@ -77,7 +78,8 @@ class ChartsPanel(Panel):
         self.accepted()
         if not isinstance(record, ChartData):
             self.maps_path = path
-            said = f"{path.name}, made {record['utc']} by {record['program']} (SIMULATED scenes)"
+            made = f"{record['utc'][:_TO_THE_MINUTE].replace('T', ' ')} UTC"
+            said = f"{path.name}, made {made} by {record['program']} (SIMULATED scenes)"
             self._headings[self.stability] = (said, f"{path}\n{record['command']}")
             self.stability.show_maps(record["maps"])
             self.tabs.setCurrentWidget(self.stability)

@@ -21,7 +21,7 @@ from gui.result_export import ResultExport
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
 from gui.theme import as_shown
-from gui.widgets.building import Hint, button, fill, in_row, label, split
+from gui.widgets.building import Hint, button, fill, hint, in_row, label, split
 from gui.widgets.dialogues import choose_path
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
@@ -38,6 +38,8 @@ from recon.base.declare import Imports, expression, options_of
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.options import ReconstructionOptions
 
+_NOTHING_OPEN = "Nothing is open: choose a result on the left, or reconstruct a photograph."
+_FORM_OPEN = "Nothing is open: fill in the form on the left, then press Reconstruct."
 _REFINABLE = "--refine-psf fits"
 """In the verdict's sentence, where fitting the PSF to the photograph is what helps."""
 
@@ -85,9 +87,9 @@ class ReconstructionsPanel(Panel):
         tip = "Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)"
         self.export_button = button("Export…", tip, lambda: self.export.choose(), enabled=False)
         buttons = in_row(self.open_button, self.refresh_button)
-        self.none = label("No reconstruction is in the data folder yet.", "dim", wraps=True)
+        self.none = hint("No reconstruction is in the data folder yet.")
         self.none.hide()
-        listed = fill(QWidget(), self.none, (self.list, 1), buttons, margins=(0, 6, 0, 0))
+        listed = fill(QWidget(), (self.none, 1), (self.list, 1), buttons, margins=(0, 6, 0, 0))
         self.tabs.addTab(listed, "Results")
         yield
         tip = "The PSF is turned or of another size for this photograph: fit it first, then reconstruct again"
@@ -109,11 +111,8 @@ class ReconstructionsPanel(Panel):
         self.place = label(role="dim")
         self.place.setAlignment(Qt.AlignmentFlag.AlignRight)
         self.place.setMinimumWidth(10)
-        self.empty = Hint(
-            "Nothing is open: choose a result on the left, or reconstruct a photograph.",
-            "Reconstruct…",
-            lambda: self.tabs.setCurrentWidget(self.form),
-        )
+        self.empty = Hint(_NOTHING_OPEN, "Reconstruct…", lambda: self.tabs.setCurrentWidget(self.form))
+        self.tabs.currentChanged.connect(lambda _: self._say_what_is_next())
         self.viewers.addWidget(self.empty)
         ends = (self.refine_button, self.keep_button, self.export_button)
         fill(top, in_row(self.heading, (self.place, 1), *ends), (self.viewers, 1))
@@ -160,6 +159,7 @@ class ReconstructionsPanel(Panel):
     def _list(self, records: list[tuple[Path, str]]) -> None:
         self.list.clear()
         self.none.setVisible(not records)
+        self.list.setVisible(bool(records))
         for record, changed in records:
             item = QListWidgetItem(f"{record.stem}\n    {changed}  {record.parent.name}")
             item.setToolTip(str(record))
@@ -300,6 +300,12 @@ class ReconstructionsPanel(Panel):
         self.place.clear()
         self.facts.show_facts([])
         self.convergence.show_histories((), None)
+
+    def _say_what_is_next(self) -> None:
+        """Say where nothing is open what to do; the button leads to the form, unless that is in front."""
+        if self.empty.words.text() in (_NOTHING_OPEN, _FORM_OPEN):
+            has_form = self.tabs.currentWidget() is self.form
+            self.empty.say(_FORM_OPEN if has_form else _NOTHING_OPEN, busy=has_form)
 
     def _not_reconstructed(self, name: str, words: str) -> None:
         """Say over what there is that it did not become a result."""

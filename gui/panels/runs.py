@@ -120,6 +120,7 @@ class RunsPanel(Panel):
         middle = len(opened.stored) // 2  # the first ones are dark
         with QSignalBlocker(self.slider):
             self.slider.setEnabled(len(opened.stored) > 1)
+            self.slider.setVisible(bool(opened.stored))
             self.slider.setRange(0, max(0, len(opened.stored) - 1))
             self.slider.setValue(middle)
         self._stored = opened.stored
@@ -193,6 +194,7 @@ class RunsPanel(Panel):
         self.slider.setToolTip("Frame of the run (arrow keys)")
         self.slider.setAccessibleName("Frame of the run")
         self.slider.valueChanged.connect(self._show_frame)
+        self.slider.hide()
         self.frame_words = label(role="dim", yields=True)
         self.about = text_view(empty="What is in a run stands here, once it is clicked.")
         self.about.setAccessibleName("About the run")
@@ -263,6 +265,7 @@ class RunsPanel(Panel):
         self.opened, self._opening, self._stored = None, None, []
         self.view.clear()
         self.slider.setEnabled(False)
+        self.slider.hide()
         self.frame_words.clear()
         self.about.setPlainText(why)
         self._can_resume = False

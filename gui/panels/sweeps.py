@@ -22,13 +22,14 @@ from gui.background import NewestOnly
 from gui.procedure_panel import ProcedurePanel
 from gui.procedure_run import Situation
 from gui.session import BenchSession
-from gui.widgets.building import fill, label, split, tabs
+from gui.widgets.building import fill, hint, label, split, tabs
 from gui.widgets.dialogues import elided
 from gui.widgets.image_view import ImageView, usual_levels
 from gui.widgets.orientation import follow_orientation
 from gui.widgets.sweep_views import PathPlot, Picture, PsfPictures, PsfTable
 from instrument.bench.photograph import Snapshot
 from instrument.files.errors import BenchError, FileError, SettingsError, count
+from instrument.live.frame_view import not_stretched
 from instrument.plan import Plan
 from instrument.plan.model import load_plan, plan_toml
 from recon.base.declare import option
@@ -88,7 +89,8 @@ class SweepsPanel(ProcedurePanel):
         self.frame = ImageView()
         follow_orientation(self.session, "frames", self.frame.orient)
         yield
-        self.frame_words = label("No frame yet.", "dim", yields=True)
+        self.frame_words = label(role="dim", wraps=True, yields=True)
+        self.no_frame = hint("No frame yet: the newest stands here.")
         self.psfs = PsfTable()
         self.picture = Picture()
         yield
@@ -98,7 +100,9 @@ class SweepsPanel(ProcedurePanel):
         yield
         above.addWidget(self.path)
         yield
-        above.addWidget(fill(QWidget(), (self.frame, 1), self.frame_words))
+        shown = fill(QWidget(), (self.no_frame, 1), (self.frame, 1), self.frame_words, margins=(6, 0, 0, 0))
+        self.frame.hide()
+        above.addWidget(shown)
         above.setChildrenCollapsible(False)
         above.setSizes([560, 420])
         yield
@@ -125,6 +129,11 @@ class SweepsPanel(ProcedurePanel):
         """Draw the path besides the words."""
         super().show_outlook(outlook)
         self.path.show_path(outlook.path)
+        self._tabs_for_routine()
+
+    def _tabs_for_routine(self) -> None:
+        """Have a place for PSFs only where some are judged."""
+        self.tabs.setTabVisible(self.tabs.indexOf(self.psfs), self.routine.watch is not None)
 
     def show_problem(self, error: BenchError) -> None:
         """Take the path away besides saying why."""
@@ -135,11 +144,15 @@ class SweepsPanel(ProcedurePanel):
         """Clear the last sweep."""
         self._shown = None
         self.frame.clear()
-        self.frame_words.setText("No frame yet.")
+        self.frame.hide()
+        self.no_frame.show()
+        self.frame_words.clear()
         self.psfs.clear()
         self.picture.clear()
         self._pictures = PsfPictures()
-        self.tabs.setCurrentWidget(self.psfs)
+        self._tabs_for_routine()
+        if self.routine.watch is not None:
+            self.tabs.setCurrentWidget(self.psfs)
 
     def looked(self, now: Situation) -> None:
         """Show the newest frame and where the run is."""
@@ -152,6 +165,7 @@ class SweepsPanel(ProcedurePanel):
         """Show the last judgement, or the routine's picture."""
         if isinstance(outcome.result, SweepCalibration):
             self.psfs.show_all(outcome.result.quality)
+            self._show_psf(0)  # rather than the last frame, which is dark
         if isinstance(outcome.result, Photograph):
             self._show_image(outcome.result.measurement)
             self.frame_words.setText("The photograph, dark frames taken off")
@@ -191,7 +205,12 @@ class SweepsPanel(ProcedurePanel):
         elided(self.frame_words, ", ".join(words))
 
     def _show_image(self, image: Image, full_scale: int | None = None) -> None:
-        self.frame.show_image(image, *usual_levels(image), full_scale)
+        levels = usual_levels(image)
+        self.frame.show_image(
+            image, *(levels if full_scale is None else not_stretched(levels, full_scale)), full_scale
+        )
+        self.no_frame.hide()
+        self.frame.show()
 
     def _read_plan(self) -> None:
         """Show the plan of a file that was chosen."""

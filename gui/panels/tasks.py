@@ -116,10 +116,11 @@ class TasksPanel(Panel):
         told = fill(QWidget(), (self.words, 1), (self.tables, 1), margins=(6, 0, 0, 0))
         self.results = tabs({"What was found": told, "Picture": self.picture})
         foot = in_row((self.list, 1), fill(QWidget(), self.use_button, self.folder_button, None))
-        below = QWidget()
-        fill(below, foot, margins=(6, 0, 0, 0))
+        self.below = QWidget()
+        """What was written; nothing stands there before."""
+        fill(self.below, foot, margins=(6, 0, 0, 0))
         self._clear()
-        return split(self.results, below, sizes=[560, 130], down=True, firm=True)
+        return split(self.results, self.below, sizes=[560, 130], down=True, firm=True)
 
     # The form ------------------------------------------------------------------------------------
     @property
@@ -252,6 +253,7 @@ class TasksPanel(Panel):
         self.list.clear()
         self.files = ()
         self.folder_button.setEnabled(False)
+        self.below.hide()
         self.use_button.setEnabled(False)
 
     def _told(self, told: Told) -> None:
@@ -292,6 +294,7 @@ class TasksPanel(Panel):
         ):
             # What was interrupted, and a chart that has more to do, is gone on with under the same name.
             page.names.suggest(re.sub(r"-\d+$", "", self._out.name.partition(".")[0]))
+        self.below.setVisible(bool(done.files))
         self.folder_button.setEnabled(bool(done.files))
         self.use_button.setEnabled(any(map(self._panel_for, done.files)))
         self.run_bar.show_end("Ended early" if done.kept else "Done", complete=not done.kept)

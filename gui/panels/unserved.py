@@ -45,13 +45,13 @@ def why_not(session: BenchSession, title: str, needs: Sequence[str], tried_on: s
         return f"{title} needs a bench with {_listed([name_of(kind) for kind in needs])}; no bench is open."
     if missing:
         return (
-            f"{title} needs {_listed(missing)}, which {session.config.label} does not have. "
+            f"{title} needs {_listed(missing)}, which this bench does not have. "
             "A table in its bench.toml adds one."
         )
     if tried_on and (wrong := not_tried_on(session.config, needs, tried_on)):
         return (
             f"{title} takes a simulated {TEMPLATES[tried_on][0]}: the simulated "
-            f"{' and '.join(map(name_of, wrong))} of {session.config.label} would see nothing of it."
+            f"{' and '.join(map(name_of, wrong))} of this bench would see nothing of it."
         )
     return ""
 

@@ -155,8 +155,8 @@ class Hint(QWidget):
         other: tuple[str, Callable[[], object]] | None = None,
     ) -> None:
         super().__init__()
-        self.words = label(words, "hint", wraps=True)
-        self.words.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self.words = hint(words)
+        self.words.setContentsMargins(0, 0, 0, 0)
         self.button = button(answer, "", lambda: clicked())
         parts: list[Part] = [self.words, in_row(None, self.button, None)]
         if other is not None:
@@ -223,6 +223,14 @@ def label(
         made.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
     if yields:
         made.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+    return made
+
+
+def hint(words: str) -> QLabel:
+    """Return a sentence in the middle of a place where there is nothing to be seen yet."""
+    made = label(words, "hint", wraps=True)
+    made.setAlignment(Qt.AlignmentFlag.AlignCenter)
+    made.setContentsMargins(16, 8, 16, 8)
     return made
 
 

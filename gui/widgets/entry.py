@@ -146,6 +146,7 @@ _LONG_UM = 1e4
 _LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZµ×%/° "
 
 
+_LONGEST_ABBREVIATION = 3
 THIN = "\u2009"
 """Between groups of three digits."""
 
@@ -168,6 +169,11 @@ def quantity(value: float, unit: str, digits: int = 4) -> str:
     if "e+" in written:
         written = f"{value:.0f}"
     return f"{grouped(written)} {unit}".strip()
+
+
+def _one(unit: str) -> str:
+    """Return a unit in the singular: 1 frame, 2 frames; an abbreviation has one form."""
+    return unit.removesuffix("s") if len(unit) > _LONGEST_ABBREVIATION else unit
 
 
 def _factor(typed: str, unit: str) -> float | None:
@@ -267,7 +273,7 @@ class NumberEdit(Refusing):
         digits = text.replace(THIN, "").rstrip(_LETTERS).strip()
         typed = text.replace(THIN, "")[len(digits) :].strip() if digits else ""
         typed = typed or self.shown_unit
-        factor: float | None = 1.0 if typed == self.unit else _factor(typed, self.unit)
+        factor: float | None = 1.0 if typed in (self.unit, _one(self.unit)) else _factor(typed, self.unit)
         try:
             number = float(digits.replace(",", "."))
         except ValueError:
@@ -366,7 +372,8 @@ class NumberEdit(Refusing):
         if self.shown_unit != self.unit:
             number = float(f"{number / _MM_UM:.15g}")
         digits = f"{number:.0f}" if self._integer else f"{number:.6g}"
-        return f"{grouped(digits)} {self.shown_unit}".strip()
+        unit = _one(self.shown_unit) if number == 1 else self.shown_unit
+        return f"{grouped(digits)} {unit}".strip()
 
     def _show(self) -> None:
         self._choose_unit()

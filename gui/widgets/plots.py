@@ -210,7 +210,7 @@ class RangeBar(QWidget):
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.figures: FrameFigures | None = None
-        self.words = label(wraps=True, selectable=True)
+        self.words = label("No frame yet.", wraps=True, selectable=True)
         self.words.setObjectName("figures")
         self.words.setToolTip("Of the raw data, all pixels; share: the largest count of the sensor's range")
         fill(self, _BAR_PX, self.words)
@@ -288,6 +288,7 @@ class HistogramPlot(QWidget):
             "Histogram of the raw data, as far as they reach; the bar below is the sensor's whole range. "
             "Drag the borders to choose levels"
         )
+        self.plot.hide()  # without counts its numbers would mean nothing
         self.setMinimumHeight(130)
         self.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         self.range = RangeBar()
@@ -300,6 +301,7 @@ class HistogramPlot(QWidget):
 
         It reaches over what the data fill; the bar below has the sensor's whole range.
         """
+        self.plot.show()
         first, last = figures.span
         bins, step = grouped(counts, first, last, _LIVE_BINS)
         self.curve.setData(first + np.arange(_LIVE_BINS) * step, np.maximum(bins, 0.5))

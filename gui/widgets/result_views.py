@@ -32,7 +32,7 @@ class FactsView(QTextBrowser):
         super().__init__(parent)
         self.setOpenLinks(False)
         self.setMinimumSize(120, 60)
-        self.setPlaceholderText("What is known of a result stands here.")
+        self.setPlaceholderText("Facts about a result.")
         self._shown: tuple[Sequence[tuple[str, str]], Sequence[str], bool] = ((), (), False)
 
     def restyle(self) -> None:
@@ -161,7 +161,7 @@ class ConvergenceView(QWidget):
             "Residual in units of what the noise explains (1: nothing is left to explain), "
             "and relative change of the result an iteration"
         )
-        self.legend = label(wraps=True)
+        self.legend = label(role="dim", wraps=True)
         self.legend.setMinimumWidth(10)
         self.against_time = QCheckBox("seconds")
         self.against_time.setToolTip("Horizontal axis: wall seconds of the solver instead of iterations")
@@ -170,7 +170,13 @@ class ConvergenceView(QWidget):
         self._numbers: dict[int, str] = {}
         self._histories: Histories = ()
         self._noise_norm: float | None = None
-        fill(self, in_row((self.legend, 1), self.against_time), (self.plot, 1), spacing=0)
+        fill(
+            self,
+            in_row((self.legend, 1), self.against_time),
+            (self.plot, 1),
+            margins=(8, 0, 0, 0),
+            spacing=0,
+        )
         self._draw()
 
     def show_histories(self, histories: Histories, noise_norm: float | None) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from PySide6.QtCore import Signal
 from PySide6.QtWidgets import QFrame, QSizePolicy, QWidget
 
@@ -42,6 +44,11 @@ class StepStrip(QFrame):
         self.button = button("", clicked=self._go, primary=True)
         for part in (self.marks, self.button):
             part.setSizePolicy(QSizePolicy.Policy.Fixed, QSizePolicy.Policy.Preferred)
+        self._light = "unknown"
+        """Of the newest frame that no run took: a run's dark frames say nothing of the scene."""
+        keeps = self.button.sizePolicy()
+        keeps.setRetainSizeWhenHidden(True)  # what lies below stays where it is
+        self.button.setSizePolicy(keeps)
         fill(self, self.marks, (self.words, 1), self.button, across=True, margins=(8, 2, 4, 2), spacing=12)
         self._reader = NewestOnly(session.jobs, "Looking what is there")
         self._rest = after_rest(self, _REST_MS, self._read)
@@ -56,7 +63,16 @@ class StepStrip(QFrame):
         """Show how things stand; to be called now and then."""
         if self._session.is_closing:
             return
-        self.show_facts(facts_of(self._session, self._made))
+        facts = facts_of(self._session, self._made)
+        if self._running and self._light != "unknown":
+            facts = replace(facts, light=self._light)
+        self._light = facts.light
+        self.show_facts(facts)
+
+    @property
+    def _running(self) -> str:
+        """What is under way, in words; empty: nothing that the next step has to wait for."""
+        return next((job.title for job in self._session.jobs.jobs if _is_run(job)), "")
 
     def show_facts(self, facts: Facts) -> None:
         """Show the way, the next step in words, and the button that leads there."""
@@ -66,7 +82,7 @@ class StepStrip(QFrame):
         marks = "&nbsp;&nbsp; ".join(_mark(one, one is step) for one in steps)
         if self.marks.text() != marks:
             self.marks.setText(marks)
-        running = next((job.title for job in self._session.jobs.jobs if _is_run(job)), "")
+        running = self._running
         waits = self.step.panel == "reconnect" and not self.step.what
         self.words.setText(f"{running} is under way …" if running else self.step.words)
         if self.button.text() != self.step.answer:

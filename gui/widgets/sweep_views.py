@@ -10,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QRectF, Qt, Signal
-from PySide6.QtGui import QPainter, QPaintEvent, QPixmap
+from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPixmap
 from PySide6.QtWidgets import QHBoxLayout, QSizePolicy, QWidget
 
 from calibration_routines.psf.psf_quality import MIN_SNR, PsfQuality
 from calibration_routines.psf.sweep_watch import PointTaken
-from gui.theme import colours
-from gui.widgets.building import cell, fill, label, split, table
+from gui.theme import LARGE_PT, colours
+from gui.widgets.building import cell, fill, hint, split, table
 from gui.widgets.plots import dots, plot_widget
 
 Place = Mapping[str, float]
@@ -36,7 +36,7 @@ class PathPlot(QWidget):
         super().__init__(parent)
         self._layout = QHBoxLayout(self)
         self._layout.setContentsMargins(0, 0, 0, 0)
-        self.nothing = label("Nothing moves.", "dim")
+        self.nothing = hint("Nothing moves.")
         self.nothing.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
         self._layout.addWidget(self.nothing)
         self.views: list[_View] = []
@@ -172,8 +172,7 @@ class PsfTable(QWidget):
         self._least: Any = pg.InfiniteLine(angle=0, pos=MIN_SNR)
         self.plot.addItem(self._least)
         self._qualities: list[PsfQuality | None] = []
-        self.nothing = label("No PSF yet: each is judged here as it arrives.", "hint", wraps=True)
-        self.nothing.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self.nothing = hint("No PSF yet: each is judged here as it arrives.")
         self._both = split(self.table, self.plot, sizes=[220, 140], down=True)
         fill(self, (self._both, 1), (self.nothing, 1))
         self.restyle()
@@ -286,6 +285,9 @@ def small(image: Image) -> PsfPicture:
     return PsfPicture(np.clip(np.rint(stretched), 0, 255).astype(np.uint8), factor)
 
 
+NO_PICTURE = "No picture yet."
+
+
 class Picture(QWidget):
     """Shows a pixmap, scaled down or up to the space there is."""
 
@@ -305,8 +307,15 @@ class Picture(QWidget):
         self.show_pixmap(QPixmap())
 
     def paintEvent(self, _event: QPaintEvent) -> None:  # noqa: N802 - Qt's name
-        """Draw the picture."""
+        """Draw the picture, or say that there is none."""
         if self.pixmap.isNull():
+            painter = QPainter(self)
+            painter.setPen(QColor(colours().dim))
+            font = self.font()
+            font.setPointSize(LARGE_PT)
+            painter.setFont(font)
+            painter.drawText(self.rect(), Qt.AlignmentFlag.AlignCenter, NO_PICTURE)
+            painter.end()
             return
         size = self.pixmap.size().scaled(self.size(), Qt.AspectRatioMode.KeepAspectRatio)
         left, top = (self.width() - size.width()) / 2, (self.height() - size.height()) / 2

@@ -18,6 +18,7 @@ from calibration_routines import (
     expose_sweep,
     sweep_plan,
 )
+from calibration_routines.procedure import routines
 from calibration_routines.psf.sweep_plan import SWEEP as SWEEP_RUN
 from calibration_routines.psf.sweep_procedure import sweep_outcome
 from drivers.simulated.world import SimulatedWorld
@@ -55,6 +56,14 @@ def bench() -> Iterator[Bench]:
         assert opened.stage is not None
         opened.stage.home()
         yield opened
+
+
+def test_a_form_begins_where_the_source_stands(bench: Bench) -> None:
+    start = routines["axial"].start
+    assert start is not None
+    assert start(bench)["z_min_um"] == 100e3, "where it homes, as the scene"
+    bench.place_source(z_um=70.4e3)
+    assert start(bench)["z_min_um"] == start(bench)["z_um"] == 70.4e3
 
 
 def world_of(bench: Bench) -> SimulatedWorld:
