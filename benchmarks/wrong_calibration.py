@@ -7,7 +7,7 @@ By propagation: scenes of five kinds before smooth diffusers of many kinds, rend
 with shot and read noise, in PSFs too, half of them with stray light; no threshold was set on seeds from 100 on.
 Scenes: pictures and volumes of all families through lenslets, smooth diffusers and the PSFs of the measured sets, with what
 fails there: up to four times as much stray light as light, erased and saturated pixels, aberration, fall-off, colour, little
-light; numbers from 1000 on are unseen. Measured: the hand at four binnings, the tilted USAF target at half size as a
+light; numbers from 1000 on are unseen. Measured: the hand at four binnings, the tilted USAF target at full and half size as a
 volume (``DIFFUSERBENCH_DATA``, else ``../shared/data``). Every photograph is checked with its own calibration and with
 wrong ones.
 """  # noqa: E501
@@ -166,11 +166,14 @@ def measured() -> Iterator[Known]:
         psf = block_mean(psfs[0], binning)
         wrong = {name: transformed(psf, how) for name, how in POSES.items()}
         yield f"hand, binned {binning}", block_mean(hand, binning), {RIGHT: psf, **wrong}
-    psfs, target = (block_mean(images, 2) for images in measured_set("usaf"))
-    places = np.column_stack([np.zeros((len(psfs), 2)), 1.0 + np.arange(len(psfs))])
-    turned = {name: transformed(psfs, how) for name, how in POSES.items() if how.scale == 1}
-    own = {name: Calibration(images[:, None], places) for name, images in ({RIGHT: psfs} | turned).items()}
-    yield "USAF volume, binned 2", target, own
+    for binning in (1, 2):
+        psfs, target = (block_mean(images, binning) for images in measured_set("usaf"))
+        places = np.column_stack([np.zeros((len(psfs), 2)), 1.0 + np.arange(len(psfs))])
+        turned = {name: transformed(psfs, how) for name, how in POSES.items() if how.scale == 1}
+        own = {
+            name: Calibration(images[:, None], places) for name, images in ({RIGHT: psfs} | turned).items()
+        }
+        yield f"USAF volume, binned {binning}", target, own
 
 
 def found(photograph: Photograph, psfs: Psfs) -> tuple[str, str, float]:

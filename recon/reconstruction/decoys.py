@@ -55,6 +55,13 @@ MOST_PLANES = 6
 """Depths that take part, evenly spaced."""
 WEIGHT = 1.0
 """Of total variation: as large as the noise that the adjoint of a PSF of unit energy passes on."""
+FAR_ABOVE = 3.0
+"""Times the noise that the calibration leaves of a photograph's fine structure, from which its errors and not
+noise set the prior's weight: too small a one lets every pattern explain the photograph."""
+HEAVIER = {Fit.UNTOLD: Fit.FITS, Fit.FOREIGN: Fit.OFF}
+"""What may then be said where the other was: nobody is accused by it who was not."""
+MOVED_DEG = 6.0
+"""Turn up to which a foreign calibration is taken for the own one that moved: such as can be fitted."""
 DECOYS, MOST_DECOYS = 8, 12
 """Usually; and with farther ones on the side of a near one that is better, each twice as far: to some eight
 degrees or per cent."""
@@ -90,11 +97,11 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
 def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | None:
     done = count(1)
 
-    def compete(small: _Small, iterations: int, *, lit: bool) -> CalibrationCheck:
+    def compete(small: _Small, iterations: int, *, lit: bool, weight: float = WEIGHT) -> CalibrationCheck:
         def scored(how: Transformation) -> Score:
             if on_stage is not None:  # how many there will be depends on what they say
                 on_stage(1 - DECOYS / (DECOYS + next(done)), "judging: the calibration among its decoys")
-            return small.score(how, iterations=iterations, background=lit)
+            return small.score(how, iterations=iterations, background=lit, weight=weight)
 
         return _competition(small, scored)
 
@@ -122,6 +129,11 @@ def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | Non
             )
             cleared = is_told(again.scores[GIVEN], accuser, small.pixels)
         check = again if cleared else check
+    left = float(np.mean(as_given(again.scores).fine)) ** 0.5
+    if check.fit in HEAVIER and left > FAR_ABOVE:
+        again = compete(small, thorough, lit=lit, weight=left)
+        moved = again.better is None or again.better in FAR or abs(again.better.rotation_deg) <= MOVED_DEG
+        check = again if again.fit is HEAVIER[check.fit] and moved else check
     if check.fit is Fit.FOREIGN and small.clipped > MOST_CLIPPED:
         return replace(check, fit=Fit.UNTOLD)
     given = _given(problem).depths
@@ -177,7 +189,9 @@ class _Small:
             return tuple(far)
         return (*near_decoys(psfs.shape[2:], sizes=len(psfs) == 1 and not field), *far)
 
-    def score(self, how: Transformation, *, iterations: int, background: bool) -> Score:
+    def score(
+        self, how: Transformation, *, iterations: int, background: bool, weight: float = WEIGHT
+    ) -> Score:
         """Reconstruct through transformed PSFs in few iterations."""
         positions = self.calibration.source_positions_um.copy()
         positions[:, 1::-1] = positions[:, 1::-1] @ how.matrix.T  # (x, y) is (column, row)
@@ -185,7 +199,7 @@ class _Small:
             self.calibration, psfs=transformed(self.calibration.psfs, how), source_positions_um=positions
         )
         problem = self._problem(copies, background=background)
-        return _score(problem, iterations if problem.n_planes == 1 else -(-iterations // 2))
+        return _score(problem, iterations if problem.n_planes == 1 else -(-iterations // 2), weight)
 
     def _problem(self, calibration: Calibration, *, background: bool) -> Problem:
         options = ReconstructionOptions(
@@ -302,9 +316,9 @@ def _on_sensor(psfs: Floats, shape: tuple[int, int]) -> Floats:
     return whole
 
 
-def _score(problem: Problem, iterations: int) -> Score:
+def _score(problem: Problem, iterations: int, weight: float) -> Score:
     """Reconstruct a problem of one channel and score it."""
-    found = pilot(problem, iterations, weight=WEIGHT)
+    found = pilot(problem, iterations, weight=weight)
     valid, last = problem.valid[0], found.outcome.history[-1]
     prior = last.objective - 0.5 * last.data_residual**2
     left = found.left[0].astype(np.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from recon import Calibration, Geometry, reconstruct
 from recon.camera.transformed import Transformation, transformed
 from recon.errors import InputError
+from recon.evaluation.measured_sets import data_folder, measured_set
 from recon.optics.diffuser import smooth_diffuser
 from recon.optics.fall_off import gaussian_fall_off
 from recon.optics.grid import GREEN, PixelGrid
@@ -217,6 +219,58 @@ def score(misfit: float, objective: float, unlike: float = 0.0) -> Score:
 
 
 GOOD = {GIVEN: score(1.2, 1.5), BETWEEN: score(1.2, 1.5)} | {how: score(1.6, 2.0, 0.1) for how in NEAR}
+
+
+@pytest.mark.parametrize(
+    ("first", "heavier", "left", "said"),
+    [
+        (Fit.UNTOLD, Fit.FITS, 40.0, Fit.FITS),
+        (Fit.UNTOLD, Fit.FITS, 4.0, Fit.UNTOLD),  # as noise: the weight is right already
+        (Fit.UNTOLD, Fit.OFF, 40.0, Fit.UNTOLD),  # nobody is accused by it who was not
+        (Fit.FOREIGN, Fit.OFF, 40.0, Fit.OFF),
+        (Fit.FOREIGN, Fit.FITS, 40.0, Fit.FOREIGN),
+    ],
+)
+def test_where_far_more_than_noise_is_left_it_sets_the_priors_weight(
+    seen: tuple[Image, Image],
+    monkeypatch: pytest.MonkeyPatch,
+    first: Fit,
+    heavier: Fit,
+    left: float,
+    said: Fit,
+) -> None:
+    scores = dict.fromkeys((GIVEN, *NEAR, *FAR), score(left, left))
+    weights: list[float] = []
+
+    def scored_with(_problem: Problem, _iterations: int, weight: float) -> Score:
+        weights.append(weight)
+        return scores[GIVEN]
+
+    def competed(_: object, scored: Callable[[Transformation], Score]) -> CalibrationCheck:
+        scored(GIVEN)
+        fit = heavier if weights[-1] != decoys.WEIGHT else first
+        return CalibrationCheck(fit, scores, 9000, NEAR[0] if fit is Fit.OFF else None)
+
+    monkeypatch.setattr(decoys, "_competition", competed)
+    monkeypatch.setattr(decoys, "_score", scored_with)
+    check = check_calibration(Problem.of(*seen))
+    assert check is not None
+    assert check.fit is said
+    assert weights[-1] == pytest.approx(max(1.0, left**0.5) if left > 9 else decoys.WEIGHT, rel=0.01)
+
+
+@pytest.mark.parametrize("turned_deg", [0, 1])
+def test_the_measured_targets_own_calibration_fits_at_full_size(turned_deg: float) -> None:
+    if not (data_folder() / "diffusercam_usaf3d").is_dir():
+        pytest.skip("the measured USAF set is not here (DIFFUSERBENCH_DATA)")
+    psfs, photograph = measured_set("usaf")
+    psfs = transformed(psfs[::8], Transformation(rotation_deg=turned_deg))
+    calibration = Calibration(psfs[:, None], np.full((len(psfs), 3), np.nan))
+    check = check_calibration(Problem.of(photograph, calibration))
+    assert check is not None
+    assert (check.fit, str(check.better)) == (
+        (Fit.OFF, "turned by -1 degrees") if turned_deg else (Fit.FITS, "None")
+    )
 
 
 def test_without_a_far_decoy_the_near_ones_tell() -> None:
