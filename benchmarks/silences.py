@@ -17,6 +17,7 @@ import os
 import pty
 import re
 import select
+import signal
 import struct
 import sys
 import tempfile
@@ -50,13 +51,13 @@ STEPS = {
     "analyze": "analyze SWEEP --out page.png",
     "compare": "compare SWEEP SWEEP",
     "refocus": "refocus SWEEP --z-mm 150 --out near --figure near.png",
-    "reconstruct": "reconstruct --psf psf.tif --image photo.tif --bin 8 --out scene.tif --figure page.png",
+    "reconstruct": "reconstruct --psf psf.tif --image photo.tif --bin 8 --out scene.tif --figure scene.jpg",
     "calibrated": "reconstruct --calibration SWEEP --z-mm 200 --image photo.tif --bin 8 --out two.tif",
     "etendue": "etendue",
     "hologram": "hologram photo.png --out slm.png --iterations 20",
     "optics": "optics --out optics.png",
     "stability": "stability light --out maps",
-    "chart": "chart scene sparse-picture --size 32 --time 20 --out chart",
+    "chart": "chart scene sparse-picture --size 32 --budget 20 --out chart",
     "test": "test",
     "table7.1": "table7.1 --iterations 10 --pictures head --expansion 4 --out table71",
     "plan new": "plan new plan.toml",
@@ -125,6 +126,7 @@ def typed(words: list[str], folder: Path, most_s: float) -> Heard:
     process, terminal = pty.fork()
     if process == 0:
         os.chdir(folder)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # ignored in the background
         os.environ.update(PYTHONPATH=str(ROOT), TERM="xterm-256color", XDG_CACHE_HOME=str(folder / "cache"))
         code = f"import sys; from instrument.cli import main; sys.exit(main({words!r}))"
         os.execv(sys.executable, [sys.executable, "-c", code])

@@ -17,6 +17,7 @@ import typer
 
 from drivers.errors import DeviceError
 from instrument.cli.app import App, examples
+from instrument.cli.progress import one_task
 from instrument.files.errors import BenchError
 from recon.errors import InputError
 
@@ -228,11 +229,11 @@ def selftest(
     typer.echo(
         f"diffuserbench {metadata.version('diffuserbench')}, Python {_python()}, {os.cpu_count()} processors"
     )
+    typer.echo("About ten seconds; the first time half a minute, for compiling.", err=True)
     broken = []
     for name in parts or PARTS:
         began_s = time.monotonic()
-        typer.echo(f"{name:<10}", nl=False)
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory() as folder, one_task(f"Testing {name}"):
             try:
                 said = PARTS[name](Path(folder))
             except (BrokenError, BenchError, DeviceError, InputError, OSError) as error:
@@ -241,7 +242,7 @@ def selftest(
             except Exception as error:  # noqa: BLE001 - a broken package fails in its own ways
                 broken.append(name)
                 said = f"BROKEN: {type(error).__name__}: {error}"
-        typer.echo(f"{time.monotonic() - began_s:5.1f} s  {said}")
+        typer.echo(f"{name:<10}{time.monotonic() - began_s:5.1f} s  {said}")
     if broken:
         typer.echo(f"Does not work: {', '.join(broken)}.", err=True)
         raise typer.Exit(1)

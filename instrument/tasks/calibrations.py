@@ -200,8 +200,8 @@ def compare(desk: Desk, options: CompareOptions) -> Done:
                 f"was computed from {source}, not measured: it cannot tell what moved.",
                 "Compare the calibrations that were measured.",
             )
-    with desk.step("comparing"):
-        found = compare_calibrations(first, second)
+    with desk.step("comparing", 100) as advance:
+        found = compare_calibrations(first, second, lambda share: advance(round(100 * share)))
     rows: list[Sequence[str]] = []
     for c in found.changes:
         turned = "?" if c.rotation_deg is None else f"{c.rotation_deg:+z.3f}°"

@@ -7,6 +7,7 @@ by least squares. What is left then is a change of the pattern itself.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -133,8 +134,10 @@ def _of_binned(changes: list[Change], ratio: float) -> tuple[list[Change], tuple
     )
 
 
-def compare(old: Calibration, new: Calibration) -> Comparison:
-    """Compare a calibration with an older one of the same camera.
+def compare(
+    old: Calibration, new: Calibration, on_progress: Callable[[float], object] | None = None
+) -> Comparison:
+    """Compare a calibration with an older one of the same camera; ``on_progress`` gets the share done.
 
     Depths that the old one does not have are refocused. Shift alone moves pictures without blurring them; it
     counts when it differs between depths, or for the position in space. Of another binning the finer one is
@@ -146,22 +149,38 @@ def compare(old: Calibration, new: Calibration) -> Comparison:
     depths, planes = central_psfs(new)
     chosen = sorted({0, len(depths) // 2, len(depths) - 1})
     exposure = _exposure_ratio(old, new)
-    changes = []
+    changes: list[Change] = []
     for k in chosen:
         reference = _at(old, float(depths[k]))
-        changes.append(compare_psfs(planes[k].mean(axis=0), reference, float(depths[k]), exposure))
+        done = len(changes)
+
+        def round_done(number: int, done: int = done) -> None:
+            if on_progress is not None:
+                on_progress((done + number / ROUNDS) / len(chosen))
+
+        plane = planes[k].mean(axis=0)
+        changes.append(compare_psfs(plane, reference, float(depths[k]), exposure, round_done))
     changes, binning = _of_binned(changes, ratio)
     distance_mm = new.geometry.diffuser_distance_mm
     due, reasons = _verdict(changes, None if distance_mm is None else 1e3 * distance_mm)
     return Comparison(tuple(changes), due, (*binning, *reasons))
 
 
-def compare_psfs(new: Array, old: Array, z_um: float = float("nan"), exposure: float = 1.0) -> Change:
-    """Compare two PSFs (height, width); ``exposure`` is the new one's over the old one's."""
+def compare_psfs(
+    new: Array,
+    old: Array,
+    z_um: float = float("nan"),
+    exposure: float = 1.0,
+    on_round: Callable[[int], object] = lambda _: None,
+) -> Change:
+    """Compare two PSFs (height, width); ``exposure`` is the new one's over the old one's.
+
+    ``on_round`` gets how many of ``ROUNDS`` are done.
+    """
     whole = register(new, old)
     light = cut_to_light(old)
     extent = 0.5 * float(np.hypot(*light.shape))
-    factor, shift, recognised = _fit(new, old, complex(whole.rows, whole.columns))
+    factor, shift, recognised = _fit(new, old, complex(whole.rows, whole.columns), on_round)
     moved = _undone(new, factor, shift)
     correlation = correlate(old, new)
     return Change(
@@ -179,11 +198,14 @@ def compare_psfs(new: Array, old: Array, z_um: float = float("nan"), exposure: f
     )
 
 
-def _fit(new: Array, old: Array, shift: complex) -> tuple[complex, complex, bool]:
+def _fit(
+    new: Array, old: Array, shift: complex, on_round: Callable[[int], object]
+) -> tuple[complex, complex, bool]:
     """Fit ``p_new = factor p_old + shift``, positions being ``row + i column`` from the image's centre."""
     factor, found = 1.0 + 0j, False
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
         places, displacements = _block_displacements(_undone(new, factor, shift), old)
+        on_round(number + 1)
         if len(places) < 4:
             break
         found = True

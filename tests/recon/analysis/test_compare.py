@@ -62,7 +62,10 @@ def test_shift_scale_and_rotation_are_found(angle_deg: float) -> None:
 
 
 def test_nothing_happened() -> None:
-    found = compare(calibration(world()), calibration(world(), seed=5))
+    shares: list[float] = []
+    found = compare(calibration(world()), calibration(world(), seed=5), shares.append)
+    assert shares == sorted(shares)
+    assert 0 < shares[0] < shares[-1] == 1
     assert not found.due
     assert "still serves" in found.reasons[0]
     assert all(c.spot < 1.05 and c.brightness == pytest.approx(1, abs=0.02) for c in found.changes)
