@@ -187,6 +187,10 @@ LEVELS = {"full range": None, "0.1 – 99.9 %": (0.1, 99.9), "1 – 99 %": (1.0,
 """Percentiles of the counts shown darkest and brightest."""
 
 
+_MOVED = 0.1
+"""Of the span of the levels: from here on a frame is shown again by its own."""
+
+
 class LivePicture(QWidget):
     """A frame with tools above it, the profile along a line below, and its histogram.
 
@@ -298,8 +302,13 @@ class LivePicture(QWidget):
 
     def measure(self) -> None:
         """Make histogram, levels and profile of the frame that is shown, once."""
-        if self.frame is not None and self.frame is not self._measured:
-            self._measure(self.frame)
+        if self.frame is None or self.frame is self._measured:
+            return
+        low, high = self.levels
+        self._measure(self.frame)
+        moved = max(abs(self.levels[0] - low), abs(self.levels[1] - high))
+        if moved > _MOVED * (self.levels[1] - self.levels[0]):  # the next frame may be seconds away
+            self.show_frame(self.frame)
 
     def restyle(self) -> None:
         """Take over the theme's colour map."""

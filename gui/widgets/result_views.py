@@ -33,6 +33,8 @@ class FactsView(QTextBrowser):
         self.setOpenLinks(False)
         self.setMinimumSize(120, 60)
         self.setPlaceholderText("Facts about a result.")
+        self.setAccessibleName("Facts about the result")
+        self.setToolTip("What is known of the result: the verdict, how it was made; can be copied")
         self._shown: tuple[Sequence[tuple[str, str]], Sequence[str], bool] = ((), (), False)
 
     def restyle(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -360,6 +361,24 @@ def test_levels_follow_percentiles_of_the_raw_data(qtbot: QtBot, live: LivePanel
     live.picture.histogram.region.setRegion((10.0, 200.0))
     assert live.picture.stretch.currentText() == "by hand"
     assert live.picture.levels == (10.0, 200.0)
+
+
+def test_a_frame_that_is_much_brighter_is_not_left_with_the_levels_of_the_one_before(
+    qtbot: QtBot, live: LivePanel
+) -> None:
+    live.toggle_live()
+    qtbot.waitUntil(lambda: not live.session.live.is_running, timeout=WAIT_MS)
+    picture = live.picture
+    picture.stretch.setCurrentText("full range")
+    picture.stretch.setCurrentText("0.1 – 99.9 %")
+    assert picture.frame is not None
+    like = picture.frame.image
+    for counts in (40, 3000):  # a slow camera: none comes between
+        image = np.linspace(0, counts, like.size).reshape(like.shape).astype(like.dtype)
+        picture.show_frame(replace(picture.frame, image=image))
+        picture.measure()
+        assert picture.view._levels[:2] == picture.levels
+    assert picture.levels[1] > 2500
 
 
 def test_a_frame_that_is_held_is_stretched_as_well(
