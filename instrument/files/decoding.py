@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import re
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -182,8 +184,32 @@ def _decode_tiff(path: Path) -> Decoded:
         raise
     except Exception as error:  # noqa: BLE001 - a damaged TIFF raises nearly anything
         if "imagecodecs" in str(error):  # a compression that only OpenCV knows here
-            return _decode_with_opencv(path, reading.read_bytes(path, _MOST_PICTURE_BYTES))
+            return _decode_compressed(path)
         raise FileError(path, f"is a damaged or unusual TIFF: {error}.") from None
+
+
+def _decode_compressed(path: Path) -> Decoded:
+    """Decode a TIFF in a compression that OpenCV knows, all images of its first series."""
+    with open_tiff(path) as tiff:
+        series: Any = tiff.series[0]
+        pages = [page.index for page in series.pages if page is not None]
+        axes, lead = series.axes, series.shape[: -series.keyframe.ndim]
+        turned = int(series.keyframe.tags.valueof(_ORIENTATION, 1))
+    said = (_turned(turned),) if 2 <= turned <= 8 else ()  # OpenCV turns it
+    data = reading.read_bytes(path, _MOST_PICTURE_BYTES)
+    if len(pages) == 1:
+        array, notes = _decode_with_opencv(path, data)
+        return array, (*notes, *said)
+    _refuse_odd_bits(path)
+    with _quiet_opencv():
+        try:
+            images = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[1]
+            stack = np.stack([_rgb(images[page]) for page in pages])
+            array = stack.reshape(*lead, *stack.shape[1:])
+        except (cv2.error, MemoryError, ValueError, IndexError, TypeError) as error:
+            raise FileError(path, f"is a damaged or unusual TIFF: {error!s:.200}.") from None
+    array, more = ordered(path, array, axes)
+    return array, (*said, *more)
 
 
 def _require_parts(path: Path, series: Any) -> None:
@@ -240,18 +266,14 @@ def _decode_with_opencv(path: Path, data: bytes) -> Decoded:
     shape = _shape_by_header(data)
     if shape is not None:
         reading.require_plausible(path, 8 * math.prod(shape), len(data))
-    # A damaged file is told of once, in our words.
-    loudness = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (cv2.error, MemoryError):
-        array = None
-    finally:
-        cv2.utils.logging.setLogLevel(loudness)
+    with _quiet_opencv():
+        try:
+            array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except (cv2.error, MemoryError):
+            array = None
     if array is None:
         raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
-    if array.ndim == 3 and array.shape[-1] >= 3:
-        array = array[..., [2, 1, 0, *range(3, array.shape[-1])]]
+    array = _rgb(array)
     notes = []
     if data[:2] == b"\xff\xd8":
         notes.append("JPEG is lossy and usually gamma-coded: prefer raw frames")
@@ -259,6 +281,23 @@ def _decode_with_opencv(path: Path, data: bytes) -> Decoded:
         array = _upright(array, turned, "YXS")
         notes.append(_turned(turned))
     return array, tuple(notes)
+
+
+@contextlib.contextmanager
+def _quiet_opencv() -> Iterator[None]:
+    """Keep OpenCV silent: a damaged file is told of once, in our words."""
+    loudness = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(loudness)
+
+
+def _rgb(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return an image of OpenCV's with its colours the other way round."""
+    if array.ndim == 3 and array.shape[-1] >= 3:
+        array = array[..., [2, 1, 0, *range(3, array.shape[-1])]]
+    return array
 
 
 def _turned(orientation: int) -> str:

@@ -210,7 +210,9 @@ def _read_folder(folder: Path, leave_out: Path | None) -> ImageFile:
     if leave_out is not None:
         paths = [p for p in paths if p.resolve() != leave_out.resolve()]
     if not paths:
-        raise FileError(folder, f"holds no images ({READABLE}).")
+        inside = [path for path in sorted(folder.iterdir()) if path.is_dir() and images_in(path)]
+        remedy = f"Folders in it that do: {', '.join(map(str, inside[:4]))}." if inside else ""
+        raise FileError(folder, f"holds no images ({READABLE}).", remedy)
     paths, depths_um = in_order(folder, paths)
     first = read_image(paths[0])
     images = [first.pixels]

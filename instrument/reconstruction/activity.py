@@ -166,6 +166,7 @@ def find_activity(
             radius_px=settings.radius_px,
             noise=noise,
             moved=None if found.is_still else found,
+            field=video.calibrated_px,
         )
     traces = np.zeros((len(search.regions), len(indices)), np.float32)
     for trace, region in zip(traces, search.regions, strict=True):

@@ -388,5 +388,24 @@ def _create(request: VideoRequest, run: Run, plan: VideoPlan, problem: Problem) 
             "run": plan.run,
             "warm_iterations": None if plan.over_time else plan.warm_iterations,
             "missing": sorted(set(range(plan.n_frames)) - set(plan.frames)),
+            "calibrated_px": _calibrated_px(problem, request.rotate_deg // 90),
         },
     )
+
+
+def _calibrated_px(problem: Problem, quarter_turns: int) -> tuple[float, float, float, float] | None:
+    """Return which pixels of the pictures lie between PSFs that vary over the field; None where one holds.
+
+    Top, left, bottom, right, of pictures turned counter-clockwise so many times.
+    """
+    if problem.model == "convolution":
+        return None
+    box = problem.grid.spanned_by(problem.calibration.source_positions_um)
+    if box is None:
+        return None
+    _, height, width = problem.grid.shape
+    for _ in range(quarter_turns):
+        top, left, bottom, right = box
+        box = (width - 1 - right, top, width - 1 - left, bottom)
+        height, width = width, height
+    return box

@@ -158,6 +158,12 @@ class VideoPictures:
             return None
         return float(multiscale["datasets"][0]["coordinateTransformations"][0]["scale"][0])
 
+    @property
+    def calibrated_px(self) -> tuple[float, float, float, float] | None:
+        """Top, left, bottom and right between the outermost PSFs, where they vary over the field."""
+        box = self.attributes.get("diffuserbench", {}).get("calibrated_px")
+        return None if box is None else (box[0], box[1], box[2], box[3])
+
     def __len__(self) -> int:
         return int(self.array.shape[0])
 

@@ -105,6 +105,24 @@ class Grid:
             float(self.z_um[z]),
         )
 
+    def pixel_of(self, z: int, x_um: float, y_um: float) -> tuple[float, float]:
+        """Return ``(row, column)`` in plane ``z`` of a place: the inverse of :meth:`place_um`."""
+        x, y = (0.0, 0.0) if self.axis_um is None else self.axis_um[z]
+        pitch = (1 if self.upright else -1) * self.pitch_um[z]
+        return float(self.centre[0] + (y_um - y) / pitch), float(self.centre[1] + (x_um - x) / pitch)
+
+    def spanned_by(self, places_um: Floats) -> tuple[float, float, float, float] | None:
+        """Return top, left, bottom and right of the pixels that places (n, 3) span; None where not known.
+
+        Each place counts in the plane nearest to it.
+        """
+        if not (np.isfinite(places_um).all() and np.isfinite(self.pitch_um).all()):
+            return None
+        planes = np.abs(self.z_um - places_um[:, 2:]).argmin(axis=1)
+        seen = np.array([self.pixel_of(int(k), x, y) for k, (x, y, _) in zip(planes, places_um, strict=True)])
+        (top, left), (bottom, right) = seen.min(axis=0).tolist(), seen.max(axis=0).tolist()
+        return top, left, bottom, right
+
     def axis_weights(self) -> Floats:
         """Weights (n_z, 3) of the z, y and x differences for total variation in space instead of in voxels.
 

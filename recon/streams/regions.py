@@ -12,6 +12,8 @@ up a candidate. What else makes neighbours go together tells itself:
   has one course, by which all pixels about it brighten, if at all.
 * A lamp, or the edge of a sheet, changes everything around as well.
 * In frames that move, what follows the motion is motion.
+* Beyond the outermost of PSFs that vary over the field nobody knows the PSF: light that is put there is what
+  the camera's model does not explain.
 """
 
 from __future__ import annotations
@@ -125,6 +127,10 @@ WEAK = "change by no more than the noise of bright places"
 PASSES = "change as what moves past does"
 WIDE = "change together with everything around"
 FOLLOWS = "follow the motion of the frames"
+BEYOND = "lie beyond the outermost calibration points"
+
+Box = tuple[float, float, float, float]
+"""Top, left, bottom and right of a part of the picture, pixels."""
 
 
 def lasts(course: Array) -> bool:
@@ -181,6 +187,7 @@ def find_regions(
     radius_px: float = 8.0,
     noise: float = 0.0,
     moved: Motion | None = None,
+    field: Box | None = None,
 ) -> Search:
     """Find regions: places where neighbours go together, and nothing but activity explains it.
 
@@ -197,6 +204,8 @@ def find_regions(
     moved : Motion, optional
         Of frames that are not still, whether they were moved back or not: what follows it, and what it
         brings in at the borders, is no region.
+    field : (top, left, bottom, right), optional
+        Pixels between the outermost calibration points, where PSFs vary over the field.
     """
     from scipy import ndimage
 
@@ -230,11 +239,11 @@ def find_regions(
             continue
         rows, columns = (places + side.start for places, side in zip(np.nonzero(mask), box, strict=True))
         free[rows, columns] = False
-        if why := _not_active(around, mask, radius_px, noise, moved):
-            left_out[why] += 1
-            continue
         weight = norm[rows, columns]
         centre = (float(np.average(rows, weights=weight)), float(np.average(columns, weights=weight)))
+        if why := _not_active(around, mask, radius_px, noise, moved) or _beyond(centre, field):
+            left_out[why] += 1
+            continue
         free[box] &= ~near  # its halo is not another region
         regions.append(Region(rows, columns, centre, float(correlation[row, column])))
     return Search(regions, dict(left_out), correlation)
@@ -290,6 +299,14 @@ def _not_active(
     if float(np.mean(around.likeness(course)[rim] >= LIKE_AROUND)) >= HALF_AROUND:
         return WIDE
     return PASSES if around.passing(mask, course) > PASSING else None
+
+
+def _beyond(centre: tuple[float, float], field: Box | None) -> str | None:
+    """Return what a region is, if no PSF was measured about it."""
+    if field is None:
+        return None
+    top, left, bottom, right = field
+    return None if top <= centre[0] <= bottom and left <= centre[1] <= right else BEYOND
 
 
 def _lasting(courses: Array) -> Array:

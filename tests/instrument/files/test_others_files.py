@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import numpy.typing as npt
@@ -228,3 +229,30 @@ def test_a_raw_frame_of_a_mosaic_is_recognised_or_asked_about(tmp_path: Path) ->
         grey[7, 8:20] = np.nan
         tifffile.imwrite(path, grey.astype(np.float32))
         assert suspected_mosaic(read_image(path, holes=True)) == ""
+
+
+def test_compressed_stacks_are_read_whole(tmp_path: Path) -> None:
+    path = tmp_path / "stack.tif"
+    pages = [Image.fromarray(page) for page in STACK]
+    pages[0].save(path, save_all=True, append_images=pages[1:], compression="tiff_lzw")
+    np.testing.assert_array_equal(read_stack(path).pixels, STACK)
+    cv2.imwritemulti(str(path), list(STACK))  # LZW as well
+    np.testing.assert_array_equal(read_stack(path).pixels, STACK)
+    pages[0].save(path, compression="tiff_lzw", tiffinfo={274: 3})
+    upright = read_image(path)
+    np.testing.assert_array_equal(upright.pixels, PICTURE[::-1, ::-1])
+    assert any("orientation (3)" in note for note in upright.notes)
+    colours = RNG.integers(0, 255, (3, 8, 6, 3)).astype(np.uint8)
+    pages = [Image.fromarray(page) for page in colours]
+    pages[0].save(path, save_all=True, append_images=pages[1:], compression="tiff_lzw")
+    np.testing.assert_array_equal(read_stack(path).pixels, colours)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(FileError):
+        read_stack(path)
+
+
+def test_a_folder_of_folders_names_the_one_with_images(tmp_path: Path) -> None:
+    (tmp_path / "Pos0").mkdir()
+    write_image(tmp_path / "Pos0" / "a.tif", PICTURE)
+    with pytest.raises(FileError, match=r"holds no images.*Pos0"):
+        read_stack(tmp_path)

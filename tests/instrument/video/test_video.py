@@ -628,6 +628,17 @@ def test_auto_takes_the_model_that_the_film_asks_for_and_depths_become_volumes(t
     video = VideoPictures(wanted.out)
     assert video.axes == "tzyx"
     assert video.read(3).shape == (2, 48, 48)
+    top, left, bottom, right = video.calibrated_px  # turned by 90 degrees, as the pictures
+    grid, places = again.grid, again.calibration.source_positions_um
+    marked = np.zeros((48, 48))
+    for x, y, z in places:
+        row, column = grid.pixel_of(int(np.abs(grid.z_um - z).argmin()), x, y)
+        assert grid.place_um(0, *grid.pixel_of(0, x, y))[:2] == pytest.approx((x, y))
+        if 0 <= round(row) < 48 and 0 <= round(column) < 48:
+            marked[round(row), round(column)] = 1
+    rows, columns = np.nonzero(np.rot90(marked))
+    assert (top, left) == pytest.approx((rows.min(), columns.min()), abs=0.51)
+    assert (bottom, right) == pytest.approx((rows.max(), columns.max()), abs=0.51)
     np.testing.assert_array_equal(video.flat(3), video.read(3).sum(axis=0))
     upright = np.rot90(video.read(0), -1, (1, 2))
     direct = VideoSolver(again, cold_iterations=6).next(counts.astype(np.float32) - 20)

@@ -10,6 +10,7 @@ from recon import InputError
 from recon.streams.activity import baseline, change, fading, floor_of, smoothed
 from recon.streams.motion import aligned, motion
 from recon.streams.regions import (
+    BEYOND,
     FOLLOWS,
     PASSES,
     WEAK,
@@ -123,6 +124,15 @@ def test_cells_are_found_with_their_courses_and_nothing_else() -> None:
         own = min(regions, key=lambda region: np.hypot(*np.subtract(region.centre, place)))
         assert np.hypot(*np.subtract(own.centre, place)) < 1
         assert np.corrcoef(own.trace(frames), course)[0, 1] > 0.97
+
+
+def test_no_region_lies_beyond_the_outermost_calibration_points() -> None:
+    frames, _ = cells()
+    excess = frames - baseline(frames, 100)
+    (top, left), (bottom, right) = np.min(PLACES, axis=0), np.max(PLACES, axis=0)
+    assert len(find_regions(excess, field=(top - 1, left - 1, bottom + 1, right + 1)).regions) == 3
+    found = find_regions(excess, field=(top + 2, left - 1, bottom + 1, right + 1))
+    assert (len(found.regions), found.left_out[BEYOND]) == (2, 1)
 
 
 def test_noise_alone_has_no_regions() -> None:
