@@ -119,7 +119,6 @@ class SceneWatch:
     def see(self, frame: Array) -> SceneState:
         """Take note of the next frame, (n_channels, height, width), float32."""
         if self.count == 0 or self.mean.shape != frame.shape:
-            self.forget()
             self._begin(frame)
             return SceneState.NEW
         change = frame - self._gain(frame) * self.mean

@@ -102,6 +102,10 @@ def test_the_finest_level_that_leaves_time_for_two_iterations(
     assert pace._right(budget_ms) == 1  # no coarser one while that is known not to help
 
 
+def test_a_fifth_of_the_time_being_work_is_enough_to_try_coarser_pixels() -> None:
+    assert measured(Pace([1, 2]), Spent(5, 1), Spent(10, 2))._right(20) == 2
+
+
 @pytest.mark.parametrize(("budget_ms", "wanted"), [(54, 4), (56, 2), (219, 2), (221, 1), (13, 4), (9, 4)])
 def test_a_finer_level_wants_a_quarter_more_than_it_takes(budget_ms: float, wanted: int) -> None:
     pace = Pace([1, 2, 4])
@@ -149,7 +153,13 @@ def test_a_finer_level_that_had_to_be_left_soon_is_waited_for_longer() -> None:
 
 @pytest.mark.parametrize(
     ("level", "share", "helped"),
-    [(2, HELPED - 0.01, True), (2, HELPED + 0.01, False), (1.25, 0.81, True), (1.25, 0.83, False)],
+    [
+        (2, HELPED - 0.01, True),
+        (2, HELPED, True),
+        (2, HELPED + 0.01, False),
+        (1.25, 0.81, True),
+        (1.25, 0.83, False),
+    ],
 )
 def test_a_coarser_level_that_is_hardly_faster_is_left_again(
     level: float, share: float, helped: bool

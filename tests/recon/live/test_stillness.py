@@ -49,6 +49,7 @@ def test_a_dimmer_frame_tells_its_noise_itself_and_a_small_one_tells_nothing() -
     rng = np.random.default_rng(2)
     lit = rng.normal(0, 1, (64, 64)) + 3 * np.sin(np.arange(64) / 9)
     assert has_light(lit, np.array([50.0]))
+    assert has_light(0.3 * lit, np.array([50.0]))
     assert not has_light(rng.normal(0, 1, (64, 64)), np.array([50.0]))
     assert not has_light(np.zeros((64, 64)), np.array([1.0]))
     assert not has_light(0.5 * np.eye(64), np.array([50.0]))  # most pixels are alike: no estimate
