@@ -135,6 +135,8 @@ def test_an_axis_without_the_size_of_its_microstep_is_no_axis() -> None:
     for name in ("x_um", "yaw_mrad"):
         with pytest.raises(ValueError, match="is no scale"):
             ZaberAxis(device=1).axis_map(name)
+        with pytest.raises(ValueError, match="is no scale"):
+            ZaberAxis(device=1, reverse=True).axis_map(name)
     assert ZaberAxis(microstep_um=0.25, reverse=True).axis_map("x_um").scale == -0.25
 
 
