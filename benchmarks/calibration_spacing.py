@@ -146,6 +146,7 @@ def compare(
             iterations=iterations,
             tolerance=1e-5,
             estimate_background=False,
+            judged=False,
         )
         image = _blurred(np.asarray(found.volume[0], np.float32).reshape(camera.shape), 0.5)
         psnr = metrics.psnr(image, truth, fit_scale=True)

@@ -25,6 +25,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 import pytest
 from hypothesis import HealthCheck, settings
 
+from recon.base import threads
+
 settings.register_profile(
     "diffuserbench",
     deadline=None,
@@ -32,6 +34,10 @@ settings.register_profile(
     derandomize=bool(os.environ.get("CI")),
 )
 settings.load_profile("diffuserbench")
+
+# Each worker of a parallel run has its share of the cores: results are the same to the last bit for any
+# number of threads (tested where threads are), and two on one core cost a quarter more than one.
+threads.set_threads(max(1, threads.get_threads() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))
 
 try:
     import PySide6.QtWidgets  # noqa: F401 # needs libraries of the system, too

@@ -1,5 +1,6 @@
 """Drivers are found by name; an unknown, a broken and an ambiguous one are refused in words."""
 
+import os
 from collections.abc import Callable
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -118,3 +119,17 @@ def test_an_entry_point_of_another_form_is_said(register: Register, tmp_path: Pa
 
 def test_the_entry_points_of_this_installation_are_sound() -> None:
     assert registration_mistakes() == ()
+
+
+def test_a_package_that_is_installed_meanwhile_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    for number, name in enumerate(("first", "second")):
+        assert name not in driver_names("stage")
+        package = tmp_path / f"{name}-1.dist-info"
+        package.mkdir()
+        (package / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n")
+        (package / "entry_points.txt").write_text(f"[{GROUP}]\n{name}.stage = drivers.grbl.stage:GrblStage\n")
+        os.utime(tmp_path, ns=(number + 1, number + 1))  # a clock's coarseness is not what is tested
+        assert name in driver_names("stage")

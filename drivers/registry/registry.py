@@ -7,11 +7,13 @@ the package that brings them. A driver is imported only when it is asked for.
 
 from __future__ import annotations
 
+import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 
 from drivers.device import Device, FoundDevice, port_claim
 from drivers.errors import DeviceError
@@ -132,14 +134,31 @@ def _all(points: list[EntryPoint]) -> str:
     return " and by ".join(map(_words, points))
 
 
+_read: dict[object, tuple[EntryPoint, ...]] = {}
+"""The entry points, by the folders of packages and when each of these was last changed."""
+
+
 def _points() -> tuple[EntryPoint, ...]:
-    """Return the entry points, those that a package lists twice once."""
-    return tuple(
-        {
-            (point.name, point.value, point.dist and point.dist.name): point
-            for point in entry_points(group=GROUP)
-        }.values()
-    )
+    """Return the entry points, those that a package lists twice once.
+
+    They are read again when a package was installed or removed since: reading them opens a file of every
+    installed package, and a bench asks twice for each of its devices.
+    """
+    there = (tuple((folder, _changed_ns(folder)) for folder in sys.path), entry_points)
+    found = _read.get(there)
+    if found is None:
+        points = entry_points(group=GROUP)
+        found = tuple({(p.name, p.value, p.dist and p.dist.name): p for p in points}.values())
+        _read.clear()
+        _read[there] = found
+    return found
+
+
+def _changed_ns(folder: str) -> int:
+    try:
+        return Path(folder).stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 _BUS_PARTS: Mapping[str, Callable[[], tuple[FoundDevice, ...]]] = {

@@ -47,7 +47,12 @@ def error(diffuser, photons):
         data = rng.poisson(clean).astype(float)
         calibration = Calibration(psf[None, None].astype(np.float32), np.full((1, 3), np.nan))
         found = reconstruct(
-            data, calibration, prior="l1", noise=float(np.sqrt(data.mean()) + 1e-3), estimate_background=False
+            data,
+            calibration,
+            prior="l1",
+            noise=float(np.sqrt(data.mean()) + 1e-3),
+            estimate_background=False,
+            judged=False,
         ).volume[0]
         # A point that is found a pixel off is found.
         a, b = gaussian_filter(found, 1), gaussian_filter(truth, 1)

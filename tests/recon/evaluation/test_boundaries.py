@@ -26,6 +26,13 @@ from recon.verdict.map import boundary, worst
 if TYPE_CHECKING:
     from tests.recon.conftest import DrawnMap
 
+
+@pytest.fixture(autouse=True)
+def _calibrations_are_not_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against decoys, which costs more than these reconstructions and changes no error of theirs."""
+    monkeypatch.setattr("recon.reconstruction.reconstruct.check_calibration", lambda *_, **__: None)
+
+
 POINTS = SceneSpec("beads", size=40, seed=7, depths=1, layers=(0.5, 0.5))
 
 
