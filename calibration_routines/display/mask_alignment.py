@@ -12,13 +12,14 @@ nothing moves at first: each picture holds many spots, each computed for another
    shift, depth, rotation and significant tilts, until a further move promises less than that repeatability
    (:mod:`~calibration_routines.display.mask_stage`).
 5. Sections of the SLM make spots of their own: their shifts give the smooth rest of the displacement, which
-   stays in the model. Then 3 once more, about that.
+   stays in the model. All light of the same pictures, speckle between the spots included, then tells place,
+   depth and tilts thirty times better (:mod:`recon.holography.place`); 3 once more checks that.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from calibration_routines.display.mask_search import (
     AlignmentSession,
     AlignmentSettings,
     Measured,
+    fit_photographs,
     measure_sections,
     refine_pose,
     search_pose,
@@ -183,16 +185,24 @@ class MaskAlignment:
         if stage is not None:
             session.check(found.efficiency, floor=0.15)
             found = self._move(stage, found)
+        shape = session.display.mask.shape
         smooth, _ = measure_sections(session, found.pose)
-        pose, rest = _place(found.pose, smooth, session.display.mask.shape)
+        pose, rest = _place(found.pose, smooth, shape)
+        fitted = fit_photographs(session, pose, rest)
+        if fitted is not None:
+            smooth = fitted.field
+            pose, rest = _place(fitted.pose, replace(smooth, rest=rest + smooth.rest), shape)
         session.spots.maker.rest = rest
         last = refine_pose(session, pose, settings.refinements, quick=0)
         session.check(last.efficiency)
-        # Sections see the displacement better than probes of the whole SLM do, those see depth and tilts.
+        # All light sees the mask's place best, then sections its displacement, and probes of the whole SLM.
         deep = [NAMES.index(name) for name in ("z_um", "pitch_mrad", "yaw_mrad")]
         values, error = pose.vector(), smooth.error.copy()
-        values[deep], error[deep] = last.pose.vector()[deep], last.error[deep]
         apart = float(np.hypot(*(last.pose.vector() - values)[:2]))
+        if fitted is None:
+            values[deep], error[deep] = last.pose.vector()[deep], last.error[deep]
+        else:
+            error[deep] = fitted.deep_error
         pose = Pose(*(float(v) for v in values))
         scatter = session.scatter()
         return AlignmentReport(

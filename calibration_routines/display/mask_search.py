@@ -22,6 +22,7 @@ from calibration_routines.scatter import Scatter, scatter_of
 from instrument.files.errors import BenchError
 from recon.base.declare import RARE, option
 from recon.holography import Display
+from recon.holography.place import FittedPlace, fit_place
 from recon.holography.pose import NAMES, Pose
 from recon.holography.sections import Sections, SectionShifts, SmoothField, fit_field, fit_shifts, hypotheses
 from recon.holography.sections import response as spot_response
@@ -33,6 +34,9 @@ ALIGNMENT_FILE = "alignment.json"
 
 STEADY_FRAMES = 5
 """Pictures of the blank SLM at the end, by which flicker and motion are told."""
+
+POOR = 0.6
+"""Part of the contrast of photographs that is not explained, beyond which their light tells no place."""
 
 SCALE_WITHIN = 0.005
 """Of the field on the camera; it is known ten times better, lens distortion included."""
@@ -85,7 +89,7 @@ class AlignmentSettings(SeenAgain, Checked):
     )
     spots: int = option(128, least=1, help="Spots in a search picture.", group=RARE)
     section_pictures: int = option(
-        8, least=1, help="Pictures of section spots in their last measurement.", group=RARE
+        4, least=1, help="Pictures of section spots in their last measurement.", group=RARE
     )
     refinements: int = option(
         4, least=1, help="Pictures in the last measurement of depth, tilts and brightness.", group=RARE
@@ -225,6 +229,7 @@ def measure_sections(session: AlignmentSession, pose: Pose) -> tuple[SmoothField
     falling = spot_response(session.spots.maker)
     about = np.zeros((len(sections), 1, 2))
     amplitudes, tried, noises = [], [], []
+    session.spots.looks.clear()
     for step, pictures in ((0.75 * k, 1), (0.45 * k, 1), (0.45 * k, settings.section_pictures)):
         for _ in range(pictures):
             shifts = about + hypotheses(step)
@@ -244,6 +249,32 @@ def measure_sections(session: AlignmentSession, pose: Pose) -> tuple[SmoothField
         f"{left:.2f} mask pixels rms, misfit {field.misfit:.1f} sigma"
     )
     return field, found
+
+
+def fit_photographs(
+    session: AlignmentSession, pose: Pose, rest: npt.NDArray[np.float64]
+) -> FittedPlace | None:
+    """Fit the place to all light of the pictures of sections' spots; None where they do not tell it.
+
+    ``pose`` and ``rest`` are what the spots themselves tell.
+    """
+    spots = session.spots
+    if not spots.sees_all:
+        session.say("the camera's pixels are too coarse for more than spots")
+        return None
+    session.listener.said("fitting all light")
+    found = fit_place(session.display, spots.looks, pose, rest, tilt_mrad=session.settings.tilt_mrad)
+    field = found.field
+    moved = Pose().plus(field.change).displacement(session.display.mask.shape) + field.rest
+    apart = float(np.sqrt(np.mean(np.sum(moved**2, axis=-1))))
+    session.say(
+        f"all light of {len(spots.looks)} pictures: {1 - found.after**2:.0%} of their contrast is explained "
+        f"({1 - found.before**2:.0%} by spots alone), {apart:.2f} mask pixels rms from what spots say"
+    )
+    if found.after > POOR or apart > session.display.factor / 2:
+        session.say("that is too little, or too far: what spots say is kept")
+        return None
+    return found
 
 
 Array = npt.NDArray[Any]

@@ -13,9 +13,11 @@ import numpy.typing as npt
 from calibration_routines.display.display_io import DisplayBench, find_camera, random_brightness
 from recon.holography import Display
 from recon.holography.camera_map import CameraMap
+from recon.holography.learn import Look
 from recon.holography.pose import Pose
 from recon.holography.sections import Sections
 from recon.holography.spots import Spot, SpotMaker, spread_spots
+from recon.holography.target import make_band
 
 Array = npt.NDArray[Any]
 
@@ -70,6 +72,9 @@ class SpotCamera:
         self._on_look = on_look
         self._seed = 0
         self._brightness_known = False
+        self.looks: list[Look] = []
+        """Pictures of sections' spots, all of their light."""
+        self._band = make_band(display.slm_shape, display.factor, "alias-free")
         self._across = io.across_px(display)
 
     def register(self) -> None:
@@ -143,8 +148,11 @@ class SpotCamera:
         lobes = [self._across / n * d for n, d in zip(display.mask.shape, sections.division, strict=True)]
         window = (ceil(0.8 * lobes[0]), ceil(0.8 * lobes[1]))
         slm = self.maker.pattern(spots, seed=self._seed).slm
-        light, around = self._look(slm, spots, window, self.maker.ideal(len(spots)) / len(sections), lobes)
+        ideal = self.maker.ideal(len(spots)) / len(sections)
+        light, around, frame = self._look(slm, spots, window, ideal, lobes)
         area = (2 * window[0] + 1) * (2 * window[1] + 1) / self._spot_area()
+        if self.sees_all:
+            self.looks.append(Look(slm, self.camera.lags(frame, self._band)))
         strength = max(float(np.median(light)), around)
         noise = np.sqrt(0.5 * around * (1 + 0.5 * area * around / strength))
         return np.sqrt(np.maximum(light, 0)).reshape(shifts.shape[:2]), float(noise)
@@ -156,7 +164,7 @@ class SpotCamera:
     def _single(self, slm: Array, spots: Sequence[Spot], window: int) -> tuple[Array, float]:
         """Read spots made by the whole SLM; returns brightness and the noise of an amplitude."""
         ideal = self.maker.ideal(len(spots))
-        found, around = self._look(slm, spots, (window, window), ideal, self.lobes_px)
+        found, around, _ = self._look(slm, spots, (window, window), ideal, self.lobes_px)
         return found, float(np.sqrt(around / 2))
 
     def _look(
@@ -166,8 +174,8 @@ class SpotCamera:
         window: tuple[int, int],
         ideal: float,
         lobes: Sequence[float],
-    ) -> tuple[Array, float]:
-        """Show a pattern and read its spots; returns their brightness and that of the speckle around them.
+    ) -> tuple[Array, float, Array]:
+        """Show a pattern and read its spots; returns their brightness, that of the speckle around them, all.
 
         ``window`` reaches so many camera pixels each way, ``ideal`` is the brightness of a right spot,
         ``lobes`` are a spot's half widths in camera pixels.
@@ -187,7 +195,12 @@ class SpotCamera:
         brightness = found / (self._spot_area() * captured * (np.sinc(y) * np.sinc(x)) ** 2)
         whole = all(spot.section is None for spot in spots)
         self._on_look(SpotLook(frame, rows, columns, tuple(spots), brightness / ideal, whole))
-        return brightness, float(np.median(around))
+        return brightness, float(np.median(around)), frame
+
+    @property
+    def sees_all(self) -> bool:
+        """Whether the camera's pixels are fine enough for what an eye resolves."""
+        return 2 * self._band.cutoff <= self._across
 
     @property
     def lobes_px(self) -> list[float]:

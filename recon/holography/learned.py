@@ -118,7 +118,7 @@ class Learned:
         for coefficients, unit in ((self.amplitude, 1), (self.phase, 1j)):
             for value, (i, j) in zip(coefficients, terms(order_of(len(coefficients))), strict=True):
                 if value:
-                    log += unit * value * np.multiply.outer(_legendre(i, shape[0]), _legendre(j, shape[1]))
+                    log += unit * value * np.multiply.outer(legendre(i, shape[0]), legendre(j, shape[1]))
         field = np.exp(log)
         return np.asarray(field / np.sqrt(np.mean(np.abs(field) ** 2)), np.complex64)
 
@@ -150,7 +150,7 @@ def order_of(count: int) -> int:
     raise InputError(f"{count} coefficients are those of no order of polynomials.")
 
 
-def _legendre(order: int, n: int) -> npt.NDArray[np.float64]:
+def legendre(order: int, n: int) -> npt.NDArray[np.float64]:
     """Return a Legendre polynomial over ``n`` pixels, rms about 1."""
     from scipy.special import eval_legendre
 

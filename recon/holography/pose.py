@@ -174,25 +174,9 @@ def _seen(slm: Array, display: Display, displacement: Array, pose: Pose) -> Arra
     """Return the low-passed image, FFT order, on the smallest grid that holds it."""
     import scipy.fft  # costs what only who aligns has to wait
 
-    from recon.holography import _kernels
-
-    height, width = display.mask.shape
-    field = np.zeros((height, width), np.complex64)
     pattern = (slm * display.dc.modulated + display.dc.amplitude).astype(np.complex64)
-    # The SLM's image in the mask's frame: as the model fills it, through a mask that does nothing yet.
-    _kernels.fill_displaced(
-        field,
-        pattern,
-        np.zeros((height, width), np.uint8),
-        np.ones(1, np.complex64),
-        np.ones(height, np.complex64),
-        np.ones(width, np.complex64),
-        displacement.astype(np.float32),
-        display.factor,
-        0,
-        height,
-    )
-    field = _propagate(field, display, pose) * display.mask.field(display.wavelength_nm).astype(np.complex64)
+    field = on_mask(pattern, display, displacement)
+    field = propagated(field, display, pose) * display.mask.field(display.wavelength_nm).astype(np.complex64)
     band = make_band(display.slm_shape, display.factor, "alias-free")
     far = scipy.fft.fft2(field, band.shape)
     ey, ex = display.envelope(band.shape)
@@ -206,8 +190,30 @@ def _seen(slm: Array, display: Display, displacement: Array, pose: Pose) -> Arra
     return low_pass(scipy.fft.irfft2(small, (rows, columns)), display.slm_shape)
 
 
-def _propagate(field: Array, display: Display, pose: Pose) -> Array:
-    """Take light from the SLM's image to the tilted mask (first order in the tilt's small depth)."""
+def on_mask(pattern: Array, display: Display, displacement: Array) -> Array:
+    """Return the SLM's image in the displaced mask's frame, as the model fills it, complex64."""
+    from recon.holography import _kernels  # costs what only who aligns has to wait
+
+    height, width = display.mask.shape
+    field = np.zeros((height, width), np.complex64)
+    # Through a mask that does nothing.
+    _kernels.fill_displaced(
+        field,
+        pattern,
+        np.zeros((height, width), np.uint8),
+        np.ones(1, np.complex64),
+        np.ones(height, np.complex64),
+        np.ones(width, np.complex64),
+        displacement.astype(np.float32),
+        display.factor,
+        0,
+        height,
+    )
+    return field
+
+
+def propagated(field: Array, display: Display, pose: Pose) -> Array:
+    """Return light taken from the SLM's image to the tilted mask (first order in the tilt's small depth)."""
     import scipy.fft  # costs what only who aligns has to wait
 
     if not (pose.z_um or pose.pitch_mrad or pose.yaw_mrad):

@@ -63,6 +63,11 @@ class Sections:
 POWERS = [(i, n - i) for n in range(ORDER + 1) for i in range(n + 1)]
 
 
+def likelihood_of(likely: float) -> npt.NDArray[np.float64]:
+    """Return the inverse covariance of the monomials before anything is measured (see :func:`fit_field`)."""
+    return np.diag([0.0 if i + j < 2 else likely**-2 for i, j in POWERS])
+
+
 def hypotheses(step: float) -> npt.NDArray[np.float64]:
     """Return local shifts (y, x) to try in a section: none, and ``step`` mask pixels each way."""
     return step * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -202,8 +207,7 @@ def fit_field(
             f"Spots of {int(known.sum())} of {len(sections)} sections of the SLM were seen; half are needed."
         )
     basis = sections.basis()[known]
-    order = np.array([i + j for i, j in POWERS])
-    likelihood = np.diag(np.where(order < 2, 0.0, 1 / likely**2))
+    likelihood = likelihood_of(likely)
     y, x = nodes_of(mask_shape)
     half_width = mask_shape[1] / 2
     at_nodes = np.stack([(y / half_width) ** i * (x / half_width) ** j for i, j in POWERS])
