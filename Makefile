@@ -32,7 +32,7 @@ docs: $(STAMP) ## the site of all documentation, with search, gallery and refere
 	$(BIN)/python -m sphinx -q -b html docs build/docs
 
 test: $(STAMP) lint types ## every check and every test
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 mutants: $(STAMP) ## change the program a little again and again, and see whether a test notices (half an hour)
 	$(BIN)/python -m tests.mutants

@@ -214,7 +214,7 @@ sys.exit(main(["demo", "--out", sys.argv[1]]))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wait_s", [0.0, 1.0, 2.5, 4.5])
+@pytest.mark.parametrize("wait_s", [0.0, 2.5])
 def test_ctrl_c_ends_the_command_with_130_and_a_safe_bench(tmp_path: Path, wait_s: float) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, str(tmp_path)],
