@@ -4,7 +4,7 @@ Every turn of the event loop is timed by the processor time of the window's own 
 and the program's own jobs do not count; so is each panel's first opening, from the click on its tab to when
 it stands (what it imports is a job's), and by the clock. Meanwhile STOP is clicked every 0.3 s from another
 thread; its times are by the clock, on however busy a machine: from the click to when the window's thread
-takes it, and to when all devices were halted.
+takes it, and to when light is off and nothing moves (an SLM that is blanked then takes its settling time).
 
     python benchmarks/gui_stalls.py [BENCH.toml] [--over 50]
 """
@@ -64,17 +64,22 @@ class Turns:
 
 
 class Stopper:
-    """Clicks STOP again and again from a thread of its own, and times how long the bench's halt takes."""
+    """Clicks STOP again and again from a thread of its own, and times how long it is until dark and still."""
 
     def __init__(self, window: MainWindow) -> None:
         self._window = window
         self._clicked_s: float | None = None
+        self._noted_s: float | None = None
         self.heard_ms: list[float] = []
         self.ms: list[float] = []
         self._ending = threading.Event()
         window.session.stop_pressed.connect(self._heard)
-        self._halt = window.session.bench.stop
-        window.session.bench.stop = self._stopped  # type: ignore[method-assign]
+        bench = window.session.bench
+        self._halt = bench.stop
+        bench.stop = self._stopped  # type: ignore[method-assign]
+        if bench.stage is not None:  # light is off by then: safety's order
+            self._still = bench.stage.stop
+            bench.stage.stop = self._stage_stopped  # type: ignore[method-assign]
         threading.Thread(target=self._click, daemon=True).start()
 
     def _click(self) -> None:
@@ -89,11 +94,20 @@ class Stopper:
         if self._clicked_s is not None:
             self.heard_ms.append((time.monotonic() - self._clicked_s) * 1e3)
 
+    def _stage_stopped(self) -> None:
+        self._still()
+        self._note()
+
     def _stopped(self) -> None:
         self._halt()
-        if (clicked_s := self._clicked_s) is not None:
-            self.ms.append((time.monotonic() - clicked_s) * 1e3)
-            self._clicked_s = None
+        self._note()
+        self._clicked_s = None
+
+    def _note(self) -> None:
+        """Note the first time after a click that all was dark and still."""
+        if self._clicked_s is not None and self._noted_s != self._clicked_s:
+            self._noted_s = self._clicked_s
+            self.ms.append((time.monotonic() - self._clicked_s) * 1e3)
 
     def end(self) -> None:
         """Click no more."""
