@@ -54,6 +54,9 @@ def test_the_ten_lines_of_the_readme_run(
     assert "counts from both" in names["tv"].job.notes["Dark"]
     assert names["tv"].image.shape == (48, 48)
     assert names["l1"].prior == "l1"
+    facts = names["tv"].facts()
+    assert "`dark` FILE or COUNTS to give it" in facts["Dark"]
+    assert not [text for text in facts.values() if "--" in text], "the terminal's flags"
 
 
 def test_a_result_shows_draws_and_saves_itself(scene: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
@@ -103,6 +106,7 @@ def test_a_files_image_is_no_array_and_says_where_its_array_is(
         (lambda: photo.astype(float), "take .pixels.astype"),
         (lambda: photo[:10], ".pixels is its array"),
         (lambda: db.reconstruct(photo, None), "not NoneType"),
+        (lambda: db.read(3), "read by its name, not int"),
     ):
         with pytest.raises((AttributeError, TypeError, db.BenchError), match=said):
             used()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
@@ -26,14 +25,13 @@ from gui.jobs import JobRunner
 from gui.widgets.building import fill, in_row, label, mark
 from instrument.files.errors import BenchError
 from instrument.reconstruction.stored_result import free_result
-from recon.base.declare import Option, options_of
+from recon.base.declare import Option, in_other_words, options_of
 from recon.errors import InputError
 
 FOLDED = ("Rarely needed", "Advanced")
 """Groups that are folded away, wherever they are declared."""
 
 _ABOVE_HEADING_PX = 6
-_FLAG = re.compile(r"--[a-z][\w-]*")
 _T = TypeVar("_T")
 
 
@@ -192,8 +190,7 @@ class OptionsForm(QWidget):
 
     def in_its_words(self, text: str) -> str:
         """Return a message with the fields' labels where the terminal's has flags."""
-        labels = {option.flag: f"“{bare_label(option)}”" for option in self._offered}
-        return _FLAG.sub(lambda flag: labels.get(flag[0], flag[0]), text)
+        return in_other_words(text, self._offered, lambda option: f"“{bare_label(option)}”")
 
     # What applies --------------------------------------------------------------------------------
     def applies(self, name: str) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,7 @@ import tifffile
 from instrument.files import reading
 from instrument.files.atomic import whole_file, write_text
 from instrument.files.decoding import READABLE, decode
-from instrument.files.errors import FileError
+from instrument.files.errors import BenchError, FileError
 from instrument.files.image_folders import images_in, in_order, order_in_words
 from instrument.files.named_arrays import is_zarr, read_zarr
 from instrument.files.seen import as_seen, levels_of, png_bytes
@@ -120,6 +121,10 @@ def read_stack(path: Path | str, *, leave_out: Path | None = None) -> ImageFile:
 
 def read(path: Path | str) -> ImageFile:
     """Read what a file holds, or a folder: one image, or a stack. Errors as :func:`read_image`."""
+    if not isinstance(path, str | PathLike):
+        raise BenchError(
+            f"A file or folder is read by its name, not {type(path).__name__}; arrays are taken as they are."
+        )
     if Path(path).is_dir() and not is_zarr(Path(path)):
         return read_stack(path)
     try:

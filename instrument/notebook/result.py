@@ -27,6 +27,8 @@ from instrument.reconstruction.result_file import (
     write_reconstruction,
     write_volume,
 )
+from recon.base.declare import in_other_words, options_of
+from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.result import Reconstruction
 from recon.types import Calibration
 
@@ -56,12 +58,15 @@ class Result(Reconstruction):
 
     def facts(self) -> Mapping[str, str]:
         """Return what is known of it, in words: what was read, chosen, and how far it can be trusted."""
+        from instrument.reconstruction.options import InputOptions
         from instrument.reconstruction.stored_result import StoredResult
 
         record = reconstruction_record(self, self.job, volume=not self.is_picture)
         pixels = self.image if self.is_picture else self.volume
         said = StoredResult(Path(), pixels, None, record).facts()
-        return {**dict(self.job.notes), **{name: text for name, text in said if name != "Made"}}
+        notes = {**dict(self.job.notes), **{name: text for name, text in said if name != "Made"}}
+        options = (*options_of(ReconstructionOptions), *options_of(InputOptions))
+        return {name: in_other_words(text, options, lambda o: f"`{o.name}`") for name, text in notes.items()}
 
     def seen(self, *, rotate_deg: int = 0) -> Shown:
         """Return the picture for a screen, 8 bit; of a volume the brightest over depth, coloured by depth."""

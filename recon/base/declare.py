@@ -12,6 +12,7 @@ import difflib
 import enum
 import functools
 import math
+import re
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -191,7 +192,7 @@ class Option:
             if instead := self.declaration.replaced().get(value):
                 return f"{name}: {instead}"
             near = difflib.get_close_matches(value.lower(), words, 1)
-            meant = f"; {near[0]!r}?" if near else "."
+            meant = f". Did you mean {near[0]!r}?" if near else "."
             return f"{name} must be one of {', '.join(words)}, not {value!r}{meant}"
         if self.kinds == (bool,) and not isinstance(value, bool):
             return f"{name} must be True or False, not {value!r}."
@@ -277,6 +278,15 @@ def _in_words(kind: Any) -> str:
 def option(default: Any = dataclasses.MISSING, **declaration: Any) -> Any:
     """Declare a field of an options class, required without a default; keywords as :class:`Declaration`."""
     return dataclasses.field(default=default, metadata={_KEY: Declaration(**declaration)})
+
+
+_FLAG = re.compile(r"--[a-z][\w-]*")
+
+
+def in_other_words(text: str, options: Iterable[Option], named: Callable[[Option], str]) -> str:
+    """Return a message with what the options are ``named`` elsewhere in place of the terminal's flags."""
+    names = {option.flag: named(option) for option in options}
+    return _FLAG.sub(lambda flag: names.get(flag[0], flag[0]), text)
 
 
 def options_of(declared: type | object) -> tuple[Option, ...]:

@@ -130,7 +130,7 @@ def test_all_mistakes_are_told_at_once_with_their_flags_and_the_units_that_peopl
         )
     assert str(raised.value).splitlines() == [
         "--count must be a whole number, 1 or more, 9 or less, not 10.",
-        "--kind must be one of plain, fancy, not 'fancie'; 'fancy'?",
+        "--kind must be one of plain, fancy, not 'fancie'. Did you mean 'fancy'?",
         "--z-mm must be a number, above 0, below 1000 (mm), not -2.",
         "--binning must be auto or a whole number, 1 or more, not 'few'.",
         "--depths must be a number, above 0, not 0.",

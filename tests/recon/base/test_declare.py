@@ -25,7 +25,7 @@ def test_all_mistakes_are_named_at_once() -> None:
     found = mistakes(Some(count=0, kind="fancie", z_um=float("nan")))
     assert found == [
         "count must be a whole number, 1 or more, not 0.",
-        "kind must be one of plain, fancy, not 'fancie'; 'fancy'?",
+        "kind must be one of plain, fancy, not 'fancie'. Did you mean 'fancy'?",
         "z_um must be a number, above 0 (um), not nan.",
     ]
     assert mistakes(Some(count=2, kind="fancy", z_um=1)) == []
