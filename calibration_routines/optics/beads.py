@@ -30,7 +30,7 @@ from calibration_routines.psf.sampling import known
 from instrument.bench.bench import Bench
 from instrument.files.atomic import named_by_worth, require_new
 from instrument.files.calibration_file import save_calibration
-from instrument.files.errors import BenchError, OperatorNeededError
+from instrument.files.errors import BenchError, OperatorNeededError, SettingsError
 from instrument.files.images import write_image
 from instrument.runs.run_control import RunControl
 from instrument.runs.writer import dated_name, free_name
@@ -57,6 +57,10 @@ BIN_FIRST = (
 class SlideChanger(Protocol):
     """A shared part that can put another slide of beads before the camera: the simulated world."""
 
+    @property
+    def slide_z_um(self) -> float:
+        """How far from the diffuser its slides are."""
+
     def change_slide(self, number: int) -> None:
         """Show slide ``number``; each has its beads at other places."""
 
@@ -71,8 +75,14 @@ _DEFLECTION_DEG = 1.0  # by which the diffuser bends light, for the window
 class BeadSlides(Checked):
     """What to photograph, and how to solve it."""
 
-    z_um: float = option(
-        2.5e3, **MM, flags=("--z",), above=0, label="Depth", help="Depth of the slide, from the diffuser."
+    z_um: float | None = option(
+        None,
+        **MM,
+        flags=("--z",),
+        above=0,
+        label="Depth",
+        help="Depth of the slide, from the diffuser.",
+        default_words="where the simulated bench has it; else it must be given",
     )
     images: int = option(
         9, least=2, label="Photographs", help="Photographs to take, the slide moved by any amount in between."
@@ -130,6 +140,20 @@ class BeadSlides(Checked):
         default_words=f"{BEADS_FOLDER}; in the window dated, beside the runs",
     )
     overwrite: bool = option(False, flags=("--force",), help="Replace a calibration that exists.")
+
+    def planned(self, bench: Bench) -> BeadSlides:
+        """Return them with their depth filled in, where the simulated world knows it."""
+        changer = _slide_changer(bench)
+        return self if self.z_um is not None or changer is None else replace(self, z_um=changer.slide_z_um)
+
+    @property
+    def distance_um(self) -> float:
+        """The depth; SettingsError where nobody has said it."""
+        if self.z_um is None:
+            raise SettingsError(
+                [("z_um", "the slide's distance from the diffuser, which nothing else tells")]
+            )
+        return self.z_um
 
     @property
     def solver(self) -> BlindSettings:
@@ -194,6 +218,10 @@ class BeadPhotographs:
     """What is wrong with place and other light in them."""
 
 
+def _slide_changer(bench: Bench) -> SlideChanger | None:
+    return next((part for part in bench.shared.values() if isinstance(part, SlideChanger)), None)
+
+
 def photograph_slides(
     bench: Bench, slides: BeadSlides, folder: Path | None, control: RunControl, listener: Listener
 ) -> BeadPhotographs:
@@ -205,7 +233,7 @@ def photograph_slides(
     Raises OperatorNeededError when the slide has to be moved by hand and nobody can be asked;
     CalibrationError when an image saturates still, the last time or at the camera's shortest exposure.
     """
-    changer = next((part for part in bench.shared.values() if isinstance(part, SlideChanger)), None)
+    changer = _slide_changer(bench)
     ask = bench.ask
     if changer is None and ask is None:
         raise OperatorNeededError(
@@ -277,10 +305,11 @@ def calibrate_beads(
     Raises BenchError when the geometry lacks what is needed; InputError when the images cannot be solved.
     """
     pitch_um, distance_mm = needed_geometry(geometry)
+    z_um = slides.distance_um
     window = window_for(slides, geometry, (images.shape[1], images.shape[2]))
     result = calibrate_from_beads(images, window, slides.solver, on_progress=progress)
-    object_um = pitch_um * slides.z_um / (1e3 * distance_mm)
-    places = [(-column * object_um, -row * object_um, slides.z_um) for row, column in result.points]
+    object_um = pitch_um * z_um / (1e3 * distance_mm)
+    places = [(-column * object_um, -row * object_um, z_um) for row, column in result.points]
     record = {
         "made_by": f"diffuserbench {version('diffuserbench')}",
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -334,7 +363,7 @@ def window_for(slides: BeadSlides, geometry: Geometry, shape: tuple[int, int]) -
         )
         bent_um = 2e3 * distance_mm * np.tan(np.deg2rad(_DEFLECTION_DEG))
         height, width = (
-            int((1e3 * side * (1 + 1e3 * distance_mm / slides.z_um) + bent_um) / pitch_um) // 2 * 2 + 1
+            int((1e3 * side * (1 + 1e3 * distance_mm / slides.distance_um) + bent_um) / pitch_um) // 2 * 2 + 1
             for side in aperture_mm
         )
         window = height, width
@@ -367,7 +396,7 @@ class BeadProcedure(Procedure):
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse what cannot be solved because the optics are not known, or saved."""
         self.slides.refuse_existing()
-        slides = self.slides
+        slides = self.slides.planned(bench)
         geometry = binned(bench.geometry, slides.binning)
         frame = bench.camera.frame_shape[0] // slides.binning, bench.camera.frame_shape[1] // slides.binning
         frames = slides.images * (slides.average + 4)
@@ -381,10 +410,11 @@ class BeadProcedure(Procedure):
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Photograph, solve, and save the calibration."""
-        geometry = binned(bench.geometry, self.slides.binning)
+        slides = self.slides.planned(bench)
+        geometry = binned(bench.geometry, slides.binning)
         facts: dict[str, Any] = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
         listener.step("photographing bead slides")
-        taken = photograph_slides(bench, self.slides, folder, control, listener)
+        taken = photograph_slides(bench, slides, folder, control, listener)
         listener.step("blind deconvolution")
 
         def solving(_words: str, done: float) -> None:
@@ -392,10 +422,10 @@ class BeadProcedure(Procedure):
             listener.share(done, 1.0)
 
         facts |= {"runs": [run.name for run in taken.runs]}
-        solved = calibrate_beads(taken.images, self.slides, geometry, provenance=facts, progress=solving)
+        solved = calibrate_beads(taken.images, slides, geometry, provenance=facts, progress=solving)
         solved = replace(solved, runs=taken.runs, findings=taken.findings)
-        out = self.slides.out or free_name(folder or bench.config.data_folder, dated_name("bead calibration"))
-        return save_beads(solved, self.slides, out)
+        out = slides.out or free_name(folder or bench.config.data_folder, dated_name("bead calibration"))
+        return save_beads(solved, slides, out)
 
 
 def psf_lines(slides: BeadSlides, geometry: Geometry, shape: tuple[int, ...]) -> tuple[str, ...]:
@@ -407,7 +437,7 @@ def psf_lines(slides: BeadSlides, geometry: Geometry, shape: tuple[int, ...]) ->
     height, width = window_for(slides, geometry, (shape[0], shape[1]))
     rows, columns = slides.grid.shape
     words = (
-        f"{rows} x {columns} PSFs of {height} x {width} pixels at z = {slides.z_um / 1e3:g} mm, over "
+        f"{rows} x {columns} PSFs of {height} x {width} pixels at z = {slides.distance_um / 1e3:g} mm, over "
         f"{slides.reach:.0%} of the field of {shape[0]} x {shape[1]} pixels"
     )
     return (words, BIN_FIRST) if shape[0] * shape[1] > MANY_PX else (words,)

@@ -355,6 +355,11 @@ class SimulatedWorld(Surroundings):
             for key in [key for key in self._cache if key[0] == "scene"]:
                 del self._cache[key]
 
+    @property
+    def slide_z_um(self) -> float:
+        """How far from the diffuser slides of beads are put."""
+        return _place(self.options, self.preset, self.distance_um)[0]
+
     def change_slide(self, number: int) -> None:
         """Put a slide of beads in front of the camera; each ``number`` has them at other places."""
         self.set_scene(make_slide(self.options, self.preset, self.distance_um, number))

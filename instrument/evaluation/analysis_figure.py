@@ -300,8 +300,9 @@ def _profile(axes: Axes, trial: PointTrial, title: str, unit: str, axis: int) ->
     axes.plot(at, profile / profile.max(), drawstyle="steps-mid", color=_COLORS[0], linewidth=1.5)
     reach = 2.5 * separation + 2
     axes.set_xlim(-reach, reach)
-    verdict = f"dip {trial.dip:.0%}" if trial.resolved else "not resolved"
-    style(axes, f"{title}: {separation:.3g} {unit}, {verdict}", unit, "brightness found")
+    # Short enough for its panel: how deep the dip is can be seen.
+    verdict = "" if trial.resolved else ", not resolved"
+    style(axes, f"{title}: {separation:.3g} {unit}{verdict}", unit, "brightness found")
 
 
 def _sixteen(axes: Axes, trial: PointTrial, a: Analysis) -> None:

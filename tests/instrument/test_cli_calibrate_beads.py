@@ -100,6 +100,7 @@ def test_mistakes(
     changed: list[str], part: str, files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["calibrate", "beads", *files, "--pixel-um", "11.6", "--distance-mm", "3.8", "--window", "21x21"]
+    words += ["--z", "2.5"]
     assert main([*words, *changed, "--out", str(tmp_path / "x")]) == 2
     assert part in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
@@ -117,14 +118,18 @@ def test_a_dry_run_says_what_it_would_do_and_writes_nothing(
 ) -> None:
     out = str(tmp_path / "x")
     words = ["calibrate", "beads", *files, "--pixel-um", "11.6", "--distance-mm", "3.8", "--window", "21x21"]
+    assert main([*words, "--dry-run", "--out", out]) == 2  # nothing tells how far the slide was
+    assert "the slide's distance from the diffuser" in capsys.readouterr().err
+    words += ["--z", "2.5"]
     assert main([*words, "--dry-run", "--out", out]) == 0
     said = capsys.readouterr().out
     assert "4 files, read and found alike" in said
     assert "5 x 5 PSFs of 21 x 21 pixels at z = 2.5 mm, over 80% of the field of 48 x 48 pixels" in said
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "bench.toml").write_text(BENCH)
+    (tmp_path / "bench.toml").write_text(BENCH + "scene_distance_mm = 3.1\n")
     assert main(["calibrate", "beads", "--dry-run", "--out", out]) == 0
     said = capsys.readouterr().out
+    assert "at z = 3.1 mm" in said  # where that bench has its slides
     assert "9 photographs of 4 frames" in said
     assert "take long to solve" in said
     assert not (tmp_path / "runs").exists()
@@ -140,7 +145,7 @@ def test_the_same_file_twice_is_refused(
     files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["calibrate", "beads", files[0], files[1], files[0], "--pixel-um", "11.6", "--distance-mm", "3.8"]
-    assert main([*words, "--window", "21x21", "--out", str(tmp_path / "x")]) == 2
+    assert main([*words, "--z", "2.5", "--window", "21x21", "--out", str(tmp_path / "x")]) == 2
     assert "Images 1 and 3 are the same" in capsys.readouterr().err
 
 

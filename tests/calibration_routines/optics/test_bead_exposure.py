@@ -31,7 +31,7 @@ def photographed(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[list[fl
 
     def take(saturate_ms: list[float], shortest_ms: float) -> tuple[list[float], Told]:
         told, taken_ms, slide = Told(), [], [0]
-        changer = SimpleNamespace(change_slide=lambda number: slide.__setitem__(0, number))
+        changer = SimpleNamespace(slide_z_um=80e3, change_slide=lambda number: slide.__setitem__(0, number))
         camera = SimpleNamespace(exposure_limits_ms=(shortest_ms, 1e3))
         bench: Any = SimpleNamespace(
             shared={"world": changer}, ask=None, camera=camera, label="bench", simulated_kinds=()
