@@ -1,20 +1,21 @@
 """The distances that ``analyze`` states, held against points whose light is propagated.
 
     python benchmarks/analysis_points.py [--pairs 20] [--only across along sixteen]
-    python benchmarks/analysis_points.py --pairs 12 --only volume --shares 1 1.5 2.25
+    python benchmarks/analysis_points.py --pairs 12 --only volume
 
 The simulated bench's preset ``tiny``, calibrated at two depths with noise. Then points alone, at places
 between pixels and planes that the analysis has not seen, by wave optics: pairs across in a picture as the
 default reconstruction makes it; pairs along the axis and sixteen in x and z in the window that states them.
 Printed is how many are told apart at the stated distance and at 0.8 of it. ``volume``: pairs along the axis
-and sixteens, each in a cell of its own with the noise that it would have alone, in one default volume.
+and sixteens, each in a cell of its own with the noise that it would have alone, in one default volume, at
+the distances that ``analyze --volumes`` states.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +27,7 @@ from recon.analysis import Analysis, analyse
 from recon.analysis.gram import WindowProblem
 from recon.analysis.points import DIP, HALF_WINDOW, Noise, PointGrid, planes_about, smallest_dip, try_points
 from recon.camera.refocus import psf_at
+from recon.evaluation.points_in_volumes import in_volumes
 from recon.evaluation.two_points import reached
 from recon.types import Calibration
 
@@ -115,12 +117,49 @@ def told(count: int, one: Callable[[np.random.Generator], bool]) -> str:
     return f"{sum(one(np.random.default_rng(1000 + seed)) for seed in range(count))} of {count}"
 
 
+def _volumes(
+    truth: Truth,
+    calibration: Calibration,
+    stack: np.ndarray,
+    found: Analysis,
+    count: int,
+    shares: Sequence[float],
+) -> None:
+    """Hold what volumes are said to reach against points whose light is propagated."""
+    points, step = found.points, found.axial_inner.step_per_um
+    assert points is not None
+    assert points.lateral_px is not None
+    assert points.axial_per_um is not None
+    began = time.process_time()
+    stated = in_volumes(calibration, found.z_um, points.lateral_px, points.axial_per_um, step)
+    optics = points.axial_per_um / (step / 2)
+    print(
+        f"volumes: {stated}, optics {optics:.2f} half steps, {time.process_time() - began:.0f} CPU s",
+        flush=True,
+    )
+    for share in shares:
+        grids = {}
+        if stated.along_per_um is not None:
+            grids["two along"] = PointGrid(1, 2, separation_planes=share * stated.along_per_um / (step / 2))
+        if stated.sixteen_factor is not None:
+            factor = share * stated.sixteen_factor
+            grids["sixteen"] = PointGrid(4, 4, factor * points.lateral_px, factor * optics)
+        for name, grid in grids.items():
+            began = time.process_time()
+            told_apart, of, how = in_a_volume(truth, stack, grid, count)
+            print(
+                f"volume ({how}), {name}, {grid.separation_px:.2f} px, {grid.separation_planes:.2f} half "
+                f"steps ({share:g} of stated): {told_apart} of {of}, {time.process_time() - began:.0f} CPU s",
+                flush=True,
+            )
+
+
 def main() -> None:
     """Analyse, then count."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--pairs", type=int, default=20)
     parser.add_argument("--only", nargs="+", choices=["across", "along", "sixteen", "volume"], default=None)
-    parser.add_argument("--shares", nargs="+", type=float, default=[1.0, 1.5], help="Of a volume's points.")
+    parser.add_argument("--shares", nargs="+", type=float, default=SHARES, help="Of a volume's points.")
     arguments = parser.parse_args()
     wanted = arguments.only or ["across", "along", "sixteen"]
     world = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
@@ -143,21 +182,8 @@ def main() -> None:
     assert points.axial_per_um is not None
     assert points.lateral_px is not None
     along = points.axial_per_um / per_plane
-    for share in arguments.shares if "volume" in wanted else ():
-        grids = {"two along": PointGrid(1, 2, separation_planes=share * along)}
-        if points.sixteen_factor is not None:
-            factor = share * points.sixteen_factor
-            grids["sixteen"] = PointGrid(4, 4, factor * points.lateral_px, factor * along)
-        for name, grid in grids.items():
-            if (grid.planes - 1) * grid.separation_planes > len(stack) - 2:
-                continue
-            began = time.process_time()
-            count, of, how = in_a_volume(truth, stack, grid, arguments.pairs)
-            print(
-                f"volume ({how}), {name}, {grid.separation_px:.2f} px, {grid.separation_planes:.2f} half "
-                f"steps ({share:g} of stated): {count} of {of}, {time.process_time() - began:.0f} CPU s",
-                flush=True,
-            )
+    if "volume" in wanted:
+        _volumes(truth, calibration, stack, found, arguments.pairs, arguments.shares)
     for name, half in (("along", (4, 4)), ("sixteen", HALF_WINDOW)):
         if name not in wanted or (name == "sixteen" and points.sixteen_factor is None):
             continue

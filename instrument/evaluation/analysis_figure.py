@@ -10,7 +10,7 @@ import numpy as np
 from instrument.files.figures import ACCENT, INK, mark_simulated, style
 from recon.analysis import Analysis
 from recon.analysis.gram import ConditionCurve
-from recon.analysis.points import PointTrial, Reached
+from recon.analysis.points import InVolumes, PointTrial, Reached
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -138,6 +138,8 @@ def facts(analysis: Analysis) -> list[tuple[str, str]]:
     ]
     if (reached := a.reached) is not None:
         lines += _reached(a, reached)
+    if (volumes := a.in_volumes) is not None:
+        lines += _in_volumes(a, volumes)
     if (tests := a.points) is not None:
         if tests.lateral_px is not None:
             um = tests.lateral_px * a.pitch_um * a.z_um / a.distance_um
@@ -146,7 +148,7 @@ def facts(analysis: Analysis) -> list[tuple[str, str]]:
             apart = _mm(tests.axial_per_um * a.z_um**2)
             lines.append(("optics: two points along", f"{1e6 * tests.axial_per_um:.3g} /m, {apart}"))
         if tests.sixteen_factor is not None:
-            lines.append(("16 points need", f"{tests.sixteen_factor:.2g} times these separations"))
+            lines.append(("optics: 16 points need", f"{tests.sixteen_factor:.2g} times these separations"))
     holds = "not known" if a.convolution_holds_deg is None else f"to {a.convolution_holds_deg:.3g}°"
     planes = f"{len(a.grid.z_um)} plane{'s' if len(a.grid.z_um) > 1 else ''} even in 1/z"
     lines += [
@@ -182,6 +184,17 @@ def _reached(a: Analysis, reached: Reached) -> list[tuple[str, str]]:
         near, far = (_mm(v) for v in reached.focus_um)
         lines.append(("depth of field, picture", f"{near} to {far}, for pairs half as far again apart"))
     return lines
+
+
+def _in_volumes(a: Analysis, found: InVolumes) -> list[tuple[str, str]]:
+    """Return what default volumes reach, in words."""
+    along = "told apart at no distance tried"
+    if found.along_per_um is not None:
+        along = f"{1e6 * found.along_per_um:.3g} /m, {_mm(found.along_per_um * a.z_um**2)}"
+    sixteen = f"not told apart as far as {found.planes} planes go"
+    if found.sixteen_factor is not None:
+        sixteen = f"{found.sixteen_factor:.2g} times the optics' separations"
+    return [("two points along, volume", along), ("16 points, volume", sixteen)]
 
 
 def _mm(um: float) -> str:

@@ -89,6 +89,7 @@ class CompareOptions:
     "diffuserbench analyze runs/2026-11-21-axial",
     "diffuserbench analyze calibration --cutoff-deg 41.5,30 --out supplement.pdf",
     "diffuserbench analyze calibration --z-mm 2.5 --fall-off-deg 13 --lenslet-um 250 --wavelength-nm 520",
+    "diffuserbench analyze calibration --volumes            points in default volumes, too: minutes",
     "diffuserbench analyze calibration --no-points          without reconstructions: seconds",
 )
 def analyze(desk: Desk, files: AnalysisFiles, settings: AnalysisSettings, noise: Noise, given: Given) -> Done:
@@ -105,6 +106,7 @@ def analyze(desk: Desk, files: AnalysisFiles, settings: AnalysisSettings, noise:
     from instrument.files.record import plain
     from instrument.reconstruction.job import find_calibration
     from recon.analysis import analyse
+    from recon.evaluation.points_in_volumes import in_volumes
     from recon.evaluation.two_points import reached
 
     out, record = files.out, files.out.with_suffix(".json")
@@ -129,6 +131,7 @@ def analyze(desk: Desk, files: AnalysisFiles, settings: AnalysisSettings, noise:
                 measured,
                 settings,
                 reach=reached,
+                reach_in_volumes=in_volumes,
                 on_progress=lambda _what, share: advance(share * 100, 100),
             )
         title, subtitle = _titles(measured, folder)

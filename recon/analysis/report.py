@@ -25,7 +25,7 @@ from recon.analysis.correlation import (
 )
 from recon.analysis.gram import ConditionCurve, Direction, condition_curve
 from recon.analysis.middle import RIM_PX, Middle
-from recon.analysis.points import PLANES, Noise, PointTests, Reached, planes_about, point_tests
+from recon.analysis.points import PLANES, InVolumes, Noise, PointTests, Reached, planes_about, point_tests
 from recon.analysis.resolution import (
     AxialResolution,
     DepthSimilarity,
@@ -54,6 +54,7 @@ Progress = Callable[[str, float], object]
 """Called with what is being done and the share that is done."""
 
 Reach = Callable[..., Reached]
+ReachInVolumes = Callable[..., InVolumes]
 
 CONDITION_COUNTS: Mapping[Direction, tuple[int, ...]] = {"x": (2, 4, 9, 16), "z": (2, 3, 4), "xz": (4, 9, 16)}
 SEPARATIONS = (1, 2, 3, 4, 5, 6, 8)
@@ -128,6 +129,11 @@ class AnalysisSettings:
         group="Optics",
     )
     points: bool = option(True, help="Two- and 16-point tests by reconstructions.", group="Point tests")
+    volumes: bool = option(
+        False,
+        help="Two points along the axis and 16 points in default volumes, too: minutes.",
+        group="Point tests",
+    )
     noise: Noise = field(default_factory=Noise)
 
 
@@ -165,6 +171,8 @@ class Analysis:
     """Points alone, solved without a prior: what the optics allow."""
     reached: Reached | None
     """What the default reconstruction makes of two points; None where it was not asked."""
+    in_volumes: InVolumes | None
+    """The same of default volumes; None where it was not asked."""
     half_light_deg: tuple[float, float]
     """Angle along y and x at which half of the axis' light reaches the sensor, by its edge, the aperture's
     obliquity and the pixels' response where that is known."""
@@ -197,6 +205,7 @@ def analyse(
     settings: AnalysisSettings | None = None,
     *,
     reach: Reach | None = None,
+    reach_in_volumes: ReachInVolumes | None = None,
     on_progress: Progress | None = None,
 ) -> Analysis:
     """Analyse a calibration.
@@ -210,6 +219,8 @@ def analyse(
     settings : AnalysisSettings, optional
     reach : callable, optional
         :func:`recon.evaluation.two_points.reached`: what the default reconstruction reaches is found, too.
+    reach_in_volumes : callable, optional
+        :func:`recon.evaluation.points_in_volumes.in_volumes`, for ``settings.volumes``.
     on_progress : callable, optional
         Called with what is being done and the share done.
     """
@@ -292,9 +303,13 @@ def analyse(
             lateral_inner.mean_px,
             step,
             settings.noise,
-            on_progress=lambda share: on_progress("two points by default", 0.7 + 0.3 * share),
+            on_progress=lambda share: on_progress("two points by default", 0.7 + 0.2 * share),
         )
         notes.extend(_conditions(z_um, settings.noise, found))
+    volumes = None
+    if tests is not None and settings.volumes and reach_in_volumes is not None:
+        on_progress("points in default volumes", 0.9)
+        volumes = _in_volumes(reach_in_volumes, calibration, z_um, tests, step, settings.noise, notes)
     resolution_px = lateral.mean_px
     if tests is not None:
         resolution_px = tests.lateral_px or resolution_px
@@ -325,6 +340,7 @@ def analyse(
         condition_voxel=(1.0, axial_inner.step_per_um / 2),
         points=tests,
         reached=found,
+        in_volumes=volumes,
         half_light_deg=half_light_deg(psf, sensor_shape, pitch_um / distance_um, _fall_off(settings)),
         lateral_spacing_um=_lateral_spacing(settings, float(depths[0]), notes),
         axial_spacing_per_um=_axial_spacing(settings, calibration, notes),
@@ -414,6 +430,26 @@ def _conditions(z_um: float, noise: Noise, found: Reached) -> list[str]:
             "less noise as the rest would make up for."
         )
     return words
+
+
+def _in_volumes(
+    reach: ReachInVolumes,
+    calibration: Calibration,
+    z_um: float,
+    tests: PointTests,
+    step_per_um: float,
+    noise: Noise,
+    notes: list[str],
+) -> InVolumes | None:
+    if tests.lateral_px is None or tests.axial_per_um is None:
+        notes.append("Volumes were not tried: no distance is known to begin with.")
+        return None
+    found = reach(calibration, z_um, tests.lateral_px, tests.axial_per_um, step_per_um, noise)
+    notes.append(
+        "Two points along and 16 points, volume: as default volumes of planes half an axial step apart have "
+        f"them ({found.planes} planes for 16 points), each group alone in the dark, with the noise above."
+    )
+    return found
 
 
 def _fall_off(settings: AnalysisSettings) -> Callable[[Array, Array], Array]:

@@ -78,10 +78,10 @@ class _Tests:
 
     def pairs(self, distances: Sequence[float], before: int = 0) -> list[_Pair]:
         """Return pairs in cells of their own, after others along each axis in turn; fewer without room."""
-        cells = self.rng.permutation(_cells(self.psf(self.z_um), max(distances)))
+        places = self.rng.permutation(cells(self.psf(self.z_um), max(distances)))
         return [
             _Pair(px, (before + n) % 2, cell + self.rng.uniform(-0.5, 0.5, 2))
-            for n, (px, cell) in enumerate(zip(distances, cells, strict=False))
+            for n, (px, cell) in enumerate(zip(distances, places, strict=False))
         ]
 
     def told_apart(self, pairs: Sequence[_Pair], light: Floats) -> list[bool]:
@@ -197,12 +197,12 @@ def _focus_um(
     return 1 / near, (1 / far if far > 0 else float("inf"))
 
 
-def _cells(psf: Array, px: float) -> Floats:
+def cells(psf: Array, px: float, least_px: float = _CELL_PX) -> Floats:
     """Return the middles of the cells that pairs stand in, (n, 2): where all of the pattern is seen.
 
     At least within a fifth of the sensor, where its pattern leaves no rim.
     """
-    cell = max(_CELL_PX, 5 * px)
+    cell = max(least_px, 5 * px)
     sides = []
     for size, (first, last) in zip(psf.shape, lit_extent(psf), strict=True):
         half = max(min(first, size - 1 - last, _FIELD * size), size / 5)
