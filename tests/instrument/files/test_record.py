@@ -40,6 +40,19 @@ def put(path: Path, record: Any) -> Path:
     return path
 
 
+def test_a_record_s_text_and_what_names_its_format(tmp_path: Path) -> None:
+    assert TEA.text({"leaf": "Grün"}, indent=None) == '{"format":"test tea","version":"3.1","leaf":"Grün"}\n'
+    assert TEA.text({"leaf": 1}) == '{\n "format": "test tea",\n "version": "3.1",\n "leaf": 1\n}\n'
+    assert '"leaf": null' in TEA.text({"leaf": math.nan})
+    for text, is_tea in (
+        ('{"format": "test tea"}', True),
+        ('{"format": "coffee"}', False),
+        ('["format"]', False),
+        ("{", False),
+    ):
+        assert TEA.is_of(put(tmp_path / "tea.json", text)) is is_tea
+
+
 def test_a_record_comes_back(tmp_path: Path) -> None:
     path = tmp_path / "tea.json"
     TEA.write(path, {"leaf": "mint", "minutes": np.float32(3)})

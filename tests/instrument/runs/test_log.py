@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import pytest
 
 from instrument.runs.log import (
     UNREAD,
+    AppendOnlyLog,
     BadLine,
     FrameLine,
     FrameRecord,
@@ -154,3 +156,37 @@ def test_a_frames_line_is_read_when_it_is_asked_for_and_named_where_it_says_noth
         records[4]
     del records[4]
     assert sorted(records) == [3, 5]
+
+
+def test_a_log_only_grows_by_whole_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "log.jsonl"
+    path.write_bytes(b"torn")
+    log = AppendOnlyLog(path)
+    first, second, third = ({"kind": "note", "text": text} for text in ("räume", "b", "c"))
+    log.append([first, second])
+    whole = b"torn\n" + log_line(first) + log_line(second)
+    assert path.read_bytes() == whole
+    assert "räume".encode() in whole
+    write, synced = os.write, []
+    monkeypatch.setattr(os, "fsync", synced.append)
+    monkeypatch.setattr(os, "write", lambda handle, data: write(handle, data[:7]))  # a few bytes at a time
+    log.append([third])
+    whole += log_line(third)
+    assert (path.read_bytes(), len(synced)) == (whole, 1)
+    monkeypatch.setattr(os, "fsync", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        log.append([first])
+    assert path.read_bytes() == whole  # all of them or none
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match="was deleted meanwhile"):
+        log.append([first])
+    handle = log._handle
+    for _ in range(2):
+        log.close()
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(handle)
+    monkeypatch.undo()
+    for before, after in ((b"", b""), (b"whole\n", b"whole\n")):
+        path.write_bytes(before)
+        AppendOnlyLog(path).close()
+        assert path.read_bytes() == after
