@@ -84,7 +84,7 @@ class Bench:
 
     def __post_init__(self) -> None:
         c = self.camera
-        object.__setattr__(self, "light", WavePropagator(c.diffuser(self.seed), c.distance_um, workers=1))
+        object.__setattr__(self, "light", WavePropagator(c.diffuser(self.seed), c.distance_um))
         object.__setattr__(self, "grid", PixelGrid(c.shape, c.pitch_um))
         object.__setattr__(self, "response", gaussian_fall_off(c.fall_off_deg))
         object.__setattr__(self, "rng", np.random.default_rng([41, self.seed]))

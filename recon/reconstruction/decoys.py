@@ -31,6 +31,7 @@ from recon.verdict.calibration_check import (
     Score,
     as_given,
     check_of,
+    is_ahead,
     is_told,
     near_decoys,
 )
@@ -58,8 +59,8 @@ WEIGHT = 1.0
 FAR_ABOVE = 3.0
 """Times the noise that the calibration leaves of a photograph's fine structure, from which its errors and not
 noise set the prior's weight: too small a one lets every pattern explain the photograph."""
-HEAVIER = {Fit.UNTOLD: Fit.FITS, Fit.FOREIGN: Fit.OFF}
-"""What may then be said where the other was: nobody is accused by it who was not."""
+HEAVIER = {Fit.UNTOLD: (Fit.FITS, Fit.OFF), Fit.FOREIGN: (Fit.OFF,)}
+"""What may then be said where the other was."""
 MOVED_DEG = 6.0
 """Turn up to which a foreign calibration is taken for the own one that moved: such as can be fitted."""
 DECOYS, MOST_DECOYS = 8, 12
@@ -118,8 +119,9 @@ def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | Non
     again = compete(many, thorough, lit=lit)
     if (check.fit, again.fit) in CONTRADICTIONS:
         return replace(again, fit=Fit.UNTOLD, better=None)
-    # A faint photograph's large pixels may tell what small ones do not.
-    check, small = (again, many) if again.fit is not Fit.UNTOLD else (check, few)
+    # A faint photograph's large pixels may tell what small ones do not; on the same ones more iterations do.
+    same = check.fit is Fit.FOREIGN and many.pixels == few.pixels
+    check, small = (again, many) if same or again.fit is not Fit.UNTOLD else (check, few)
     if check.wrong and not lit:  # by stray light, or by light from beyond the field?
         again = compete(small, thorough, lit=True)
         cleared = again.fit is Fit.FITS
@@ -132,8 +134,7 @@ def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | Non
     left = float(np.mean(as_given(again.scores).fine)) ** 0.5
     if check.fit in HEAVIER and left > FAR_ABOVE:
         again = compete(small, thorough, lit=lit, weight=left)
-        moved = again.better is None or again.better in FAR or abs(again.better.rotation_deg) <= MOVED_DEG
-        check = again if again.fit is HEAVIER[check.fit] and moved else check
+        check = again if again.fit in HEAVIER[check.fit] and _is_certain(again) else check
     if check.fit is Fit.FOREIGN and small.clipped > MOST_CLIPPED:
         return replace(check, fit=Fit.UNTOLD)
     given = _given(problem).depths
@@ -206,6 +207,14 @@ class _Small:
             prior="tv", model=self.model, estimate_background=background, drop_empty=False
         )
         return Problem.of(self.photograph, calibration, options)
+
+
+def _is_certain(check: CalibrationCheck) -> bool:
+    """Whether what explains a photograph better certainly does, and is no larger turn than can be fitted."""
+    if check.better is None:
+        return True
+    near = check.better in FAR or abs(check.better.rotation_deg) <= MOVED_DEG
+    return near and is_ahead(check.scores[check.better], (as_given(check.scores),), check.pixels)
 
 
 def _competition(small: _Small, scored: Callable[[Transformation], Score]) -> CalibrationCheck:

@@ -11,7 +11,7 @@ def test_all_collect_the_same_light_and_the_objective_alone_is_sharp_at_one_dept
     grid = PixelGrid(oc.SHAPE, oc.PITCH_UM)
     light, peak = {}, {}
     for name in ("objective", "random lenslets"):
-        optics = WavePropagator(oc._diffuser(name, 0), oc.DISTANCE_UM, workers=1)
+        optics = WavePropagator(oc._diffuser(name, 0), oc.DISTANCE_UM)
         psfs = [optics.psf((0.0, 0.0, z), grid, GREEN.samples(1), emission="isotropic") for z in oc.DEPTHS_UM]
         light[name] = float(psfs[1].sum())
         peak[name] = [float(psf.max() / psf.sum()) for psf in psfs]

@@ -47,7 +47,7 @@ D_UM, Z_UM = 8900.0, 150e3
 def seen() -> tuple[Image, Image]:
     """A photograph of bars and the PSF, by propagation, with shot and read noise."""
     rng = np.random.default_rng(1)
-    optics = WavePropagator(smooth_diffuser((880.0, 880.0), 5.0, seed=1), D_UM, workers=1)
+    optics = WavePropagator(smooth_diffuser((880.0, 880.0), 5.0, seed=1), D_UM)
     psf = optics.psf((0.0, 0.0, Z_UM), GRID, GREEN.samples(1)) * 1.0
     psf *= 20_000 / psf.max()
     scene = picture(bar_target(128), Z_UM, 0.7 * 96 * 13.0 * Z_UM / D_UM)
@@ -87,7 +87,7 @@ def test_what_became_of_a_wrong_one_is_named(
 
 
 def test_another_diffusers_is_foreign_and_never_reliable(seen: tuple[Image, Image]) -> None:
-    optics = WavePropagator(smooth_diffuser((880.0, 880.0), 5.0, seed=2), D_UM, workers=1)
+    optics = WavePropagator(smooth_diffuser((880.0, 880.0), 5.0, seed=2), D_UM)
     other = optics.psf((0.0, 0.0, Z_UM), GRID, GREEN.samples(1))
     result = reconstruct(seen[0], other, iterations=20)
     assert result.verdict is not None
@@ -226,7 +226,7 @@ GOOD = {GIVEN: score(1.2, 1.5), BETWEEN: score(1.2, 1.5)} | {how: score(1.6, 2.0
     [
         (Fit.UNTOLD, Fit.FITS, 40.0, Fit.FITS),
         (Fit.UNTOLD, Fit.FITS, 4.0, Fit.UNTOLD),  # as noise: the weight is right already
-        (Fit.UNTOLD, Fit.OFF, 40.0, Fit.UNTOLD),  # nobody is accused by it who was not
+        (Fit.UNTOLD, Fit.OFF, 40.0, Fit.OFF),
         (Fit.FOREIGN, Fit.OFF, 40.0, Fit.OFF),
         (Fit.FOREIGN, Fit.FITS, 40.0, Fit.FOREIGN),
     ],
@@ -239,7 +239,7 @@ def test_where_far_more_than_noise_is_left_it_sets_the_priors_weight(
     left: float,
     said: Fit,
 ) -> None:
-    scores = dict.fromkeys((GIVEN, *NEAR, *FAR), score(left, left))
+    scores = dict.fromkeys((GIVEN, *NEAR, *FAR), score(left, left)) | {NEAR[0]: score(left - 1, left - 1)}
     weights: list[float] = []
 
     def scored_with(_problem: Problem, _iterations: int, weight: float) -> Score:
@@ -276,6 +276,24 @@ def test_the_measured_targets_own_calibration_fits_at_full_size(turned_deg: floa
 def test_without_a_far_decoy_the_near_ones_tell() -> None:
     assert check_of(GOOD, 10_000).fit is Fit.FITS
     assert check_of(GOOD | {NEAR[0]: score(1.1, 1.4, 0.001)}, 10_000).better == NEAR[0]
+
+
+def test_a_pattern_that_is_half_its_own_mirror_image_is_not_foreign() -> None:
+    given, worse, much = score(3.0, 4.0), score(3.0, 4.02, 0.2), score(3.3, 4.5, 0.2)
+    scores = dict.fromkeys(NEAR, worse) | {GIVEN: given, FAR[0]: much, FAR[1]: much, FAR[2]: score(3.0, 4.0)}
+    assert check_of(scores, 9000, structure=8.0).fit is Fit.UNTOLD
+    assert check_of(scores | {FAR[1]: worse}, 9000, structure=8.0).fit is Fit.FOREIGN
+    better = score(2.9, 3.9)
+    assert check_of(scores | {FAR[2]: better}, 900, structure=8.0).fit is not Fit.UNTOLD
+
+
+def test_on_the_same_pixels_more_iterations_tell_who_is_foreign(
+    seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unsure = dict.fromkeys((GIVEN, *NEAR, *FAR), GOOD[GIVEN])
+    told = iter([CalibrationCheck(f, unsure, 9000) for f in (Fit.FOREIGN, Fit.UNTOLD)])
+    monkeypatch.setattr(decoys, "_competition", lambda *_: next(told))
+    assert fit(*seen)[0] is Fit.UNTOLD  # 96 x 96 pixels: the thorough way has no more
 
 
 def test_differences_within_the_noise_accuse_nobody() -> None:
