@@ -35,15 +35,22 @@ def problem(sensor: int, depths: int):
 
     from recon.camera.convolution import Convolution
 
+    operator = Convolution(lenslet_psfs(sensor, depths), (sensor, sensor))
+    data = np.random.default_rng(0).poisson(100, (1, sensor, sensor)).astype(np.float32)
+    return operator, data
+
+
+def lenslet_psfs(sensor: int, depths: int):
+    """Return PSFs of random lenslets, (depths, 1, sensor, sensor)."""
+    import numpy as np
+
     rng = np.random.default_rng(0)
     lenses = rng.uniform(-0.36, 0.36, (400, 2)) * sensor
     psfs = np.zeros((depths, 1, sensor, sensor), np.float32)
     for z in range(depths):
         rows, columns = np.round(lenses * (1 + 0.3 * z / depths) + sensor / 2).astype(int).T
         np.add.at(psfs[z, 0], (rows % sensor, columns % sensor), 0.05)
-    operator = Convolution(psfs, (sensor, sensor))
-    data = rng.poisson(100, (1, sensor, sensor)).astype(np.float32)
-    return operator, data
+    return psfs
 
 
 def solver(method: str, operator, data):

@@ -446,7 +446,7 @@ def test_a_picture_of_colour_and_its_refusals():
         reconstruct(b, c, model="local", solver="admm-sensor")
     with pytest.raises(InputError, match="several places of the field"):
         reconstruct(b, c.psfs[0, 0], model="lowrank")
-    with pytest.raises(InputError, match="not 'locl'; 'local'"):
+    with pytest.raises(InputError, match=r"not 'locl'\. Did you mean 'local'"):
         reconstruct(b, c, model="locl")
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import recon
+from benchmarks import gpu
 from recon.base import threads
 from recon.base.metrics import psnr
 from recon.base.namespace import array_namespace, require_memory
@@ -199,3 +200,10 @@ def test_a_volume_on_the_device_is_that_of_the_host(monkeypatch, prior):
     np.testing.assert_allclose(device.volume, host.volume, atol=2e-3 * host.volume.max())
     with pytest.raises(InputError, match=r"local model|several places"):
         recon.reconstruct(measurement, calibration, device="gpu", model="local")
+
+
+def test_the_benchmark_of_a_gpu_finds_volumes_alike(capsys: pytest.CaptureFixture[str]) -> None:
+    gpu.main(["--numpy", "--sizes", "16", "--depths", "3", "--iterations", "3"])
+    rows = [line.split("|") for line in capsys.readouterr().out.splitlines() if " 16 x 16 x 3 " in line]
+    assert len(rows) == 2 * len(gpu.PRIORS)  # as they come, and in the page
+    assert all(float(row[6]) < 1e-3 for row in rows), rows
