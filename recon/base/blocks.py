@@ -9,6 +9,9 @@ import numpy.typing as npt
 
 Array = npt.NDArray[Any]
 
+WHOLE = 0.9
+"""Least share of the blocks that are whole, of the share of pixels that are not erased."""
+
 
 def block_sum(
     image: Array, factor: int, *, about_axis: bool = False, dtype: npt.DTypeLike = np.float32
@@ -59,6 +62,27 @@ def block_mean(
     total = block_sum(image, factor, about_axis=about_axis, dtype=dtype)
     total *= total.dtype.type(1 / factor**2)
     return total
+
+
+def whole_blocks(valid: npt.NDArray[np.bool_], most: int) -> int:
+    """Return the side of blocks about the axis, at most ``most``, of which nearly all have no erased pixel.
+
+    One erased pixel erases its block: a few hot pixels or a bright spot cost little, scattered ones nearly
+    all. Of ``most`` its halves are tried; 1 where erased pixels are too many for any.
+
+    Parameters
+    ----------
+    valid : ndarray of bool, (..., height, width)
+        False where a pixel is erased.
+    most : int
+    """
+    factor = most
+    while factor > 1:
+        whole = block_mean(valid, factor, about_axis=True) > 1 - 1e-6
+        if whole.mean() >= WHOLE * valid.mean():
+            break
+        factor //= 2
+    return factor
 
 
 def blocks_about_axis(n: int, factor: int) -> tuple[int, int]:

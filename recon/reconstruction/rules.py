@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+import numpy.typing as npt
 
+from recon.base.blocks import whole_blocks
 from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR, TOLERATED, Depths, ModelName, choose_model
 from recon.camera.varying_psfs import principal_psfs
 from recon.reconstruction.choice import Decision
@@ -95,15 +97,16 @@ SAMPLES = 7.0
 dB: priors bring back more than the PSF's width says."""
 
 
-def binning_of(depths: Depths, overrides: Overrides, *, whole: bool) -> Decision:
-    """Decide how many pixels are averaged; ``whole``: none is erased."""
+def binning_of(depths: Depths, overrides: Overrides, valid: npt.NDArray[np.bool_]) -> Decision:
+    """Decide how many pixels are averaged; ``valid``, (n_channels, height, width): which are not erased."""
     sharpest = min(resolution_px(p) for psfs in depths.central for p in psfs)
     side = max(depths.central.shape[2:])
     if not np.isfinite(sharpest):
         sharpest = float(side)
     fitting = min(max(1, int(sharpest / SAMPLES)), max(1, side // LEAST_SIDE))
     asked = overrides.binning is not None
-    binning = overrides.binning or (fitting if whole else 1)
+    kept = whole_blocks(valid, fitting)
+    binning = overrides.binning or kept
     why = (
         f"the sharpest PSF's autocorrelation is {sharpest:.1f} pixels wide at half its height, and "
         f"{SAMPLES:g} (binned) pixels over that width are enough"
@@ -113,7 +116,7 @@ def binning_of(depths: Depths, overrides: Overrides, *, whole: bool) -> Decision
             f"the sharpest PSF's autocorrelation is {sharpest:.1f} pixels wide at half its height, less than "
             f"the {SAMPLES:g} that would be enough: there is nothing to bin"
         )
-    if not whole and not asked and fitting > 1:
+    if kept < fitting and not asked:
         why = f"erased pixels are not averaged with others; else {why}"
     up = None if binning == 1 else str(binning - 1)
     down = str(binning + 1) if side // (binning + 1) >= 16 else None

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.blocks import whole_blocks
 from recon.camera.camera_model import CAMERAS, Extent, ModelName
 from recon.errors import InputError
 from recon.reconstruction.background import (
@@ -125,7 +126,6 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     one = merge.value == "merged"
     if tint is not None and one:
         data, valid, calibration = merged(data, valid, calibration, tint)
-    whole = bool(valid.all())
     depths = problem.depths
     if one and problem.calibration.psfs.shape[1] > 1:
         depths = Problem.of(
@@ -163,7 +163,7 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     estimated = smooth.value == "estimated"
     planes, dropped = planes_of(sparse, depths, overrides)
     between, added = between_of(calibration, depths, planes, overrides)
-    binning = binning_of(depths, overrides, whole=whole)
+    binning = binning_of(depths, overrides, valid)
     # A background of a few numbers takes what light from beyond the field has of them, not all of it.
     stray = sparse is not None and is_stray(sparse.smooth_share)
     haze = stray and not given and not (estimated and kind == "l1")
@@ -264,8 +264,7 @@ def _coarse(
     data: Array, valid: Array, calibration: Calibration, z_um: float | None, *, beyond: int = 0
 ) -> list[Problem]:
     """Return small copies of every channel; the calibration's last planes may be beyond its depths."""
-    # Erased pixels cannot be averaged with others: the coarse pass then has all pixels.
-    factor = -(-max(data.shape[1:]) // COARSE_PX) if valid.all() else 1
+    factor = whole_blocks(valid, -(-max(data.shape[1:]) // COARSE_PX))
     options = ReconstructionOptions(z_um=z_um, estimate_background=False)
     several = calibration.psfs.shape[1] > 1
     coarse = []

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recon.base.blocks import block_mean, block_sum, blocks_about_axis
+from recon.base.blocks import block_mean, block_sum, blocks_about_axis, whole_blocks
 from recon.base.noise import NoiseModel, averaged_noise
 
 
@@ -44,3 +44,15 @@ def test_a_mean_of_pixels_has_less_noise():
     assert averaged_noise(NoiseModel(4.0, 2.0), 4) == NoiseModel(2.0, 0.5)
     assert averaged_noise(6.0, 9) == 2.0
     assert averaged_noise(None, 4) is None
+
+
+def test_blocks_stay_large_where_few_pixels_are_erased():
+    valid = np.ones((1, 600, 800), bool)
+    assert whole_blocks(valid, 9) == 9
+    valid[0, [100, 300], [200, 400]] = False  # hot pixels
+    assert whole_blocks(valid, 9) == 9
+    valid[0, :150, :200] = False  # a bright corner
+    assert whole_blocks(valid, 9) == 9
+    few = np.random.default_rng(0).random(valid.shape) < 0.98
+    assert whole_blocks(few, 9) == 2
+    assert whole_blocks(np.random.default_rng(0).random(valid.shape) < 0.6, 9) == 1
