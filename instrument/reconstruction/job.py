@@ -127,6 +127,9 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
     Raises FileError or BenchError when a file cannot be used, the two do not belong together, or the window
     or binning does not fit.
     """
+    if isinstance(psf_file, Path) and psf_file.is_dir():
+        other = "PSFs of several depths in a folder are given by --volume, a calibration by --calibration."
+        raise FileError(psf_file, "is a folder; a file is expected.", other)
     psf, image = read_image(psf_file), read_image(image_file, holes=True)
     crop, binning = inputs.crop, inputs.binning
     _refuse_constant(image)

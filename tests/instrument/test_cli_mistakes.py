@@ -26,7 +26,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     ([*RECONSTRUCT, "--psf", "psf.tif", "--image", "black.tif"], "Was the scene lit?"),
     ([*RECONSTRUCT, "--psf", "holes.tif", "--image", "photo.tif"], "no finite numbers"),
     ([*RECONSTRUCT, "--psf", "absent.tif", "--image", "photo.tif"], "there is no such file"),
-    ([*RECONSTRUCT, "--psf", "plain", "--image", "photo.tif"], "is a folder; a file is expected"),
+    ([*RECONSTRUCT, "--psf", "plain", "--image", "photo.tif"], "in a folder are given by --volume"),
     ([*RECONSTRUCT, "--psf", "/proc", "--image", "photo.tif"], "is a folder; a file is expected"),
     ([*RECONSTRUCT, "--psf", "text.tif", "--image", "photo.tif"], "is no image that can be read"),
     ([*RECONSTRUCT, "--psf", "empty.tif", "--image", "photo.tif"], "is empty"),
