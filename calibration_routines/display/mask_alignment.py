@@ -13,7 +13,7 @@ nothing moves at first: each picture holds many spots, each computed for another
    (:mod:`~calibration_routines.display.mask_stage`).
 5. Sections of the SLM make spots of their own: their shifts give the smooth rest of the displacement, which
    stays in the model. All light of the same pictures, speckle between the spots included, then tells place,
-   depth and tilts thirty times better (:mod:`recon.holography.place`); 3 once more checks that.
+   depth and tilts 11 to 30 times better (:mod:`recon.holography.place`); 3 once more checks that.
 """
 
 from __future__ import annotations
