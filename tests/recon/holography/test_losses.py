@@ -112,7 +112,7 @@ def test_a_registered_loss_is_found_by_recon(registered):
     model = make_model(registered)
     found = compute_hologram(model, iterations=10)
     assert found.history[-1].loss < 0.7 * found.history[0].loss
-    with pytest.raises(InputError, match=r"charbonnier.*; 'charbonnier'\?"):
+    with pytest.raises(InputError, match=r"charbonnier.*Did you mean 'charbonnier'\?"):
         HologramOptions(loss="charbonnie")
 
 
