@@ -147,7 +147,8 @@ class StagePanel(DevicePanel):
             position.setToolTip(f"Where the stage says that {letter} is")
             gauge = share_bar(_GAUGE)
             gauge.setFixedHeight(6)
-            limits = f"{quantity(axis.lower_limit, unit, 6)} to {quantity(axis.upper_limit, unit, 6)}"
+            lower, upper = quantity(axis.lower_limit, unit, 6), quantity(axis.upper_limit, unit, 6)
+            limits = f"{lower} to {upper}"
             gauge.setToolTip(f"Place between the soft limits: {limits}")
             target = NumberEdit(
                 unit,
@@ -164,7 +165,7 @@ class StagePanel(DevicePanel):
             )
             minus.setFixedWidth(34)
             plus.setFixedWidth(34)
-            limit = label(limits.replace(" to ", " … "), "dim")
+            limit = label(f"{lower.removesuffix(upper.split()[-1]).rstrip()} … {upper}", "dim")
             limit.setToolTip("Soft limits")
             self._grid.addWidget(label(letter, "value"), number, 0)
             self._grid.addLayout(in_column(gauge, limit, spacing=1), number, 2)
