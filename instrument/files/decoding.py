@@ -203,8 +203,10 @@ def _decode_compressed(path: Path) -> Decoded:
     _refuse_odd_bits(path)
     with _quiet_opencv():
         try:
-            images = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[1]
-            stack = np.stack([_rgb(images[page]) for page in pages])
+            first, end = min(pages), max(pages) + 1  # other series may be of any size
+            encoded = np.frombuffer(data, np.uint8)
+            images = cv2.imdecodemulti(encoded, cv2.IMREAD_UNCHANGED, range=(first, end))[1]
+            stack = np.stack([_rgb(images[page - first]) for page in pages])
             array = stack.reshape(*lead, *stack.shape[1:])
         except (cv2.error, MemoryError, ValueError, IndexError, TypeError) as error:
             raise FileError(path, f"is a damaged or unusual TIFF: {error!s:.200}.") from None

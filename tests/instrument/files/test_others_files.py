@@ -251,6 +251,16 @@ def test_compressed_stacks_are_read_whole(tmp_path: Path) -> None:
         read_stack(path)
 
 
+def test_only_the_series_that_is_taken_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "stack.tif"
+    cv2.imwritemulti(str(path), [*STACK, np.zeros((400, 400), STACK.dtype)])
+    decoded = []
+    decode = cv2.imdecodemulti
+    monkeypatch.setattr(cv2, "imdecodemulti", lambda *a, **k: decoded.append(decode(*a, **k)) or decoded[-1])
+    np.testing.assert_array_equal(read_stack(path).pixels, STACK)
+    assert [len(images) for _, images in decoded] == [len(STACK)]
+
+
 def test_a_folder_of_folders_names_the_one_with_images(tmp_path: Path) -> None:
     (tmp_path / "Pos0").mkdir()
     write_image(tmp_path / "Pos0" / "a.tif", PICTURE)

@@ -91,6 +91,12 @@ def test_planes_of_every_colour_stay():
 def test_the_sharpest_colour_and_the_widest_decide():
     scene = make_scene("sparse-picture", size=64, spot_px=5.0, photons=1000.0, channels=3, grid=1)
     assert choose(scene.measurement, scene.calibration).binning > 1
+    hot = np.zeros(scene.measurement.shape[:2], bool)
+    hot[20, 30] = True  # few erased pixels change no choice, many that are scattered forbid to average
+    scattered = np.random.default_rng(0).random(hot.shape) < 0.4
+    for erased, binned in ((hot, True), (scattered, False)):
+        seen = recon.Measurement(scene.measurement, erasures=erased)
+        assert (recon.choose(recon.Problem.of(seen, scene.calibration)).choice.binning > 1) == binned
     psfs = np.repeat(scene.calibration.psfs[:, :1], 3, axis=1)
     psfs[:, 2] = make_scene("sparse-picture", size=64, grid=1).calibration.psfs[:, 0]
     apart = replace(scene.calibration, psfs=psfs)
