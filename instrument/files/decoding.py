@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-import re
 import struct
 import zipfile
 import zlib
@@ -27,7 +26,8 @@ READABLE = "TIFF, PNG, JPEG, BMP, .npy, .npz with one array, HDF5, MATLAB, OME-Z
 Decoded = tuple[npt.NDArray[Any], tuple[str, ...]]
 """An array as its file has it, stack first and colour last, and what was noticed in words."""
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-_OPENCV_MAGIC = (_PNG_MAGIC, b"\xff\xd8", b"BM")
+_JPEG_MAGIC = b"\xff\xd8"
+_OPENCV_MAGIC = (_PNG_MAGIC, _JPEG_MAGIC, b"BM")
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 _MOST_BYTES = 1 << 35
@@ -277,7 +277,7 @@ def _decode_with_opencv(path: Path, data: bytes) -> Decoded:
         raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
     array = _rgb(array)
     notes = []
-    if data[:2] == b"\xff\xd8":
+    if data.startswith(_JPEG_MAGIC):
         notes.append("JPEG is lossy and usually gamma-coded: prefer raw frames")
     if 2 <= (turned := _exif_orientation(data)) <= 8:
         array = _upright(array, turned, "YXS")
@@ -308,8 +308,8 @@ def _turned(orientation: int) -> str:
 
 def _exif_orientation(data: bytes) -> int:
     """Return how a JPEG or PNG says that it stands, as a TIFF's tag 274; 1 where it says nothing."""
-    mark = b"Exif\0\0" if data[:2] == b"\xff\xd8" else b"eXIf"
-    place = data.find(mark) if data.startswith((b"\xff\xd8", _PNG_MAGIC)) else -1
+    mark = b"Exif\0\0" if data.startswith(_JPEG_MAGIC) else b"eXIf"
+    place = data.find(mark) if data.startswith((_JPEG_MAGIC, _PNG_MAGIC)) else -1
     if place < 0:
         return 1
     from PIL import Image  # of Matplotlib's own needs; OpenCV turns only what it also changes otherwise
@@ -354,7 +354,23 @@ def _shape_by_header(data: bytes) -> tuple[int, int] | None:
     if data.startswith(b"BM"):
         width, height = struct.unpack("<ii", data[18:26].ljust(8, b"\0"))
         return abs(width), abs(height)
-    found = re.search(rb"\xff[\xc0-\xc3\xc5-\xc7\xc9-\xcb\xcd-\xcf]...(..)(..)", data, re.DOTALL)
-    if found is None:
-        return None
-    return int.from_bytes(found[1], "big"), int.from_bytes(found[2], "big")
+    return _sides_of_jpeg(data) if data.startswith(_JPEG_MAGIC) else None
+
+
+def _sides_of_jpeg(data: bytes) -> tuple[int, int] | None:
+    """Return the sides in the frame header (SOFn) of a JPEG, found from part to part (ITU T.81, B.1)."""
+    place = len(_JPEG_MAGIC)
+    while place + 9 <= len(data) and data[place] == 0xFF:
+        kind = data[place + 1]
+        if kind == 0xFF:  # a fill byte
+            place += 1
+            continue
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", data[place + 5 : place + 9])
+            return height, width
+        if kind in (0xD9, 0xDA):  # the end, or pixels before any frame header
+            return None
+        place += (
+            2 if 0xD0 <= kind <= 0xD8 or kind == 1 else 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+        )
+    return None

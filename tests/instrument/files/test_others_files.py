@@ -140,6 +140,26 @@ def test_a_damaged_note_beside_a_whole_picture_costs_the_picture_nothing(tmp_pat
     assert not any("orientation" in note for note in read.notes)
 
 
+def test_numbers_that_look_like_a_jpegs_header_are_no_size(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 65536, (256, 256)).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "a.tif"), noise)  # OpenCV's own default is LZW
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif").pixels, noise)
+    # Nor are those of a note in front of a JPEG's own header.
+    note = b"\xff\xc0\0\x11\x08" + 8 * b"\xff"
+    Image.fromarray(np.full((8, 8), 100, np.uint8)).save(tmp_path / "a.jpg", comment=note)
+    assert read_image(tmp_path / "a.jpg").pixels.shape == (8, 8)
+
+
+def test_a_jpeg_that_says_it_is_huge_is_refused_undecoded(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    Image.fromarray(np.full((8, 8), 100, np.uint8)).save(path)
+    data = path.read_bytes()
+    size = data.index(b"\xff\xc0") + 5
+    path.write_bytes(data[:size] + b"\xff\xff\xff\xff" + data[size + 4 :])
+    with pytest.raises(FileError, match="made to fill the memory"):
+        read_image(path)
+
+
 def test_packed_pixels_keep_their_values(tmp_path: Path) -> None:
     path = tmp_path / "packed.tif"
     for bits in (10, 12, 14):
