@@ -38,8 +38,11 @@ _POOR = 0.1  # part of its contrast that is left of a moved image
 _FLAT = 0.3  # contrast, relative to the mean, below which other light cannot be told from brightness
 _SHAKEN_PX = 0.05  # frames that scatter less are averaged as they are
 _SURE = 3.0  # standard deviations of its own uncertainty, beyond which a scatter is the bench's
+_STEADY_LIGHT = "give the lamp a steady supply, lengthen the exposure over its flicker"
+_STILL = "clamp source, stage and camera, wait after moves, take the table off what vibrates"
 _SHARP_PX = 2.0
-"""Width of a pattern's finest structure: blurred by ``s`` pixels it changes by about ``(s / this)^2``."""
+"""Width of a pattern's finest structure: blurred by ``s`` pixels it changes by about ``(s / this)^2``,
+moved by ``s`` by about ``s / this``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,21 +188,35 @@ class Scatter:
             found.append(
                 f"the light flickers by {self.flicker:.1%} from frame to frame, so that the brightness of a "
                 f"{what} of {many} is known to {self.brightness_error:.1%} only (wanted: {TOLERATED:.0%}): "
-                "give the lamp a steady supply, lengthen the exposure over its flicker, or average "
-                f"{self.frames_needed} frames."
+                f"{_STEADY_LIGHT}, or average {self.frames_needed} frames."
             )
         if self.ambient > TOLERATED:
-            found.append(
-                f"other light came and went between frames, by {self.ambient:.1%} of the {what}'s mean: keep "
-                "daylight, lamps and screens out."
-            )
+            found.append(self._other_light(what))
         if self.blur > TOLERATED:
             found.append(
                 f"the picture shakes by {self.motion_px:.2f} pixels from frame to frame (frames were put "
                 f"onto one another; the place of a {what} is known to {self.place_error_px:.2f} pixels): "
-                "clamp source, stage and camera, wait after moves, take the table off what vibrates."
+                f"{_STILL}."
             )
         return tuple(found)
+
+    def causes(self, what: str = "picture") -> tuple[str, ...]:
+        """Return why single frames disagree: what changes them most, however little it is."""
+        changes = {
+            f"the light flickers by {self.flicker:.1%} from {what} to {what}: {_STEADY_LIGHT}.": self.flicker,
+            self._other_light(what): self.ambient,
+            f"the picture shakes by {self.motion_px:.2f} pixels from {what} to {what}: {_STILL}.": (
+                self.motion_px / _SHARP_PX
+            ),
+        }
+        most = max(changes.values())
+        return tuple(words for words, change in changes.items() if change > 0 and change >= most / 2)
+
+    def _other_light(self, what: str) -> str:
+        return (
+            f"other light came and went between frames, by {self.ambient:.1%} of the {what}'s mean: keep "
+            "daylight, lamps and screens out."
+        )
 
 
 STEADY = Scatter(1, averages=0)

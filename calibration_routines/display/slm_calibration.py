@@ -89,12 +89,15 @@ def measure_look_up_table(io: DisplayBench, *, n_levels: int = 33, seed: int = 0
             order.append(int(level))
             reference.append(False)
     images = [np.where(varied, level, 0).astype(np.uint8) for level in order]
-    # Every fourth pixel has more than enough light.
-    pictures = np.array([picture[::2, ::2] for picture in io.photographs(images, exposure_ms)])
-    references = pictures[reference].astype(np.float32)
-    phases, error, scatter = _phases(pictures[~np.array(reference)], references, np.array(before))
+    pictures, references = [], []
+    for picture, again in zip(io.photographs(images, exposure_ms), reference, strict=True):
+        if again:  # whole: a picture of every other pixel does not tell how far it moved
+            references.append(picture)
+        else:  # every fourth pixel has more than enough light
+            pictures.append(picture[::2, ::2])
+    phases, error, scatter = _phases(np.array(pictures), np.array(references, np.float32), np.array(before))
     if error > MAX_PHASE_ERROR_RAD:
-        words = scatter.findings("picture") or (
+        words = scatter.causes() or (
             "light, mask or camera are not steady, or the SLM flickers: look for saturation, loose mounts.",
         )
         raise CalibrationError(
@@ -126,10 +129,8 @@ def _phases(frames: Array, references: Array, before: Array) -> tuple[Array, flo
         try:
             found.append(phases_from_frames(pictures))
         except InputError:
-            if scatter.findings():
-                raise CalibrationError(
-                    f"The SLM's table cannot be measured: {' '.join(scatter.findings('picture'))}"
-                ) from None
+            if words := scatter.causes():
+                raise CalibrationError(f"The SLM's table cannot be measured: {' '.join(words)}") from None
             raise
     phases, error = min(found, key=lambda one: one[1])
     return phases, error, scatter
