@@ -117,7 +117,12 @@ class SceneWatch:
         self.count = 0
 
     def see(self, frame: Array) -> SceneState:
-        """Take note of the next frame, (n_channels, height, width), float32."""
+        """Take note of the next frame, (n_channels, height, width), float32.
+
+        Raises ValueError for a frame without pixels.
+        """
+        if frame.size == 0:
+            raise ValueError(f"a frame has pixels; this one is {frame.shape}.")
         if self.count == 0 or self.mean.shape != frame.shape:
             self._begin(frame)
             return SceneState.NEW

@@ -146,3 +146,5 @@ def test_a_watch_keeps_a_frame_of_its_own_and_averages_at_least_one() -> None:
     assert SceneWatch(1).average == 1
     with pytest.raises(ValueError, match="average must be 1 or more, not 0"):
         SceneWatch(0)
+    with pytest.raises(ValueError, match=r"a frame has pixels; this one is \(1, 0, 4\)"):
+        watch.see(frame[:, :0])
