@@ -38,7 +38,6 @@ from tests.mutants.session import Fate, Trials
 
 ROOT = Path(__file__).parents[2]
 ENOUGH = 0.95
-NO_MUTANT_EVERY = 25
 
 
 def known_equal() -> dict[str, str]:
@@ -85,6 +84,7 @@ def main() -> int:
     parser.add_argument("--sample", type=int, default=60, help="mutants of each area")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=30.0, help="no mutant is begun after so long")
+    parser.add_argument("--most", type=float, default=60.0, help="seconds of tests of a mutant, as watched")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     parser.add_argument("--only", default="", help="only mutants in whose name this stands")
     parser.add_argument("--tests", nargs="+", default=[], help="only these [default: those of the areas]")
@@ -98,7 +98,7 @@ def main() -> int:
         return 0
     tests = options.tests or sorted({test for area in areas for test in AREAS[area][1]})
     modules = sorted({path for area in areas for path in AREAS[area][0]})
-    trials = Trials(ROOT, modules, chosen, options.jobs, 60 * options.minutes, NO_MUTANT_EVERY)
+    trials = Trials(ROOT, modules, chosen, options.jobs, 60 * options.minutes, options.most)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     os.environ["CI"] = "1"  # property tests try the same examples every time
     os.chdir(ROOT)

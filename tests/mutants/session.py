@@ -28,10 +28,9 @@ import pytest
 from tests.mutants.areas import AREAS
 from tests.mutants.mutations import Mutant
 
-MOST_TESTS_S = 60.0
-"""Of the tests of one mutant together, as they took when they were watched."""
 MOST_WATCHED_S = 30.0
 """A test that took longer is not asked."""
+_NO_MUTANT_EVERY = 25
 _WATCH_LIMIT_S = 900.0
 _KEPT = Path("build/mutants.pickle")
 
@@ -88,8 +87,8 @@ class Trials:
         Processes at a time.
     seconds : float
         After which no mutant is begun, counted from the first.
-    alone_every : int
-        After so many mutants a process without one.
+    most_tests_s : float
+        Of the tests of one mutant together, as they took when they were watched.
     """
 
     def __init__(
@@ -99,10 +98,10 @@ class Trials:
         mutants: Sequence[tuple[str, Mutant]],
         jobs: int,
         seconds: float,
-        alone_every: int,
+        most_tests_s: float,
     ) -> None:
         self._root, self._modules, self._mutants = root, modules, mutants
-        self._jobs, self._seconds, self._alone_every = jobs, seconds, alone_every
+        self._jobs, self._seconds, self._most_tests_s = jobs, seconds, most_tests_s
         self.fates: list[tuple[str, Mutant, Fate]] = []
         self.alone = self.failed_alone = self.not_possible = 0
         self._failed = False
@@ -208,15 +207,15 @@ class Trials:
             reached = {(str(self._root / mutant.path), line) for line in range(*_span(mutant.lines))}
             coming = [test for test in usable if reached & watched[test[1]].lines]
             for seconds, name in _own_files_first(coming, mutant.path.stem):
-                if chosen and total_s + seconds > MOST_TESTS_S:
+                if chosen and total_s + seconds > self._most_tests_s:
                     continue
                 chosen.append(items[name])
                 total_s += seconds
             if not chosen:
                 self.fates.append((area, mutant, "no test"))
                 continue
-            limit_s = 60.0 + 20.0 * total_s
-            with_none = [None] if number % self._alone_every == 0 else []
+            limit_s = 15.0 + 15.0 * total_s
+            with_none = [None] if number % _NO_MUTANT_EVERY == 0 else []
             for what in (mutant, *with_none):
                 self._gather(children, self._jobs - 1)
                 child = self._fork(lambda what=what, chosen=chosen: self._tried(what, chosen), limit_s)
