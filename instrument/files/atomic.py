@@ -108,15 +108,16 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     path = Path(path)
     check_writable(path)
     temporary = _draft_name(path, path.stem, path.suffix)
-    held = -1
     try:
-        held = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-        _hold(held)
-        yield temporary
-        with temporary.open("rb") as written:
-            os.fsync(written.fileno())
-        temporary.replace(path)
-        sync_folder(path.parent)
+        with contextlib.ExitStack() as after:
+            held = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+            after.callback(os.close, held)
+            _hold(held)
+            yield temporary
+            with temporary.open("rb") as written:
+                os.fsync(written.fileno())
+            temporary.replace(path)
+            sync_folder(path.parent)
     except OSError as error:
         if error.errno is None and shutil.disk_usage(path.parent).free < _NEARLY_FULL_BYTES:
             # Some writers only notice that less was written than they asked for.
@@ -125,9 +126,7 @@ def whole_file(path: Path | str) -> Iterator[Path]:
         raise
     finally:
         with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        if held >= 0:
-            os.close(held)
+            temporary.unlink()
 
 
 @contextlib.contextmanager
@@ -140,7 +139,7 @@ def draft_folder(path: Path, *, locked: bool = True) -> Iterator[Path]:
     """
     draft = _draft_name(path, path.name)
     draft.mkdir()
-    held = os.open(draft, os.O_RDONLY | os.O_CLOEXEC)
+    held = os.open(draft, os.O_RDONLY)
     try:
         if locked:
             _hold(held)
@@ -162,7 +161,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     refuse_input(path)
     with draft_folder(path) as draft:
         yield draft
-        for place, _, files in os.walk(draft, topdown=False):
+        for place, _, files in os.walk(draft):
             for name in files:
                 with (Path(place) / name).open("rb") as written:
                     os.fsync(written.fileno())
@@ -215,7 +214,7 @@ def clear_left(folder: Path, *, again: bool = False) -> None:
     with contextlib.suppress(OSError):
         for name in filter(_LEFT.fullmatch, os.listdir(place)):  # noqa: PTH208 # 10^5 names take no Paths
             with contextlib.suppress(OSError):
-                handle = os.open(place / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+                handle = os.open(place / name, os.O_RDONLY | os.O_NOFOLLOW)
                 try:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     if (place / name).is_dir():

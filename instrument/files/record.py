@@ -17,6 +17,7 @@ import enum
 import json
 import logging
 import math
+import sys
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -73,10 +74,7 @@ class RecordFormat:
         """Return a record as text; without an indent as short as can be."""
         separators = (",", ":") if indent is None else None
         stamped = self.stamped(fields)
-        return (
-            json.dumps(stamped, indent=indent, separators=separators, ensure_ascii=False, allow_nan=False)
-            + "\n"
-        )
+        return json.dumps(stamped, indent=indent, separators=separators, ensure_ascii=False) + "\n"
 
     def write(self, path: Path, fields: Mapping[str, Any], *, indent: int | None = 1) -> None:
         """Write a record, whole or not at all; errors as ``write_text``."""
@@ -171,7 +169,7 @@ def _numbers(version: Any) -> tuple[int, int]:
         major, _, minor = str(version).partition(".")
         return int(major), int(minor or 0)
     except ValueError:
-        return (2**31, 0)
+        return (sys.maxsize, 0)
 
 
 @lru_cache(maxsize=256)
@@ -234,7 +232,7 @@ def _reader(kind: Any) -> Reader:
     if origin is tuple:
         return _tuple_reader(arguments)
     if origin is np.ndarray:
-        dtype = typing.get_args(arguments[1])[0] if len(arguments) > 1 else None
+        (dtype,) = typing.get_args(arguments[1])
         return _converter(lambda data: np.array(data, dtype))
     if isinstance(origin, type) and issubclass(origin, Mapping):
         key, entry = _reader(arguments[0]), _reader(arguments[1])

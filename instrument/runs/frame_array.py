@@ -271,7 +271,7 @@ class FrameArray:
         target = self.chunk_path(index)
         target.parent.mkdir(parents=True, exist_ok=True)
         path = target.with_name("part")
-        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         try:
             written = 0
             while written < len(data):

@@ -148,6 +148,9 @@ class BadLine:
         return not self.data.endswith(b"\n")
 
 
+_CLOSED = -1
+
+
 class AppendOnlyLog:
     """A file of JSON lines that only ever grows.
 
@@ -157,7 +160,7 @@ class AppendOnlyLog:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
         try:
             self._size = os.fstat(self._handle).st_size
             if self._size and os.pread(self._handle, 1, self._size - 1) != b"\n":
@@ -184,8 +187,8 @@ class AppendOnlyLog:
 
     def close(self) -> None:
         """Close the file; closing twice does nothing."""
-        if self._handle >= 0:
-            handle, self._handle = self._handle, -1
+        if self._handle != _CLOSED:
+            handle, self._handle = self._handle, _CLOSED
             os.close(handle)
 
 
@@ -260,8 +263,8 @@ def _frame_line(line: bytes) -> FrameLine | None:
     begins = _FRAME.match(line)
     if begins is None:
         return None
-    before, found, digits = line.rpartition(_SUM_BEGINS)
-    if not found or digits != b'%08x"}\n' % zlib.crc32(b"}", zlib.crc32(before)):
+    before, _, digits = line.rpartition(_SUM_BEGINS)
+    if digits != b'%08x"}\n' % zlib.crc32(b"}", zlib.crc32(before)):
         return None
     return FrameLine(int(begins[1]), line)
 

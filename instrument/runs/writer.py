@@ -388,7 +388,7 @@ def lock_run(path: Path) -> contextlib.ExitStack:
     """
     with contextlib.ExitStack() as held:
         for what, flags in ((path, os.O_RDONLY), (path / LOCK, os.O_RDWR | os.O_CREAT)):
-            handle = os.open(what, flags | os.O_CLOEXEC, 0o644)
+            handle = os.open(what, flags, 0o644)
             held.callback(os.close, handle)
             try:
                 free = lock(handle)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -91,6 +91,17 @@ def test_a_newer_version_of_free_facts_is_told(tmp_path: Path, caplog: pytest.Lo
         assert not caplog.records
         free.read(put(tmp_path / "b.json", {"format": "test tea", "version": "3.2"}))
     assert "newer than this program's" in caplog.text
+    caplog.clear()
+    replace(free, minor=0).read(put(tmp_path / "c.json", {"format": "test tea", "version": 3}))
+    assert not caplog.records
+
+
+def test_a_part_of_a_record_tells_what_is_new_in_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "tea.json"
+    assert TEA.value(list[Inner], [{"x": 1, "y": 2}], path) == [Inner(1.0)]
+    assert "holds 'y', which this program does not know: left out." in caplog.text
+    with pytest.raises(FileError, match="is a damaged recipe for tea: it should be a table, not 3"):
+        TEA.value(Inner, 3, path)
 
 
 @pytest.mark.parametrize(
@@ -182,7 +193,10 @@ def test_a_union_is_read_as_its_only_type_and_pairs_by_place() -> None:
         one: Path | None
         either: Path | str | None
         pair: tuple[Path, str]
+        word: Literal["yes", "no"] = "no"
+        whole: int = 1
 
+    assert value_of(int, "as it is") == "as it is"  # type: ignore[comparison-overlap]
     data = {"one": "a", "either": "b", "pair": ["c", "d"]}
     assert value_of(Local, data) == Local(Path("a"), "b", (Path("c"), "d"))
     assert value_of(Local, data | {"one": None, "either": None}) == Local(None, None, (Path("c"), "d"))

@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from instrument.files.errors import FileError
+from instrument.runs import log as log_module
 from instrument.runs.log import (
     UNREAD,
     AppendOnlyLog,
@@ -72,6 +74,8 @@ def test_numbers_that_no_frame_has_are_refused(
         (288, 1, (6, 8, 3), "uint16"),
         (576, 1, (6, 8, 3), "float32"),
         (24, 2, (3, 4), "uint16"),
+        (4, 4, (1, 2), "uint16"),
+        (1, 6, (1, 1), "uint8"),
         (0, 1, None, ""),
         (0, 16, None, ""),  # of no height
         (4, 16, None, ""),
@@ -116,6 +120,9 @@ LARGE = FRAME | {"metadata": FRAME["metadata"] | {"binning": 0}}
         (log_line(NOTE)[:-11] + b'00000000"}\n', [], [(1, 0)]),
         (log_line(NOTE)[:-1] + b" x\n" + log_line(FRAME), [FRAME], [(1, 0)]),
         (b"junk" + log_line(NOTE), [NOTE], [(1, 0)]),
+        (b"?" + log_line(NOTE), [NOTE], [(1, 0)]),
+        (log_line(FRAME) + log_line(NOTE) + log_line(FRAME), [FRAME, NOTE, FRAME], []),
+        (log_line(FRAME).replace(b"96", b"97"), [], [(1, 0)]),
         (b"junk\n" + log_line(NOTE) + b"\n" + log_line(NOTE), [NOTE, NOTE], [(1, 0), (3, 0)]),
         (log_line(NOTE)[:-1] + log_line(FRAME), [NOTE, FRAME], []),
         (log_line(NOTE)[:-1] + b"?" + log_line(FRAME), [NOTE, FRAME], []),
@@ -144,6 +151,17 @@ def test_what_of_a_log_can_be_read_is_read_and_the_rest_is_kept(
     assert BadLine(1, b"a").is_torn
 
 
+def test_only_whole_lines_of_frames_are_left_unread_and_a_hollow_log_is_not_read(tmp_path: Path) -> None:
+    path, frame = tmp_path / "log", log_line(FRAME)
+    path.write_bytes(frame + log_line(NOTE) + frame + frame.replace(b"96", b"97") + frame[:-1])
+    found, bad = read_lines(path, unread=True)
+    assert [record.get(UNREAD) for record in found] == [FrameLine(3, frame), None, FrameLine(3, frame)]
+    assert [piece.number for piece in bad] == [4, 5]
+    os.truncate(path, 10 << 30)
+    with pytest.raises(FileError, match="made to fill the memory"):
+        read_lines(path)
+
+
 def test_a_frames_line_is_read_when_it_is_asked_for_and_named_where_it_says_nothing(tmp_path: Path) -> None:
     records = FrameRecords(tmp_path / "log.jsonl")
     records.add(FrameLine(3, log_line(FRAME)))
@@ -161,7 +179,10 @@ def test_a_frames_line_is_read_when_it_is_asked_for_and_named_where_it_says_noth
 def test_a_log_only_grows_by_whole_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "log.jsonl"
     path.write_bytes(b"torn")
+    syncs: list[Path] = []
+    monkeypatch.setattr(log_module, "sync_folder", syncs.append)
     log = AppendOnlyLog(path)
+    assert syncs == [tmp_path]
     first, second, third = ({"kind": "note", "text": text} for text in ("räume", "b", "c"))
     log.append([first, second])
     whole = b"torn\n" + log_line(first) + log_line(second)
@@ -190,3 +211,11 @@ def test_a_log_only_grows_by_whole_lines(tmp_path: Path, monkeypatch: pytest.Mon
         path.write_bytes(before)
         AppendOnlyLog(path).close()
         assert path.read_bytes() == after
+        assert not path.stat().st_mode & 0o111
+    path.unlink()
+    monkeypatch.setattr(log_module, "sync_folder", lambda _: 1 / 0)
+    open_files = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
+    with pytest.raises(ZeroDivisionError):
+        AppendOnlyLog(path)
+    assert len(os.listdir("/proc/self/fd")) == open_files  # noqa: PTH208
+    assert not path.stat().st_mode & 0o111

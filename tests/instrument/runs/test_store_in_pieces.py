@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from instrument.files.atomic import check_writable, output_folder, require_new
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
 from instrument.plan import Part, Plan
-from instrument.runs import frame_array, inspection, writer
+from instrument.runs import frame_array, writer
 from instrument.runs.frame_array import FrameArray, SyncPool, description_of
-from instrument.runs.inspection import contact_sheet, summary, verify
+from instrument.runs.inspection import summary, verify
 from instrument.runs.log import Gap
 from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_files import RunError
@@ -107,23 +106,6 @@ def test_a_recordings_array_grows_with_it_and_ends_with_its_last_frame(
     assert verify(run).is_sound
 
 
-def test_a_contact_sheet_shows_frames_spread_evenly_and_none_of_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    written: list[Path] = []
-    monkeypatch.setattr(inspection, "save_figure", lambda _, path: written.append(path))
-    monkeypatch.setattr(inspection, "ROWS", 1)
-    with RunWriter.create(tmp_path, label="r", bench=BENCH) as writer:
-        writer.start()
-        writer.write([frame(i) for i in range(7)])
-        run = writer.finish(FinishReason.COMPLETED)
-    sheet = tmp_path / "sheet.png"
-    assert contact_sheet(run, sheet) == [0, 2, 4, 6]
-    assert contact_sheet(run, sheet, leave_out=range(6)) == [6]
-    assert contact_sheet(run, sheet, leave_out=range(7)) == []
-    assert written == [sheet, sheet]
-
-
 def test_a_photograph_and_a_run_are_summed_up(tmp_path: Path) -> None:
     write_image(tmp_path / "a.tif", np.zeros((4, 5), np.uint16))
     photo = summary(tmp_path / "a.tif")
@@ -136,33 +118,6 @@ def test_a_photograph_and_a_run_are_summed_up(tmp_path: Path) -> None:
     assert (found.stored, found.frames, found.kind, found.became) == (1, 1, "recording", "completed")
     Run.open(path).array.chunk_path(0).unlink()
     assert summary(path).became == "completed, DAMAGED"
-
-
-def test_why_a_file_may_not_be_written_is_said(tmp_path: Path) -> None:
-    there = tmp_path / "there.txt"
-    there.write_text("")
-    require_new(tmp_path / "new.txt")
-    require_new(there, overwrite=True)
-    for overwrite, remedy in ((None, False), (False, True)):
-        with pytest.raises(FileError, match="exists already and was left as it is") as caught:
-            require_new(there, overwrite=overwrite)
-        assert ("--force" in str(caught.value)) == remedy
-    check_writable(there, 1)
-    for path, words in (
-        (tmp_path, "is a folder; a file name is expected"),
-        (tmp_path / "no" / "a.txt", r"its folder .*no does not exist"),
-        (there / "a.txt", r"its folder .*there.txt is no folder"),
-        (Path("/dev/null"), "is a device or pipe"),
-    ):
-        with pytest.raises(FileError, match=words):
-            check_writable(path)
-    with pytest.raises(FileError, match=r"needs 1000000000000\.0 MB, and .* MB are free on its disk"):
-        check_writable(tmp_path / "huge", 10**18)
-    output_folder(tmp_path / "a" / "b")
-    output_folder(tmp_path / "a" / "b")
-    assert (tmp_path / "a" / "b").is_dir()
-    with pytest.raises(FileError, match="is a file; a folder is expected"):
-        output_folder(there)
 
 
 def test_an_array_keeps_what_was_written_and_nothing_half_written(
@@ -212,16 +167,6 @@ def test_an_array_keeps_what_was_written_and_nothing_half_written(
     ):
         with pytest.raises(ValueError, match=words):
             array.write([(index, image)])
-
-
-def test_saturated_pixels_of_a_contact_sheet_are_red() -> None:
-    pixels = np.zeros((4, 1300), np.uint8)
-    pixels[2, 2] = 255
-    run: Any = SimpleNamespace(frame=lambda _: pixels, metadata=lambda _: SimpleNamespace(significant_bits=8))
-    picture = inspection._shown(run, 0)
-    assert picture.shape == (2, 650, 3)
-    assert picture[1, 1].tolist() == [1, 0, 0]
-    assert picture[0, 0].tolist() == [0, 0, 0]
 
 
 def test_frames_that_came_at_one_time_have_no_period() -> None:
