@@ -11,6 +11,7 @@ from shiboken6 import isValid
 
 from drivers.common.stream import FrameStream
 from drivers.errors import DeviceError
+from drivers.frame import FrameMetadata
 from gui.jobs import Job, JobRunner
 from instrument.files.errors import BenchError, in_words
 from instrument.live.live import LiveResult, LiveStatus, LiveView
@@ -100,10 +101,12 @@ class LiveFollower:
     Parameters
     ----------
     camera : LiveCamera
+    lit : callable
+        Whether something was lit during a frame; asked from the view's thread.
     """
 
-    def __init__(self, camera: LiveCamera) -> None:
-        self._camera = camera
+    def __init__(self, camera: LiveCamera, lit: Callable[[FrameMetadata], bool]) -> None:
+        self._camera, self._lit = camera, lit
         self._view: LiveView | None = None
         self._stream: FrameStream | None = None
         self._shape: tuple[int, ...] = ()
@@ -144,7 +147,7 @@ class LiveFollower:
             if shape != self._shape:
                 self.reconstructor.restart()
                 self._shape = shape
-            self._view = LiveView(stream, self.reconstructor).start()
+            self._view = LiveView(stream, self.reconstructor, self._lit).start()
 
     def newest(self) -> LiveResult | None:
         """Return the newest picture; None before the first."""

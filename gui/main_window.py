@@ -198,6 +198,7 @@ class MainWindow(QMainWindow):
             self.resizeDocks([first["bottom"]], [150], Qt.Orientation.Vertical)
 
     def _dock_seen(self, name: str, visible: bool) -> None:
+        self._places[name].set_seen(visible)
         if visible:
             self.maker.ask(name)
 

@@ -23,6 +23,7 @@ from gui.session import BenchSession
 from gui.session_news import name_of
 from gui.way_on import WayOn
 from gui.widgets.building import after_rest, button, choice, fill, label, mark, scrolled, split, text_view
+from gui.widgets.tab_order import tab_in_order
 from instrument.bench.config_file import TEMPLATES
 from instrument.files.errors import BenchError, SettingsError, count, duration, size
 
@@ -337,6 +338,7 @@ class ProcedurePanel(Panel):
             take_slice(self.views.parts(self.routine.name))
             QTimer.singleShot(REST_MS, self, self._make_form)
         except StopIteration:
+            tab_in_order(self)
             self._typed()
 
     @property

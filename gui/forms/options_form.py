@@ -108,7 +108,7 @@ class OptionsForm(QWidget):
         self.more.setAutoRaise(True)
         self.more.setArrowType(Qt.ArrowType.RightArrow)
         self.more.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextBesideIcon)
-        self.more.setToolTip(", ".join(field.bare_label for field in folded))
+        self.more.setToolTip(", ".join(field.bare_label for field in folded) or FOLDED[0])
         self.more.toggled.connect(self._fold)
         self._seldom.hide()
         fill(self, usual, in_row(self.more, None), self._seldom, None, margins=(2, 6, 8, 2))

@@ -13,6 +13,7 @@ from gui.panel import Panel
 from gui.panels.unserved import UnservedPanel, why_not
 from gui.session import BenchSession
 from gui.theme import TURN, dress
+from gui.widgets.tab_order import tab_in_order
 
 Area = Literal["centre", "top right", "right", "bottom"]
 
@@ -57,6 +58,8 @@ class PanelEntry(NamedTuple):
         try:
             yield None
             yield from panel.parts()
+            tab_in_order(panel)
+            yield None
             parts = panel.findChildren(QWidget)
             for part in parts:  # what showing it first would do in one go
                 part.ensurePolished()

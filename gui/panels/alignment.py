@@ -50,7 +50,7 @@ class AlignmentPanel(ProcedurePanel):
 
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
-        self.spots = ImageView()
+        self.spots = ImageView(name="Newest picture of spots")
         follow_orientation(self.session, "frames", self.spots.orient)
         yield
         self.spot_words = label("No picture yet.", "dim", yields=True)

@@ -73,8 +73,7 @@ class FilmsPanel(Panel):
         self.activity_button = button("Find activity…", tip, lambda: self._hand_on("activity", "video"))
         self.heading = label(selectable=True, yields=True)
         yield
-        self.view = ImageView()
-        self.view.setAccessibleName("Picture of the film")
+        self.view = ImageView(name="Picture of the film")
         self.measure = Measure(self.view, several=True)
         self.session.kept_changed.connect(self._turn)
         self._rest = after_rest(self, _REST_MS, self._read_curves)

@@ -76,7 +76,7 @@ class LiveReconstructionPanel(Panel):
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
-        self.follower = LiveFollower(session.live)
+        self.follower = LiveFollower(session.live, lambda frame: session.lights.during(frame) != NOTHING_LIT)
         self.loaded: _Loaded | None = None
         self._reader = NewestOnly(session.jobs, "Loading the calibration", self._refuse)
         self._loading: Job | None = None
@@ -96,7 +96,7 @@ class LiveReconstructionPanel(Panel):
     def parts(self) -> Iterator[None]:
         """Make the widgets."""
         session = self.session
-        self.view = ImageView()
+        self.view = ImageView(name="Reconstruction of the newest frame")
         follow_orientation(session, "results", self.view.orient)
         yield
         self.file, self.browse_button = path_field(

@@ -188,7 +188,7 @@ class RunsPanel(Panel):
         self.hint.hide()
 
     def _make_details(self) -> None:
-        self.view = ImageView()
+        self.view = ImageView(name="Frame of the run")
         follow_orientation(self.session, "frames", self.view.orient)
         self.slider = QSlider(Qt.Orientation.Horizontal)
         self.slider.setToolTip("Frame of the run (arrow keys)")

@@ -29,7 +29,7 @@ class SlmPanel(DevicePanel):
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
-        self.view = ImageView("grey")
+        self.view = ImageView("grey", name="Phase on the SLM")
         self.view.setToolTip("Grey levels on the SLM now, 0 to 255")
         self.now = label("–", wraps=True)
         self.file, self.browse_button = path_field(

@@ -52,6 +52,7 @@ class JogPad(QFrame):
         self._panel = panel
         self.setObjectName("jog-pad")
         self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setAccessibleName("Jog by arrow keys")
         self.setToolTip(
             "With this in focus: arrow keys move x and y, PgUp and PgDn z;\nShift: ten steps, Ctrl: a tenth"
         )

@@ -21,11 +21,28 @@ from instrument.bench.config_file import load_config, tried_bench
 from recon.base.declare import Imports, expression
 
 _TRIED = {
-    "default": ("Try the camera", "A simulated camera behind a diffuser: calibrate, photograph, reconstruct"),
-    "display": ("Try the display", "A simulated SLM and scattering mask: align, compute, show holograms"),
-    "led_microscope": ("Try the microscope", "A simulated LED array microscope: phase from half circles"),
-    "screen": ("Try a screen", "A simulated camera before a monitor: calibrate by pictures on it"),
+    "default": (
+        "Try the camera",
+        "A simulated camera behind a diffuser: calibrate, photograph, reconstruct",
+        "PSFs of a moving point source; pictures and volumes by inverse problems",
+    ),
+    "display": (
+        "Try the display",
+        "A simulated SLM and scattering mask: align, compute, show holograms",
+        "A phase-only SLM before a random mask, which widens its field of view (étendue expansion)",
+    ),
+    "led_microscope": (
+        "Try the microscope",
+        "A simulated LED array microscope: phase from half circles",
+        "Differential phase contrast (DPC)",
+    ),
+    "screen": (
+        "Try a screen",
+        "A simulated camera before a monitor: calibrate by pictures on it",
+        "PSF from photographs of known pictures, without a stage",
+    ),
 }
+_WRITTEN = "its bench.toml is written into a folder of its own, with its runs beside it"
 _IMAGES = "Images (*.tif *.tiff *.png *.npy *.npz *.bmp *.jpg);;All files (*)"
 _COLUMNS = 2
 _WIDEST_PX = 900
@@ -44,24 +61,35 @@ class StartPanel(Panel):
         at = f"Open now: {session.config.label}." if has_bench else "No bench is open."
         self.place = label(f"{at} What is made goes to {session.runs_folder}.", "dim", wraps=True)
         parts: list[QWidget] = [label("What would you like to do?", "title"), self.place]
-        tried = {name: (*words, partial(self.try_bench, name)) for name, words in _TRIED.items()}
-        own: dict[str, tuple[str, str, Callable[[], object]]] = {
-            "open": ("Open a bench…", "A bench.toml that names your devices", self._choose_bench),
+        tried = {
+            name: (words, about, f"{tip}; {_WRITTEN}.", partial(self.try_bench, name))
+            for name, (words, about, tip) in _TRIED.items()
+        }
+        own: dict[str, tuple[str, str, str, Callable[[], object]]] = {
+            "open": (
+                "Open a bench…",
+                "A bench.toml that names your devices",
+                "One table a device, its driver and address; Ctrl+O leads here from any panel",
+                self._choose_bench,
+            ),
             "new": (
                 "New bench from what is connected…",
                 "Finds devices and writes a bench.toml",
+                "Looks at every bus for about a quarter of a minute; nothing moves or lights up",
                 self._new_bench,
             ),
         }
-        files: dict[str, tuple[str, str, Callable[[], object]]] = {
+        files: dict[str, tuple[str, str, str, Callable[[], object]]] = {
             "files": (
                 "Reconstruct my own files…",
                 "A PSF and a photograph from anywhere; or drop them here",
+                "PSF: the picture of one point of light (point spread function). No bench is needed",
                 self._choose_psf,
             ),
             "results": (
                 "Open files…",
                 "A picture, a volume or a record that was made before",
+                "Results of Reconstruct or of the terminal, looked at in Reconstructions",
                 self._choose_result,
             ),
         }
@@ -72,8 +100,10 @@ class StartPanel(Panel):
         ):
             grid = QGridLayout()
             grid.setSpacing(8)
-            for number, (name, (words, about, call)) in enumerate(cards.items()):
-                grid.addWidget(self._card(name, words, about, call), number // _COLUMNS, number % _COLUMNS)
+            for number, (name, (words, about, tip, call)) in enumerate(cards.items()):
+                grid.addWidget(
+                    self._card(name, words, about, tip, call), number // _COLUMNS, number % _COLUMNS
+                )
             parts += [label(heading, "heading"), _holding(grid)]
         self.page = fill(QWidget(), *parts, None, margins=(16, 12, 16, 8), spacing=6)
         self.page.setMaximumWidth(_WIDEST_PX)
@@ -85,12 +115,15 @@ class StartPanel(Panel):
         self.setFocusProxy(self.cards["default"])
         fill(self.body, self.pages)
 
-    def _card(self, name: str, words: str, about: str, call: Callable[[], object]) -> QCommandLinkButton:
+    def _card(
+        self, name: str, words: str, about: str, tip: str, call: Callable[[], object]
+    ) -> QCommandLinkButton:
         card = QCommandLinkButton(words, about)
         card.setObjectName("card")
         card.setIconSize(QSize(0, 0))
         card.setMinimumHeight(_CARD_PX)
-        card.setAccessibleDescription(about)
+        card.setAccessibleDescription(f"{about}. {tip}")
+        card.setToolTip(tip)
         card.clicked.connect(lambda: call())
         self.cards[name] = card
         return card

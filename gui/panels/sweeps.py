@@ -86,7 +86,7 @@ class SweepsPanel(ProcedurePanel):
         """Make the widgets."""
         self.path = PathPlot()
         yield
-        self.frame = ImageView()
+        self.frame = ImageView(name="Newest frame")
         follow_orientation(self.session, "frames", self.frame.orient)
         yield
         self.frame_words = label(role="dim", wraps=True, yields=True)

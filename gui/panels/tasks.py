@@ -33,6 +33,7 @@ from gui.widgets.building import (
     text_view,
 )
 from gui.widgets.sweep_views import Picture
+from gui.widgets.tab_order import tab_in_order
 from instrument.tasks import CHARTS, TASKS, VIDEOS
 from instrument.tasks.task import WRITTEN, Desk, Done, Task
 from recon.base.declare import Imports, Option, expression
@@ -163,6 +164,7 @@ class TasksPanel(Panel):
         if name not in self._pages:
             self._pages[name] = self._made(name, task)
             self.stack.addWidget(scrolled(self._pages[name].form))
+            tab_in_order(self)
         if name != self.name:
             return
         self.stack.setCurrentIndex(list(self._pages).index(name))

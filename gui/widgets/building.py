@@ -157,10 +157,10 @@ class Hint(QWidget):
         super().__init__()
         self.words = hint(words)
         self.words.setContentsMargins(0, 0, 0, 0)
-        self.button = button(answer, "", lambda: clicked())
+        self.button = button(answer, words, lambda: clicked())
         parts: list[Part] = [self.words, in_row(None, self.button, None)]
         if other is not None:
-            self.other = button(other[0], "", lambda: other[1]())
+            self.other = button(other[0], words, lambda: other[1]())
             self.other.setFlat(True)
             parts.append(in_row(None, self.other, None))
         fill(self, None, *parts, None, margins=(16, 8, 16, 8), spacing=10)
@@ -168,6 +168,7 @@ class Hint(QWidget):
     def say(self, words: str, *, busy: bool = False) -> None:
         """Say something else; ``busy``: nothing is to be done here meanwhile, and there is no button."""
         self.words.setText(words)
+        self.button.setToolTip(words)
         self.button.setVisible(not busy)
 
 
@@ -350,6 +351,7 @@ def scrolled(form: QWidget) -> QScrollArea:
     scroll.setWidgetResizable(True)
     scroll.setFrameShape(QFrame.Shape.NoFrame)
     scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+    scroll.setFocusPolicy(Qt.FocusPolicy.NoFocus)  # it follows the keyboard's place in the form
     scroll.setWidget(holder)
     fill(holder, form)
     return scroll
@@ -367,14 +369,26 @@ class PanelPlace(QScrollArea):
         self.setWidgetResizable(True)
         self.setFrameShape(QFrame.Shape.NoFrame)
         self.setMinimumSize(*_SMALLEST)
+        self.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         self.content: QWidget | None = None
+        self._seen = True
 
     def hold(self, content: QWidget) -> None:
         """Put a panel here."""
         self.content = content
         holder = _Holder(content)
         self.setWidget(holder)  # first: each new parent has all of a panel take its looks again
+        holder.setVisible(self._seen)
         holder.take()
+
+    def set_seen(self, seen: bool) -> None:
+        """Show or hide what is held.
+
+        Qt calls what lies in a dock behind another one visible: keys would go where nobody looks.
+        """
+        self._seen = seen
+        if (holder := self.widget()) is not None:
+            holder.setVisible(seen)
 
 
 class _Holder(QWidget):

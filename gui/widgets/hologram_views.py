@@ -48,8 +48,8 @@ class WeightsView(StretchedImage):
 
     changed = Signal()
 
-    def __init__(self, parent: QWidget | None = None) -> None:
-        super().__init__(parent=parent)
+    def __init__(self) -> None:
+        super().__init__(name="Target, with what counts")
         self.mode: WeightsMode = "uniform"
         self.periphery = 0.1
         self.brush_radius = 0.06
@@ -261,11 +261,11 @@ class HologramViews(QWidget):
             "button or Space paints, right button or Backspace rubs out, arrow keys move the brush"
         )
         yield
-        self.seen = ImageView()
+        self.seen = ImageView(name="What is seen, computed")
         yield
-        self.phase = ImageView()
+        self.phase = ImageView(name="Phase")
         yield
-        self.captured = ImageView()
+        self.captured = ImageView(name="Photograph")
         yield
         self.plane = narrow(choice((), "The plane that is looked at", self._show_plane))
         self.plane.hide()

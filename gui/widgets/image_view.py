@@ -87,13 +87,15 @@ class ImageView(QWidget):
     ----------
     colour_map : str, optional
         A name of ``colour_maps.NAMES``; None means the theme's.
+    name : str
+        For screen readers; what is written over and below the image is its description.
     """
 
     hovered = Signal(str)
     clicked = Signal(int, int)
 
-    def __init__(self, colour_map: str | None = None, parent: QWidget | None = None) -> None:
-        super().__init__(parent)
+    def __init__(self, colour_map: str | None = None, *, name: str = "Picture") -> None:
+        super().__init__()
         pg.setConfigOptions(imageAxisOrder="row-major")
         self.graphics = _TurnedGraphics(colours().window)
         self.box: Any = pg.ViewBox(lockAspect=True, invertY=True, enableMenu=False)
@@ -132,7 +134,7 @@ class ImageView(QWidget):
         scene.sigMouseClicked.connect(self._mouse_clicked)
         self.setMinimumSize(160, 120)
         self.setFocusProxy(self.graphics)
-        self.keys = ArrowKeys(self.graphics)
+        self.keys = ArrowKeys(self.graphics, name)
         self.arrows_pan = True
         self.keys.zoomed.connect(self._zoom)
         self.keys.moved.connect(self._pan_by_keys)
@@ -225,6 +227,7 @@ class ImageView(QWidget):
         if words != self.caption:
             self._caption.setText(words)
             self._caption.setVisible(bool(words))
+            self._describe()
         room = max(self.graphics.width() - 2 * _MARGIN_PX, 1)
         self._caption.setFixedWidth(min(room, self._caption.fontMetrics().horizontalAdvance(words) + 24))
         self._caption.adjustSize()
@@ -239,11 +242,15 @@ class ImageView(QWidget):
         if words != self.caution:
             self._caution.setText(words)
             self._caution.setVisible(bool(words))
+            self._describe()
         margin = _MARGIN_PX
         width = max(self.graphics.width() - 2 * margin, 1)
         self._caution.setFixedWidth(min(width, self._caution.fontMetrics().horizontalAdvance(words) + 40))
         self._caution.adjustSize()
         self._caution.move(margin, margin)
+
+    def _describe(self) -> None:
+        self.graphics.setAccessibleDescription(". ".join(filter(None, (self.caution, self.caption))))
 
     def clear(self) -> None:
         """Show nothing."""
@@ -361,8 +368,8 @@ class StretchedImage(ImageView):
         Whether voxels are square on the screen; without, the image fills its place.
     """
 
-    def __init__(self, *, keep_aspect: bool = True, parent: QWidget | None = None) -> None:
-        super().__init__(parent=parent)
+    def __init__(self, *, keep_aspect: bool = True, name: str = "Picture") -> None:
+        super().__init__(name=name)
         self.box.setAspectLocked(keep_aspect)
 
     def describe(self, column: int, row: int) -> str:
@@ -409,6 +416,8 @@ class ArrowKeys(QObject):
     ----------
     widget : QWidget
         Where the keyboard is when the keys are pressed.
+    name : str
+        Of the widget, for screen readers.
 
     Signals
     -------
@@ -433,8 +442,9 @@ class ArrowKeys(QObject):
     entered = Signal()
     left = Signal()
 
-    def __init__(self, widget: QWidget) -> None:
+    def __init__(self, widget: QWidget, name: str) -> None:
         super().__init__(widget)
+        widget.setAccessibleName(name)
         self.step_of: Callable[[float, float], tuple[float, float]] = lambda across, down: (across, down)
         """What a step to the right and down on the screen is in the picture."""
         widget.setFocusPolicy(Qt.FocusPolicy.StrongFocus)

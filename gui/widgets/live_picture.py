@@ -225,7 +225,7 @@ class LivePicture(QWidget):
     def parts(self) -> Iterator[None]:
         """Make the view and its tools."""
         session = self._session
-        self.view = ImageView()
+        self.view = ImageView(name="Newest frame of the camera")
         self.view.keys.moved.connect(lambda across, down: self._by_keys(across, down, alt=False))
         self.view.keys.resized.connect(lambda across, down: self._by_keys(across, down, alt=True))
         self.view.keys.acted.connect(lambda send: self.region_sent.emit() if send else None)

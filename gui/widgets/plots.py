@@ -47,6 +47,7 @@ def plot_widget(
     pyqtgraph has no type annotations, hence ``Any``.
     """
     plot = _Plot(enableMenu=False)
+    plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
     plot.restyle()
     # Room for letters below the line, and for the half of a number that stands at an axis' end.
     plot.getPlotItem().layout.setContentsMargins(0, 6, 16, 4)
@@ -119,6 +120,7 @@ class LevelsBar(QWidget):
         self.map.setCurrentText(colours().colour_map)
         self.map.currentTextChanged.connect(lambda _: self.changed.emit())
         self.plot: Any = pg.PlotWidget(background=colours().panel, enableMenu=False)
+        self.plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)  # levels are typed in their fields
         self.plot.setFixedHeight(44)
         self.plot.setMinimumWidth(50)
         self.plot.hideAxis("left")

@@ -43,7 +43,7 @@ class StabilityView(QWidget):
         self.plot.scene().sigMouseMoved.connect(self._moved)
         self.cell = (0, 0)
         """Column and row of the cell that was described last, from the lower left."""
-        self.keys = ArrowKeys(self.plot)
+        self.keys = ArrowKeys(self.plot, "Cells of the stability map")
         self.keys.entered.connect(lambda: self._step(0, 0))
         self.keys.moved.connect(self._step)
         self._cursor = QGraphicsRectItem()

@@ -85,6 +85,7 @@ class StepStrip(QFrame):
         running = self._running
         waits = self.step.panel == "reconnect" and not self.step.what
         self.words.setText(f"{running} is under way …" if running else self.step.words)
+        self.button.setToolTip(self.step.words)
         if self.button.text() != self.step.answer:
             self.button.setText(self.step.answer)
         self.button.setVisible(bool(self.step.answer) and not running and not waits)

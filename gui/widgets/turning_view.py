@@ -172,11 +172,10 @@ class TurningCanvas(QWidget):
         self._shades: npt.NDArray[np.uint8] = np.zeros((1, 256, 3), np.uint8)
         self._dragged_from: QPointF | None = None
         self.setMinimumSize(160, 120)
-        self.setAccessibleName("Volume from any side")
         self.setToolTip(
             "Drag or arrow keys: turn; wheel, + and -: zoom; 0: from the front; space: keep turning"
         )
-        self.keys = ArrowKeys(self)
+        self.keys = ArrowKeys(self, "Volume from any side")
         self.keys.moved.connect(lambda across, down: self.turn(_KEY_DEG * across, -_KEY_DEG * down))
         self.keys.zoomed.connect(self._zoomed)
         self._turning = every(self, _TURN_MS, self._turn_on)

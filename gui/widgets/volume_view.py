@@ -78,14 +78,14 @@ class VolumeView(QWidget):
 
     def parts(self) -> Iterator[None]:
         """Make the widgets, with a ``yield`` after each part."""
-        self.front = StretchedImage()
+        self.front = StretchedImage(name="Volume from the front")
         self.bar = LengthBar(self.front)
         yield
-        self.coloured = StretchedImage()
+        self.coloured = StretchedImage(name="Depth as colour")
         yield
-        self.side = StretchedImage(keep_aspect=False)
+        self.side = StretchedImage(keep_aspect=False, name="Volume from the side")
         yield
-        self.top = StretchedImage(keep_aspect=False)
+        self.top = StretchedImage(keep_aspect=False, name="Volume from above")
         yield
         self.profile = plot_widget("plane")
         self._along: Any = self.profile.plot(pen=curve_pen(0))

@@ -48,7 +48,7 @@ class LightLog:
             self._changes.append((time.monotonic_ns(), words))
 
     def during(self, frame: FrameMetadata) -> str:
-        """Return what was lit while a frame was exposed; of a change meanwhile, both.
+        """Return what was lit while a frame was exposed; of a change meanwhile, both. From any thread.
 
         Empty where it is not known any more.
         """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -79,9 +79,17 @@ class LiveView:
         Running, or not yet started: then the view starts it, and closes it at its own end.
     reconstructor : LiveReconstructor
         Belongs to the view while that runs.
+    lit : callable, optional
+        Tells from a frame's metadata whether something was lit, as of :meth:`LiveReconstructor.feed`.
     """
 
-    def __init__(self, stream: FrameStream, reconstructor: LiveReconstructor) -> None:
+    def __init__(
+        self,
+        stream: FrameStream,
+        reconstructor: LiveReconstructor,
+        lit: Callable[[FrameMetadata], bool] = lambda _: True,
+    ) -> None:
+        self._lit = lit
         self.stream = stream
         self.reconstructor = reconstructor
         self._changed = threading.Condition()
@@ -206,7 +214,7 @@ class LiveView:
                 newer = self._reader.next_frame(0.0 if refinable else _POLL_S)
                 if newer is not None:
                     frame = newer
-                    picture = self.reconstructor.feed(frame.image)
+                    picture = self.reconstructor.feed(frame.image, lit=self._lit(frame.metadata))
                     self._publish(picture, frame, newer.metadata.dropped_before)
                     refinable = True
                 elif refinable and frame is not None:

@@ -24,7 +24,7 @@ from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import Progress
 from recon.streams.detail import Detail, ladder
 from recon.streams.fit import CalibrationWatch
-from recon.streams.live_picture import NOISE_ONLY, ComingLevel, Level, LiveOptions, LivePicture
+from recon.streams.live_picture import DARK, NOISE_ONLY, ComingLevel, Level, LiveOptions, LivePicture
 from recon.streams.pace import Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch
 from recon.streams.video import require_steps, stream_problem
@@ -142,7 +142,7 @@ class LiveReconstructor:
         return problem
 
     # Pictures --------------------------------------------------------------------------------------
-    def feed(self, image: Array) -> LivePicture:
+    def feed(self, image: Array, *, lit: bool = True) -> LivePicture:
         """Return a picture of a frame.
 
         The first makes its filter, which takes about a tenth of a second; the first of another scene takes a
@@ -155,6 +155,9 @@ class LiveReconstructor:
         ----------
         image : ndarray, (height, width) or (height, width, n_channels)
             Counts. Of the PSF's pixels, or of a whole multiple of them, which is then binned to them.
+        lit : bool
+            Whether something was lit, as far as is known. Where nothing was and the frame holds noise only,
+            its picture is black and costs nothing; what is lit and looks like noise may be a dim point.
         """
         began = _now()
         frame = self._measured(np.asarray(image))
@@ -166,6 +169,9 @@ class LiveReconstructor:
         cut = self._scene is SceneState.NEW and not self._greeted
         too_slow = affordable < 1 and self._scene is not SceneState.STILL
         self._greeted = self._scene is SceneState.NEW
+        if self._dark and not lit:
+            self._follows, self._settled = False, True
+            return self._picture(level, np.zeros_like(self._as_given(small))[None], None, began)
         solver = level.solver
         if solver is None or cut or too_slow:
             self._follows = self._settled = False
@@ -425,16 +431,16 @@ class LiveReconstructor:
             )
         return block_mean(image[None] if image.ndim == 2 else np.moveaxis(image, 2, 0), factor)
 
-    def _picture(self, level: Level, volume: Floats, done: int, began: Spent) -> LivePicture:
-        """Return a picture: of the filter, or of ``done`` iterations."""
-        filtered, detail = done == 0, level.detail
+    def _picture(self, level: Level, volume: Floats, done: int | None, began: Spent) -> LivePicture:
+        """Return a picture: of ``done`` iterations, of the filter (0), or of a dark frame (None)."""
+        filtered, detail = not done, level.detail
         plane = self._filtered_plane(detail) if filtered else self.live.plane
         of = f"{self._n_planes} depths" if filtered else detail.depths(self._z_um)
         return LivePicture(
             image=self.shown(volume, detail.planes),
             binning=level.binning,
-            method="wiener" if filtered else level.method,
-            iterations=done,
+            method="" if done is None else "wiener" if filtered else level.method,
+            iterations=done or 0,
             total_iterations=0 if filtered or level.solver is None else level.solver.iterations,
             scene=self._scene,
             frames=self._watch.count,
@@ -448,7 +454,7 @@ class LiveReconstructor:
             else f"brightest of {of}"
             if plane is None
             else f"depth {plane} of {of}",
-            doubt=NOISE_ONLY if self._dark else self._fit.doubt,
+            doubt=DARK if done is None else NOISE_ONLY if self._dark else self._fit.doubt,
         )
 
 

@@ -32,6 +32,9 @@ from where the exact-data ADMM would end."""
 NOISE_ONLY = "Noise only, no light of a scene"
 """Doubt of a picture whose frames hold nothing else."""
 
+DARK = "Dark, nothing was lit: no picture is made"
+"""Doubt of the black picture of a frame that was taken with nothing lit and holds noise only."""
+
 _LIVE = "Live pictures"
 
 
@@ -82,7 +85,8 @@ class LivePicture:
     binned ``binning x binning``; brightness does not depend on the binning."""
     binning: int
     method: str
-    """The solver that made it; ``"wiener"`` for a filter, which is of one depth and one PSF."""
+    """The solver that made it; ``"wiener"`` for a filter, which is of one depth and one PSF; empty for a dark
+    frame's black picture."""
     iterations: int
     """Done for this picture; 0 for ``"wiener"``."""
     total_iterations: int
@@ -115,6 +119,8 @@ class LivePicture:
         """
         pixels = "all pixels" if self.binning == 1 else f"binned {self.binning} x {self.binning}"
         steps = f"{self.iterations} iterations ({self.total_iterations} in all)"
+        if not self.method:
+            return self.doubt
         how = "Wiener filter" if self.method == "wiener" else steps
         scene = f"still, {self.frames} frames averaged" if self.frames > 1 else str(self.scene)
         settled = "settled" if self.settled else ""

@@ -23,6 +23,8 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from gui.widgets.tab_order import stops_of
+
 SIZES = {"1366x768": QSize(1350, 690), "1920x1080": QSize(1904, 1000)}
 """Screens, and what they have for a window's inside beside a task bar and the window's frame."""
 _SLACK_PX = 1
@@ -34,7 +36,7 @@ def faults(root: QWidget) -> list[str]:
     stop = root.findChild(QWidget, "stop")
     hidden = stop is not None and stop.visibleRegion().boundingRect() != stop.rect()
     gone = ["STOP is not wholly in sight"] if hidden else []
-    return [*gone, *cut_off(root), *scrolled_twice(root), *nameless(root)]
+    return [*gone, *cut_off(root), *scrolled_twice(root), *nameless(root), *tabbed(root)]
 
 
 def cut_off(root: QWidget) -> Iterator[str]:
@@ -97,6 +99,32 @@ def nameless(root: QWidget) -> Iterator[str]:
             yield f"{_where(part)}: has no name ({part.toolTip()!r})"
         if isinstance(part, QAbstractButton) and part.focusPolicy() == Qt.FocusPolicy.NoFocus:
             yield f"{_where(part)}: {_words(part)!r} cannot be reached by keys"
+        if isinstance(part, QAbstractButton) and not part.toolTip():
+            yield f"{_where(part)}: {_words(part)!r} has no tool tip"
+
+
+def tabbed(root: QWidget) -> Iterator[str]:
+    """Yield what Tab does wrong: stops that nobody sees, that have no name, parts that it leaves out."""
+    stops = list(stops_of(root.window()))
+    for stop in stops:
+        if stop.visibleRegion().isEmpty() and not _scrolled_away(stop):
+            yield f"{_where(stop)}: the keyboard goes there, and nobody sees it"
+        if not QAccessible.queryAccessibleInterface(stop).text(QAccessible.Text.Name).strip():
+            yield f"{_where(stop)}: the keyboard goes there, and it has no name"
+    for part in _visible(root, *_WITH_KEYS):
+        if part.objectName().startswith("qt_") or isinstance(part.parentWidget(), QTabBar | QComboBox):
+            continue
+        by_arrows = isinstance(part, QAbstractButton) and part.group() is not None
+        if part.isEnabled() and not by_arrows and part not in stops:
+            yield f"{_where(part)}: Tab does not come to {_words(part) if hasattr(part, 'text') else ''!r}"
+
+
+def _scrolled_away(part: QWidget) -> bool:
+    """Whether a part is out of sight only because its form is scrolled elsewhere."""
+    around = part.parentWidget()
+    while around is not None and not isinstance(around, QScrollArea):
+        around = around.parentWidget()
+    return around is not None and (not around.visibleRegion().isEmpty() or _scrolled_away(around))
 
 
 def _visible(root: QWidget, *kinds: type[QWidget]) -> Iterator[QWidget]:

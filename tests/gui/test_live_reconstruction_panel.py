@@ -84,8 +84,10 @@ def test_a_picture_of_noise_is_called_so_by_its_own_frame_and_an_old_one_old(
     assert not panel.view.caution
     session = window.session
     session.bench.scene_off()
-    qtbot.waitUntil(lambda: panel.view.caution.startswith("Noise only"), timeout=WAIT_MS)
-    assert "Noise only" in panel.status.text()
+    qtbot.waitUntil(lambda: panel.view.caution.startswith("Dark"), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: "Dark" in panel.status.text(), timeout=WAIT_MS)
+    assert panel.view.image is not None
+    assert not panel.view.image.any(), "noise that is stretched looks like a picture"
     session.bench.scene_on()
     qtbot.waitUntil(lambda: not panel.view.caution, timeout=WAIT_MS)
     held = threading.Event()
@@ -303,7 +305,7 @@ def test_a_preview_that_is_ended_and_begun_again_stays_one(
     reconstructor, inside, most, fed = panel.loaded.reconstructor, [0], [0], [0]
     feed, lock = reconstructor.feed, threading.Lock()
 
-    def slowly(image: Any) -> Any:
+    def slowly(image: Any, **known: Any) -> Any:
         with lock:
             inside[0] += 1
             most[0] = max(most[0], inside[0])
@@ -311,7 +313,7 @@ def test_a_preview_that_is_ended_and_begun_again_stays_one(
         with lock:
             inside[0] -= 1
             fed[0] += 1
-        return feed(image)
+        return feed(image, **known)
 
     monkeypatch.setattr(reconstructor, "feed", slowly)
     qtbot.waitUntil(lambda: inside[0] == 1, timeout=WAIT_MS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from calibration_routines.psf.sweep_procedure import SweepProcedure
 from gui.main_window import MainWindow
 from gui.panels.runs import RunsPanel
 from gui.panels.sweeps import SweepsPanel
+from gui.widgets.tab_order import stops_of
 from instrument.runs.run import Run, RunCondition
 
 LEFT = Qt.MouseButton.LeftButton
@@ -316,6 +318,12 @@ def test_every_routine_can_be_reached_by_the_keyboard(qtbot: QtBot, panel: Sweep
             assert widget.accessibleName()
             assert widget.toolTip() or isinstance(widget, QWidget)
         wait_for_check(qtbot, panel)
+        own = [stop for stop in stops_of(panel.window()) if panel.isAncestorOf(stop)]
+        form = [panel.choice, *(stop for stop in own if panel.view.isAncestorOf(stop)), panel.verdict]
+        down = [widget.mapTo(panel, widget.rect().center()).y() for widget in form]
+        assert all(after > before - 5 for before, after in pairwise(down)), f"{routine.name}: Tab jumps up"
+        begins = own.index(panel.choice)
+        assert own[begins : begins + len(form)] == form, routine.name
         qtbot.keyClick(panel.choice, Qt.Key.Key_Down)
 
 

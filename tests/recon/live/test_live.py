@@ -10,7 +10,7 @@ import pytest
 from recon import Calibration, InputError, NoiseModel, reconstruct
 from recon.base.metrics import psnr
 from recon.streams.live import LiveReconstructor
-from recon.streams.live_picture import NOISE_ONLY, Level, LivePicture
+from recon.streams.live_picture import DARK, NOISE_ONLY, Level, LivePicture
 from recon.streams.pace import HOLD, Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch, has_light
 
@@ -559,6 +559,12 @@ def test_a_frame_of_noise_is_called_so_and_one_with_light_is_not() -> None:
     assert psnr(picture.image, reference.image) > 40
     for frame in dark[4:]:
         assert reconstructor.feed(frame).doubt == NOISE_ONLY
+    black = reconstructor.feed(dark[4], lit=False)
+    assert black.quality == black.doubt == DARK
+    assert black.image.shape == refined.image.shape
+    assert not black.image.any()
+    assert reconstructor.refine() is None, "there is nothing to go on with"
+    assert reconstructor.feed(photograph(0, 1), lit=False).doubt == "", "a lamp that nobody told of is seen"
 
 
 @pytest.mark.parametrize("side", [16, 24])

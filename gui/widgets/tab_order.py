@@ -1,0 +1,87 @@
+"""The order in which Tab goes through a panel: as its parts stand, whenever they were made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import (
+    QAbstractScrollArea,
+    QComboBox,
+    QFormLayout,
+    QLayout,
+    QLineEdit,
+    QScrollArea,
+    QSplitter,
+    QStackedWidget,
+    QTabBar,
+    QTabWidget,
+    QWidget,
+)
+
+
+def tab_in_order(root: QWidget) -> None:
+    """Have Tab go through what a widget holds from top to bottom and from left to right.
+
+    Qt goes in the order in which widgets got their place, which in panels made a part at a time is none that
+    anybody sees.
+    """
+    stops = [part for part in _in_order(root) if part.focusPolicy() & Qt.FocusPolicy.TabFocus]
+    for before, after in pairwise(stops):
+        QWidget.setTabOrder(before, after)
+
+
+def stops_of(window: QWidget) -> Iterator[QWidget]:
+    """Yield what Tab stops at in a window, from its beginning."""
+    part = window.nextInFocusChain()
+    while part is not None and part is not window:
+        takes = part.focusPolicy() & Qt.FocusPolicy.TabFocus and part.focusProxy() is None
+        if takes and part.isVisible() and part.isEnabled():
+            yield part
+        part = part.nextInFocusChain()
+
+
+def _in_order(part: QWidget) -> Iterator[QWidget]:
+    yield part
+    for inner in _inside(part):
+        yield from _in_order(inner)
+
+
+def _inside(part: QWidget) -> Iterator[QWidget]:
+    """Yield a widget's own children as they stand in it."""
+    match part:
+        case QSplitter() | QStackedWidget() | QTabWidget():
+            if isinstance(part, QTabWidget):
+                yield part.tabBar()
+            pages = (part.widget(number) for number in range(part.count()))
+            yield from (page for page in pages if page is not None)
+        case QScrollArea():
+            if (held := part.widget()) is not None:
+                yield held
+        case QAbstractScrollArea() | QComboBox() | QLineEdit() | QTabBar():
+            pass  # one stop, whatever it is made of
+        case _:
+            layout = part.layout()
+            if layout is not None:
+                yield from _laid_out(layout)
+            else:
+                own = (child for child in part.children() if isinstance(child, QWidget))
+                yield from (child for child in own if not child.isWindow())
+
+
+def _laid_out(layout: QLayout) -> Iterator[QWidget]:
+    """Yield the widgets of a layout and of those in it, in their order; of a form row by row."""
+    items = [layout.itemAt(number) for number in range(layout.count())]
+    if isinstance(layout, QFormLayout):
+        roles = (QFormLayout.ItemRole.LabelRole, QFormLayout.ItemRole.FieldRole)
+        rows = [[layout.itemAt(row, role) for role in roles] for row in range(layout.rowCount())]
+        spanning = [layout.itemAt(row, QFormLayout.ItemRole.SpanningRole) for row in range(layout.rowCount())]
+        items = [item for row, whole in zip(rows, spanning, strict=True) for item in (*row, whole)]
+    for item in items:
+        if item is None:
+            continue
+        if (widget := item.widget()) is not None:
+            yield widget
+        elif (inner := item.layout()) is not None:
+            yield from _laid_out(inner)
