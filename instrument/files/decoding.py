@@ -148,6 +148,21 @@ def _decode_npz(path: Path) -> Decoded:
         raise FileError(path, f"is no .npz with one plain array: {error}.") from None
 
 
+_OPENCV_KNOWS = {
+    tifffile.COMPRESSION[name]
+    for name in (
+        "NONE",
+        "CCITTRLE",
+        "CCITTFAX3",
+        "CCITTFAX4",
+        "LZW",
+        "JPEG",
+        "ADOBE_DEFLATE",
+        "PACKBITS",
+        "DEFLATE",
+    )
+}
+_LOSSY = "JPEG is lossy and usually gamma-coded: prefer raw frames"
 _WHOLE_BYTES = (1, 8, 16, 32, 64)
 _ORIENTATION = 274
 
@@ -183,7 +198,7 @@ def _decode_tiff(path: Path) -> Decoded:
     except FileError:
         raise
     except Exception as error:  # noqa: BLE001 - a damaged TIFF raises nearly anything
-        if "imagecodecs" in str(error):  # a compression that only OpenCV knows here
+        if "imagecodecs" in str(error) or isinstance(error, ImportError):  # OpenCV knows more compressions
             return _decode_compressed(path)
         raise FileError(path, f"is a damaged or unusual TIFF: {error}.") from None
 
@@ -195,8 +210,14 @@ def _decode_compressed(path: Path) -> Decoded:
         pages = [page.index for page in series.pages if page is not None]
         axes, lead = series.axes, series.shape[: -series.keyframe.ndim]
         turned = int(series.keyframe.tags.valueof(_ORIENTATION, 1))
-    said = (_turned(turned),) if 2 <= turned <= 8 else ()  # OpenCV turns it
+        kind = tifffile.COMPRESSION(series.keyframe.compression)
+    said: tuple[str, ...] = (_turned(turned),) if 2 <= turned <= 8 else ()  # OpenCV turns it
+    said += (_LOSSY,) if kind is tifffile.COMPRESSION.JPEG else ()
     data = reading.read_bytes(path, _MOST_PICTURE_BYTES)
+    if kind not in _OPENCV_KNOWS:
+        raise FileError(
+            path, f"is compressed as {kind.name}, which is not read.", "Save it as LZW, or plain."
+        )
     if len(pages) == 1:
         array, notes = _decode_with_opencv(path, data)
         return array, (*notes, *said)
@@ -278,7 +299,7 @@ def _decode_with_opencv(path: Path, data: bytes) -> Decoded:
     array = _rgb(array)
     notes = []
     if data.startswith(_JPEG_MAGIC):
-        notes.append("JPEG is lossy and usually gamma-coded: prefer raw frames")
+        notes.append(_LOSSY)
     if 2 <= (turned := _exif_orientation(data)) <= 8:
         array = _upright(array, turned, "YXS")
         notes.append(_turned(turned))

@@ -150,6 +150,14 @@ def test_numbers_that_look_like_a_jpegs_header_are_no_size(tmp_path: Path) -> No
     assert read_image(tmp_path / "a.jpg").pixels.shape == (8, 8)
 
 
+def test_a_compression_that_nothing_here_knows_is_named(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", PICTURE)
+    with tifffile.TiffFile(tmp_path / "a.tif", mode="r+b") as tiff:
+        tiff.pages.first.tags["Compression"].overwrite(50000)
+    with pytest.raises(FileError, match="compressed as ZSTD"):
+        read_image(tmp_path / "a.tif")
+
+
 def test_a_jpeg_that_says_it_is_huge_is_refused_undecoded(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     Image.fromarray(np.full((8, 8), 100, np.uint8)).save(path)
