@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 import weakref
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -346,6 +349,22 @@ def test_a_fresh_frame_was_exposed_wholly_after_it_was_asked_for(
             assert number_of(stream.fresh()) > exposing
     with pytest.raises(StoppedError):
         stream.fresh()
+
+
+def test_a_fresh_frame_is_the_first_after_all_that_can_have_been_on_their_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for buffers, in_flight in ((4, 2), (7, 0)):
+        camera = FreeRunningCamera()
+        monkeypatch.setattr(FreeRunningCamera, "frames_in_flight", in_flight)
+        stream = FrameStream(camera, buffers)
+        numbers = itertools.count()
+        reader = SimpleNamespace(next_frame=lambda _, numbers=numbers: next(numbers))
+        monkeypatch.setattr(stream, "reader", lambda reader=reader: reader)
+        old = [*range(buffers), *range(in_flight), "the one being exposed"]
+        for asked in range(2):
+            found: Any = stream.fresh()
+            assert found == asked * (len(old) + 1) + len(old)
 
 
 def test_a_fresh_frame_of_a_silent_camera_is_not_waited_for_forever(

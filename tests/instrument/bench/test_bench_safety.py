@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 
 import pytest
@@ -12,7 +12,7 @@ import pytest
 from drivers.errors import DeviceError, DeviceLostError, LimitError, StoppedError
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
-from instrument.bench.safety import StepsFailedError, stop_until
+from instrument.bench.safety import StepsFailedError, stop_until, try_all
 from instrument.files.errors import BenchError, OperatorNeededError
 from tests.mocks.devices import MockDevice, MockWorld
 
@@ -85,6 +85,26 @@ def test_when_everything_fails_everything_is_still_tried_and_named() -> None:
         bench.close()
     assert calls(bench)[len(KINDS) :] == SAFE_STEPS + CLOSING
     assert len(caught.value.failures) == 8
+
+
+def test_the_first_interruption_is_the_one_that_is_raised_once_all_was_tried() -> None:
+    tried: list[str] = []
+
+    def step(name: str, error: BaseException | None) -> tuple[str, Callable[[], None]]:
+        def run() -> None:
+            tried.append(name)
+            if error is not None:
+                raise error
+
+        return name, run
+
+    first = KeyboardInterrupt()
+    errors = {"fails": OSError("broken"), "first": first, "second": SystemExit(3), "works": None}
+    with pytest.raises(KeyboardInterrupt) as caught:
+        try_all([step(name, error) for name, error in errors.items()])
+    assert caught.value is first
+    assert tried == list(errors)
+    assert all(name in first.__notes__[0] for name in ("fails", "broken", "first", "second"))
 
 
 def test_an_error_inside_the_context_stays_the_error_and_carries_what_could_not_be_made_safe() -> None:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 from unittest.mock import Mock
 
 import pytest
@@ -15,11 +15,11 @@ import pytest
 from drivers.errors import LimitError, StoppedError
 from instrument.bench.bench import Bench
 from instrument.files.errors import FileError
-from instrument.plan import Light, Plan
+from instrument.plan import Light, Plan, Step
 from instrument.runs import runner as module
 from instrument.runs.acquire import abilities_of, free_bytes
 from instrument.runs.run import FinishReason
-from instrument.runs.runner import Runner, RunState, RunStatus, StepSettings
+from instrument.runs.runner import Runner, RunState, RunStatus, StepSettings, discarded
 from tests.instrument.runs.test_runner import calls, open_mock_bench, plan
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")
@@ -288,3 +288,34 @@ def test_a_step_brings_light_and_stage_to_what_it_says(bench: Bench) -> None:
     assert bench.stage.position()["z_um"] == 20.0
     settings._set_light(Light(kind="off"))
     assert bench.led_array.pattern.is_dark
+
+
+def test_only_what_differs_is_set_and_a_move_forgets_where_stage_and_source_were() -> None:
+    bench = Mock()
+    settings = StepSettings(bench)
+    names = "exposure_ms", "gain", "source_um", "stage", "slm_image", "scene_lit", "light"
+
+    def done(**wanted: Any) -> list[str]:
+        bench.reset_mock()
+        for action in settings.actions(cast(Step, SimpleNamespace(**dict.fromkeys(names) | wanted))):
+            action()
+        return [name for name, *_ in bench.mock_calls]
+
+    here, moved, placed = (0.0, 0.0, 1.0), ["stage.move_to"], ["place_source"]
+    assert done(scene_lit=True, source_um=here) == [*placed, "scene_on"]
+    assert done(scene_lit=True, source_um=here, exposure_ms=1.0) == ["camera.set_exposure_ms"]
+    assert done(scene_lit=False, source_um=here) == ["scene_off"]
+    assert done(stage={"z_um": 1.0}) == moved
+    assert done(stage={"z_um": 1.0}) == []
+    assert done(source_um=here) == placed
+    assert done(stage={"z_um": 1.0}) == moved
+
+
+def test_a_run_that_is_not_carried_out_is_closed(bench: Bench) -> None:
+    runner, writer = made(bench, plan())
+    with pytest.raises(ZeroDivisionError), discarded(runner):
+        raise ZeroDivisionError
+    writer.close.assert_called_once_with()
+    with discarded(runner):
+        pass
+    writer.close.assert_called_once_with()

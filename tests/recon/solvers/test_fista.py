@@ -121,3 +121,48 @@ def test_resumes_from_a_checkpoint_exactly(problem):
 def test_rules_need_an_end():
     with pytest.raises(ValueError, match="needs an end"):
         StoppingRules(iterations=None, tolerance=0)
+
+
+def literal(operator, data, prior, *, initial, restart, accelerate, step, iterations):
+    """Beck & Teboulle 2009 with the restarts of O'Donoghue & Candès 2015, as they are written."""
+    step = 1 / operator.norm_bound**2 if step is None else step
+    x = before = np.zeros(operator.domain_shape) if initial is None else initial
+    t, last, restarts, told = 1.0, np.inf, 0, []
+    for _ in range(iterations):
+        t_next = (1 + np.sqrt(1 + 4 * t**2)) / 2 if accelerate else 1.0
+        y = x + (t - 1) / t_next * (x - before)
+        new = prior.prox(y - step * operator.adjoint(operator.forward(y) - data), step)
+        against = np.vdot(y - new, new - x) > 0
+        before, x = x, new
+        residual = np.linalg.norm(operator.forward(x) - data)
+        objective = 0.5 * residual**2 + prior.value(x)
+        again = against if restart == "gradient" else objective > last if restart == "function" else False
+        t, last, restarts = 1.0 if again else t_next, objective, restarts + again
+        size = np.linalg.norm(x)
+        told.append((objective, residual, np.linalg.norm(x - before) / size if size else 0.0))
+    return x, told, restarts
+
+
+@pytest.mark.parametrize("restart", ["function", "gradient", "none"])
+@pytest.mark.parametrize(
+    ("accelerate", "step", "begun"), [(True, None, False), (True, 1e-3, True), (False, None, True)]
+)
+def test_every_iterate_is_that_of_the_papers(problem, restart, accelerate, step, begun):
+    operator, data = problem
+    options = {"initial": np.full(operator.domain_shape, 0.2) if begun else None, "accelerate": accelerate}
+    options |= {"restart": restart, "step": step}
+    prior = L1(0.02) + NonNegativity()
+    x, told, restarts = literal(operator, data, prior, iterations=150, **options)
+    out = Fista(operator, data, prior, **options).run(StoppingRules(iterations=150, tolerance=0))
+    np.testing.assert_allclose(out.solution, x, rtol=1e-7, atol=1e-9)
+    records = [(record.objective, record.data_residual, record.change) for record in out.history]
+    np.testing.assert_allclose(records, told, rtol=1e-6, atol=1e-9)
+    assert (restarts > 0) == (restart != "none" and accelerate and step is None)
+
+
+def test_an_operator_that_sees_nothing_and_a_dark_object_divide_by_nothing(problem):
+    operator, data = problem
+    dark = Convolution(np.zeros((1, 4, 5)), (6, 5), dtype=np.float64)
+    assert dark.norm_bound == 0
+    assert Fista(dark, data, Zero()).step_length == 1.0
+    assert Fista(operator, 0 * data, NonNegativity()).step().change == 0.0

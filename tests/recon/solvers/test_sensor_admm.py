@@ -303,3 +303,29 @@ def test_new_penalties_keep_split_variables_and_multipliers():
     assert splits.solution() == pytest.approx(before)
     after = splits.mu[1][:, None, None] * (splits.t_w - splits.solution())
     assert after == pytest.approx(multipliers)
+
+
+def test_data_that_are_no_numbers_end_the_run_and_a_direction_that_leads_nowhere_is_not_gone(monkeypatch):
+    operator, data = problem()
+    spoilt = data.copy()
+    spoilt[0, 3, 3] = np.nan
+    with np.errstate(all="ignore"):
+        assert run(operator, spoilt, PRIORS["tv"]).stop_reason is StopReason.NOT_FINITE
+    solver = SensorAdmm(operator, data, NonNegativity())
+    for preconditioned in (np.zeros_like, np.negative):  # as rounding may have it where nothing is left
+        monkeypatch.setattr(
+            CosinePreconditioner, "apply", lambda _, r, out, f=preconditioned: np.copyto(out, f(r)) or out
+        )
+        solver.step()
+        assert not solver._e.any()
+
+
+def test_the_penalties_are_balanced_within_bounds_and_for_a_dark_object_too():
+    operator, data = problem(2)
+    solver = SensorAdmm(operator, 0 * data, PRIORS["tv"])
+    solver.iteration = 12  # the data's gradient has no object to be measured against
+    solver._splits.balanced_penalties = lambda: np.array([[2.0, 1e9], [1e-9, 3.0]])
+    solver._mu[...] = [[1.0, 1.0], [1.0, 1.0]]
+    assert solver._balanced_penalties().tolist() == [[2.0, 10.0], [2.0 * 0.03, 3.0]]
+    solver._mu[...] = [[1.0, 0.0], [1.0, 1e-4]]
+    assert solver._balanced_penalties().tolist() == [[2.0, 0.0], [2.0 * 0.03, 1e-2]]
