@@ -158,7 +158,6 @@ class RunWriter:
     def __init__(self, path: Path, held: contextlib.ExitStack) -> None:
         self.path = path
         self.mended: tuple[str, ...] = ()
-        self._is_continued = False
         self._held = held
         try:
             run = Run.open(path)
@@ -242,7 +241,7 @@ class RunWriter:
                 held.close()
                 raise
             writer = cls(path, held)
-            writer.mended, writer._is_continued = tuple(mended), True
+            writer.mended = tuple(mended)
         return writer
 
     def start(self, **fields: Any) -> None:
@@ -264,8 +263,7 @@ class RunWriter:
                 array = self._array or self._make_array(frames)
                 if self._is_recording and (last := max(f.index for f in frames)) >= array.n_frames:
                     array.resize(max(last + 1, 2 * array.n_frames))
-                if self._is_continued:
-                    self._keep_images(array, frames)
+                self._keep_images(array, frames)
                 images = [(f.index, f.image.astype(np.float32) if self._float else f.image) for f in frames]
                 stored = array.write(images)
                 self._log.append(
@@ -304,13 +302,13 @@ class RunWriter:
 
     def _describe(self) -> None:
         """Let the array say what the log tells of its frames; a recording's has as many as there are."""
-        run = Run.open(self.path)
-        if self._array is None or (run.plan is not None and not run.records):
+        if self._array is None:
             return
-        if not run.records:
+        run = Run.open(self.path)
+        if run.records:
+            self._array.describe(*descriptions(run, run.n_frames))
+        elif run.plan is None:
             self._array.resize(run.n_frames)
-        else:
-            self._array.describe(*descriptions(run, run.n_frames if run.plan is None else len(run.plan)))
 
     def finish(self, reason: FinishReason, error: str = "") -> Run:
         """Say how the run ended, close its files, and return it for reading.

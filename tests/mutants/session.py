@@ -214,7 +214,7 @@ class Trials:
             if not chosen:
                 self.fates.append((area, mutant, "no test"))
                 continue
-            limit_s = 15.0 + 15.0 * total_s
+            limit_s = 15.0 + 8.0 * total_s
             with_none = [None] if number % _NO_MUTANT_EVERY == 0 else []
             for what in (mutant, *with_none):
                 self._gather(children, self._jobs - 1)

@@ -135,7 +135,7 @@ def test_a_page_shows_twelve_frames_spread_evenly_and_what_is_saturated(
     pages: list[tuple[Figure, Path]] = []
     monkeypatch.setattr(inspection, "save_figure", lambda figure, path: pages.append((figure, path)))
     monkeypatch.setattr(inspection, "as_seen", lambda frame, raw: np.where(frame > 51, 102, 51) * raw)
-    frames = np.zeros((30, 6, 1290), np.uint16)
+    frames = np.zeros((30, 6, 1280), np.uint16)
     frames[:, 2:, 0] = 62  # of six significant bits; full scale is 63
     frames[:, 4:, 0] = 63
     run = a_run(
@@ -162,11 +162,13 @@ def test_a_page_shows_twelve_frames_spread_evenly_and_what_is_saturated(
     ]
     assert figure.axes[0].get_title() == "1 step 1  10 ms\noff"
     assert figure.axes[1].get_title() == "4   10 ms\noff"
+    assert figure.axes[0].title.get_fontsize() == 8
     assert not figure.axes[0].axison
     picture = figure.axes[0].images[0].get_array()
     assert picture is not None
-    assert picture.shape == (3, 645, 3)
+    assert picture.shape == (3, 640, 3)
     np.testing.assert_allclose(picture[:, 0], [(0.2,) * 3, (0.4,) * 3, (1, 0, 0)])
+    assert inspection._shown(run, 1).max() == 1
 
     run.frame = lambda _: np.stack([frames[0, :, :320]] * 2 + [frames[0, :, 320:640]], axis=2)
     monkeypatch.setattr(inspection, "as_seen", lambda frame, raw: np.full(frame.shape, 51))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import os
+import shutil
 import threading
 from concurrent.futures import Future, wait
 from pathlib import Path
@@ -24,6 +26,7 @@ from instrument.runs.log import Gap
 from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_files import RunError
 from instrument.runs.writer import RunWriter
+from tests.instrument.files.test_atomic import open_below
 from tests.instrument.runs.test_store import BENCH, frame
 
 
@@ -37,6 +40,8 @@ def test_an_array_says_what_it_holds(shape: tuple[int, ...], axes: list[str], da
     assert described["shape"] == [5, *sides]
     assert described["chunk_grid"]["configuration"]["chunk_shape"] == [1, *sides]
     assert described["dimension_names"] == axes
+    endian = {} if data_type == "uint8" else {"configuration": {"endian": "little"}}
+    assert described["codecs"] == [{"name": "bytes"} | endian]
     array = FrameArray(Path("nowhere"), described)
     assert (array.n_frames, array.frame_shape, array.is_colour) == (5, shape, len(shape) == 3)
     assert array.frame_bytes == np.prod(shape) * np.dtype(data_type).itemsize
@@ -44,6 +49,7 @@ def test_an_array_says_what_it_holds(shape: tuple[int, ...], axes: list[str], da
 
 @pytest.mark.parametrize("shape", [[5, 6], [5, 3, 6, 8, 1], [5, 0, 8], [5, 3, 6, 0]])
 def test_what_no_frames_have_is_refused(shape: list[int]) -> None:
+    assert FrameArray(Path("nowhere"), description_of(1, (1, 1), "uint16")).frame_bytes == 2
     with pytest.raises(ValueError, match="no frames have the shape"):
         FrameArray(Path("nowhere"), {**description_of(1, (6, 8), "uint16"), "shape": shape})
     with pytest.raises(ValueError, match="and the type 'int64'"):
@@ -132,21 +138,39 @@ def test_an_array_keeps_what_was_written_and_nothing_half_written(
     assert scale["datasets"][0]["coordinateTransformations"][0]["scale"] == [1, 2.5, 2.5]
     assert [axis["name"] for axis in scale["axes"]] == ["t", "y", "x"]
     images = {index: frame(index).image for index in (10, 2)}
-    before = len(list(Path("/proc/self/fd").iterdir()))
+    others = set(threading.enumerate())
     stored = array.write(list(images.items()))
     with monkeypatch.context() as fails:
         fails.setattr(SyncPool, "files", lambda *_: (_ for _ in ()).throw(OSError("no disk")))
         with pytest.raises(OSError, match="no disk"):
             array.write([(3, images[2])])
-    with monkeypatch.context() as fails:
-        fails.setattr("os.write", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
-        with pytest.raises(OSError, match="disk full"):
-            array.write([(4, images[2])])
-    assert len(list(Path("/proc/self/fd").iterdir())) <= before
+
+    def fail(words: str) -> None:
+        if words == "folder gone":
+            shutil.rmtree(array.chunk_path(4).parent)
+        raise OSError(words)
+
+    for words in ("disk full", "folder gone"):
+        for owner, name in ((SyncPool, "files"), (os, "write")):
+            with monkeypatch.context() as fails:
+                fails.setattr(owner, name, lambda *_, words=words: fail(words))
+                with pytest.raises(OSError, match=words):
+                    array.write([(4, images[2])])
+            assert not list(array.path.rglob("part"))
+    assert not open_below(tmp_path)
+    for _ in range(2):
+        array.close()
+    array.write([(3, images[2])])  # a pool of its own again
     array.close()
-    array.close()
+    assert not [one for one in set(threading.enumerate()) - others if one.name.startswith("sync")]
+    array.chunk_path(3).unlink()
+    array.describe(description_of(13, (6, 8), "uint16"), json.loads((array.path / "zarr.json").read_text()))
+    assert (array.n_frames, FrameArray(array.path).n_frames) == (13, 13)
+    array.resize(12)
+    assert (array.n_frames, FrameArray(array.path).n_frames) == (12, 12)
     assert [chunk.n_bytes for chunk in stored] == [96, 96]
     assert array.checksum(10) == stored[0]
+    assert not array.chunk_path(10).stat().st_mode & 0o111
     assert FrameArray.indices(array.path) == [2, 10]
     assert FrameArray.indices(tmp_path) == []
     assert not list(array.path.rglob("part"))
@@ -199,6 +223,9 @@ def test_a_plan_without_slm_images_makes_no_folder_for_them_and_others_are_copie
 
 
 def test_a_broken_checkout_has_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as answered:
+        answered.setattr(writer.subprocess, "run", lambda *_, **how: SimpleNamespace(stdout="abc-dirty\n"))
+        assert writer.git_commit() == ("abc-dirty" if (Path(__file__).parents[3] / ".git").exists() else None)
     monkeypatch.setattr(writer, "__file__", str(tmp_path / "instrument" / "runs" / "writer.py"))
     assert writer.git_commit() is None
     (tmp_path / ".git").mkdir()
@@ -210,12 +237,8 @@ def test_a_closed_run_has_no_open_file_and_no_thread(tmp_path: Path) -> None:
 
     def left() -> tuple[list[str], list[str]]:
         """Return the files of this run, and the threads, that are there now: other tests may leave theirs."""
-        files = []
-        for handle in Path("/proc/self/fd").iterdir():
-            with contextlib.suppress(OSError):  # it was closed since it was listed
-                files.append(str(handle.readlink()))
         threads = [t.name for t in set(threading.enumerate()) - before if t.name.startswith("sync")]
-        return [file for file in files if file.startswith(str(tmp_path))], threads
+        return open_below(tmp_path), threads
 
     with RunWriter.create(tmp_path, label="r", bench=BENCH) as opened:
         opened.start()
@@ -247,3 +270,80 @@ def test_a_recording_that_ends_before_its_first_frame_has_none(tmp_path: Path) -
         run = opened.finish(FinishReason.COMPLETED)
     assert run.n_frames == 0
     assert run.missing() == []
+
+
+def test_a_run_that_is_not_given_is_let_go_and_one_that_goes_on_ends_anew(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path / "a" / "b", label="r", bench=BENCH) as opened:
+        opened.start()
+        opened.write([frame(0)])
+        path = opened.finish(FinishReason.STOPPED, "why").path
+    with pytest.raises(RunError, match="was written to while it was looked at"):
+        RunWriter.reopen(path, log_bytes=1)
+    (path / "bench.toml").write_text("changed")
+    for start, reason in ((False, FinishReason.STOPPED), (True, FinishReason.COMPLETED)):
+        ended = Run.open(path).state["finished_utc"]
+        with RunWriter.reopen(path, log_bytes=Run.open(path).log_bytes) as again:
+            assert len(again.mended) == (not start)
+            if start:
+                again.start()
+                state = Run.open(path).state
+                assert (state["state"], state["reason"], state["error"]) == ("running", None, "")
+                again.write([frame(0)])  # in its own place
+            state = again.finish(reason).state
+        assert (state["finished_utc"] == ended) != start
+        assert state["reason"] == reason
+        assert Run.open(path).events[-1]["descriptions"] == Run.open(path).array.description_sums()
+    assert len(list((path / "kept").iterdir())) == 2
+    (path / "provenance.json").unlink()
+    (path / "log.jsonl").write_bytes(b"")
+    for _ in range(2):  # the first try leaves no lock
+        with pytest.raises(RunError, match=r"provenance.json: is gone"):
+            RunWriter.reopen(path)
+
+
+def test_frames_of_one_batch_may_lie_far_apart_and_an_array_without_frames_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as opened:
+        opened.write([frame(0)])
+        opened.write([frame(300), frame(1)])
+        assert verify(Run.open(opened.path)).frames == 3
+    for plan, n_frames in ((None, 0), (Plan(label="p", parts=(Part(label="a", repeats=4),)), 4)):
+        with RunWriter.create(tmp_path, label="q", bench=BENCH, plan=plan) as opened:
+            with monkeypatch.context() as fails:
+                fails.setattr("instrument.runs.log.AppendOnlyLog.append", lambda *_: 1 / 0)
+                with pytest.raises(ZeroDivisionError):
+                    opened.write([frame(2)])
+            assert opened.finish(FinishReason.FAILED).array.n_frames == n_frames
+
+
+@pytest.mark.parametrize(
+    ("folder", "file", "error"),
+    [
+        (True, True, None),
+        (None, True, None),
+        (False, True, RunError),
+        (True, False, RunError),
+        (True, None, OSError),
+    ],
+)
+def test_a_run_is_held_by_its_folder_and_its_file_or_where_folders_have_no_locks_by_its_file(
+    folder: bool | None,
+    file: bool | None,
+    error: type[Exception] | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def lock(handle: int) -> bool:
+        free = folder if Path(f"/proc/self/fd/{handle}").is_dir() else file
+        if free is None:
+            raise OSError(errno.ENOLCK, "no locks here")
+        return free
+
+    monkeypatch.setattr(writer, "lock", lock)
+    with pytest.raises(error) if error else contextlib.nullcontext():
+        held = writer.lock_run(tmp_path)
+        assert len(open_below(tmp_path)) == 2
+        held.close()
+    assert not open_below(tmp_path)
+    assert (tmp_path / "lock").exists() == (folder is not False)
