@@ -3,10 +3,13 @@
     python benchmarks/gpu.py --out docs/benchmarks/gpu.md       with a CUDA GPU and the extra [gpu]
     python benchmarks/gpu.py --numpy --sizes 32 --depths 1 4    a trial: NumPy plays the GPU's library
 
-Pictures (``--depths 1``) and volumes by total variation and by l1 with default solvers, one PSF a depth, a
-fixed number of iterations, nothing chosen and nothing judged. Each case runs once before it is timed.
-``--sizes 1024 --depths 128`` is a grid of 2048 x 2048 x 128. Of pictures each goes its own way to one end:
-they are near each other only after many iterations (``--iterations 300``: 0.5 % at 24 x 24).
+Pictures (``--depths 1``) and volumes by total variation and by l1 through one PSF a depth; by total variation
+through nine PSFs a depth too, by the local and the low-rank model; a video's frames, each from where the one
+before ended; live pictures of one frame. Default solvers, a fixed number of iterations, nothing chosen and
+nothing judged; each case runs once before it is timed. Kinds beside one PSF are measured up to
+``--most-depths``. ``--sizes 1024 --depths 128 --only tv l1`` is a grid of 2048 x 2048 x 128. Of pictures each
+goes its own way to one end: they are near each other only after many iterations (``--iterations 300``: 0.5 %
+at 24 x 24). Holograms have no code for a GPU.
 """
 
 from __future__ import annotations
@@ -17,6 +20,9 @@ import datetime
 import importlib.util
 import platform
 import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,44 +31,120 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.volume_speed import lenslet_psfs
-from recon import Calibration, Reconstruction, reconstruct
+from recon import Calibration, Geometry, reconstruct
 from recon.base.threads import get_threads
+from recon.reconstruction.options import ReconstructionOptions
+from recon.streams.live import LiveReconstructor
+from recon.streams.video import VideoSolver, stream_problem
 
-PRIORS = ("tv", "l1")
 GIB = 2**30
+FRAMES = 4
+"""Of a video, the first of which begins cold and is not timed."""
 
 
-def solved(size: int, depths: int, prior: str, device: str, iterations: int) -> Reconstruction:
-    """Return the timed run of a case."""
-    psfs = lenslet_psfs(size, depths)
-    rng = np.random.default_rng(1)
-    shifts = rng.integers(-size // 5, size // 5 + 1, (30, 2))
-    light = sum(np.roll(psfs[k % depths, 0], tuple(way), (0, 1)) for k, way in enumerate(shifts))
-    image = rng.poisson(100 * light).astype(np.float32)
-    z_um = 1e4 / np.linspace(1.0, 0.3, depths)
-    places = np.column_stack([np.zeros((depths, 2)), z_um])
-    asked: dict[str, Any] = {"prior": prior, "model": "convolution", "noise": 1.0, "tolerance": 0.0}
-    asked |= {"estimate_background": False, "drop_empty": False, "judged": False, "device": device}
-    for count in (1, iterations):  # the first compiles, and plans transforms
-        found = reconstruct(image, Calibration(psfs, places), iterations=count, **asked)
-    return found
+@dataclass(frozen=True)
+class Case:
+    """A size, and what is seen there."""
+
+    size: int
+    depths: int
+    iterations: int
+
+    def calibration(self, psfs: int = 1) -> Calibration:
+        """Return lenslets' PSFs; of several a depth each as bright as its place in the field is."""
+        own = lenslet_psfs(self.size, self.depths)
+        z_um = 2e4 / np.linspace(1.0, 0.6, self.depths)
+        places = [(x, y) for y in range(psfs) for x in range(psfs)]
+        offsets = (np.array(places, np.float64) - (psfs - 1) / 2) * 1e3
+        every = [(p, z, xy) for p, z in zip(own, z_um, strict=True) for xy in offsets]
+        y, x = np.mgrid[: self.size, : self.size] / self.size - 0.5
+        stack = [p * np.exp(1e-3 * (xy[0] * x + xy[1] * y)).astype(np.float32) for p, _, xy in every]
+        return Calibration(
+            np.stack(stack),
+            np.array([(*xy, z) for _, z, xy in every]),
+            geometry=Geometry(10.0, 5.0, None),
+        )
+
+    @property
+    def image(self) -> np.ndarray:
+        """A photograph of thirty points."""
+        psfs, rng = lenslet_psfs(self.size, self.depths), np.random.default_rng(1)
+        shifts = rng.integers(-self.size // 5, self.size // 5 + 1, (30, 2))
+        light = sum(np.roll(psfs[k % self.depths, 0], tuple(way), (0, 1)) for k, way in enumerate(shifts))
+        return rng.poisson(100 * light).astype(np.float32)
 
 
-def row(size: int, depths: int, prior: str, iterations: int, *, played: bool) -> tuple[str, float]:
+Solved = tuple[np.ndarray, float, str]
+"""What came out, seconds an iteration, and the solver."""
+
+
+def still(case: Case, device: str, prior: str, model: str) -> Solved:
+    """Reconstruct a photograph."""
+    asked: dict[str, Any] = {"prior": prior, "model": model, "noise": 1.0, "tolerance": 0.0, "device": device}
+    asked |= {"estimate_background": False, "drop_empty": False, "judged": False}
+    calibration = case.calibration(1 if model == "convolution" else 3)
+    for count in (1, case.iterations):  # the first compiles, and plans transforms
+        found = reconstruct(case.image, calibration, iterations=count, **asked)
+    return found.volume, found.seconds / case.iterations, found.solver
+
+
+def film(case: Case, device: str) -> Solved:
+    """Solve frames of a scene that stands."""
+    options = ReconstructionOptions(model="convolution", drop_empty=False, device=device)
+    frame = case.image
+    problem = stream_problem(frame, case.calibration(), options, choosing=False, noise=1.0)
+    with VideoSolver(problem, cold_iterations=case.iterations, warm_iterations=case.iterations) as solver:
+        solver.next(frame)
+        began = time.perf_counter()
+        for _ in range(FRAMES):
+            found = solver.next(frame)
+        each = (time.perf_counter() - began) / FRAMES / case.iterations
+        return np.asarray(found), each, problem.solver.name
+
+
+def live(case: Case, device: str) -> Solved:
+    """Make live pictures of one frame, as many as have so many iterations; a tenth of a second for each."""
+    maker = LiveReconstructor(case.calibration(), device=device, budget_ms=100.0, noise=1.0)
+    frame = case.image
+    maker.feed(frame)
+    while (found := maker.refine()) is None or not found.total_iterations:
+        found = maker.feed(frame)
+    before, began = found.total_iterations, time.perf_counter()
+    while (done := found.total_iterations - before) < case.iterations:
+        newer = maker.refine()
+        if newer is None:  # nothing more to gain
+            break
+        found = newer
+    return found.image, (time.perf_counter() - began) / max(done, 1), f"binned {found.binning}"
+
+
+KINDS: dict[str, Callable[[Case, str], Solved]] = {
+    "tv": lambda case, device: still(case, device, "tv", "convolution"),
+    "l1": lambda case, device: still(case, device, "l1", "convolution"),
+    "local": lambda case, device: still(case, device, "tv", "local"),
+    "lowrank": lambda case, device: still(case, device, "tv", "lowrank"),
+    "video": film,
+    "live": live,
+}
+
+
+def row(kind: str, case: Case, *, played: bool) -> tuple[str, float]:
     """Return a line of the table, and how many times faster the GPU is."""
     with contextlib.ExitStack() as stack:
-        cpu = solved(size, depths, prior, "cpu", iterations)
+        cpu = KINDS[kind](case, "cpu")
         if played:
-            from tests.golden.adapter import numpy_as_device
+            from tests.device import played as played_device
 
-            stack.enter_context(numpy_as_device())
-        gpu = solved(size, depths, prior, "gpu", iterations)
-    apart = float(np.linalg.norm(gpu.volume - cpu.volume) / max(np.linalg.norm(cpu.volume), 1e-30))
-    each = [r.seconds / iterations for r in (cpu, gpu)]
+            stack.enter_context(played_device())
+        gpu = KINDS[kind](case, "gpu")
+    same = gpu[0].shape == cpu[0].shape  # live pictures may have other pixels
+    apart = float(np.linalg.norm(gpu[0] - cpu[0]) / max(np.linalg.norm(cpu[0]), 1e-30)) if same else np.nan
     memory = "" if played else f"{_pool_bytes() / GIB:.2f}"
-    solvers = ", ".join(dict.fromkeys((cpu.solver, gpu.solver)))
-    words = f"| {prior}, {solvers} | {size} x {size} x {depths} | {each[0]:.4f} | {each[1]:.4f} "
-    return words + f"| {each[0] / each[1]:.1f} | {apart:.0e} | {memory} |", each[0] / each[1]
+    times = cpu[1] / max(gpu[1], 1e-9)
+    size = f"{case.size} x {case.size} x {case.depths}"
+    solvers = ", ".join(dict.fromkeys((cpu[2], gpu[2])))
+    words = f"| {kind}, {solvers} | {size} | {cpu[1]:.4f} | {gpu[1]:.4f} | {times:.1f} "
+    return words + f"| {apart:.0e} | {memory} |", times
 
 
 def _pool_bytes() -> int:
@@ -82,33 +164,30 @@ def _device(*, played: bool) -> str:
     return str(cupy.cuda.runtime.getDeviceProperties(0)["name"].decode())
 
 
-def _words(numbers: list[int]) -> str:
-    return " ".join(map(str, numbers))
-
-
-def page(sizes: list[int], depths: list[int], iterations: int, *, played: bool) -> str:
+def page(a: argparse.Namespace) -> str:
     """Return the page."""
+    asked = f"--sizes {' '.join(map(str, a.sizes))} --depths {' '.join(map(str, a.depths))}"
     lines = [
         "# CPU and GPU",
         "",
-        f"{datetime.date.today()}, {platform.machine()}, {get_threads()} threads; {_device(played=played)}. "
-        f"`python benchmarks/gpu.py --sizes {_words(sizes)} --depths {_words(depths)}`",
+        f"{datetime.date.today()}, {platform.machine()}, {get_threads()} threads; {_device(played=a.numpy)}. "
+        f"`python benchmarks/gpu.py {asked}`",
         "",
-        "| prior, solvers | sensor x depths | CPU, s an iteration | GPU | times | apart | memory, GiB |",
+        "| what, solvers | sensor x depths | CPU, s an iteration | GPU | times | apart | memory, GiB |",
         "|---|---|---|---|---|---|---|",
     ]
     faster: dict[tuple[str, int], list[int]] = {}
-    for prior in PRIORS:
-        for n in depths:
-            for size in sizes:
-                line, times = row(size, n, prior, iterations, played=played)
+    for kind in a.only or KINDS:
+        for n in (n for n in a.depths if n <= a.most_depths or kind in ("tv", "l1")):
+            for size in a.sizes:
+                line, times = row(kind, Case(size, n, a.iterations), played=a.numpy)
                 print(line, flush=True)
                 lines.append(line)
-                faster.setdefault((prior, n), []).extend([size] if times > 1 else [])
+                faster.setdefault((kind, n), []).extend([size] if times > 1 else [])
     lines.append("")
-    for (prior, n), won in faster.items():
+    for (kind, n), won in faster.items():
         said = f"from {min(won)} x {min(won)} on" if won else "at none of these sizes"
-        lines.append(f"* {prior}, {n} depth{'s' * (n > 1)}: the GPU is faster {said}.")
+        lines.append(f"* {kind}, {n} depth{'s' * (n > 1)}: the GPU is faster {said}.")
     return "\n".join(lines) + "\n"
 
 
@@ -121,6 +200,8 @@ def main(arguments: list[str] | None = None) -> None:
         "--sizes", type=int, nargs="+", default=[64, 128, 256, 512], help="of the sensor, pixels"
     )
     parser.add_argument("--depths", type=int, nargs="+", default=[1, 32, 128])
+    parser.add_argument("--most-depths", type=int, default=32, help="of other kinds than tv and l1")
+    parser.add_argument("--only", nargs="+", choices=KINDS, help="these kinds")
     parser.add_argument("--iterations", type=int, default=10)
     parser.add_argument("--numpy", action="store_true", help="NumPy plays the GPU's library")
     parser.add_argument("--out", type=Path, help="the page")
@@ -129,7 +210,7 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error(
             "cupy is not installed: pip install 'diffuserbench[gpu]', or --numpy to try the command."
         )
-    written = page(a.sizes, a.depths, a.iterations, played=a.numpy)
+    written = page(a)
     if a.out is None:
         print(written)
     else:

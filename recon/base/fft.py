@@ -172,12 +172,37 @@ def idct(X: RealArray, out: RealArray) -> RealArray:
 
 
 def _cosine(x: RealArray, out: RealArray, kind: int) -> RealArray:
+    if namespace_of(x) is not np:
+        return _onto(_cosine_by_halves(x, inverse=kind == 3), out)
     _check(out, x.shape, x.dtype)
     shape = [n for n in x.shape if n > 1] or [1]  # an axis of one element is copied element by element
     scale = float(np.prod(2.0 * np.array(shape))) ** -0.5
     kernel = _kernels().cosine
     kernel(x.reshape(shape), out.reshape(shape), np.arange(len(shape)), kind, scale, threads_here())
     return out
+
+
+def _cosine_by_halves(x: RealArray, *, inverse: bool) -> RealArray:
+    """Orthonormal cosine transform over all axes by complex ones of the same length (Makhoul 1980)."""
+    xp, result = namespace_of(x), x
+    for axis, n in enumerate(x.shape):
+        if n == 1:
+            continue
+        at = np.arange(n)
+        turn = xp.asarray(np.exp(-0.5j * np.pi * at / n).astype(complex_dtype(x.dtype)))
+        scale = xp.asarray(np.sqrt(np.where(at, 2.0, 1.0) / n).astype(x.dtype))
+        order = np.concatenate([at[::2], at[1::2][::-1]])
+        lines = xp.moveaxis(result, axis, -1)
+        if inverse:
+            lines = lines / scale
+            backward = xp.zeros_like(lines)
+            backward[..., 1:] = lines[..., :0:-1]
+            mixed = xp.fft.ifft((lines - 1j * backward) / turn)
+            result = mixed.real[..., xp.asarray(np.argsort(order))]
+        else:
+            result = (xp.fft.fft(lines[..., xp.asarray(order)]) * turn).real * scale
+        result = xp.moveaxis(result, -1, axis).astype(x.dtype, copy=False)
+    return result
 
 
 def _onto(result: RealArray, out: RealArray | None) -> RealArray:

@@ -48,9 +48,8 @@ def array_namespace(device: Device) -> Namespace:
 
 def namespace_of(array: Any) -> Namespace:
     """Return the module that an array is of."""
-    return (
-        np if isinstance(array, np.ndarray) else importlib.import_module(type(array).__module__.split(".")[0])
-    )
+    kind = type(array)
+    return np if kind is np.ndarray else importlib.import_module(kind.__module__.split(".")[0])
 
 
 def to_host(array: Any) -> npt.NDArray[Any]:

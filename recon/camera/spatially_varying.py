@@ -80,7 +80,7 @@ class Strip:
 
 
 @dataclass(frozen=True)
-class _Axis:
+class Axis:
     """One axis of a convolution on its grid: the FFT length, and which of it goes where on the sensor."""
 
     length: int
@@ -89,7 +89,7 @@ class _Axis:
     count: int
 
     @classmethod
-    def of(cls, start: int, patch: int, psf: int, sensor: int, *, real: bool) -> _Axis:
+    def of(cls, start: int, patch: int, psf: int, sensor: int, *, real: bool) -> Axis:
         """Place ``patch`` pixels of object that cast their first PSF pixel at ``start`` on ``sensor`` pixels.
 
         Only what falls on the sensor must be free of wrap-around: a full convolution's first and last pixels
@@ -117,11 +117,11 @@ class PlacedStrip:
         self.height = rows.stop - rows.start
         self.masks = np.ascontiguousarray(strip.masks, dtype)
         start, width = columns.start + strip.offset[1], columns.stop - columns.start
-        self.axis = _Axis.of(start, width, psf_width, sensor_shape[1], real=True)
+        self.axis = Axis.of(start, width, psf_width, sensor_shape[1], real=True)
         placed = [
             (
                 p,
-                _Axis.of(
+                Axis.of(
                     p.rows.start + strip.offset[0],
                     p.rows.stop - p.rows.start,
                     psf_height,

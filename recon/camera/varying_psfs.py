@@ -8,14 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.namespace import Namespace
 from recon.camera.base import Array
 from recon.camera.convolution import field_of
 from recon.camera.spatially_varying import Part, SpatiallyVarying, Strip, Window
+from recon.camera.varying_on_device import VaryingOnDevice
 from recon.errors import InputError
 
 Floats = npt.NDArray[np.float64]
@@ -137,11 +140,11 @@ def local_convolution(
     fields: list[FieldOfPsfs],
     sensor_shape: tuple[int, int],
     *,
-    n_channels: int | None = None,
     support: npt.NDArray[np.bool_] | None = None,
     grid_shape: tuple[int, int] | None = None,
     dtype: npt.DTypeLike = np.float32,
-) -> SpatiallyVarying:
+    xp: Namespace = np,
+) -> SpatiallyVarying | VaryingOnDevice:
     """Build the local convolution model of one or many depths.
 
     Where the calibration points form a grid, work is cut along its cells: inside a cell four PSFs are
@@ -153,17 +156,18 @@ def local_convolution(
     fields : list of FieldOfPsfs
         One a depth, all with the same PSF shape.
     sensor_shape : (int, int)
-    n_channels : int, optional
     support : ndarray of bool, (n_z, field height, field width), optional
         Where the object may be other than zero: cells, depths and PSFs that it does not touch are left out,
         and windows shrink to it.
     grid_shape : (int, int), optional
         Lateral shape of the object's array, at least the field's: rows and columns beyond it do nothing.
     dtype : dtype
+    xp : module
+        Whose arrays: ``numpy``, or a GPU's ``cupy``.
 
     Returns
     -------
-    SpatiallyVarying
+    SpatiallyVarying or VaryingOnDevice
         Domain (n_channels, n_z, field height, field width), field = sensor + PSF - 1, centred as
         :class:`~recon.camera.convolution.Convolution`.
     """
@@ -172,7 +176,7 @@ def local_convolution(
         psfs, corner = cut_to_support(field.psfs)
         yield from _strips(z, psfs, field.points, rows, columns, needed, _offset(corner, field))
 
-    return _model(fields, sensor_shape, strips, n_channels, support, grid_shape, dtype)
+    return _model(fields, sensor_shape, strips, support, grid_shape, dtype, xp)
 
 
 Mask = npt.NDArray[np.bool_]
@@ -182,11 +186,11 @@ def _model(
     fields: list[FieldOfPsfs],
     sensor_shape: tuple[int, int],
     strips_of: Callable[[int, FieldOfPsfs, Mask, Array, Array], Iterator[Strip]],
-    n_channels: int | None,
     support: Mask | None,
     grid_shape: tuple[int, int] | None,
     dtype: npt.DTypeLike,
-) -> SpatiallyVarying:
+    xp: Namespace,
+) -> SpatiallyVarying | VaryingOnDevice:
     """Put together what each depth is cut into, of those that the support touches."""
     if not fields:
         raise InputError("The list of depths is empty: give the PSFs of at least one.")
@@ -200,14 +204,16 @@ def _model(
         needed = np.ones(field_shape, bool) if support is None else support[z]
         if needed.any():
             strips += strips_of(z, field, needed, rows, columns)
-    return SpatiallyVarying(
+    made: Any = SpatiallyVarying if xp is np else partial(VaryingOnDevice, xp=xp)
+    camera: SpatiallyVarying | VaryingOnDevice = made(
         strips,
         field_shape if grid_shape is None else grid_shape,
         sensor_shape,
         n_z=len(fields),
-        n_channels=max(f.psfs.shape[1] for f in fields) if n_channels is None else n_channels,
+        n_channels=max(f.psfs.shape[1] for f in fields),
         dtype=dtype,
     )
+    return camera
 
 
 def _offset(corner: tuple[int, int], field: FieldOfPsfs) -> tuple[int, int]:
@@ -347,11 +353,11 @@ def low_rank(
     *,
     rank: int | None = None,
     error: float | None = None,
-    n_channels: int | None = None,
     support: npt.NDArray[np.bool_] | None = None,
     grid_shape: tuple[int, int] | None = None,
     dtype: npt.DTypeLike = np.float32,
-) -> SpatiallyVarying:
+    xp: Namespace = np,
+) -> SpatiallyVarying | VaryingOnDevice:
     """Build the low-rank model of one or many depths: ``rank`` convolutions of the whole frame a depth.
 
     Parameters and result as :func:`~recon.camera.varying_psfs.local_convolution`, with ``rank`` or
@@ -367,4 +373,4 @@ def low_rank(
             weights = weights * needed[window]
         yield Strip(z, window, weights, (whole(window, psfs),), _offset(corner, field))
 
-    return _model(fields, sensor_shape, strips, n_channels, support, grid_shape, dtype)
+    return _model(fields, sensor_shape, strips, support, grid_shape, dtype, xp)

@@ -7,6 +7,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.namespace import namespace_of
 from recon.camera.base import Array, LinearOperator
 from recon.priors.base import Prior, Separable, Zero, require_weight
 
@@ -46,7 +47,7 @@ class Differences(LinearOperator):
 
     def forward(self, x: Array, out: Array | None = None) -> Array:
         """Return the differences, one object-sized array for each axis."""
-        out = np.empty(self.range_shape, self.dtype) if out is None else out
+        out = namespace_of(x).empty(self.range_shape, self.dtype) if out is None else out
         for d, axis, weight, wrap in self._axes(out):
             first, last, inner, shifted = _parts(axis)
             np.subtract(x[shifted], x[inner], out=d[inner])
@@ -56,7 +57,7 @@ class Differences(LinearOperator):
 
     def adjoint(self, y: Array, out: Array | None = None) -> Array:
         """Return minus the divergence of the differences ``y``."""
-        out = np.empty(self.domain_shape, self.dtype) if out is None else out
+        out = namespace_of(y).empty(self.domain_shape, self.dtype) if out is None else out
         out[...] = 0
         for d, axis, weight, wrap in self._axes(y):
             first, last, inner, shifted = _parts(axis)

@@ -282,7 +282,7 @@ class ReconstructionOptions:
         help="Where to compute.",
         choices=DEVICES,
         group=_COMPUTE,
-        applies=("picture", "volume", "live picture"),
+        applies=("picture", "volume", "video", "live picture"),
     )
     precision: Literal["auto"] | Precision = option(
         "auto",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property, reduce
 from operator import add
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR
 from recon.camera.convolution import Convolution, field_of
 from recon.camera.factors import BackgroundRemoval, Erasures, PatternedCamera
 from recon.camera.spatially_varying import SpatiallyVarying
+from recon.camera.varying_on_device import VaryingOnDevice
 from recon.camera.varying_psfs import FieldOfPsfs, grid_axes, local_convolution, low_rank
 from recon.errors import NoMemoryError
 from recon.priors import Prior, TotalVariation
@@ -183,7 +185,7 @@ class Part:
             self.storage = memory.Storage(scratch, self.plan.room)
         return camera
 
-    def _varying(self, fields: list[FieldOfPsfs]) -> SpatiallyVarying:
+    def _varying(self, fields: list[FieldOfPsfs]) -> SpatiallyVarying | VaryingOnDevice:
         problem, shape = self.problem, self.problem.sensor_shape
         field_shape, (row, column) = field_of(shape, fields[0].psfs.shape[2:])
         support = None
@@ -192,12 +194,12 @@ class Part:
             off_axis = np.hypot(np.arange(field_shape[0])[:, None] - row, np.arange(field_shape[1]) - column)
             support = np.broadcast_to(off_axis <= reach, (len(fields), *field_shape))
         grid = fft.fast_length(field_shape[0]), fft.fast_length(field_shape[1])
+        made: dict[str, Any] = {"support": support, "grid_shape": grid, "dtype": self.dtype}
+        made["xp"] = self.namespace
         camera = (
-            local_convolution(fields, shape, support=support, grid_shape=grid, dtype=self.dtype)
+            local_convolution(fields, shape, **made)
             if problem.model == "local"
-            else low_rank(
-                fields, shape, error=LOW_RANK_ERROR, support=support, grid_shape=grid, dtype=self.dtype
-            )
+            else low_rank(fields, shape, error=LOW_RANK_ERROR, **made)
         )
         plane = self.dtype.itemsize * int(np.prod(camera.domain_shape[2:]))
         available = memory.available_bytes() if self._limit is None else self._limit

@@ -15,6 +15,7 @@ import numpy as np
 
 from recon.base.registry import Registry
 from recon.camera.base import Array, LinearOperator
+from recon.camera.camera_model import CAMERAS
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, Sum
 from recon.solvers.base import IterationRecord, Outcome, Solver, StoppingRules, StopReason
@@ -112,11 +113,8 @@ def _by_name(problem: Problem, priors: Iterable[str], where: str = "") -> str | 
 def _admm_refuses(problem: Problem) -> str | None:
     if problem.patterned:
         return _ONE_LIGHT
-    if problem.options.device != "cpu" and problem.varies:
-        return (
-            f"The {problem.model} model runs on the cpu only. Choose the model convolution for the "
-            f"{problem.options.device}"
-        )
+    if problem.options.device != "cpu" and problem.model in CAMERAS:
+        return f"The model {problem.model} runs on the cpu only"
     if problem.together:
         return _by_name(problem, splitting_priors())
     return _by_name(problem, volume_priors(), "for volumes, varying PSFs, backgrounds and a GPU")
@@ -145,10 +143,12 @@ def _of_picture(start: Array | None) -> Array | None:
 
 def _varying_admm(part: Part, camera: LinearOperator, start: Array | None) -> Solver:
     from recon.solvers.operator_admm import OperatorAdmm
+    from recon.solvers.splitting import Room
 
     prior = part.prior_on(part.mean_axis_weights, (False,) * 3)
     shown = part.problem.window
-    return OperatorAdmm(camera, part.central, part.sensor_data, prior, initial=start, shown=shown)
+    room = Room(part.namespace)
+    return OperatorAdmm(camera, part.central, part.sensor_data, prior, initial=start, room=room, shown=shown)
 
 
 def _sensor_admm(part: Part, start: Array | None) -> Solver:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.brief import brief
-from recon.base.namespace import Namespace, to_host
+from recon.base.namespace import Namespace, namespace_of, to_host
 from recon.base.threads import linear_algebra_on_one_thread
 from recon.priors.base import Prior
 
@@ -312,7 +312,7 @@ class Solver(ABC):
         """
         for name in ("iteration", *self.state_names):
             value, present = state[name], attrgetter(name)(self)
-            if isinstance(present, np.ndarray):
+            if isinstance(present, np.ndarray) and namespace_of(present) is np:
                 present[...] = value
                 continue
             owner, _, attribute = name.rpartition(".")

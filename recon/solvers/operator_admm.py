@@ -20,6 +20,7 @@ from typing import ClassVar
 import numpy as np
 
 from recon.base import fft
+from recon.base.namespace import require_memory
 from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import Convolution
 from recon.priors.base import Prior
@@ -28,9 +29,11 @@ from recon.solvers.base import IterationRecord
 from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
 from recon.solvers.moving import move
 from recon.solvers.prior_splits import ProxSplit, split_prior
-from recon.solvers.splitting import SensorData, Tuning, squares
+from recon.solvers.splitting import Room, SensorData, Tuning, squares
 from recon.solvers.volume_admm import ExactAdmm
 
+_VOLUMES = 16
+"""x, four states, and what an update of them passes through."""
 FIRST_ITERATIONS = 4
 """Iterations from a cold start whose data term has nothing to set out from."""
 FIRST_STEPS, STEPS = 8, 4
@@ -55,6 +58,8 @@ class OperatorAdmm(ExactAdmm):
         priors, and any other with an exact prox.
     initial : ndarray, ``camera.domain_shape``, optional
     tuning : Tuning, optional
+    room : Room, optional
+        On which device.
     shown : tuple of slice, optional
         Rows and columns whose change an iteration is told, by default all: the field beyond the sensor, which
         hardly bends the data, goes on moving long after what is shown has settled. All where they are dark.
@@ -73,25 +78,28 @@ class OperatorAdmm(ExactAdmm):
         *,
         initial: Array | None = None,
         tuning: Tuning | None = None,
+        room: Room | None = None,
         shown: tuple[slice, slice] = (slice(None), slice(None)),
     ) -> None:
-        super().__init__(central, data, tuning, None, 1.7, self._bend)
+        super().__init__(central, data, tuning, room, 1.7, self._bend)
         self.camera, self.shown = camera, shown
         dtype = camera.dtype
         tv, self.separable, others = split_prior(prior, _is_not_periodic)
         self.kappa = dtype.type(self.tuning.kappa if tv else 1.0)
-        self.x = np.zeros(camera.domain_shape, dtype)
+        xp = self.xp
+        require_memory(xp, _VOLUMES * dtype.itemsize * int(np.prod(camera.domain_shape)))
+        self.x = xp.zeros(camera.domain_shape, dtype)
         if initial is not None:
-            self.x[...] = initial
+            self.x[...] = xp.asarray(initial)
         self.splits = tuple(ProxSplit(term, self.x) for term in (self.separable, *others))
         # What the splits of x itself add to T.
         self._pixels = float(self.kappa) * len(self.splits)
         weights = None if tv is None else tv.axis_weights
         self._eigenvalues = None if weights is None else self._laplacian(weights)
-        self._cosines = np.empty_like(self.x[0] if weights is not None else self.x[:0])
+        self._cosines = xp.empty_like(self.x[0] if weights is not None else self.x[:0])
         self._psi = tv.differences(self.x) if tv else None
-        self.S = np.zeros(0, dtype) if self._psi is None else self._psi.forward(self.x)
-        power = central.power()[0]
+        self.S = xp.zeros(0, dtype) if self._psi is None else self._psi.forward(self.x)
+        power = xp.asarray(central.power()[0])
         self._q = power / self._lateral_eigenvalues(weights)
         self._begin(tv, self.system.masked(camera.forward(self.x)[0]), power)
 
@@ -99,9 +107,9 @@ class OperatorAdmm(ExactAdmm):
         """Do one iteration; the first ones solve their data term better."""
         self.system.max_steps = FIRST_STEPS if self.iteration < FIRST_ITERATIONS else STEPS
         window = (..., *self.shown)
-        before = self.solution[window]
+        before = self._solved[window].copy()
         record = super().step()
-        now = self.solution[window]
+        now = self._solved[window]
         size = squares(now)
         if size == 0:  # all light is beyond what is shown, and decides
             return record
@@ -120,16 +128,16 @@ class OperatorAdmm(ExactAdmm):
             for w, n in zip(weights, (n_z, height, width), strict=True)
         ]
         total = axes[0][:, None, None] + axes[1][:, None] + axes[2] + self._pixels
-        return np.asarray(total, self.camera.dtype)
+        return self.xp.asarray(total.astype(self.camera.dtype))
 
     def _lateral_eigenvalues(self, weights: Array | None) -> Array:
         """T as the preconditioner has it: periodic, and without depth."""
         if weights is None:
-            return np.full((1, 1), self._pixels, self.camera.dtype)
+            return self.xp.full((1, 1), self._pixels, self.camera.dtype)
         height, width = self.operator.grid_shape
         y, x = (laplacian_eigenvalues(n) for n in (height, width))
         total = weights[1] ** 2 * y[:, None] + weights[2] ** 2 * x[: width // 2 + 1] + self._pixels
-        return np.asarray(total, self.camera.dtype)
+        return self.xp.asarray(total.astype(self.camera.dtype))
 
     def _invert(self, x: Array) -> Array:
         """``T^-1 x``; may overwrite ``x``."""
@@ -160,7 +168,7 @@ class OperatorAdmm(ExactAdmm):
         return self._psi.adjoint(d)
 
     def _predict(self, r: Array) -> Array:
-        self._l1 = self.separable.weight * float(np.sum(np.abs(self.x), dtype=np.float64))
+        self._l1 = self.separable.weight * float(abs(self.x).sum(dtype=np.float64))
         self.x = self._invert(r)
         return self.system.masked(self.camera.forward(self.x)[0])
 

@@ -196,10 +196,14 @@ class ExactAdmm(VolumeSplitting):
         return sum(one.prior.value(one.split) for one in self.splits)
 
     @property
+    def _solved(self) -> Array:
+        """The split variable that obeys the bounds; without any, the first other prior's."""
+        return self.splits[1 if self.separable.is_zero and len(self.splits) > 1 else 0].split
+
+    @property
     def solution(self) -> Array:
-        """The split variable that obeys the bounds (without any, the first other prior's), in host memory."""
-        first = self.splits[1 if self.separable.is_zero and len(self.splits) > 1 else 0]
-        return np.array(to_host(first.split))
+        """The same, in host memory."""
+        return np.array(to_host(self._solved))
 
     def _end(self) -> Array:
         return self.solution

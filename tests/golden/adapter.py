@@ -7,15 +7,13 @@ of arrays, numbers and words.
 from __future__ import annotations
 
 import sys
-import types
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +30,7 @@ from recon.holography import (
     judge,
     random_mask,
 )
+from tests.device import played
 
 Result = dict[str, Any]
 Calibration = Mapping[str, Any]
@@ -81,29 +80,14 @@ def volume(measurement: npt.NDArray[Any], calibration: Calibration, **options: A
 
 def picture_on_device(measurement: npt.NDArray[Any], psf: npt.NDArray[Any], **options: Any) -> Result:
     """Reconstruct a picture as on a GPU, its array library played by NumPy."""
-    with numpy_as_device():
+    with played():
         return picture(measurement, psf, device="gpu", **options)
 
 
 def volume_on_device(measurement: npt.NDArray[Any], calibration: Calibration, **options: Any) -> Result:
     """Reconstruct a volume as on a GPU, its array library played by NumPy."""
-    with numpy_as_device():
+    with played():
         return volume(measurement, calibration, device="gpu", **options)
-
-
-@contextmanager
-def numpy_as_device() -> Iterator[None]:
-    """Have the GPU's code run on NumPy, under another name."""
-    twin = types.ModuleType("twin")
-    twin.__dict__.update({k: v for k, v in np.__dict__.items() if not k.startswith("__")})
-    with ExitStack() as patched:
-        for name, value in (
-            ("recon.reconstruction.part.array_namespace", lambda _device: twin),
-            ("recon.solvers.volume_admm.require_memory", lambda *_: None),
-            ("recon.solvers.douglas_rachford.require_memory", lambda *_: None),
-        ):
-            patched.enter_context(mock.patch(name, value))
-        yield
 
 
 def started_picture(

@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 import sys
 import threading
-import types
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +20,7 @@ from recon.reconstruction.planes import put_back
 from recon.reconstruction.reduction import reduced, reduced_calibration
 from recon.reconstruction.rules import drift, precision_of
 from recon.solvers.base import StopReason
+from tests.device import played
 
 solving = sys.modules[recon.solve.__module__]
 
@@ -434,9 +434,6 @@ class Kept:
         self.parts.add(part)
 
 
-# Another module than numpy, with its functions: what a GPU's is to the code.
-TWIN = types.ModuleType("twin")
-TWIN.__dict__.update({k: v for k, v in np.__dict__.items() if not k.startswith("__")})
 SAME_FOR_ALL = {
     "checkpoint": {"keeper": True},
     "float64": {"precision": "float64"},
@@ -450,11 +447,9 @@ SAME_FOR_ALL = {
 
 
 @pytest.fixture
-def a_gpu(monkeypatch):
-    """Arrays of another module, as on a GPU, with no memory of its own to ask for."""
-    monkeypatch.setattr("recon.reconstruction.part.array_namespace", lambda d: np if d == "cpu" else TWIN)
-    for module in ("volume_admm", "douglas_rachford"):
-        monkeypatch.setattr(f"recon.solvers.{module}.require_memory", lambda *_: None)
+def a_gpu():
+    with played():
+        yield
 
 
 def solved(scene, warm, asked):
@@ -505,10 +500,7 @@ def test_nothing_switches_the_choice_off_for_a_volume(beads, chosen_beads, what)
     asked = SAME_FOR_ALL.get(what, {"solver": "admm"})
     result, keeper = solved(beads, chosen_beads, asked | {"prior": "l1"})
     assert 1 < len(result.choice.planes) < 6
-    if what == "device":  # says why it has one PSF a depth
-        assert "runs on the cpu only" in decision(result.choice, "model").why
-    else:
-        assert result.choice.model == chosen_beads.choice.model
+    assert result.choice.model == chosen_beads.choice.model
     if keeper is not None:
         assert f"auto-{result.choice.key}-channel-0" in keeper.parts
 

@@ -6,7 +6,7 @@ import pytest
 from recon.base import fft
 from recon.camera.base import estimate_norm
 from recon.camera.convolution import Convolution
-from recon.camera.spatially_varying import _Axis
+from recon.camera.spatially_varying import Axis
 from recon.camera.varying_psfs import (
     FieldOfPsfs,
     cut_to_support,
@@ -166,10 +166,10 @@ def test_without_a_rank_or_an_error_two_per_cent_are_missed_at_most():
 
 def test_psfs_of_other_channels_are_refused():
     with pytest.raises(InputError, match="PSFs of 2 channels do not serve 3"):
-        local_convolution([field(GRID, channels=2)], (9, 9), n_channels=3)
+        local_convolution([field(GRID, channels=2), field(GRID, channels=3)], (9, 9))
 
 
 @pytest.mark.parametrize(("start", "length"), [(0, 26), (-8, 26), (-3, 23)])
 def test_an_axis_is_as_long_as_what_must_not_be_wrapped_onto(start, length):
-    axis = _Axis.of(start, 17, 10, 20, real=True)
+    axis = Axis.of(start, 17, 10, 20, real=True)
     assert axis.length == fft.fast_length(length, real=True)
