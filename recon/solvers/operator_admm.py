@@ -88,7 +88,7 @@ class OperatorAdmm(ExactAdmm):
         self.kappa = dtype.type(self.tuning.kappa if tv else 1.0)
         xp = self.xp
         require_memory(xp, _VOLUMES * dtype.itemsize * int(np.prod(camera.domain_shape)))
-        self.x = xp.zeros(camera.domain_shape, dtype)
+        self.x: Array = xp.zeros(camera.domain_shape, dtype)
         if initial is not None:
             self.x[...] = xp.asarray(initial)
         self.splits = tuple(ProxSplit(term, self.x) for term in (self.separable, *others))
@@ -128,16 +128,21 @@ class OperatorAdmm(ExactAdmm):
             for w, n in zip(weights, (n_z, height, width), strict=True)
         ]
         total = axes[0][:, None, None] + axes[1][:, None] + axes[2] + self._pixels
-        return self.xp.asarray(total.astype(self.camera.dtype))
+        return self._there(total)
 
     def _lateral_eigenvalues(self, weights: Array | None) -> Array:
         """T as the preconditioner has it: periodic, and without depth."""
         if weights is None:
-            return self.xp.full((1, 1), self._pixels, self.camera.dtype)
+            return self._there(np.full((1, 1), self._pixels))
         height, width = self.operator.grid_shape
         y, x = (laplacian_eigenvalues(n) for n in (height, width))
         total = weights[1] ** 2 * y[:, None] + weights[2] ** 2 * x[: width // 2 + 1] + self._pixels
-        return self.xp.asarray(total.astype(self.camera.dtype))
+        return self._there(total)
+
+    def _there(self, values: Array) -> Array:
+        """Return the host's numbers on the device, in the solver's precision."""
+        there: Array = self.xp.asarray(values.astype(self.camera.dtype))
+        return there
 
     def _invert(self, x: Array) -> Array:
         """``T^-1 x``; may overwrite ``x``."""
