@@ -16,12 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.correlation import correlate, cut_to_light, lit_extent, similarity, spot_px
+from recon.analysis.what_moved import Explanation, Seen, moved_across, moved_along
 from recon.base.blocks import block_mean
 from recon.camera.refocus import central_psfs, psf_at
 from recon.camera.registration import register
 from recon.camera.transformed import geometric_centre, resampled
 from recon.errors import InputError
-from recon.types import Calibration
+from recon.types import Calibration, Geometry
 
 Array = npt.NDArray[Any]
 
@@ -35,8 +36,11 @@ EDGE_PX = 0.5
 """Displacement at the pattern's edge by scale or rotation that counts: a quarter of the smallest features."""
 SHIFT_PX = 1.0
 """Shift from which pictures and depths of one calibration no longer lie on those of the other."""
-DIMMER = 0.2
+DIMMER = 0.05
 """Relative change of brightness that is worth a word."""
+DRIFTED = 0.03
+"""Of the light between depths, likewise: noise changes it by a thousandth."""
+_TELLS = 0.1  # relative change of light that a lamp does not have by itself
 FRESH = 0.98
 """Inner product after alignment below which the pattern has changed, if the spot has not grown as well."""
 MORE_ALIKE = 0.2
@@ -73,6 +77,12 @@ class Change:
     Patterns of different diffusers have as much in common."""
     brightness: float
     """Light of the new PSF over the old, at equal exposure where both calibrations know theirs."""
+    place_error_px: float = 0.0
+    scale_error: float = 0.0
+    """``place_error_px`` and ``scale_error``: standard deviations of either shift, and of the size, by how
+    the blocks of the pattern agree."""
+    extent_px: float = 1.0
+    """From the pattern's middle to its corner."""
 
 
 @dataclass(frozen=True)
@@ -161,8 +171,7 @@ def compare(
         plane = planes[k].mean(axis=0)
         changes.append(compare_psfs(plane, reference, float(depths[k]), exposure, round_done))
     changes, binning = _of_binned(changes, ratio)
-    distance_mm = new.geometry.diffuser_distance_mm
-    due, reasons = _verdict(changes, None if distance_mm is None else 1e3 * distance_mm)
+    due, reasons = _verdict(changes, new.geometry)
     return Comparison(tuple(changes), due, (*binning, *reasons))
 
 
@@ -180,7 +189,7 @@ def compare_psfs(
     whole = register(new, old)
     light = cut_to_light(old)
     extent = 0.5 * float(np.hypot(*light.shape))
-    factor, shift, recognised = _fit(new, old, complex(whole.rows, whole.columns), on_round)
+    factor, shift, errors = _fit(new, old, complex(whole.rows, whole.columns), on_round)
     moved = _undone(new, factor, shift)
     correlation = correlate(old, new)
     return Change(
@@ -188,32 +197,41 @@ def compare_psfs(
         rows=shift.real,
         columns=shift.imag,
         scale=abs(factor),
-        rotation_deg=float(-np.rad2deg(np.angle(factor))) if recognised else None,
+        rotation_deg=float(-np.rad2deg(np.angle(factor))) if errors is not None else None,
         as_is=correlation.maximum,
         aligned=similarity(moved, old),
         spot=correlation.spot_px / spot_px(new),
         edge_px=abs(factor - 1) * extent,
         decoy=correlate(old, np.ascontiguousarray(new[::-1, ::-1])).maximum,
         brightness=float(new.sum(dtype=np.float64) / old.sum(dtype=np.float64)) / exposure,
+        place_error_px=math.inf if errors is None else errors[0],
+        scale_error=math.inf if errors is None else errors[1],
+        extent_px=extent,
     )
 
 
 def _fit(
     new: Array, old: Array, shift: complex, on_round: Callable[[int], object]
-) -> tuple[complex, complex, bool]:
-    """Fit ``p_new = factor p_old + shift``, positions being ``row + i column`` from the image's centre."""
-    factor, found = 1.0 + 0j, False
+) -> tuple[complex, complex, tuple[float, float] | None]:
+    """Fit ``p_new = factor p_old + shift``, positions being ``row + i column`` from the image's centre.
+
+    Returns standard deviations of a shift and of the factor, too; None where blocks were not recognised.
+    """
+    factor, errors = 1.0 + 0j, None
     for number in range(ROUNDS):
         places, displacements = _block_displacements(_undone(new, factor, shift), old)
         on_round(number + 1)
         if len(places) < 4:
             break
-        found = True
         # On the undone image: q = c p + t; q in the new image is factor q + shift.
         matrix = np.stack([places, np.ones_like(places)], axis=1)
         (c, t), *_ = np.linalg.lstsq(matrix, places + displacements, rcond=None)
         shift, factor = shift + factor * t, factor * c
-    return complex(factor), complex(shift), found
+        rest = displacements - (c - 1) * places - t
+        variance = float((np.abs(rest) ** 2).sum()) / (2 * len(places) - 4)  # of a row or a column
+        apart = float((np.abs(places - places.mean()) ** 2).sum())
+        errors = math.sqrt(variance / len(places)), math.sqrt(variance / max(apart, 1e-12))
+    return complex(factor), complex(shift), errors
 
 
 def _block_displacements(
@@ -259,6 +277,16 @@ def _exposure_ratio(old: Calibration, new: Calibration) -> float:
     return 1.0
 
 
+def _either(change: Change, distance_um: float) -> str:
+    """Return by how much the diffuser moved, or else the source, and which of both the light says."""
+    if not np.isfinite(change.z_um) or abs(change.scale - 1) < 1e-4:
+        return ""
+    change_um = (change.scale - 1) * (change.z_um + distance_um)  # scale = (1 + d'/z) / (1 + d/z)
+    to = "farther from" if change_um > 0 else "nearer to"
+    words = f" If the diffuser moved, it is {abs(change_um):.3g} um {to} the sensor."
+    return words + _source_instead(change, distance_um)
+
+
 def _source_instead(change: Change, distance_um: float) -> str:
     """Return where the source stood if not the diffuser moved, and which of both the light says."""
     nearness = change.scale * (1 + distance_um / change.z_um) - 1
@@ -270,7 +298,7 @@ def _source_instead(change: Change, distance_um: float) -> str:
         f" If the source did, it stands at {stood_um / 1e3:.4g} instead of {change.z_um / 1e3:.4g} mm, and "
         f"gives {expected:.2f} times the light"
     )
-    if abs(expected - 1) < DIMMER / 2:
+    if abs(expected - 1) < _TELLS:
         return f"{words}: the light does not tell."
     if abs(change.brightness / expected - 1) < 0.25 * abs(expected - 1):
         return f"{words}, as is seen: it was the source, unless the lamp changed."
@@ -279,8 +307,23 @@ def _source_instead(change: Change, distance_um: float) -> str:
     return f"{words}; {change.brightness:.2f} is seen, which tells neither."
 
 
-def _verdict(changes: list[Change], distance_um: float | None) -> tuple[bool, tuple[str, ...]]:
+def _what_moved(changes: list[Change], geometry: Geometry) -> tuple[Explanation | None, Explanation | None]:
+    """Return what moved across and along, where there are several depths and the geometry is known."""
+    known = geometry.diffuser_distance_mm, geometry.pixel_pitch_um
+    if None in known or len(changes) < 2 or not all(math.isfinite(c.place_error_px) for c in changes):
+        return None, None
+    distance_um, pitch_um = 1e3 * (known[0] or 0.0), known[1] or 0.0
+    seen = [
+        Seen(c.z_um, c.rows, c.columns, c.scale - 1, c.place_error_px, c.scale_error, c.extent_px)
+        for c in changes
+    ]
+    return moved_across(seen, distance_um, pitch_um), moved_along(seen, distance_um)
+
+
+def _verdict(changes: list[Change], geometry: Geometry) -> tuple[bool, tuple[str, ...]]:
     due, reasons = False, []
+    distance_um = None if geometry.diffuser_distance_mm is None else 1e3 * geometry.diffuser_distance_mm
+    across, along = _what_moved(changes, geometry)
     alike = max(max(c.as_is, c.aligned) - c.decoy for c in changes)
     best = max(max(c.as_is, c.aligned) for c in changes)
     if best < ALIKE and alike < MORE_ALIKE * (1 - max(c.decoy for c in changes)):
@@ -298,14 +341,10 @@ def _verdict(changes: list[Change], distance_um: float | None) -> tuple[bool, tu
         due = True
         turned = "" if not edge.rotation_deg else f" and turned by {edge.rotation_deg:+.2f} degrees"
         cause = ""
-        if distance_um is not None and np.isfinite(edge.z_um) and abs(edge.scale - 1) > 1e-4:
-            # scale = (1 + d'/z) / (1 + d/z)
-            change_um = (edge.scale - 1) * (edge.z_um + distance_um)
-            cause = (
-                f" If the diffuser moved, it is {abs(change_um):.3g} um "
-                f"{'farther from' if change_um > 0 else 'nearer to'} the sensor."
-            )
-            cause += _source_instead(edge, distance_um)
+        if along is not None:
+            cause = f" {along.sentence}"
+        if (along is None or len(along.parts) != 1) and distance_um is not None:
+            cause += _either(edge, distance_um)
         reasons.append(
             f"The pattern is {edge.scale - 1:+.2%} in size{turned}, {edge.edge_px:.2g} pixels at its "
             f"edge.{cause}"
@@ -323,19 +362,44 @@ def _verdict(changes: list[Change], distance_um: float | None) -> tuple[bool, tu
     if spread > SHIFT_PX:
         due = True
         reasons.append(
-            f"The shift differs by {spread:.2g} pixels between depths: the line of the source or the "
-            "diffuser moved sideways, and volumes would be sheared."
+            f"The shift differs by {spread:.2g} pixels between depths, and volumes would be sheared."
+            + _said(across, len(changes))
         )
     elif largest > SHIFT_PX:
         reasons.append(
             f"The pattern moved by {largest:.3g} pixels: pictures move by as much, and stay as sharp."
+            + _said(across, len(changes))
         )
-    brightness = float(np.median([c.brightness for c in changes]))
-    if abs(brightness - 1) > DIMMER:
-        reasons.append(
-            f"The light is {brightness:.2f} times what it was: check lamp and exposure; sharpness does not "
-            "depend on it."
-        )
+    elif across is not None:
+        reasons.append(f"The pattern moved by {largest:.2g} pixels.{_said(across, len(changes))}")
+    if along is not None and edge.edge_px <= EDGE_PX:
+        reasons.append(f"The pattern is {edge.scale - 1:+.2%} in size. {along.sentence}")
+    reasons += _light(changes)
     if not due:
         reasons.insert(0, "The old calibration still serves.")
     return due, tuple(reasons)
+
+
+def _said(across: Explanation | None, depths: int) -> str:
+    if across is not None:
+        return f" {across.sentence}"
+    return " One depth does not tell whether source, diffuser or sensor moved." if depths == 1 else ""
+
+
+def _light(changes: list[Change]) -> list[str]:
+    """Return what became of the light: of all depths, and between them."""
+    light = np.array([c.brightness for c in changes])
+    brightness = float(np.median(light))
+    found = []
+    if abs(brightness - 1) > DIMMER:
+        found.append(
+            f"The light is {brightness:.2f} times what it was: check lamp and exposure; sharpness does not "
+            "depend on it."
+        )
+    if np.ptp(light) > DRIFTED * brightness:
+        seen = ", ".join(f"{c.brightness:.2f} at {c.z_um / 1e3:.4g}" for c in changes)
+        found.append(
+            f"The light changed differently at each depth (times what it was: {seen} mm): the lamp's drift "
+            "in one of the sweeps, or a source nearer or farther."
+        )
+    return found

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy import ndimage
 
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.compare import compare, compare_psfs
+from recon.analysis.what_moved import Seen, moved_across
 from recon.base.blocks import block_mean
 from recon.errors import InputError
 from recon.types import Calibration
+
+Floats = npt.NDArray[np.float64]
 
 GREEN = (0.0, 1.0, 0.0)
 DEPTHS_UM = (60e3, 120e3)
@@ -78,7 +83,42 @@ def test_a_diffuser_that_moved_away_is_named_with_its_distance() -> None:
     assert changes.scale == pytest.approx((1 + 9.05 / 60) / (1 + 8.9 / 60), abs=8e-4)
     shifted_only = compare(calibration(world()), calibration(world(), x_um=500.0, seed=2))
     assert shifted_only.due  # the shift differs between depths: the source's line moved
-    assert "differs" in " ".join(shifted_only.reasons)
+    (moved,) = (words for words in shifted_only.reasons if "differs" in words)
+    assert "The source moved across by (+" in moved
+    assert float(moved.split("(+")[1].split(",")[0]) == pytest.approx(500, rel=0.03)
+    (size,) = (words for words in found.reasons if "in size" in words)
+    assert "The diffuser moved, it is about" in size
+    assert "source" not in size
+    assert float(size.split("it is about ")[1].split(" um")[0]) == pytest.approx(150, rel=0.2)
+    alone = compare(_first(calibration(world())), _first(calibration(world(), x_um=500.0, seed=2)))
+    assert "One depth does not tell" in " ".join(alone.reasons)
+
+
+def _first(made: Calibration) -> Calibration:
+    return made.part([0])
+
+
+@pytest.mark.parametrize(
+    ("across", "part"), [(lambda z: 1 + 8900 / z, "diffuser"), (lambda z: 0 * z + 1, "sensor")]
+)
+def test_what_moved_across_is_told_by_how_the_shift_goes_with_depth(
+    across: Callable[[Floats], Floats], part: str
+) -> None:
+    """And among what it is not known where the shifts are not known well enough."""
+    z_um = np.array([60e3, 90e3, 150e3])
+    for error_px, told in ((0.02, 1), (0.5, 2)):
+        shifts = 6.0 * across(z_um)
+        seen = [Seen(z, 0.0, by, 0.0, error_px, 1e-5, 100) for z, by in zip(z_um, shifts, strict=True)]
+        found = moved_across(seen, 8900.0, 13.0)
+        assert found is not None
+        assert len(found.parts) == told
+        assert part in found.sentence
+        assert "source" not in found.sentence
+    assert moved_across(seen[:1], 8900.0, 13.0) is None
+    torn = [replace(each, columns=by, place_error_px=0.02) for each, by in zip(seen, (5, -9, 5), strict=True)]
+    found = moved_across(torn, 8900.0, 13.0)
+    assert found is not None
+    assert "more than one did" in found.sentence
 
 
 def test_another_diffuser_is_another_calibration() -> None:
