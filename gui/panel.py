@@ -18,6 +18,7 @@ from gui.session_news import name_of
 from gui.widgets.building import Hint, after_rest, button, every, fill, in_row, label, mark
 from gui.widgets.dialogues import elided
 from gui.widgets.entry import Refusing
+from gui.words import in_the_window
 from instrument.bench.config import Kind
 from instrument.files.errors import BenchError
 from recon.base.declare import Imports
@@ -102,7 +103,8 @@ class Panel(QWidget):
         return None
 
     def in_its_words(self, text: str) -> str:
-        """Return a message with the form's labels where the terminal's has flags."""
+        """Return a message with the form's labels for the terminal's flags, and panels for its commands."""
+        text = in_the_window(text)
         return text if self.options_form is None else self.options_form.in_its_words(text)
 
     def refused(self, field: QWidget | None, why: str) -> None:

@@ -34,6 +34,7 @@ from gui.widgets.building import (
 )
 from gui.widgets.sweep_views import Picture
 from gui.widgets.tab_order import tab_in_order
+from gui.words import in_the_window
 from instrument.tasks import CHARTS, TASKS, VIDEOS
 from instrument.tasks.task import WRITTEN, Desk, Done, Task
 from recon.base.declare import Imports, Option, expression
@@ -259,7 +260,7 @@ class TasksPanel(Panel):
         self.use_button.setEnabled(False)
 
     def _told(self, told: Told) -> None:
-        text = self._pages[self._running].form.in_its_words(told.text)
+        text = self._pages[self._running].form.in_its_words(in_the_window(told.text))
         if told.kind == "table":
             made = table(told.headings, text, row_px=_ROW_PX)
             made.setRowCount(len(told.rows))
@@ -305,7 +306,7 @@ class TasksPanel(Panel):
             self._show(pictures[0])
 
     def _failed(self, why: str) -> None:
-        self._ended(self._pages[self._running].form.in_its_words(why))
+        self._ended(self._pages[self._running].form.in_its_words(in_the_window(why)))
 
     def _ended(self, words: str) -> None:
         self.words.appendPlainText(words)

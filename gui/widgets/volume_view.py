@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import QSignalBlocker, Qt, Signal
+from PySide6.QtCore import QSignalBlocker, Qt, QTimer, Signal
 from PySide6.QtWidgets import QGridLayout, QProgressBar, QStackedWidget, QWidget
 
 from gui.background import NewestOnly
@@ -314,7 +315,8 @@ class VolumeView(QWidget):
         if self.projections is None:
             return {}
         p = self.projections
-        return {"front": p.front, "top": p.top, "side": p.side, "depth": self._coloured(p)}
+        depth = _in_colours(p, self.levels.levels, red=spares_hues(self.levels.colour_map))
+        return {"front": p.front, "top": p.top, "side": p.side, "depth": depth}
 
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""
@@ -393,19 +395,30 @@ class VolumeView(QWidget):
             self._show_projections(self.projections)
 
     def _show_projections(self, p: Projections) -> None:
-        levels = self.levels.levels
+        levels, colours_spared = self.levels.levels, spares_hues(self.levels.colour_map)
         self._draw(self.front, p.front, levels)
-        self._draw(self.top, p.top, levels)
-        self._draw(self.side, np.ascontiguousarray(p.side.T), levels)
-        self._draw(self.coloured, self._coloured(p), (0.0, 1.0))
+        others = ((self.top, p.top), (self.side, p.side.T))
+        for view, image in others:  # each in a turn of its own; of quick wishes the last is drawn
+            QTimer.singleShot(0, view, partial(self._draw_projection, p, view, image, levels))
+        self._reader.ask(
+            lambda: _in_colours(p, levels, red=colours_spared),
+            lambda shown: self._draw_projection(p, self.coloured, shown, levels),
+            "colours",
+        )
         first, last = (self._depth_words(z)[2:] or f"plane {z + 1}" for z in (0, len(p.top) - 1))
         hues = f"depth as colour: blue {first}, red {last}"
         self._name(
             "x–y, brightest over depth",
             "z–y, brightest over x",
             "x–z, brightest over y",
-            "the red map does not show depth" if spares_hues(self.levels.colour_map) else hues,
+            "the red map does not show depth" if colours_spared else hues,
         )
+
+    def _draw_projection(
+        self, p: Projections, view: StretchedImage, image: Plane, levels: tuple[float, float]
+    ) -> None:
+        if p is self.projections and self.mode == "brightest" and levels == self.levels.levels:
+            self._draw(view, np.ascontiguousarray(image), (0.0, 1.0) if view is self.coloured else levels)
 
     def _name(self, *titles: str) -> None:
         for shown, title in zip(self._titles, titles, strict=True):
@@ -453,16 +466,18 @@ class VolumeView(QWidget):
             self._lines[view][0].setValue(across)
             self._lines[view][1].setValue(down)
 
-    def _coloured(self, p: Projections) -> Plane:
-        low, high = self.levels.levels
-        shown = in_colour_of_depth(p.front - np.float32(low), p.deepest, len(p.top), max(high - low, 1e-12))
-        if spares_hues(self.levels.colour_map):  # for eyes used to the dark: no channel but red
-            shown[..., 0] = shown.max(axis=-1)
-            shown[..., 1:] = 0
-        return shown.astype(np.float32)
-
     def _depth_words(self, plane: int) -> str:
         return "" if self._planes is None else f", {self._planes[0][plane] / 1000:.4g} mm"
+
+
+def _in_colours(p: Projections, levels: tuple[float, float], *, red: bool) -> Plane:
+    """Return the front with its depth as colour; ``red``: for eyes used to the dark no channel but that."""
+    low, high = levels
+    shown = in_colour_of_depth(p.front - np.float32(low), p.deepest, len(p.top), max(high - low, 1e-12))
+    if red:
+        shown[..., 0] = shown.max(axis=-1)
+        shown[..., 1:] = 0
+    return shown.astype(np.float32)
 
 
 def _line(view: StretchedImage, angle: int) -> Any:

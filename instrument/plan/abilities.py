@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.stage import OVER, StageAxis, approached
-from instrument.files.errors import FileError, ranges
+from instrument.files.errors import FileError, count, ranges, size
 from instrument.files.slm_image import read_slm_levels
 from instrument.plan.led_shapes import LedPlaces
 from instrument.plan.model import Part, Plan, PlanError, Step
@@ -178,8 +178,8 @@ def check(
     need = estimate(plan, abilities, todo=todo, start=start).total_bytes
     if abilities.free_bytes is not None and need + SPARE_BYTES > abilities.free_bytes:
         problems.append(
-            f"{len(steps)} frames need {need / 1e9:.2f} GB and {SPARE_BYTES / 1e9:.2f} GB to spare, but only "
-            f"{abilities.free_bytes / 1e9:.2f} GB are free on the disk. Free some, or choose another folder."
+            f"{count(len(steps), 'frame')} need {size(need)} and {size(SPARE_BYTES)} to spare, but only "
+            f"{size(abilities.free_bytes)} are free on the disk. Free some, or choose another folder."
         )
     if problems:
         raise PlanError(plan.label, problems)

@@ -16,7 +16,7 @@ from drivers.common.stream_reader import StreamReader
 from drivers.errors import DeviceError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from instrument.bench.bench import Bench
-from instrument.files.errors import BenchError
+from instrument.files.errors import BenchError, count, size
 from instrument.plan.abilities import SPARE_BYTES
 from instrument.runs.acquire import free_bytes, record_of
 from instrument.runs.finish import end_run
@@ -85,8 +85,8 @@ def prepare_recording(
     need = frames * _frame_bytes(bench)
     if (free := free_bytes(folder)) < need + SPARE_BYTES:
         raise BenchError(
-            f"{folder}: {frames} frames need {need / 1e9:.2f} GB and {SPARE_BYTES / 1e9:.2f} GB to "
-            f"spare, but only {free / 1e9:.2f} GB are free. Free some, or choose another folder."
+            f"{folder}: {count(frames, 'frame')} need {size(need)} and {size(SPARE_BYTES)} to "
+            f"spare, but only {size(free)} are free. Free some, or choose another folder."
         )
     writer = RunWriter.create(folder, label=options.label, bench=record_of(bench))
     return Recorder(bench, writer, options, on_progress)

@@ -178,9 +178,11 @@ def test_the_red_theme_shows_nothing_but_red(
 ) -> None:
     np.save(tmp_path / "v.npy", np.random.default_rng(0).random((4, 40, 40), np.float32))
     panel.open(tmp_path / "v.npy")
-    qtbot.waitUntil(lambda: panel.volume.projections is not None, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: panel.volume.coloured.image is not None, timeout=WAIT_MS)
+    before = panel.volume.coloured.image
     try:
         list(change_theme("red", panel, [panel]))
+        qtbot.waitUntil(lambda: panel.volume.coloured.image is not before, timeout=WAIT_MS)
         shown = panel.volume.coloured.image
         assert shown[..., 0].max() > 0.5
         assert shown[..., 1:].max() == 0

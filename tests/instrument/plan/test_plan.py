@@ -202,7 +202,7 @@ def test_slm_images_are_looked_at_before_anything_moves(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_is_too_small_is_refused() -> None:
-    with pytest.raises(PlanError, match="GB are free"):
+    with pytest.raises(PlanError, match="only 1 kB are free"):
         check(sweep(), abilities(free_bytes=1000))
 
 

@@ -183,7 +183,7 @@ def test_a_disk_that_fills_up_ends_the_recording_in_words(
         monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
         with pytest.raises(RunError, match="nearly full"):
             recorder.execute()
-        with pytest.raises(BenchError, match="GB are free"):
+        with pytest.raises(BenchError, match="only 1 kB are free"):
             prepare_recording(bench, tmp_path, n_frames=100)
 
 

@@ -136,7 +136,7 @@ def test_a_recording_needs_room_for_its_frames_and_some_to_spare(
     free = [needed * FRAME_BYTES + SPARE_BYTES - 1]
     monkeypatch.setattr(module, "free_bytes", lambda _: free[0])
     options = RecordingOptions(n_frames=n_frames)
-    with pytest.raises(BenchError, match="GB are free"):
+    with pytest.raises(BenchError, match="B are free"):
         prepare_recording(bench, tmp_path, options)
     free[0] += 1
     prepare_recording(bench, tmp_path, options)._writer.close()

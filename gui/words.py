@@ -1,0 +1,42 @@
+"""The terminal's commands in messages, as what does the same in the window."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Mapping
+
+_ELSEWHERE = {
+    "resume": "“Go on with it”, or “Resume” in Runs",
+    "list": "Runs",
+    "snap": "“Snap” in the live view",
+    "record": "“Record” in the live view",
+    "run": "a plan in Sweeps",
+    "plan": "a plan in Sweeps",
+    "calibrate": "Sweeps",
+    "align": "Alignment",
+    "hologram": "Holograms",
+    "reconstruct": "Reconstructions",
+    "chart": "a chart in Files",
+    "new": "a simulated bench of the start page",
+    "devices": "“New bench from what is connected” on the start page",
+}
+"""What is no task of its own in the panel Files."""
+_REST = r"(?:\s+(?:--[a-z][a-z-]*|[A-Z]{3,}|mask|slm|illumination|(?:/|[A-Za-z]:\\)\S*[^\s.,;:]))*"
+"""Of a command: its sub-command, options, places and paths."""
+
+
+def in_the_window(text: str) -> str:
+    """Return a message with the window's own ways in place of the terminal's commands."""
+    ways, command = _ways()
+    return command.sub(lambda found: ways[found[1] or found[2]], text)
+
+
+@functools.cache
+def _ways() -> tuple[Mapping[str, str], re.Pattern[str]]:
+    from instrument.tasks import TASKS  # of a dozen modules: not before the window is there
+
+    ways = {name: f"“{task.title}” in Files" for name, task in TASKS.items()} | _ELSEWHERE
+    ways["reconstruct --video"] = ways["video"]
+    names = "|".join(map(re.escape, sorted(ways, key=len, reverse=True)))
+    return ways, re.compile(rf"'(?:diffuserbench )?({names}){_REST}'|\bdiffuserbench ({names})\b{_REST}")

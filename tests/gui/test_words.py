@@ -1,0 +1,55 @@
+"""Messages of the terminal in the window: what is said to be done is done here."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import instrument
+from gui.words import in_the_window
+
+ROOT = Path(instrument.__file__).parents[1]
+_IN_WINDOW = ("recon", "instrument", "calibration_routines")
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        (
+            "12 of 40 frames are kept. For the others: diffuserbench resume /runs/2026-11-25_axial",
+            "12 of 40 frames are kept. For the others: “Go on with it”, or “Resume” in Runs",
+        ),
+        (
+            "diffuserbench verify RUN names every damaged frame.",
+            "“Verify runs” in Files names every damaged frame.",
+        ),
+        ("Make one: diffuserbench align mask", "Make one: Alignment"),
+        ("is no video of 'reconstruct --video'.", "is no video of “Reconstruct a recording” in Files."),
+        ("install diffuserbench again", "install diffuserbench again"),
+    ],
+)
+def test_commands_are_the_windows_own_ways(said: str, shown: str) -> None:
+    assert in_the_window(said) == shown
+
+
+def test_no_message_sends_to_the_terminal() -> None:
+    left = {words for words in _messages() if re.search(r"diffuserbench [a-z]", in_the_window(words))}
+    assert not {words for words in left if "serve" not in words and "install" not in words}
+
+
+def _messages() -> Iterator[str]:
+    """Yield the sentences in the program's texts: neither examples of commands nor documentation."""
+    for file in (path for room in _IN_WINDOW for path in (ROOT / room).rglob("*.py")):
+        text = file.read_text(encoding="utf-8")
+        if "diffuserbench " not in text or "cli" in file.parts:
+            continue
+        tree = ast.parse(text)
+        documents = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree):
+            said = node.value if isinstance(node, ast.Constant) and id(node) not in documents else None
+            if isinstance(said, str) and not re.search(r"^diffuserbench |^ *[#\[]", said, re.MULTILINE):
+                yield said
