@@ -79,8 +79,7 @@ def _array_problems(run: Run) -> list[FileProblem]:
     array = run.array
     n_frames = array.n_frames if run.plan is None else len(run.plan)
     wanted, group = descriptions(run, n_frames)
-    ended = run.events[-1] if run.events and run.events[-1].get("kind") == "finished" else {}
-    sums = ended.get("descriptions", {})
+    sums = run.events[-1].get("descriptions", {}) if run.events else {}  # of "finished"
     found = []
     for name, expected, look in ((DESCRIPTIONS[0], wanted, _reading_of), (DESCRIPTIONS[1], group, _scale_of)):
         try:
@@ -127,7 +126,7 @@ def mend_files(path: Path) -> list[str]:
         write_bytes(path / LOG, b"".join(map(log_line, records)))
         done.append(f"what could not be read of the log was cut out and is kept in {KEPT}/{kept.name}")
     for problem in file_problems(run):
-        if problem.text is None or problem.name == LOG:
+        if problem.text is None:
             continue
         target = path / problem.name
         words = f"{problem.name} was made again"

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from instrument.files.errors import FileError
+from instrument.runs import repair
 from instrument.runs.inspection import Verification, runs_and_photographs, summary, verify
 from instrument.runs.log import AppendOnlyLog, FrameRecord
 from instrument.runs.repair import file_problems, keep_beside
@@ -265,12 +267,17 @@ def test_damage_is_noted_and_the_note_goes_with_it(tmp_path: Path) -> None:
     note_damage(tmp_path, [])
 
 
-def test_what_is_kept_beside_never_takes_the_place_of_what_was(tmp_path: Path) -> None:
+def test_what_is_kept_beside_never_takes_the_place_of_what_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[Path] = []
+    monkeypatch.setattr(repair, "sync_folder", synced.append)
     kept = [keep_beside(tmp_path, "a/b", bytes([n])) for n in range(12)]
     assert [path.read_bytes() for path in kept] == [bytes([n]) for n in range(12)]
     assert all(path.parent == tmp_path / "kept" and path.name.endswith("_a_b") for path in kept)
     (tmp_path / "file").write_bytes(b"moved")
     assert keep_beside(tmp_path, "file").read_bytes() == b"moved"
+    assert synced == [tmp_path, tmp_path / "kept"]
     assert not (tmp_path / "file").exists()
 
 
@@ -295,7 +302,14 @@ def test_a_run_is_continued_with_what_was_done_to_its_files_in_words(tmp_path: P
         assert writer.mended == ()
     (path / "plan.json").unlink()
     (path / "bench.json").write_text("{")
+    (path / "slm").mkdir()
+    (path / "slm" / "a.png").write_bytes(b"not what its name says")
+    half = Run.open(path).array.chunk_path(1).with_name("part")
+    half.write_bytes(b"half")
+    (path / "state.json").write_text("[1]")
     with RunWriter.reopen(path) as writer:
+        assert not half.exists()
+        assert (path / "slm" / "a.png").exists()
         assert (
             writer.mended[0] == "plan.json was made again" or writer.mended[1] == "plan.json was made again"
         )
@@ -303,4 +317,26 @@ def test_a_run_is_continued_with_what_was_done_to_its_files_in_words(tmp_path: P
             words.startswith("bench.json was made again; the old one is kept in kept/")
             for words in writer.mended
         )
-        assert len(writer.mended) == 2
+        names = sorted(words.partition(" ")[0] for words in writer.mended)
+        assert names == ["bench.json", "plan.json", "state.json"]
+    with (path / "log.jsonl").open("ab") as log:
+        log.write(b"junk\n")
+    with RunWriter.reopen(path) as writer:
+        (words,) = writer.mended
+    assert words.startswith("what could not be read of the log was cut out and is kept in kept/")
+    assert (path / words.rpartition(" ")[2]).read_bytes() == b"junk\n"
+
+
+def test_steps_in_time_that_are_known_at_a_runs_end_are_no_damage_before(tmp_path: Path) -> None:
+    with new_run(tmp_path, plan=None) as writer:
+        writer.start()
+        for index in range(2):
+            shot = frame(index)
+            later = replace(shot.metadata, device_time_ns=3 * 10**9 * index, host_time_ns=index)
+            writer.write([replace(shot, metadata=later)])
+    for _ in range(2):
+        assert Run.open(writer.path).frame_period_s == 3.0
+        assert verify(Run.open(writer.path)).is_sound
+        with RunWriter.reopen(writer.path) as again:
+            assert again.mended == ()
+            again.finish(FinishReason.STOPPED)

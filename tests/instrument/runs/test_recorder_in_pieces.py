@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 from collections.abc import Iterator
@@ -88,6 +89,23 @@ def test_lost_frames_keep_their_numbers_and_are_counted_by_who_lost_them(bench: 
         assert status.bytes_per_s == pytest.approx(FRAME_BYTES * status.frames_per_s)
         assert 0 < status.seconds < 3600
         assert status.free_bytes > 0
+
+
+def test_time_runs_from_the_first_frame_on_and_is_never_nothing(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for step_s in (0.0, 1.0):
+        ticks = itertools.count(100.0, step_s)
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=ticks.__next__))
+        _, told = recorded(bench, (0, 0), None, (0, 0), n_frames=2)
+        first, last = (status.seconds for status in told)
+        assert (first == last == 1e-9) if step_s == 0 else (1 <= first < last < 20)
+
+
+def test_a_frame_that_is_late_is_waited_for(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    take, late = Stream.next_frame, [True]
+    monkeypatch.setattr(Stream, "next_frame", lambda *given: None if late and late.pop() else take(*given))
+    assert recorded(bench, (0, 0), n_frames=1)[0] == [[0]]
 
 
 def test_a_recording_may_end_with_what_was_lost(bench: Bench) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -17,8 +18,9 @@ from instrument.bench.bench import Bench
 from instrument.files.errors import FileError
 from instrument.plan import Light, Plan, Step
 from instrument.runs import runner as module
-from instrument.runs.acquire import abilities_of, free_bytes
+from instrument.runs.acquire import abilities_of, free_bytes, prepare, record_of, there_now
 from instrument.runs.run import FinishReason
+from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import Runner, RunState, RunStatus, StepSettings, discarded
 from tests.instrument.runs.test_runner import calls, open_mock_bench, plan
 
@@ -225,6 +227,16 @@ def test_an_abort_between_the_steps_of_a_refused_sequence_is_heeded(
     assert calls(bench).count("camera.snap") == 1
 
 
+@pytest.mark.parametrize(("used", "times"), [(True, 3), (False, 1), (None, 1)])
+def test_what_a_watcher_has_used_is_set_anew(
+    bench: Bench, ended: list[FinishReason], used: bool | None, times: int
+) -> None:
+    runner, _ = made(bench, plan(3), todo=[1, 2, 3], on_frame=lambda *_: used)
+    runner.execute()
+    assert ended == [FinishReason.COMPLETED]
+    assert calls(bench).count("camera.set_exposure_ms") == times
+
+
 def test_a_refused_sequence_that_must_be_timed_by_hardware_ends_the_run(
     bench: Bench, ended: list[FinishReason], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -319,3 +331,32 @@ def test_a_run_that_is_not_carried_out_is_closed(bench: Bench) -> None:
     with discarded(runner):
         pass
     writer.close.assert_called_once_with()
+
+
+def test_a_run_keeps_the_pitch_of_the_pixels_that_it_stores(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pitch_um = bench.camera.pixel_pitch_um
+    monkeypatch.setattr(type(bench.camera), "binning", 4)
+    assert record_of(bench).pixel_pitch_um == 4 * pitch_um
+
+
+def test_what_is_to_be_stopped_before_it_began_makes_no_run(bench: Bench, tmp_path: Path) -> None:
+    control = RunControl()
+    control.abort()
+    with pytest.raises(EndedEarlyError):
+        prepare(bench, plan(1), tmp_path, control=control)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_where_nothing_can_be_kept_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    assert there_now(tmp_path / "a" / "b") == tmp_path
+    with pytest.raises(FileError, match="file is a file, not a folder; nothing can be kept there"):
+        free_bytes(tmp_path / "file" / "runs")
+    monkeypatch.setattr(os, "access", lambda there, mode: there != tmp_path or mode != os.W_OK)
+    with pytest.raises(FileError, match=f"you may not write to {tmp_path}; nothing can be kept there"):
+        free_bytes(tmp_path / "runs")
+    monkeypatch.setattr(Path, "exists", lambda _: False)
+    with pytest.raises(FileError, match="not even its disk"):
+        there_now(tmp_path)
