@@ -7,7 +7,6 @@ fast it is, and what only CUDA knows, it does not show.
 
 from __future__ import annotations
 
-import sys
 import types
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -52,12 +51,13 @@ class DeviceArray(np.ndarray):
         """Return a mean of the device, also where it is a number."""
         return _outer(self.view(np.ndarray).mean(*args, **given))
 
+    def __array_namespace__(self, *, api_version: str | None = None) -> Any:
+        """Return the device's library."""
+        return LIBRARY
+
     def get(self) -> np.ndarray:
         """Return a copy in the host's memory."""
         return np.array(self.view(np.ndarray))
-
-
-DeviceArray.__module__ = NAME
 
 
 def _inner(value: Any) -> Any:
@@ -111,7 +111,7 @@ class _Library(types.ModuleType):
     array = asarray
 
 
-LIBRARY = sys.modules[NAME] = _Library(NAME, np)  # arrays are asked for their module by its name
+LIBRARY = _Library(NAME, np)
 
 
 @contextmanager

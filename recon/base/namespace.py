@@ -48,8 +48,9 @@ def array_namespace(device: Device) -> Namespace:
 
 def namespace_of(array: Any) -> Namespace:
     """Return the module that an array is of."""
-    kind = type(array)
-    return np if kind is np.ndarray else importlib.import_module(kind.__module__.split(".")[0])
+    if isinstance(array, np.ndarray):
+        return array.__array_namespace__()  # NumPy's, also of other packages' images that are its arrays
+    return importlib.import_module(type(array).__module__.split(".")[0])
 
 
 def to_host(array: Any) -> npt.NDArray[Any]:
