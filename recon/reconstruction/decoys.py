@@ -124,19 +124,20 @@ def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | Non
     check, small = (again, many) if same or again.fit is not Fit.UNTOLD else (check, few)
     if check.wrong and not lit:  # by stray light, or by light from beyond the field?
         again = compete(small, thorough, lit=True)
-        cleared = again.fit is Fit.FITS
-        if cleared and check.better is not None:  # which this competition may not have come to
+        own, cleared, stands = as_given(again.scores), again.fit is Fit.FITS, True
+        if check.better is not None:  # which this competition may not have come to
             accuser = again.scores.get(check.better) or small.score(
                 check.better, iterations=thorough, background=True
             )
-            cleared = is_told(again.scores[GIVEN], accuser, small.pixels)
-        check = again if cleared else check
+            cleared = cleared and is_told(own, accuser, small.pixels)
+            stands = is_ahead(accuser, (own,), small.pixels, NEARLY)
+        check = again if cleared else check if stands else replace(again, fit=Fit.UNTOLD, better=None)
     left = float(np.mean(as_given(again.scores).fine)) ** 0.5
     if check.fit in HEAVIER and left > FAR_ABOVE:
         again = compete(small, thorough, lit=lit, weight=left)
         check = again if again.fit in HEAVIER[check.fit] and _is_certain(again) else check
-    if check.fit is Fit.FOREIGN and small.clipped > MOST_CLIPPED:
-        return replace(check, fit=Fit.UNTOLD)
+    if check.wrong and small.clipped > MOST_CLIPPED:
+        return replace(check, fit=Fit.UNTOLD, better=None)
     given = _given(problem).depths
     one = given.varies and not problem.depths.varies and given.field_error > VARIED
     return None if one and check.fit in (Fit.FOREIGN, Fit.UNTOLD) else check
@@ -160,11 +161,10 @@ class _Small:
         erasures = self.photograph.erasures
         return int(np.size(self.photograph.image) - (0 if erasures is None else np.count_nonzero(erasures)))
 
-    def structure(self) -> float:
-        """Return how much of :meth:`fine` the PSFs resolve: all or nothing."""
+    def resolves(self) -> bool:
+        """Tell whether the PSFs resolve :meth:`fine`."""
         problem = self._problem(self.calibration, background=False)
-        finest = lateral_resolution(problem.depths.central[problem.n_depths // 2, 0]).mean_px
-        return self.fine() if finest <= FINE_PX else 0.0
+        return lateral_resolution(problem.depths.central[problem.n_depths // 2, 0]).mean_px <= FINE_PX
 
     def fine(self) -> float:
         """Return the mean square of the photograph's fine structure beyond noise."""
@@ -224,7 +224,6 @@ def _competition(small: _Small, scored: Callable[[Transformation], Score]) -> Ca
     check = check_of(scores, small.pixels)
     if check.sure:
         return check
-    structure = small.structure()
     scores[BETWEEN] = scored(BETWEEN)
     near = [how for how in decoys if how not in FAR]
     for how in _minima(scores, near, small.pixels):
@@ -233,7 +232,7 @@ def _competition(small: _Small, scored: Callable[[Transformation], Score]) -> Ca
     while scores[best].objective < scores[before].objective and len(scores) < MOST_DECOYS:
         before, best = best, Transformation(scale=best.scale**2, rotation_deg=2 * best.rotation_deg)
         scores[best] = scored(best)
-    return check_of(scores, small.pixels, structure)
+    return check_of(scores, small.pixels, small.fine(), resolved=small.resolves())
 
 
 def _minima(

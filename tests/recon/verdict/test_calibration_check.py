@@ -102,14 +102,18 @@ def test_where_nothing_is_lit_or_all_is_nothing_is_told(seen: tuple[Image, Image
         assert fit(noise, seen[1])[0] is Fit.UNTOLD
 
 
-def test_a_photograph_mostly_at_full_scale_has_its_noise_and_makes_nobody_foreign(
+def test_a_photograph_mostly_at_full_scale_has_its_noise_and_accuses_nobody(
     seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clipped = np.minimum(seen[0], np.percentile(seen[0], 40))
     assert Problem.of(clipped, seen[1]).noise[0] > 0.3 * Problem.of(*seen).noise[0]
-    foreign = CalibrationCheck(Fit.FOREIGN, GOOD, 9000)
-    monkeypatch.setattr(decoys, "_competition", lambda *_: foreign)
-    assert [fit(image, seen[1])[0] for image in (seen[0], clipped)] == [Fit.FOREIGN, Fit.UNTOLD]
+    scores = GOOD | {FAR[0]: BETTER}
+    for accused in (
+        CalibrationCheck(Fit.OFF, scores, 9000, FAR[0]),
+        CalibrationCheck(Fit.FOREIGN, GOOD, 9000),
+    ):
+        monkeypatch.setattr(decoys, "_competition", lambda *_, accused=accused: accused)
+        assert [fit(image, seen[1])[0] for image in (seen[0], clipped)] == [accused.fit, Fit.UNTOLD]
     without = Measurement(clipped, erasures=clipped == clipped.max())
     check = check_calibration(Problem.of(without, seen[1]))
     assert check is not None
@@ -132,7 +136,7 @@ def test_a_saturated_psf_is_named_as_what_does_not_fit(
     unsure = dict.fromkeys((GIVEN, *NEAR, *FAR), GOOD[GIVEN])
     clipped = np.minimum(seen[1], np.percentile(seen[1], 95))
     for better, named in ((NEAR[0], "PSF is saturated"), (FAR[0], "mirrored")):
-        off = CalibrationCheck(Fit.OFF, unsure, 9000, better)
+        off = CalibrationCheck(Fit.OFF, unsure | {better: BETTER}, 9000, better)
         monkeypatch.setattr(decoys, "_competition", lambda *_, off=off: off)
         check = check_calibration(Problem.of(seen[0], clipped))
         assert check is not None
@@ -143,7 +147,7 @@ def test_a_saturated_psf_is_named_as_what_does_not_fit(
 def test_files_that_are_not_in_proportion_to_the_light_are_named(
     seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, both: bool
 ) -> None:
-    unsure = dict.fromkeys((GIVEN, *NEAR, *FAR), GOOD[GIVEN])
+    unsure = dict.fromkeys((GIVEN, *NEAR, *FAR), GOOD[GIVEN]) | {NEAR[0]: BETTER}
     monkeypatch.setattr(decoys, "_competition", lambda *_: CalibrationCheck(Fit.OFF, unsure, 9000, NEAR[0]))
     photograph, psf = (255 * (image / image.max()) ** (1 / 2.2) for image in seen)
     coded = check_calibration(Problem.of(photograph, psf if both else seen[1]))
@@ -173,7 +177,14 @@ def test_of_a_picture_with_a_background(seen: tuple[Image, Image]) -> None:
     assert [right and right.fit, wrong and str(wrong.better)] == [Fit.FITS, "turned by -1 degrees"]
 
 
-@pytest.mark.parametrize(("gain", "found"), [(0.0, Fit.OFF), (0.5, Fit.FITS)])
+@pytest.mark.parametrize(
+    ("gain", "found"),
+    [
+        (-0.1, Fit.OFF),
+        (0.0, Fit.UNTOLD),
+        (0.5, Fit.FITS),
+    ],  # of what stray light alone explains nobody is accused
+)
 def test_an_accused_one_is_cleared_against_its_accuser_wherever_that_was_tried(
     seen: tuple[Image, Image], monkeypatch: pytest.MonkeyPatch, gain: float, found: Fit
 ) -> None:
@@ -181,7 +192,7 @@ def test_an_accused_one_is_cleared_against_its_accuser_wherever_that_was_tried(
     accused = CalibrationCheck(Fit.OFF, GOOD, 9000, on_the_way)
     told = iter((accused, accused, CalibrationCheck(Fit.FITS, GOOD, 9000)))
     monkeypatch.setattr(decoys, "_competition", lambda *_: next(told))
-    accuser = right._replace(objective=right.objective + gain)
+    accuser = score(1.2, right.objective + gain, 0.001)
     monkeypatch.setattr(decoys._Small, "score", lambda *_, **__: accuser)
     assert fit(*seen)[0] is found
 
@@ -218,6 +229,7 @@ def score(misfit: float, objective: float, unlike: float = 0.0) -> Score:
     return Score(misfit, objective, tuple(misfit * tiles), tuple(objective * tiles))
 
 
+BETTER = score(1.1, 1.4, 0.001)
 GOOD = {GIVEN: score(1.2, 1.5), BETWEEN: score(1.2, 1.5)} | {how: score(1.6, 2.0, 0.1) for how in NEAR}
 
 
@@ -281,7 +293,8 @@ def test_without_a_far_decoy_the_near_ones_tell() -> None:
 def test_a_pattern_that_is_half_its_own_mirror_image_is_not_foreign() -> None:
     given, worse, much = score(3.0, 4.0), score(3.0, 4.02, 0.2), score(3.3, 4.5, 0.2)
     scores = dict.fromkeys(NEAR, worse) | {GIVEN: given, FAR[0]: much, FAR[1]: much, FAR[2]: score(3.0, 4.0)}
-    assert check_of(scores, 9000, structure=8.0).fit is Fit.UNTOLD
+    for resolved in (True, False):
+        assert check_of(scores, 9000, structure=8.0, resolved=resolved).fit is Fit.UNTOLD
     assert check_of(scores | {FAR[1]: worse}, 9000, structure=8.0).fit is Fit.FOREIGN
     better = score(2.9, 3.9)
     assert check_of(scores | {FAR[2]: better}, 900, structure=8.0).fit is not Fit.UNTOLD
