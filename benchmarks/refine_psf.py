@@ -1,11 +1,12 @@
 """PSFs refined by the photograph: planted errors and how they are recovered.
 
-    python benchmarks/refine_psf.py [--sets simulated hand usaf] [--size 128] [--seeds 2]
+    python benchmarks/refine_psf.py [--sets simulated stack hand usaf] [--size 128] [--seeds 2]
 
 Plants 2 % of scale, 2 degrees, a shift of 5 pixels, alone and together, and prints what is found and what the
 picture is worth: of simulated scenes, whose diffuser moves between calibration and photograph and is rendered
 lenslet by lenslet, against the truth; of the measured hand and USAF target (``DIFFUSERBENCH_DATA``, else
-``../shared/data``), where the right PSF is not known, against what is found of the PSF as it came. PSNR is
+``../shared/data``), where the right PSF is not known, against what is found of the PSF as it came; of a
+picture asked for at each depth of a stack of six, of which none is its own (1 degree planted). PSNR is
 after the best shift, as a moved PSF moves the picture, and the best gain.
 """
 
@@ -15,6 +16,7 @@ import argparse
 import sys
 import time
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -27,6 +29,7 @@ from recon.camera.registration import aligned, register
 from recon.camera.transformed import Transformation, transformed
 from recon.evaluation.measured_sets import measured_set
 from recon.evaluation.scene import make_scene
+from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.psf_refinement import Refinement, refine_psf
 
@@ -87,6 +90,25 @@ def simulated(family: str, size: int, seed: int) -> None:
         told(f"{family}, seed {seed}", planted, found, seconds, f"{given:.1f}, {mended:.1f}, {right:.1f}")
 
 
+def in_a_stack(family: str, optics: Literal["random", "smooth"], size: int, seed: int) -> None:
+    """Ask for a picture at every depth that was calibrated, print which depth is found and what is gained."""
+    scene = make_scene(family, size=size, seed=seed, depths=6, optics=optics, drift_deg=1.0)
+    true_um = 2 / (1 / scene.z_um[0] + 1 / scene.z_um[-1])
+    truth = scene.truth.sum(axis=0) if scene.truth.ndim == 3 else scene.truth
+    for z_um in scene.z_um:
+        options = ReconstructionOptions(z_um=float(z_um), model="convolution", iterations=60, judged=False)
+        pictures = [
+            reconstruct(scene.measurement, scene.calibration, options, refine_psf=fit)
+            for fit in (False, True)
+        ]
+        found = pictures[1].refinement
+        print(
+            f"| {family}, {optics}, seed {seed} | {z_um / 1e3:.2f} | {true_um / 1e3:.2f} | {found} | "
+            f"{psnr(pictures[0].image, truth):.1f}, {psnr(pictures[1].image, truth):.1f} |",
+            flush=True,
+        )
+
+
 def measured(name: str, binning: int) -> None:
     """Transform the PSFs of a measured set, print what is found, and pictures beside the first's."""
     psfs, image = (block_mean(a, binning) for a in measured_set(name))
@@ -106,7 +128,7 @@ def measured(name: str, binning: int) -> None:
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--sets", nargs="+", default=["simulated", "hand", "usaf"])
+    parser.add_argument("--sets", nargs="+", default=["simulated", "stack", "hand", "usaf"])
     parser.add_argument("--families", nargs="+", default=list(FAMILIES))
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--seeds", type=int, default=2)
@@ -117,7 +139,8 @@ def main() -> None:
         "photograph", "planted", "scale found, %", "turn found, degrees", "left, held out: given, found",
         "taken", "PSNR: given, refined, right", "CPU s",
     )  # fmt: skip
-    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|", flush=True)
+    if {*a.sets} - {"stack"}:
+        print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|", flush=True)
     if "simulated" in a.sets:
         for family in a.families:
             for seed in range(a.seeds):
@@ -126,6 +149,12 @@ def main() -> None:
         measured("hand", 4)
     if "usaf" in a.sets:
         measured("usaf", 4)
+    if "stack" in a.sets:
+        of_stack = ("photograph", "asked for, mm", "true, mm", "found", "PSNR: given, refined")
+        print(f"\n| {' | '.join(of_stack)} |\n{'|---' * len(of_stack)}|", flush=True)
+        for seed in range(a.seeds):
+            for optics in ("random", "smooth"):
+                in_a_stack("sparse-picture", optics, min(a.size, 64), seed)
 
 
 if __name__ == "__main__":

@@ -129,7 +129,7 @@ def reconstruct(
         if _is_file(image) or _is_file(psf):
             inputs = _inputs({name: overrides.pop(name) for name in _INPUTS & set(overrides)})
             options = with_overrides(options or ReconstructionOptions(), overrides)
-            job = _job(_opened(image, "photograph"), psf, inputs, options.z_um)
+            job = _job(_opened(image, "photograph"), psf, inputs, options)
             measurement = job.as_measurement(inputs.noise)
             return Result.of(one_door.reconstruct(measurement, job.calibration, options, **further), job)
         if about := sorted(_FILES_ONLY & set(overrides)):
@@ -181,7 +181,7 @@ def _inputs(given: Mapping[str, Any]) -> InputOptions:
     return inputs
 
 
-def _job(image: ImageFile, psf: Any, inputs: InputOptions, z_um: float | None) -> Job:
+def _job(image: ImageFile, psf: Any, inputs: InputOptions, options: ReconstructionOptions) -> Job:
     """Bring a photograph and PSFs together."""
     if isinstance(psf, Calibration):
         job = job_with(psf, Path("the calibration"), image, inputs)
@@ -190,7 +190,8 @@ def _job(image: ImageFile, psf: Any, inputs: InputOptions, z_um: float | None) -
     else:
         file = _opened(psf, "PSF")
         job = volume_job(file, image, inputs) if file.is_stack else job_from_files(file, image, inputs)
-    return job if z_um is None else refocused(job, z_um)
+    z_um, beside = options.z_um, options.refine_psf
+    return job if z_um is None else refocused(job, z_um, beside=beside)
 
 
 def _job_of_arrays(image: Any, psf: Any) -> Job:

@@ -139,7 +139,7 @@ class PictureRequest(_Request):
             job = job_from_files(self.psf, self.image, inputs)
         else:
             raise BenchError("Give either --psf FILE or --calibration FOLDER (one of them).")
-        return job if options.z_um is None else refocused(job, options.z_um)
+        return job if options.z_um is None else refocused(job, options.z_um, beside=options.refine_psf)
 
     def _measurement(self, job: Job) -> Measurement:
         """Return the photograph; refused for a calibration of several depths without one of them."""
@@ -231,8 +231,10 @@ def require_distance(z_um: float) -> None:
         raise BenchError(f"The scene's distance must be above 0 mm, not {z_um / 1e3:g} mm.")
 
 
-def refocused(job: Job, z_um: float) -> Job:
+def refocused(job: Job, z_um: float, *, beside: bool = False) -> Job:
     """Return the job with a PSF for a depth that its calibration does not contain, and a note that says so.
+
+    With ``beside`` the calibrated depths stay beside it, for a fit of the depth.
 
     Where the calibration has the depth the job is returned as it is. Where it has several, but the distance
     from diffuser to sensor is not known, the nearest is taken, and a note says so.
@@ -262,6 +264,13 @@ def refocused(job: Job, z_um: float) -> Job:
     calibration, made = at_depth(calibration, z_um)
     if made is None:
         return job
+    if beside and len(members_of_depths(job.calibration.source_positions_um)) > 1:
+        own = (job.calibration, calibration)
+        calibration = replace(
+            calibration,
+            psfs=np.concatenate([c.psfs for c in own]),
+            source_positions_um=np.concatenate([c.source_positions_um for c in own]),
+        )
     return replace(
         job,
         calibration=calibration,

@@ -252,7 +252,7 @@ class ReconstructionOptions:
     )
     refine_psf: bool = option(
         False,
-        help="First fit the PSFs' size and rotation to the photograph.",
+        help="First fit the PSFs' size, rotation and, of a stack, depth to the photograph.",
         label="Refine the PSF",
         group=_CHOICE,
         applies=("picture", "volume"),

@@ -75,6 +75,8 @@ class Problem:
         Change an iteration at which to stop, where it was chosen; else the solver's own.
     choice : Choice or None
         What was chosen and why; ``reduction`` then has the way back.
+    stack : Calibration or None
+        All that was calibrated, where the PSFs of one depth were asked for.
     """
 
     measurement: Measurement
@@ -93,6 +95,7 @@ class Problem:
     tolerance: float | None = None
     choice: Choice | None = None
     reduction: Reduction | None = None
+    stack: Calibration | None = None
 
     @classmethod
     def of(
@@ -141,6 +144,7 @@ class Problem:
             options = settled(options, model="convolution")
         if measurement.patterns is not None and options.model == "auto":
             options = settled(options, model="convolution")
+        stack = None if options.z_um is None else calibration
         calibration, depths, doubts = depths_of(calibration, options)
         require_same_channels(calibration.psfs, counts.data[:: measurement.frames])
         require_same_pixels(calibration.psfs[0], counts.data)
@@ -168,6 +172,7 @@ class Problem:
             "float32" if options.precision == "auto" else options.precision,
             extent,
             tuple(dict.fromkeys((*filter(None, (holes,)), *doubts, *depths.warnings, *counts.warnings))),
+            stack=stack,
         )
         if options.axis_weights is not None:
             problem._require_axis_weights(options.axis_weights)

@@ -10,6 +10,10 @@ one, stray light of three times the scene's gives the same to 0.01 %). Slow wave
 measured data and pull the scale by half a percent; without them forty iterations say what four hundred do, to
 0.06 %.
 
+Of a picture of one depth of several that were calibrated, the size tells the depth (Kuo 2020, Eq. 5.2). Where
+another calibrated one is nearer to that, its PSF is in focus there as the enlarged one is not: it is fitted
+as well, and the one of the two is taken that leaves less.
+
 A photograph cannot tell where a PSF lies nor how bright it is: a PSF that is moved or brighter makes a
 picture that is moved or darker, and fits as well.
 """
@@ -27,7 +31,9 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.blocks import block_sum
-from recon.camera.camera_model import CAMERAS, Depths, choose_model
+from recon.camera.camera_model import CAMERAS, Depths, choose_model, one_depth
+from recon.camera.grid import FAR_UM
+from recon.camera.refocus import central_psfs, paraxial_scale
 from recon.camera.transformed import Transformation, transformed
 from recon.camera.varying_psfs import FieldOfPsfs
 from recon.errors import InputError
@@ -89,6 +95,11 @@ class Refinement:
         How far the transformation is from none, in its own standard errors.
     seconds : float
         Wall time.
+    of_z_um : float or None
+        The calibrated depth whose PSFs these are, where it is not the one that was asked for.
+    z_um, z_error_um : float or None
+        The scene's depth by the size that was found, and its standard deviation; None where only one depth
+        was calibrated, or the distance from diffuser to sensor is not known.
     """
 
     transformation: Transformation
@@ -99,6 +110,9 @@ class Refinement:
     certainty: float
     significance: float
     seconds: float
+    of_z_um: float | None = None
+    z_um: float | None = None
+    z_error_um: float | None = None
 
     @property
     def helps(self) -> bool:
@@ -128,6 +142,9 @@ class Refinement:
             "scale_error": self.scale_error,
             "rotation_deg": how.rotation_deg,
             "rotation_error_deg": self.rotation_error_deg,
+            "of_z_um": self.of_z_um,
+            "z_um": self.z_um,
+            "z_error_um": self.z_error_um,
             "held_out_given": self.given,
             "held_out_found": self.found,
             "standard_errors": self.certainty,
@@ -141,6 +158,10 @@ class Refinement:
         copy = f"turned by {how.rotation_deg:+.2f} +- {self.rotation_error_deg:.2f} degrees"
         if self.scale_error is not None:
             copy += f", {100 * (how.scale - 1):+.2f} +- {100 * self.scale_error:.2f} % larger"
+        if self.of_z_um is not None:
+            copy = f"of the depth of {self.of_z_um / 1e3:.4g} mm, {copy}"
+        if self.z_um is not None and self.z_error_um is not None:
+            copy += f", as from {self.z_um / 1e3:.4g} +- {self.z_error_um / 1e3:.2g} mm"
         left = f"{self.given:.3g} to {self.found:.3g} times the noise"
         if self.helps:
             return f"fits better {copy}: fine structure left on held-out pixels falls from {left}"
@@ -156,7 +177,7 @@ def as_refined(calibration: Calibration, refinement: Mapping[str, Any]) -> Calib
     ----------
     calibration : Calibration
     refinement : mapping
-        As :meth:`Refinement.to_json` has it: ``scale`` and ``rotation_deg`` count.
+        As :meth:`Refinement.to_json` has it: ``scale``, ``rotation_deg`` and ``of_z_um`` count.
 
     Raises InputError when these are no numbers that PSFs can be turned and enlarged by.
     """
@@ -164,6 +185,8 @@ def as_refined(calibration: Calibration, refinement: Mapping[str, Any]) -> Calib
         how = Transformation(scale=refinement["scale"], rotation_deg=refinement["rotation_deg"])
     except (KeyError, TypeError) as error:
         raise InputError(f"A refinement of PSFs has scale and rotation_deg, not {refinement}.") from error
+    if refinement.get("of_z_um") is not None:
+        calibration = one_depth(calibration, refinement["of_z_um"])
     positions = calibration.source_positions_um.copy()
     # A pattern that is turned or enlarged is that of a source elsewhere: (x, y) is (column, row).
     positions[:, 1::-1] = positions[:, 1::-1] @ how.matrix.T
@@ -198,7 +221,8 @@ def refined(
         return problem, None
     if not refinement.helps:
         return problem, refinement
-    return Problem.of(problem.measurement, refinement.of(problem.calibration), problem.options), refinement
+    calibration = refinement.of(problem.calibration if refinement.of_z_um is None else _stack(problem))
+    return Problem.of(problem.measurement, calibration, problem.options), refinement
 
 
 class _CancelledError(Exception):
@@ -228,11 +252,19 @@ def refine_psf(
 
     start = _searched(_Trials(problem, SEARCH_PX, SEARCH_ITERATIONS), count)
     trials = _Trials(problem, FIT_PX, FIT_ITERATIONS)
-    fit = _fitted(trials, start, FIT_STEPS_PX[0] / trials.radius_px, lambda done: count(0.3 + 0.35 * done))
-    fit = _fitted(
-        trials, fit.place, FIT_STEPS_PX[1] / trials.radius_px, lambda done: count(0.65 + 0.35 * done)
-    )
-    given, found = trials.judged(0 * fit.place), trials.judged(fit.place)
+    fit = _fitted(trials, start, FIT_STEPS_PX[0] / trials.radius_px, lambda done: count(0.3 + 0.2 * done))
+    fit = _fitted(trials, fit.place, FIT_STEPS_PX[1] / trials.radius_px, lambda done: count(0.5 + 0.2 * done))
+    given, found, of_z_um = trials.judged(0 * fit.place), trials.judged(fit.place), None
+    z_um = _depth_um(problem, fit.place)
+    if z_um is not None and (other := _nearer(problem, z_um)) is not None:
+        own = float(other.depths.z_um[0])
+        place = fit.place - [0.0, np.log(_growth(problem, own))]
+        trials_there = _Trials(other, FIT_PX, FIT_ITERATIONS)
+        step = FIT_STEPS_PX[1] / trials_there.radius_px
+        there = _fitted(trials_there, place, step, lambda done: count(0.7 + 0.3 * done))
+        if trials_there.fitted(there.place).mean() < trials.fitted(fit.place).mean():
+            fit, found, of_z_um = there, trials_there.judged(there.place), own
+            z_um = _depth_um(other, fit.place)
     how, errors = _transformation(fit.place), np.sqrt(np.diag(fit.covariance))
     ratio = np.log(np.maximum(given, LEAST) / np.maximum(found, LEAST))
     scatter = float(np.std(ratio, ddof=1)) / np.sqrt(len(ratio))
@@ -244,9 +276,51 @@ def refine_psf(
         float(np.sqrt(given.mean())),
         float(np.sqrt(found.mean())),
         float(np.mean(ratio)) / max(scatter, 1e-12),
-        float(np.sqrt(fit.place @ np.linalg.pinv(fit.covariance, hermitian=True) @ fit.place)),
+        np.inf
+        if of_z_um is not None
+        else float(np.sqrt(fit.place @ np.linalg.pinv(fit.covariance, hermitian=True) @ fit.place)),
         time.perf_counter() - began,
+        of_z_um,
+        z_um,
+        None if z_um is None else float(errors[1]) * z_um**2 * (1 / _distance_um(problem) + 1 / z_um),
     )
+
+
+def _stack(problem: Problem) -> Calibration:
+    """Return all that was calibrated."""
+    return problem.calibration if problem.stack is None else problem.stack
+
+
+def _distance_um(problem: Problem) -> float:
+    """Return the distance from diffuser to sensor; NaN where it is not known."""
+    distance_mm = problem.calibration.geometry.diffuser_distance_mm
+    return float("nan") if distance_mm is None else 1e3 * distance_mm
+
+
+def _growth(problem: Problem, z_um: float) -> float:
+    """Return how much larger a pattern is from a depth than from that of a problem's PSF."""
+    return paraxial_scale(float(problem.depths.z_um[0]), z_um, _distance_um(problem))
+
+
+def _depth_um(problem: Problem, place: Floats) -> float | None:
+    """Return the depth from which a problem's pattern is so large; None where no other was calibrated."""
+    d, stack = _distance_um(problem), problem.stack
+    if (
+        stack is None
+        or len(place) < 2
+        or not np.isfinite(d)
+        or not (stack.source_positions_um[:, 2] > 0).all()
+    ):
+        return None
+    if len(central_psfs(stack)[0]) < 2:
+        return None
+    return 1 / max(((1 + d / float(problem.depths.z_um[0])) * float(np.exp(place[1])) - 1) / d, 1 / FAR_UM)
+
+
+def _nearer(problem: Problem, z_um: float) -> Problem | None:
+    """Return the problem with the PSFs of the calibrated depth nearest to another, where these are others."""
+    other = Problem.of(problem.measurement, _stack(problem), replace(problem.options, z_um=z_um))
+    return None if other.depths.z_um[0] == problem.depths.z_um[0] else other
 
 
 def _transformation(place: Floats) -> Transformation:

@@ -22,8 +22,11 @@ from scipy.signal import convolve2d
 from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.files.images import read_image, write_image
+from instrument.reconstruction.request import PictureRequest
 from instrument.reconstruction.stored_result import open_result
 from recon.priors import PRIORS
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.problem import Problem
 from recon.reconstruction.solvers import SOLVERS
 from recon.types import Calibration, Geometry
 
@@ -453,6 +456,19 @@ def test_without_the_diffusers_distance_the_nearest_psf_is_said_to_be_taken(
     assert "not refocused to 30 mm" in capsys.readouterr().out
     assert main([*words, "--out", "out.tif", "--z-mm", "40"]) == 0
     assert "refocused" not in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("here")
+def test_for_a_fit_of_the_depth_the_calibrated_ones_stay_beside_what_is_brought_to_another() -> None:
+    psfs = np.stack([PSF, np.roll(PSF, 1, axis=0)])[:, None].astype(np.float32)
+    places = np.array([[0, 0, 20_000], [0, 0, 40_000]], float)
+    save_calibration(Calibration(psfs, places, geometry=Geometry(10.0, 5.0)), Path("measured"))
+    for fit, depths_um in ((False, [30_000]), (True, [20_000, 40_000, 30_000])):
+        options = ReconstructionOptions(z_um=30_000, refine_psf=fit)
+        job = PictureRequest(image=Path("raw.tif"), calibration=Path("measured"), options=options).prepare()
+        assert job.calibration.source_positions_um[:, 2] == pytest.approx(depths_um)
+        problem = Problem.of(job.as_measurement(None), job.calibration, options)
+        assert problem.depths.z_um == pytest.approx([30_000])
 
 
 @pytest.mark.usefixtures("here")

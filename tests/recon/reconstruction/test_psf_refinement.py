@@ -12,8 +12,9 @@ from recon import reconstruct
 from recon.camera.transformed import Transformation, transformed
 from recon.errors import InputError
 from recon.evaluation.scene import TestScene, make_scene
+from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.psf_refinement import Refinement, refine_psf
+from recon.reconstruction.psf_refinement import Refinement, as_refined, refine_psf
 from recon.types import Calibration
 
 
@@ -97,6 +98,25 @@ def test_of_volumes_the_rotation_alone_is_fitted() -> None:
     assert found.transformation.scale == 1
     assert abs(found.transformation.rotation_deg) == pytest.approx(3.0, abs=0.3)
     assert "larger" not in str(found)
+
+
+def test_of_one_depth_of_several_that_which_fits_is_taken() -> None:
+    scene = make_scene("sparse-picture", size=48, seed=3, depths=3, optics="smooth", z_near=5, drift_deg=2.0)
+    _, true_um, far_um = scene.z_um
+    wrong = ReconstructionOptions(z_um=far_um)
+    result = reconstruct(
+        scene.measurement, scene.calibration, wrong, iterations=2, judged=False, refine_psf=True
+    )
+    found = result.refinement
+    assert found is not None
+    assert found.helps
+    assert (found.of_z_um, result.provenance["psf_z_um"]) == (true_um, true_um)
+    assert found.z_um == pytest.approx(true_um, rel=0.03)
+    assert found.transformation.scale == pytest.approx(1, abs=0.005)
+    assert found.transformation.rotation_deg == pytest.approx(-2.0, abs=0.3)
+    assert f"of the depth of {true_um / 1e3:.4g} mm, turned by" in str(found)
+    kept = as_refined(scene.calibration, found.to_json())
+    assert kept.source_positions_um[:, 2] == pytest.approx([true_um])
 
 
 @pytest.mark.parametrize("photograph", [np.zeros((16, 20)), np.full((16, 20), 7.0)])
