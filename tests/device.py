@@ -121,6 +121,9 @@ def played() -> Iterator[types.ModuleType]:
         patched.enter_context(
             mock.patch("recon.reconstruction.part.array_namespace", {"cpu": np, "gpu": LIBRARY}.__getitem__)
         )
+        patched.enter_context(
+            mock.patch("recon.holography.model.array_namespace", {"cpu": np, "gpu": LIBRARY}.__getitem__)
+        )
         for solver in ("volume_admm", "douglas_rachford", "operator_admm"):
             patched.enter_context(mock.patch(f"recon.solvers.{solver}.require_memory"))
         yield LIBRARY

@@ -24,12 +24,14 @@ import numpy.typing as npt
 
 from recon.base.declare import with_overrides
 from recon.base.fft import irfft, rfft
+from recon.base.namespace import array_namespace
 from recon.base.threads import get_threads, in_blocks
 from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.learned import Panel
 from recon.holography.losses import loss_of
 from recon.holography.near import NearField
+from recon.holography.on_device import OnDevice, Tables
 from recon.holography.options import HologramOptions
 from recon.holography.target import BESIDE, Target, Window, band_of, weights_on
 
@@ -146,6 +148,7 @@ class HologramModel:
         ]
         self._nodes: npt.NDArray[Any] | None = None
         self._mean_light = 1.0
+        self.xp = array_namespace(options.device)
         self.take(display)
         self._mean_light = self._mean_power()
         self._table *= self._real.type(1 / np.sqrt(self._mean_light))
@@ -179,6 +182,36 @@ class HologramModel:
         self._table = response.astype(self.dtype)
         ey, ex = display.transmitted(self.band.shape)
         self._ey, self._ex = ey.astype(self._real), ex.astype(self._real)
+        self._there = None if self.xp is np else OnDevice(self.xp, self._tables())
+
+    def _tables(self) -> Tables:
+        """Return what a device computes with; InputError where it takes more than that knows."""
+        display, options = self.display, self.options
+        lacking = {
+            "displaced masks": self._nodes is not None,
+            "displays that were learned": self._panel is not None,
+            "pictures near the SLM": display.near,
+            "mirrors": options.mirrors is not None,
+            f"the method {options.method!r}": options.method != "lbfgs",
+        }
+        if found := [what for what, there in lacking.items() if there]:
+            raise InputError(f"On the {options.device} there are no {found[0]}: take the cpu.")
+        return Tables(
+            band=self.band,
+            loss=self.loss,
+            cutoff=self._cutoff,
+            behind=[self._table[display.mask.levels] * hy[:, None] * hx for hy, hx in self._defocus],
+            envelope=self._ey[:, None] * self._ex,
+            wanted=self._wanted,
+            images=self._wanted_images,
+            peaks=self.peaks,
+            weights=self._weights,
+            inside=None if self.window is None or self.loss.mean_square else self._inside,
+            factor=display.factor,
+            modulated=display.dc.modulated,
+            amplitude=display.dc.amplitude,
+            dtype=self.dtype,
+        )
 
     @property
     def counted(self) -> float:
@@ -196,6 +229,9 @@ class HologramModel:
 
     def evaluate(self, slm: ComplexArray) -> Evaluation:
         """Return loss, gradient and PSNR for SLM patterns, complex (n_frames, height, width)."""
+        if self._there is not None:
+            loss, gradient, error = self._there.evaluate(slm)
+            return Evaluation(loss, gradient, -10 * np.log10(error) if error > 0 else np.inf)
         patterns = self._check(slm)
         gradient = np.zeros(patterns.shape, self.dtype)
         loss = 0.0

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.declare import with_overrides
+from recon.base.namespace import to_host
 from recon.errors import InputError
 from recon.holography.model import HologramModel
 from recon.holography.options import HologramOptions
@@ -27,7 +28,7 @@ Array = npt.NDArray[Any]
 
 _OF_THE_MODEL = (
     *("loss", "centre", "radius", "periphery", "weights", "grid"),
-    *("frames", "complex_slm", "mirrors", "light"),
+    *("frames", "complex_slm", "mirrors", "light", "device"),
 )
 
 
@@ -128,11 +129,12 @@ def compute_hologram(
         return _on_mirrors(model, initial, options, watch)
     if options.phase_levels is not None:
         phase = Phase(model)
-        return _on_levels(phase, phase.pack(_start(initial, model, options)), options.phase_levels, watch)
+        start = model.xp.asarray(phase.pack(_start(initial, model, options)))
+        return _on_levels(phase, start, options.phase_levels, watch)
     search: _Lbfgs | _Nesterov
     if method == "lbfgs":
         variable = Bounded(model) if complex_slm else Phase(model)
-        search = _Lbfgs(variable, variable.pack(_start(initial, model, options)))
+        search = _Lbfgs(variable, model.xp.asarray(variable.pack(_start(initial, model, options))))
     else:
         search = _Nesterov(model, _start(initial, model, options), complex_slm)
     if isinstance(search, _Lbfgs) and isinstance(variable, Phase) and model.wraps:
@@ -206,7 +208,7 @@ class _Lbfgs:
 
     @property
     def slm(self) -> Array:
-        return self.variable.field(self.x.copy())  # steps are taken in place
+        return to_host(self.variable.field(self.x.copy()))  # steps are taken in place
 
     def step(self) -> Point | None:
         for _ in range(2):
@@ -347,7 +349,7 @@ def _rounded(
 ) -> Hologram:
     last = history[-1]
     record = HologramRecord(last.iteration, last.seconds, *variable.evaluate(x)[0])
-    slm = variable.field(x).astype(np.complex64)
+    slm = to_host(variable.field(x)).astype(np.complex64)
     return Hologram(slm, (*history[:-1], record), reason, last.seconds)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.declare import option, require
+from recon.base.namespace import DEVICES, Device
 from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.losses import LOSSES, Loss, loss_of
@@ -237,6 +238,13 @@ class HologramOptions:
         applies=_OF_PICTURES,
     )
     seed: int = option(0, help="Of the random start.", group=_RARE)
+    device: Device = option(
+        "cpu",
+        help="Where to compute: far pictures through a mask in its place, by the method lbfgs.",
+        choices=DEVICES,
+        group=_RARE,
+        applies=_OF_PICTURES,
+    )
 
     def __post_init__(self) -> None:
         """Raise InputError that names all mistakes at once."""

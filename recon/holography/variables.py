@@ -68,7 +68,7 @@ class Phase:
         return phases.ravel()
 
     def field(self, x: Array) -> Array:  # noqa: D102
-        slm = np.empty((self.model.frames, *self.model.display.slm_shape), self.model.dtype)
+        slm: Array = self.model.xp.empty((self.model.frames, *self.model.display.slm_shape), self.model.dtype)
         phases = x.reshape(slm.shape)
         np.cos(phases, out=slm.real)
         np.sin(phases, out=slm.imag)
@@ -107,7 +107,8 @@ class Bounded:
 
     def field(self, x: Array) -> Array:  # noqa: D102
         z = self._inside(x)
-        return np.asarray(z * (1 + np.abs(z) ** 4) ** -0.25, self.model.dtype)
+        slm: Array = (z * (1 + np.abs(z) ** 4) ** -0.25).astype(self.model.dtype, copy=False)
+        return slm
 
     def evaluate(self, x: Array) -> tuple[Point, Array]:  # noqa: D102
         z = self._inside(x)
