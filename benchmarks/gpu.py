@@ -5,8 +5,8 @@
 
 Pictures (``--depths 1``) and volumes by total variation and by l1 through one PSF a depth; by total variation
 through nine PSFs a depth too, by the local and the low-rank model; a video's frames, each from where the one
-before ended; live pictures of one frame; holograms at 4 x 4 mask pixels a pixel of the SLM. Default solvers, a
-fixed number of iterations, nothing chosen and nothing judged; each case runs once before it is timed. Kinds
+before ended; live pictures of one frame; holograms at 4 x 4 mask pixels a pixel of the SLM. Default solvers,
+a fixed number of iterations, nothing chosen and nothing judged; each case runs once before it is timed. Kinds
 beside one PSF are measured up to ``--most-depths``. ``--sizes 1024 --depths 128 --only tv l1`` is a grid of
 2048 x 2048 x 128. Of pictures each goes its own way to one end: they are near each other only after many
 iterations (``--iterations 300``: 0.5 % at 24 x 24).

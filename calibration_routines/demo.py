@@ -54,7 +54,7 @@ PICTURE = Path(__file__).with_name("demo_picture.jpg")
 """A cup of coffee; photograph by Rachel Michetti, CC0 (docs/reference/demo.md)."""
 
 
-VOLUME_ITERATIONS = 12
+VOLUME_ITERATIONS = 8
 """Of the lights: they are in their planes long before the last change is small."""
 SCREEN_PIXELS = (420, 280)
 """Width and height of the picture on the screen: no finer than the camera's binned pixels see it."""
@@ -100,7 +100,7 @@ class DemoSettings:
         12.0, unit="s", least=0.1, help="Time for the chart of methods, at most.", **_HIDDEN
     )
     time_scale: float = option(
-        0.1, least=0, help="Real seconds per simulated second of motion and exposure.", **_HIDDEN
+        0.02, least=0, help="Real seconds per simulated second of motion and exposure.", **_HIDDEN
     )
     seed: int = option(0, least=0, help="Of the simulated diffuser, sensor and noise.")
 

@@ -32,7 +32,7 @@ def demo(options: DemoSettings, out: OutFolder = Path("runs")) -> None:
     Homes the stage, places the point source, exposes without saturating, takes dark frames, sweeps the source
     along the axis, checks the PSFs; photographs a picture on a screen in three colours and lights in a
     volume, reconstructs both, compares them with the ground truth, charts what methods cost against how good
-    they are, and writes everything into one folder. Motion and exposures are ten times as fast as on a real
+    they are, and writes everything into one folder. Motion and exposures are fifty times as fast as on a real
     bench. Ctrl-C stops it at any moment, the bench safe.
     """
     with _Terminal(Console(highlight=False)) as listener:

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.blocks import block_mean, block_sum
+from recon.base.threads import in_blocks
 from recon.optics.sensor_kernel import expose_pixels
 
 
@@ -136,19 +137,25 @@ def expose(
         Where to put the counts.
     """
     counts = np.empty(electrons_per_s.shape, np.uint16) if out is None else out
-    expose_pixels(
-        electrons_per_s,
-        pattern.response,
-        pattern.dark_e_per_s,
-        pattern.offset_e,
-        exposure_s,
-        readout.gain / readout.electrons_per_count,
-        readout.black_level,
-        readout.full_scale,
-        readout.full_well_e,
-        readout.read_noise_e,
-        readout.noise_scale,
-        np.uint64(seed & 0xFFFF_FFFF_FFFF_FFFF),
-        counts,
-    )
+
+    def rows(start: int, stop: int) -> None:
+        expose_pixels(
+            electrons_per_s,
+            pattern.response,
+            pattern.dark_e_per_s,
+            pattern.offset_e,
+            exposure_s,
+            readout.gain / readout.electrons_per_count,
+            readout.black_level,
+            readout.full_scale,
+            readout.full_well_e,
+            readout.read_noise_e,
+            readout.noise_scale,
+            np.uint64(seed & 0xFFFF_FFFF_FFFF_FFFF),
+            counts,
+            start,
+            stop,
+        )
+
+    in_blocks(rows, len(counts), grain=64)
     return counts

@@ -122,10 +122,12 @@ def expose_pixels(
     noise_scale: float,
     seed: np.uint64,
     counts: npt.NDArray[np.uint16],
+    start: int,
+    stop: int,
 ) -> None:
-    """Write the counts of one exposure; see :mod:`recon.optics.sensor` for the model."""
-    height, width = counts.shape
-    for i in range(height):
+    """Write the counts of one exposure's rows; see :mod:`recon.optics.sensor` for the model."""
+    width = counts.shape[1]
+    for i in range(start, stop):
         # One stream a row, so that a row's noise does not depend on what came before it.
         state = stream(seed, i)
         for j in range(width):
