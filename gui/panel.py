@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar, cast
 
 from PySide6.QtCore import QTimer
 from PySide6.QtGui import QGuiApplication
@@ -45,6 +45,7 @@ class Panel(QWidget):
         super().__init__(parent)
         self.session = session
         self.destroyed.connect(session.jobs.silence)  # panels live as long as their window
+        session.device_changed.connect(self._forget_fault)
         self.body = QWidget()
         """Where the panel's own widgets go: give it a layout."""
         self.body.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
@@ -128,6 +129,12 @@ class Panel(QWidget):
             each.setToolTip(self._tips.pop(each))
         self._note.clear()
         self._note.setToolTip("")
+
+    def _forget_fault(self, kind: str) -> None:
+        """Take a device's failure away that is over; the log keeps it."""
+        device = self.session.bench.devices.get(cast(Kind, kind))
+        if device is not None and self.session.is_open(kind) and device.name in self._note.toolTip():
+            self.accepted()
 
     def asked(self, make: Callable[[], _T]) -> _T | None:
         """Return what a form asks for; None, and the reason shown, where that makes no sense."""

@@ -89,7 +89,11 @@ def prepare_recording(
             f"spare, but only {size(free)} are free. Free some, or choose another folder."
         )
     writer = RunWriter.create(folder, label=options.label, bench=record_of(bench))
-    return Recorder(bench, writer, options, on_progress)
+    try:
+        return Recorder(bench, writer, options, on_progress)
+    except Exception as error:  # of a camera that was unplugged meanwhile
+        end_run(bench, writer, FinishReason.FAILED, error)
+        raise
 
 
 def _frame_bytes(bench: Bench) -> int:
@@ -193,9 +197,9 @@ class Recorder:
             self._stream = None  # its buffers go at once, whoever keeps the recorder
 
     def _execute(self) -> Run:
-        stream = self._stream = FrameStream(self._bench.camera, self.n_buffers)
-        reader = stream.reader()
         try:
+            stream = self._stream = FrameStream(self._bench.camera, self.n_buffers)
+            reader = stream.reader()
             self._writer.start(drops_counted_by=self._bench.camera.drops_counted_by, n_buffers=self.n_buffers)
             with stream:
                 self._record(reader)

@@ -138,6 +138,7 @@ def test_an_unplugged_camera_is_named_and_comes_back(qtbot: QtBot, window: MainW
     assert "unplugged" in session.state("camera").text
     live.count()
     assert "unplugged" in live.status.text(), "below the old picture, not its figures"
+    live.refused(None, session.state("camera").text)
     button = window.chips.reconnect_buttons["camera"]
     assert button.isVisible()
     assert session.is_open("stage")
@@ -151,6 +152,7 @@ def test_an_unplugged_camera_is_named_and_comes_back(qtbot: QtBot, window: MainW
     qtbot.waitUntil(lambda: session.live.newest() is not None, timeout=WAIT_MS)
     assert session.is_open("camera")
     assert not button.isVisible()
+    assert not live._note.text(), "its cause is gone"
 
 
 def test_one_device_that_cannot_be_opened_leaves_the_others_at_work(

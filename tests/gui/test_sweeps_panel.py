@@ -147,6 +147,10 @@ def test_a_sweep_with_pause_quality_as_it_arrives_and_its_run_in_the_list(
     assert panel.run_bar.words.text() == "Done"
     assert [q is not None and not q.findings for q in panel.psfs.qualities] == [True] * 4
     assert "all 4 PSFs good" in panel.verdict.toPlainText()
+    assert panel.use_button.isVisible()
+    panel.take("lateral")
+    assert not panel.use_button.isVisible(), "that was the axial sweep's"
+    assert not panel.run_bar.words.text()
     runs = window.show_panel("runs")
     assert isinstance(runs, RunsPanel)
     qtbot.waitUntil(lambda: runs.table.rowCount() == 1, timeout=WAIT_MS)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -172,6 +173,25 @@ def test_a_camera_unplugged_keeps_what_was_recorded(tmp_path: Path) -> None:
     assert run.condition is RunCondition.FAILED
     assert sorted(run.records) == list(range(20))
     assert_every_frame_is_at_its_number(run)
+
+
+def test_a_camera_unplugged_before_it_begins_leaves_no_run_that_seems_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost(_: FreeRunningCamera) -> None:
+        raise DeviceLostError("camera", "was unplugged.")
+
+    def unplugged_meanwhile(*args: Any, **known: Any) -> RunWriter:
+        writer = create(*args, **known)
+        monkeypatch.setattr(FreeRunningCamera, "frame_shape", property(lost))
+        return writer
+
+    create = RunWriter.create
+    monkeypatch.setattr(RunWriter, "create", unplugged_meanwhile)
+    with bench_with(camera_of(1000)) as bench, pytest.raises(DeviceLostError, match="unplugged"):
+        record(bench, tmp_path, n_frames=100)
+    (path,) = tmp_path.iterdir()
+    assert Run.open(path).condition is RunCondition.FAILED
 
 
 def test_a_disk_that_fills_up_ends_the_recording_in_words(
