@@ -24,29 +24,69 @@ def columns(field: Any, forward: bool, threads: int) -> None:
 
 @njit(nogil=True, cache=True, fastmath=True)
 def fill(
-    field: Any, slm: Any, mask: Any, table: Any, hy: Any, hx: Any, k: int, start: int, stop: int
+    pairs: Any, slm: Any, mask: Any, table: Any, hy: Any, hx: Any, k: int, start: int, stop: int
 ) -> None:
-    """``field[y, x] = slm[y // k, x // k] * table[mask[y, x]] * hy[y] * hx[x]`` (Eqs. 7.8, 7.15)."""
+    """``field[y, x] = slm[y // k, x // k] * table[mask[y, x]] * hy[y] * hx[x]`` (Eqs. 7.8, 7.15).
+
+    ``pairs`` is the field's real view, parts side by side: loops go through it as vectors.
+    """
+    width = mask.shape[1]
+    one = pairs.dtype.type(1.0)
+    re, im = np.empty(width, pairs.dtype), np.empty(width, pairs.dtype)
+    seen = -1
     for y in range(start, stop):
-        for i in range(slm.shape[1]):
-            value = slm[y // k, i] * hy[y]
-            for x in range(i * k, (i + 1) * k):
-                field[y, x] = value * table[mask[y, x]] * hx[x]
+        if y // k != seen:
+            seen = y // k
+            for x in range(width):
+                value = slm[seen, x // k] * hx[x]
+                re[x], im[x] = value.real, value.imag
+        line, levels = pairs[y], mask[y]
+        if len(table) == 2:
+            first = table[0] * hy[y]
+            step = table[1] * hy[y] - first
+            for x in range(width):
+                m = one * levels[x]
+                there, across = first.real + step.real * m, first.imag + step.imag * m
+                line[2 * x] = re[x] * there - im[x] * across
+                line[2 * x + 1] = re[x] * across + im[x] * there
+        else:
+            for x in range(width):
+                at = table[levels[x]] * hy[y]
+                line[2 * x] = re[x] * at.real - im[x] * at.imag
+                line[2 * x + 1] = re[x] * at.imag + im[x] * at.real
 
 
 @njit(nogil=True, cache=True, fastmath=True)
 def gather(
-    out: Any, field: Any, mask: Any, table: Any, hy: Any, hx: Any, k: int, start: int, stop: int
+    out: Any, pairs: Any, mask: Any, table: Any, hy: Any, hx: Any, k: int, start: int, stop: int
 ) -> None:
     """Adjoint of :func:`fill`, added to rows ``start`` to ``stop`` of the SLM-sized ``out``."""
+    width = mask.shape[1]
+    one = pairs.dtype.type(1.0)
+    re, im = np.empty(width, pairs.dtype), np.empty(width, pairs.dtype)
     for j in range(start, stop):
+        re[:] = 0
+        im[:] = 0
         for y in range(j * k, (j + 1) * k):
-            weight = np.conj(hy[y])
-            for i in range(out.shape[1]):
-                total = out[j, i] * 0
-                for x in range(i * k, (i + 1) * k):
-                    total += field[y, x] * np.conj(table[mask[y, x]] * hx[x])
-                out[j, i] += total * weight
+            line, levels = pairs[y], mask[y]
+            if len(table) == 2:
+                first = table[0] * hy[y]
+                step = table[1] * hy[y] - first
+                for x in range(width):
+                    m = one * levels[x]
+                    there, across = first.real + step.real * m, first.imag + step.imag * m
+                    re[x] += line[2 * x] * there + line[2 * x + 1] * across
+                    im[x] += line[2 * x + 1] * there - line[2 * x] * across
+            else:
+                for x in range(width):
+                    at = table[levels[x]] * hy[y]
+                    re[x] += line[2 * x] * at.real + line[2 * x + 1] * at.imag
+                    im[x] += line[2 * x + 1] * at.real - line[2 * x] * at.imag
+        for i in range(out.shape[1]):
+            total = out[j, i] * 0
+            for x in range(i * k, (i + 1) * k):
+                total += complex(re[x], im[x]) * np.conj(hx[x])
+            out[j, i] += total
 
 
 @njit(nogil=True, cache=True, fastmath=True)
@@ -217,13 +257,13 @@ def respond_back(phase: Any, response: Any, light: Any, gradient: Any, out: Any)
 
 @njit(nogil=True, cache=True, fastmath=True)
 def rows_to_spectrum(
-    field: Any, spectrum: Any, ey: Any, ex: Any, filled: int, scale: float, start: int, stop: int
+    field: Any, pairs: Any, spectrum: Any, ey: Any, ex: Any, filled: int, scale: float, start: int, stop: int
 ) -> None:
     """Finish the field's transform along its rows and add the intensity's spectrum, cropped to the pass-band.
 
-    ``field`` ends as the field in the image plane. Only its first ``filled`` columns are read. ``spectrum``
-    (rows, kept columns) receives the row transform of ``|field|^2 ey ex`` times ``scale``; its transform
-    along the columns is still to do.
+    ``field`` ends as the field in the image plane; ``pairs`` is its real view. Only its first ``filled``
+    columns are read. ``spectrum`` (rows, kept columns) receives the row transform of ``|field|^2 ey ex``
+    times ``scale``; its transform along the columns is still to do.
     """
     width = field.shape[1]
     kept = spectrum.shape[1]
@@ -236,10 +276,11 @@ def rows_to_spectrum(
         rows[:, filled:] = 0
         c2c(rows, rows, axis, True, 1.0, 1)
         for y in range(n):
-            gain = ey[top + y] * scale
+            gain = ey.dtype.type(ey[top + y] * scale)
+            line, light = pairs[top + y], intensity[y]
             for x in range(width):
-                value = rows[y, x]
-                intensity[y, x] = (value.real * value.real + value.imag * value.imag) * gain * ex[x]
+                re, im = line[2 * x], line[2 * x + 1]
+                light[x] = (re * re + im * im) * gain * ex[x]
         r2c(intensity[:n], half[:n], axis, True, 1.0, 1)
         for y in range(n):
             for x in range(kept):
@@ -248,9 +289,12 @@ def rows_to_spectrum(
 
 @njit(nogil=True, cache=True, fastmath=True)
 def rows_from_spectrum(
-    field: Any, spectrum: Any, ey: Any, ex: Any, scale: float, start: int, stop: int
+    field: Any, pairs: Any, spectrum: Any, ey: Any, ex: Any, scale: float, start: int, stop: int
 ) -> None:
-    """Multiply ``field`` by the real image whose row spectra are given, then transform back along rows."""
+    """Multiply ``field`` by the real image whose row spectra are given, then transform back along rows.
+
+    ``pairs`` is the field's real view.
+    """
     width = field.shape[1]
     kept = spectrum.shape[1]
     axis = np.array([1])
@@ -265,9 +309,12 @@ def rows_from_spectrum(
         c2r(half[:n], image[:n], axis, False, 1.0, 1)
         rows = field[top : top + n]
         for y in range(n):
-            gain = ey[top + y] * scale
+            gain = ey.dtype.type(ey[top + y] * scale)
+            line, weights = pairs[top + y], image[y]
             for x in range(width):
-                rows[y, x] *= image[y, x] * gain * ex[x]
+                weight = weights[x] * gain * ex[x]
+                line[2 * x] *= weight
+                line[2 * x + 1] *= weight
         c2c(rows, rows, axis, False, 1.0, 1)
 
 

@@ -314,6 +314,7 @@ class HologramModel:
         spectrum[:, 0] = 1
         self._kernels.rows_from_spectrum(
             self._field[0],
+            self._field[0].view(self._real),
             spectrum,
             np.ones_like(self._ey),
             np.ones_like(self._ex),
@@ -384,7 +385,8 @@ class HologramModel:
 
             def fill(start: int, stop: int, behind: Any = behind, pattern: Any = pattern) -> None:
                 if self._nodes is None:
-                    self._kernels.fill(behind, pattern, mask, self._table, hy, hx, k, start, stop)
+                    pairs = behind.view(self._real)
+                    self._kernels.fill(pairs, pattern, mask, self._table, hy, hx, k, start, stop)
                 else:
                     self._kernels.fill_displaced(
                         behind, pattern, mask, self._table, hy, hx, self._nodes, k, start, stop
@@ -398,7 +400,15 @@ class HologramModel:
 
             def rows(start: int, stop: int, field: Any = field, scale: float = scale) -> None:
                 self._kernels.rows_to_spectrum(
-                    field, self._spectrum, self._ey, self._ex, filled, scale, start, stop
+                    field,
+                    field.view(self._real),
+                    self._spectrum,
+                    self._ey,
+                    self._ex,
+                    filled,
+                    scale,
+                    start,
+                    stop,
                 )
 
             in_blocks(rows, self.band.shape[0], grain=64)
@@ -447,7 +457,10 @@ class HologramModel:
         scale = 1.0 / np.prod(self.band.shape)
 
         def rows(start: int, stop: int) -> None:
-            self._kernels.rows_from_spectrum(field, self._spectrum, self._ey, self._ex, scale, start, stop)
+            pairs = field.view(self._real)
+            self._kernels.rows_from_spectrum(
+                field, pairs, self._spectrum, self._ey, self._ex, scale, start, stop
+            )
 
         in_blocks(rows, self.band.shape[0], grain=64)
         self._columns_and_gather(frame, plane, out)
@@ -464,7 +477,8 @@ class HologramModel:
         if nodes is None:
 
             def gather(start: int, stop: int) -> None:
-                self._kernels.gather(out, field, mask, self._table, hy, hx, k, start, stop)
+                pairs = field.view(self._real)
+                self._kernels.gather(out, pairs, mask, self._table, hy, hx, k, start, stop)
 
             in_blocks(gather, out.shape[0], grain=16)
             return

@@ -217,7 +217,7 @@ class SpotField:
         mask, k, rows = self.display.mask.levels, self._factor, self._field.shape[0]
         hy, hx = defocus
         if self._nodes is None:
-            self._kernels.fill(self._field, pattern, mask, self._table, hy, hx, k, 0, rows)
+            self._kernels.fill(self._field.view(np.float32), pattern, mask, self._table, hy, hx, k, 0, rows)
         else:
             self._kernels.fill_displaced(
                 self._field, pattern, mask, self._table, hy, hx, self._nodes, k, 0, rows
@@ -227,7 +227,7 @@ class SpotField:
         mask, k = self.display.mask.levels, self._factor
         hy, hx = defocus
         if self._nodes is None:
-            self._kernels.gather(out, self._field, mask, self._table, hy, hx, k, 0, len(out))
+            self._kernels.gather(out, self._field.view(np.float32), mask, self._table, hy, hx, k, 0, len(out))
         else:
             rows = self._field.shape[0]
             self._kernels.gather_displaced(
