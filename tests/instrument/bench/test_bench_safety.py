@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from drivers.errors import DeviceError, DeviceLostError, LimitError, StoppedError
+from instrument.bench import bench as bench_module
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.bench.safety import StepsFailedError, stop_until, try_all
@@ -351,3 +352,30 @@ def test_stop_from_another_thread_ends_a_move_and_darkens_the_source() -> None:
         assert len(ended) == 1
         assert bench.source_position_um[0] < target_um - 1000
         assert bench.led_array.pattern.is_dark
+
+
+def test_a_bench_that_was_closed_is_not_closed_again_when_the_program_ends() -> None:
+    bench = bench_with().open()
+    assert bench in bench_module._at_exit._open
+    bench.close()
+    assert bench not in bench_module._at_exit._open
+
+
+@pytest.mark.parametrize(("leds", "missing"), [([0, 3], ""), ([2, 4, 5], "4, 5")])
+def test_leds_of_the_source_that_the_array_has_not_are_named(leds: list[int], missing: str) -> None:
+    bench = bench_with(extra=f"[source]\nleds = {leds}\n")
+    if missing:
+        with pytest.raises(LimitError, match=rf"has LEDs 0 to 3, but \[source\] .* names {missing}\."):
+            bench.open()
+        assert "led_array.close" in calls(bench)
+    else:
+        bench.open().close()
+
+
+def test_a_setting_that_the_camera_refuses_is_told_with_where_it_stands() -> None:
+    bench = bench_with()
+    settings = bench.config.devices["camera"].settings
+    object.__setattr__(settings, "exposure_ms", 5000.0)
+    with pytest.raises(LimitError) as caught:
+        bench.open()
+    assert any("The value is from [camera]" in note for note in caught.value.__notes__)
