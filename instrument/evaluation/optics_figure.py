@@ -62,12 +62,11 @@ def optics_figure(compared: Comparison) -> Figure:
     for (name, found), colour in zip(compared.found.items(), _COLOURS, strict=True):
         lights = sorted(found.psnr_db)
         values = [found.psnr_db[light] for light in lights]
-        below.semilogx(lights, values, "o-", color=colour)
-        below.annotate(name, (lights[-1], values[-1]), (6, 0), textcoords="offset points", color=colour)
+        below.semilogx(lights, values, "o-", color=colour, label=name)
     style(below, "Picture against the scene", "photons on the sensor", "PSNR, dB")
-    below.margins(x=0.15)
+    below.legend(loc="lower right", frameon=False)
     figure.supxlabel(BEADS, fontsize=9)
-    mark_simulated(figure, 1.0)
+    mark_simulated(figure, 0.985)
     return figure
 
 
