@@ -160,8 +160,9 @@ class VideoJob:
         calibration = Calibration(a["psfs"], a["positions"], geometry=Geometry(pitch_um, distance_mm))
         extent = None
         if a["extent"].size:
-            height, width, reach = a["extent"].tolist()
-            extent = Extent((int(height), int(width)), None if np.isnan(reach) else reach)
+            height, width, *limits = a["extent"].tolist()
+            reach, margin = (None if np.isnan(x) else float(x) for x in (*limits, np.nan)[:2])
+            extent = Extent((int(height), int(width)), reach, margin)  # jobs of before have no margin
         options = ReconstructionOptions(**asked)
         return stream_problem(measurement, calibration, options, choosing=False, extent=extent)
 
@@ -184,8 +185,8 @@ def _problem_arrays(problem: Problem) -> dict[str, Any]:
     known = [] if noise is None else [noise] if isinstance(noise, float | int) else asdict(noise).values()
     asked = {name: value for name, value in record(problem.options).items() if value is not None}
     optics = (geometry.pixel_pitch_um, geometry.diffuser_distance_mm)
-    window, reach = problem.extent.psf_window, problem.extent.acceptance_px
-    extent = [] if window is None else [*window, np.nan if reach is None else reach]
+    window, limits = problem.extent.psf_window, (problem.extent.acceptance_px, problem.extent.margin)
+    extent = [] if window is None else [*window, *(np.nan if limit is None else limit for limit in limits)]
     return {
         "frame": np.asarray(measurement.image),
         "noise": np.array(list(known), float),

@@ -44,6 +44,9 @@ class Extent:
         Height and width of the central part of the PSFs; None: all of them.
     acceptance_px : float or None
         Only object pixels this near to the axis are modelled, where PSFs vary over the field; None: all.
+    margin : float or None
+        Where PSFs vary over the field only what lies between the outermost ones of each depth is modelled,
+        and this part of the distance between these beyond them; None: all.
     left_out : Calibration or None
         PSFs of depths that are not modelled: what is left of the data is searched for light from there.
     beyond : int
@@ -52,6 +55,7 @@ class Extent:
 
     psf_window: tuple[int, int] | None = None
     acceptance_px: float | None = None
+    margin: float | None = None
     left_out: Calibration | None = None
     beyond: int = 0
 

@@ -136,6 +136,21 @@ class FieldOfPsfs:
             )
 
 
+def spanned(field: FieldOfPsfs, y: Array, x: Array, margin: float) -> npt.NDArray[np.bool_]:
+    """Tell which object pixels (offsets from the axis) lie between a depth's outermost PSFs.
+
+    ``margin`` is how far beyond them counts as well, in parts of the distance between them. One PSF spans
+    nothing: of a line of them, or of one, all that is beside it counts.
+    """
+    inside = np.ones(np.broadcast_shapes(y.shape, x.shape), bool)
+    for places, at in zip(field.points.T, (y, x), strict=True):
+        low, high = float(places.min()), float(places.max())
+        if high - low > 1:
+            reach = margin * (high - low)
+            inside &= (at >= low - reach) & (at <= high + reach)
+    return inside
+
+
 def local_convolution(
     fields: list[FieldOfPsfs],
     sensor_shape: tuple[int, int],

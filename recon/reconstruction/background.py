@@ -9,19 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.base import Array
 from recon.errors import InputError
 from recon.reconstruction.choice import Decision
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.part import expects_background
-from recon.reconstruction.pilot import pilot
+from recon.reconstruction.pilot import held_out, pilot
 from recon.reconstruction.problem import Problem
 
-MODEL_ERROR = 0.02
-"""What a calibrated camera leaves unexplained as a rule, relative to the standard deviation of the data: 0.01
-on the measured hand, whose picture is good. Noise and this together are the unit of a trial."""
-HELD_OUT = 0.1
-"""Share of the pixels that judge."""
 ITERATIONS, PLAIN_ITERATIONS = 20, 120
 """Of a trial's passes. The splitting of one convolution without a background begins far from the data, in a
 twentieth of the others' time an iteration: with 25 it had the measured hand ask for a background."""
@@ -138,25 +132,14 @@ def trial_of(channels: Sequence[Problem], *, whole: bool = False) -> Trial:
 
 
 def _tried(problem: Problem, *, whole: bool) -> Trial:
-    data, valid = problem.data[0], problem.valid[0]
-    spread2 = max(float(data[valid].var(dtype=np.float64)) - 1, 0.0)
-    unit = np.float32(np.sqrt(1 + MODEL_ERROR**2 * spread2))
-    unseen = valid & (np.random.default_rng(0).random(valid.shape) < HELD_OUT)
-    if not unseen.any():
-        unseen = valid
-    seen = valid & ~unseen if (valid & ~unseen).any() else valid
-    data = data / unit
-    coarse = replace(
-        problem, data=np.where(seen, data, 0)[None], valid=seen[None], noise=problem.noise * unit
+    coarse, error = held_out(problem)
+    valid, mean = (
+        problem.valid[0],
+        float(problem.data[0][problem.valid[0]].mean()) * float(problem.noise[0] / coarse.noise[0]),
     )
-    predicted = np.where(seen, 0, data)[unseen]  # what was not seen is to be predicted
-
-    def error(left: Array) -> float:
-        return float(np.sqrt(np.mean((left[0][unseen] + predicted).astype(np.float64) ** 2)))
-
     lit = pilot(replace(coarse, smooth=True), ITERATIONS, solver="admm")
     assert lit.background is not None
-    light = float(lit.background[0][valid].mean()) / max(float(data[valid].mean()), 1e-30)
+    light = float(lit.background[0][valid].mean()) / max(mean, 1e-30)
     rows, columns = problem.window
     picture = lit.solution[0, :, rows, columns]
     dark = float(np.mean(picture < BLACK * np.percentile(picture, BRIGHTEST)))

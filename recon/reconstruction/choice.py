@@ -77,6 +77,8 @@ class Choice:
     acceptance_px : float or None
         Distance from the axis, in object pixels, beyond which the sensor accepts nothing; None: no limit
         within the field.
+    margin : float or None
+        As of :class:`~recon.camera.camera_model.Extent`.
     decisions : tuple of Decision
     seconds : float
         Wall time that choosing took.
@@ -97,6 +99,7 @@ class Choice:
     decisions: tuple[Decision, ...]
     seconds: float
     beyond: bool = False
+    margin: float | None = None
 
     @property
     def key(self) -> str:
@@ -104,6 +107,7 @@ class Choice:
         chosen = (
             self.model, self.planes, self.between, self.binning, self.merged, self.background,
             self.precision, self.psf_window, self.acceptance_px, *(["beyond"] if self.beyond else []),
+            *([f"margin {self.margin:g}"] if self.margin is not None else []),
         )  # fmt: skip
         return hashlib.sha256(repr(chosen).encode()).hexdigest()[:8]
 

@@ -233,7 +233,7 @@ class ReconstructionOptions:
         metavar="NAME=VALUE",
         group=_CHOICE,
         parse_all=_overrides,
-        applies=("picture", "volume"),
+        applies=("picture", "volume", "video"),
     )
     estimate_background: bool | None = option(
         None,

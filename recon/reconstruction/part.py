@@ -7,6 +7,7 @@ from operator import add
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from recon.base import fft
 from recon.base.namespace import array_namespace
@@ -16,7 +17,7 @@ from recon.camera.convolution import Convolution, field_of
 from recon.camera.factors import BackgroundRemoval, Erasures, PatternedCamera
 from recon.camera.spatially_varying import SpatiallyVarying
 from recon.camera.varying_on_device import VaryingOnDevice
-from recon.camera.varying_psfs import FieldOfPsfs, grid_axes, local_convolution, low_rank
+from recon.camera.varying_psfs import FieldOfPsfs, grid_axes, local_convolution, low_rank, spanned
 from recon.errors import NoMemoryError
 from recon.priors import Prior, TotalVariation
 from recon.reconstruction.problem import Problem
@@ -92,6 +93,7 @@ class Part:
         self.tau: float | None = None
         self.weight, self.held = 0.0, 1.0
         self._removed: BackgroundRemoval | None = None
+        self._support: npt.NDArray[np.bool_] | None = None
         self._usual: Array = np.zeros((1, 1, 1), self.dtype)
         self.removal = (
             BackgroundRemoval(self.valid.shape, BACKGROUND_FREQUENCIES, self.valid, self.dtype)
@@ -189,10 +191,13 @@ class Part:
         problem, shape = self.problem, self.problem.sensor_shape
         field_shape, (row, column) = field_of(shape, fields[0].psfs.shape[2:])
         support = None
-        reach = problem.extent.acceptance_px
-        if reach is not None:
-            off_axis = np.hypot(np.arange(field_shape[0])[:, None] - row, np.arange(field_shape[1]) - column)
-            support = np.broadcast_to(off_axis <= reach, (len(fields), *field_shape))
+        reach, margin = problem.extent.acceptance_px, problem.extent.margin
+        if reach is not None or margin is not None:
+            y, x = np.arange(field_shape[0])[:, None] - row, np.arange(field_shape[1])[None] - column
+            near = np.hypot(y, x) <= (np.inf if reach is None else reach)
+            support = self._support = np.stack(
+                [near if margin is None else near & spanned(f, y, x, margin) for f in fields]
+            )
         grid = fft.fast_length(field_shape[0]), fft.fast_length(field_shape[1])
         made: dict[str, Any] = {"support": support, "grid_shape": grid, "dtype": self.dtype}
         made["xp"] = self.namespace
@@ -331,8 +336,17 @@ class Part:
 
     # From a solution ---------------------------------------------------------------------------------
     def lifted(self, solution: Array) -> Array:
-        """Return a solver's solution on the camera's domain."""
-        return solution.reshape(self.camera.domain_shape)
+        """Return a solver's solution on the camera's domain; 0 where no object was modelled.
+
+        There no data hold it, and a prior goes on with what is beside.
+        """
+        solution = solution.reshape(self.camera.domain_shape)
+        if self._support is None:
+            return solution
+        height, width = self._support.shape[1:]
+        solution = solution.copy()
+        solution[..., :height, :width] *= self._support
+        return solution
 
     def background(self, solution: Array) -> Array:
         """Return the smooth background that goes with a solution, in units of the noise, as ``data``."""

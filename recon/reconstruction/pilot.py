@@ -99,6 +99,35 @@ def pilot(
         part.close()
 
 
+MODEL_ERROR = 0.02
+"""What a calibrated camera leaves unexplained as a rule, relative to the standard deviation of the data: 0.01
+on the measured hand, whose picture is good. Noise and this together are the unit of held-out errors."""
+HELD_OUT = 0.1
+"""Share of the pixels that judge."""
+
+
+def held_out(problem: Problem) -> tuple[Problem, Callable[[Array], float]]:
+    """Return a problem of one channel without some of its pixels, and what judges a pilot of it by them.
+
+    That takes what the pilot left, and returns its root mean square there, in units of noise and usual error.
+    """
+    data, valid = problem.data[0], problem.valid[0]
+    spread2 = max(float(data[valid].var(dtype=np.float64)) - 1, 0.0)
+    unit = np.float32(np.sqrt(1 + MODEL_ERROR**2 * spread2))
+    unseen = valid & (np.random.default_rng(0).random(valid.shape) < HELD_OUT)
+    if not unseen.any():
+        unseen = valid
+    seen = valid & ~unseen if (valid & ~unseen).any() else valid
+    data = data / unit
+    predicted = np.where(seen, 0, data)[unseen]  # what was not seen is to be predicted
+
+    def error(left: Array) -> float:
+        return float(np.sqrt(np.mean((left[0][unseen] + predicted).astype(np.float64) ** 2)))
+
+    data = np.where(seen, data, 0)[None]
+    return replace(problem, data=data, valid=seen[None], noise=problem.noise * unit), error
+
+
 def _said(part: Part, iterate: Array) -> tuple[Array, Array | None, Array]:
     """Return a solver's iterate as an object, the background that goes with it, and what both leave."""
     solution = np.maximum(part.lifted(iterate), 0)

@@ -12,7 +12,7 @@ from recon.analysis.correlation import autocorrelate
 from recon.camera.camera_model import Depths, ModelName
 from recon.camera.spatially_varying import SpatiallyVarying
 from recon.reconstruction.part import Part
-from recon.reconstruction.pilot import pilot
+from recon.reconstruction.pilot import held_out, pilot
 from recon.reconstruction.problem import Problem
 
 Array = npt.NDArray[Any]
@@ -20,7 +20,7 @@ Array = npt.NDArray[Any]
 COARSE_PX = 96
 """Longest side that the coarse pass works on, pixels, about. Depths are told apart by a pixel's shift at the
 pattern's edge: on fewer pixels all depths look alike."""
-COARSE_ITERATIONS = 40
+COARSE_ITERATIONS, WITHIN_ITERATIONS = 40, 20
 ACCEPTED = 0.005
 """Brightness, relative to the axis, below which the sensor counts as accepting nothing."""
 LIGHT_LOST = 2e-4
@@ -68,6 +68,32 @@ def _coarse_pass(problem: Problem) -> tuple[npt.NDArray[np.float64], float]:
     mean = float(problem.data[0][valid].mean(dtype=np.float64))
     share = per_plane / max(float(per_plane.sum()), 1e-30)
     return share, 0.0 if mean <= 0 else float(found.background[0][valid].mean()) / mean
+
+
+MARGIN = 0.05
+"""Of the distance between the outermost PSFs: so far beyond them these are still taken for known."""
+
+
+@dataclass(frozen=True)
+class Within:
+    """Held-out errors of coarse copies whose object lies anywhere, and only where PSFs were measured."""
+
+    anywhere: float
+    spanned: float
+
+
+def within_of(channels: list[Problem]) -> Within:
+    """Try coarse problems of one channel each; errors are their root mean square."""
+    errors = np.zeros((len(channels), 2))
+    for channel, found in zip(channels, errors, strict=True):
+        seen, error = held_out(channel)
+        weight = None
+        for place, margin in enumerate((None, MARGIN)):
+            tried = replace(seen, extent=replace(seen.extent, margin=margin))
+            done = pilot(tried, WITHIN_ITERATIONS, weight=weight, solver="admm")
+            weight, found[place] = done.weight, error(done.left)
+    anywhere, spanned = np.sqrt(np.mean(errors**2, axis=0)).tolist()
+    return Within(anywhere, spanned)
 
 
 def camera_cost(problem: Problem, model: ModelName) -> int:

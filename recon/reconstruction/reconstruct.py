@@ -17,12 +17,12 @@ from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.camera_model import CAMERAS
 from recon.errors import InputError
 from recon.priors import PRIORS
-from recon.reconstruction.background import HELD_OUT
 from recon.reconstruction.course import Course
 from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
+from recon.reconstruction.pilot import HELD_OUT
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.psf_refinement import refined
 from recon.reconstruction.result import Reconstruction

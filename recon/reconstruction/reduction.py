@@ -189,6 +189,7 @@ def reduced(choice: Choice, problem: Problem) -> Problem:
         else Extent(
             (small[0], small[1]),
             None if choice.acceptance_px is None else choice.acceptance_px / factor,
+            choice.margin,
             left_out,
             len(BEYOND) if choice.beyond else 0,
         ),

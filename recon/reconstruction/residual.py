@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.reconstruction.background import MODEL_ERROR
+from recon.reconstruction.pilot import MODEL_ERROR
 from recon.reconstruction.problem import Problem
 from recon.solvers.base import Outcome, StopReason
 

@@ -27,7 +27,7 @@ from recon.reconstruction.colours import channels_of, merged
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.planes import BEYOND, between_of, no_beyond, planes_of, with_planes_beyond
-from recon.reconstruction.probe import COARSE_PX, camera_cost, coarse_copy, coarse_passes
+from recon.reconstruction.probe import COARSE_PX, camera_cost, coarse_copy, coarse_passes, within_of
 from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.reduction import on_blocks, reduced, reduced_calibration
 from recon.reconstruction.rules import (
@@ -168,7 +168,12 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     stray = sparse is not None and is_stray(sparse.smooth_share)
     haze = stray and not given and not (estimated and kind == "l1")
     plain = picture and model == "convolution" and not estimated
-    window, reach, field = field_of(depths, overrides, model, haze=haze, plain=plain)
+    within = None
+    if overrides.field is None and model in ("local", "lowrank") and coarse:
+        tell(0.7, "choosing: the field")
+        prior = _trial_prior(problem)
+        within = within_of([coarse_copy(c, model, prior, background=estimated) for c in coarse])
+    extent, field = field_of(depths, overrides, model, within, haze=haze, plain=plain)
     usual = USUAL_ITERATIONS["convolution" if model == "convolution" else "varying"]
     side = max(data.shape[1:]) // int(binning.numbers["binning"])
     precise = precision_of(overrides, usual, side)
@@ -200,8 +205,9 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
         merged=one,
         background=estimated,
         precision="float64" if precise.value == "float64" else "float32",
-        psf_window=window,
-        acceptance_px=reach,
+        psf_window=extent.psf_window or (data.shape[1], data.shape[2]),
+        acceptance_px=extent.acceptance_px,
+        margin=extent.margin,
         tolerance=tolerance,
         decisions=tuple(
             replace(d, why=held[d.name], overruled=False) if d.name in held else d for d in decisions
@@ -282,6 +288,12 @@ def _contrast(data: Array, valid: Array, deviation: Array) -> float:
     return max(s / max(float(n), 1e-30) for s, n in zip(spread, deviation, strict=True))
 
 
+def _trial_prior(problem: Problem) -> str:
+    """Return the problem's prior, or what it counts where ADMM has no way for it."""
+    name = problem.prior_name
+    return name if name in volume_priors() else kind_of(name)
+
+
 def _trial(problem: Problem, coarse: list[Problem], model: ModelName, *, whole: bool = False) -> Trial:
     """Try the coarse copies with the problem's prior; one that ADMM has no way for by what it counts.
 
@@ -289,8 +301,7 @@ def _trial(problem: Problem, coarse: list[Problem], model: ModelName, *, whole: 
     background the true camera explains as well, and its passes are less finished, which looks like light
     that a background would take (four dense pictures without stray light lost 3.0 to 4.8 dB by one).
     """
-    name = problem.prior_name
-    prior = name if name in volume_priors() else kind_of(name)
+    prior = _trial_prior(problem)
 
     def tried(model: ModelName) -> Trial:
         return trial_of([coarse_copy(c, model, prior, background=True) for c in coarse], whole=whole)

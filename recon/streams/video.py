@@ -81,12 +81,18 @@ def stream_problem(
     measurement = frame if isinstance(frame, Measurement) else Measurement(frame)
     measurement = replace(measurement, **known)
     doubt, reason = "", ""
+    wishes = options.choose or Overrides()
+    if wishes != Overrides(field=wishes.field):
+        raise InputError(
+            "Of the choices only field=all is for films: they keep all depths, pixels and channels; --model "
+            "and --background say the rest."
+        )
     if options.model == "auto":
         doubt = _by_one_psf(calibration, options)
         if doubt and choosing and isinstance(calibration, Calibration):
             options, extent, reason, doubt = _chosen(measurement, others, calibration, options)
         else:
-            options = replace(options, model="convolution")
+            options = replace(options, model="convolution", choose=None)
     problem = Problem.of(measurement, calibration, options, extent=extent)
     if choosing and not reason:
         require_two_images(problem)
@@ -113,15 +119,20 @@ def _chosen(
     mean = replace(frame, image=np.mean([np.asarray(frame.image), *others], axis=0, dtype=np.float32))
     if mean.noise is None and mean.flat:  # as noisy as one frame: that is what is solved
         mean = replace(mean, noise=float(frame.deviations(frame.counts())[0]))
-    asked = Overrides(planes="all", between=False, beyond=False, binning=1, channels="all")
+    asked = replace(
+        options.choose or Overrides(),
+        planes="all", between=False, beyond=False, binning=1, channels="all",
+    )  # fmt: skip
     posed = Problem.of(mean, calibration, replace(options, choose=asked))
     require_two_images(posed)
     choice = choice_for(posed)
     extent = None
     if choice.model != "convolution":
-        extent = Extent(choice.psf_window, choice.acceptance_px)
+        extent = Extent(choice.psf_window, choice.acceptance_px, choice.margin)
     why = {d.name: d.why for d in choice.decisions}
     reason = f"by the mean of {len(others) + 1} frames: {why['model']}"
+    if choice.margin is not None:
+        reason += f"; the object lies where PSFs were measured: {why['field']}"
     said = ""
     if choice.background and options.estimate_background is None:
         said = f"A smooth background is estimated as well: {why['background']}."

@@ -623,6 +623,7 @@ def test_auto_takes_the_model_that_the_film_asks_for_and_depths_become_volumes(t
     assert prepared.notes["Model"].startswith(("local: by the mean of 4 frames", "lowrank: by the mean of 4"))
     again = VideoJob(prepared.job.folder).problem
     assert again.extent.psf_window is not None
+    assert ("where PSFs were measured" in prepared.notes["Model"]) == (again.extent.margin is not None)
     assert solve_video(prepared, lambda _: None, threading.Event())
     finish_video(prepared)
     video = VideoPictures(wanted.out)

@@ -12,11 +12,12 @@ from recon.camera import field_registration
 from recon.camera import field_registration as remembered
 from recon.camera.camera_model import sort_by_depth
 from recon.camera.field_registration import NOT_ON_AXIS
-from recon.camera.varying_psfs import FieldOfPsfs
+from recon.camera.varying_psfs import FieldOfPsfs, spanned
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.part import Part
+from recon.reconstruction.probe import MARGIN
 
 
 def choose(measurement, calibration, **asked):
@@ -166,3 +167,44 @@ def test_a_picture_is_judged_as_pictures_are_whatever_solves_it():
     result = recon.reconstruct(volume.measurement, volume.calibration, iterations=5)
     assert result.verdict is not None
     assert result.verdict.method == "admm tv of volumes"
+
+
+def _asked(scene, **asked):
+    return choose(scene.measurement, scene.calibration, z_um=float(scene.z_um[0]), **asked)
+
+
+def test_an_object_is_shut_in_where_psfs_were_measured_unless_it_lies_beyond_them():
+    settings = {"size": 48, "grid": 3, "aberration": 2.0, "background": 1.0, "photons": 8000.0, "seed": 3}
+    inside, beyond = (
+        make_scene("sparse-picture", grid_field=0.5, field=field, **settings) for field in (0.4, 1.4)
+    )
+    shut = _asked(inside)
+    assert shut.margin == MARGIN
+    assert "where PSFs were measured" in decision(shut, "field").value
+    assert _asked(beyond).margin is None
+    assert _asked(inside, choose=Overrides(field="all")).margin is None
+
+
+def test_where_no_object_is_modelled_a_picture_is_dark():
+    scene = make_scene("dense-picture", size=48, grid=3, grid_field=0.5, field=0.4, seed=3)
+    z_um = float(scene.z_um[0])
+    problem = recon.Problem.of(
+        scene.measurement, scene.calibration, recon.Options(z_um=z_um, model="local", iterations=20)
+    )
+    shut = replace(problem, extent=replace(problem.extent, margin=MARGIN))
+    outside = ~spanned(problem.depths.fields[0], *np.ogrid[-24:24, -24:24], MARGIN)
+    assert 0.3 < outside.mean() < 0.9
+    assert np.abs(recon.solve(problem).image[outside]).max() > 0
+    assert np.abs(recon.solve(shut).image[outside]).max() == 0
+    assert recon.solve(shut).image.max() > 0
+
+
+def test_pixels_between_the_outermost_psfs_and_a_margin_are_spanned():
+    psfs = np.ones((3, 1, 4, 4), np.float32)
+    y, x = np.ogrid[-10:11, -10:11]
+    corners = spanned(FieldOfPsfs(psfs, [(-4, -2), (4, -2), (0, 6)]), y, x, 0.25)
+    assert corners.any(axis=1).nonzero()[0].tolist() == list(range(4, 17))  # -6 to 6
+    assert corners.any(axis=0).nonzero()[0].tolist() == list(range(6, 19))  # -4 to 8
+    line = spanned(FieldOfPsfs(psfs, [(-4, 0), (0, 0), (4, 0)]), y, x, 0.0)
+    assert line[:, 0].nonzero()[0].tolist() == list(range(6, 15))
+    assert line[6:15].all()

@@ -13,8 +13,9 @@ from scipy.signal import fftconvolve
 
 from recon import InputError, Measurement, solve
 from recon.evaluation.scene import make_scene
-from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.part import Part
+from recon.reconstruction.probe import MARGIN
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.selection import choose
 from recon.solvers import memory
@@ -150,6 +151,21 @@ def test_a_video_has_the_background_that_a_photograph_would_have() -> None:
         ).smooth
         told.append(problem.smooth)
     assert told == [False, True]
+
+
+def test_a_film_s_object_is_shut_in_as_a_photograph_s_is_and_says_so() -> None:
+    scene = make_scene(
+        "sparse-picture", size=48, grid=3, aberration=2.0, background=1.0, photons=8000.0, field=0.4,
+        grid_field=0.5, seed=3,
+    )  # fmt: skip
+    shut = stream_problem(scene.measurement, scene.calibration)
+    assert shut.extent.margin == MARGIN
+    assert "the object lies where PSFs were measured" in shut.reason
+    everywhere = stream_problem(scene.measurement, scene.calibration, choose=Overrides(field="all"))
+    assert everywhere.extent.margin is None
+    assert "the object lies" not in everywhere.reason
+    with pytest.raises(InputError, match="only field=all is for films"):
+        stream_problem(scene.measurement, scene.calibration, choose=Overrides(binning=2))
 
 
 @pytest.mark.parametrize("camera", ["one PSF", "erased"])
