@@ -8,8 +8,8 @@
 Cases run in processes of their own on points seen through random lenslets (SIMULATED): first the
 forecast that ``reconstruct --explain`` gives, from six iterations, then the whole of it. Written are
 ``growth.png`` and ``growth.csv``: seconds and memory against each size, the exponent by which they grow, what
-the forecast missed, and the largest that fits into this machine's memory, by the last two sizes. ``--most``
-scales the sizes.
+the forecast missed, and the largest that fits into this machine's memory, straight on from the last two.
+Sizes are scaled by ``--most``.
 """
 
 from __future__ import annotations
@@ -307,14 +307,17 @@ def main() -> None:
             )
         time_slope, memory_slope = slope(sizes, seconds), slope(sizes, memory)
         words = f"time ~ size^{time_slope:.2f}, memory ~ size^{memory_slope:.2f}"
+        each = (memory[-1] - memory[-2]) / (sizes[-1] - sizes[-2])
         if memory_slope > 0.1:
-            fits = sizes[-1] * (0.9 * available_bytes() / memory[-1]) ** (1 / memory_slope)
+            fits = sizes[-1] + (0.9 * available_bytes() - memory[-1]) / each
             words += f"; {fits:.2g} {what} fit into {available_bytes() / GIB:.0f} GiB"
         print(f"{what:<8}{words}")
         axes.loglog(sizes, seconds, "o-", color=SECOND, label="seconds")
         axes.loglog(sizes, [f[0] for f in found], "x", color=SECOND, label="forecast")
         axes.loglog(sizes, [m / 2**20 for m in memory], "s-", color=ACCENT, label="MiB")
         axes.loglog(sizes, [f[1] / 2**20 for f in found], "+", color=ACCENT, label="forecast")
+        axes.set_xticks(sizes, [str(size) for size in sizes])
+        axes.minorticks_off()
         style(axes, words.replace("; ", "\n").replace(", ", "\n"), what, "", title_size=9)
         axes.legend(fontsize=8, frameon=False, labelcolor=INK)
     with (options.out / "growth.csv").open("w", newline="") as file:
