@@ -328,8 +328,7 @@ class ProcedurePanel(Panel):
     # Inside --------------------------------------------------------------------------------------
     def _chosen(self) -> None:
         self.use_button.hide()  # what was made by another routine is in Runs
-        self.run_bar.show_end("", complete=False)
-        self.run_bar.bar.setValue(0)
+        self.run_bar.clear()
         self.views.show_page(self.routine.name)
         self.about.setText(f"{self.routine.help.removesuffix('.')}.")
         self.run_bar.set_startable("Its form is being made.")

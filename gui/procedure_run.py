@@ -201,7 +201,8 @@ class ProcedureRun(QObject):
             try:
                 return procedure.carry_out(bench, control=control, listener=mailbox)
             except RunEndedError as error:
-                return Ended(error.words, unfinished(error.run.path))
+                words = "\n".join([error.words, *getattr(error, "__notes__", ())])
+                return Ended(words, unfinished(error.run.path))
             except EndedEarlyError as error:
                 words = "\n".join([str(error), *getattr(error, "__notes__", ())])
                 return Ended(words, unfinished(control.run))
@@ -371,6 +372,11 @@ class RunBar(QWidget):
         elif now.seconds_left is not None:
             words.append(f"{'at most ' if now.at_most else ''}{duration(now.seconds_left)} left")
         self.words.setText(", ".join(words))
+
+    def clear(self) -> None:
+        """Show nothing of what was carried out before."""
+        self.bar.reset()
+        self.words.clear()
 
     def show_end(self, words: str, *, complete: bool) -> None:
         """Show how it ended."""

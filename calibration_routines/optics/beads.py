@@ -30,7 +30,7 @@ from calibration_routines.psf.sampling import known
 from instrument.bench.bench import Bench
 from instrument.files.atomic import named_by_worth, require_new
 from instrument.files.calibration_file import save_calibration
-from instrument.files.errors import BenchError, OperatorNeededError, SettingsError
+from instrument.files.errors import BenchError, OperatorNeededError, SettingsError, count
 from instrument.files.images import write_image
 from instrument.runs.run_control import RunControl
 from instrument.runs.writer import dated_name, free_name
@@ -233,16 +233,38 @@ def photograph_slides(
     Raises OperatorNeededError when the slide has to be moved by hand and nobody can be asked;
     CalibrationError when an image saturates still, the last time or at the camera's shortest exposure.
     """
-    changer = _slide_changer(bench)
-    ask = bench.ask
-    if changer is None and ask is None:
+    if _slide_changer(bench) is None and bench.ask is None:
         raise OperatorNeededError(
             "The bead slide must be moved by hand between photographs, and there is no terminal to ask at. "
             "Photograph it with snap, and give the images: calibrate beads FILE FILE ..."
         )
+    photographs: list[Photograph] = []
+    try:
+        _photograph_each(bench, slides, folder, control, listener, photographs)
+    except BaseException as error:
+        if photographs:
+            kept = ", ".join(str(one.run.path) for one in photographs)
+            error.add_note(f"{count(len(photographs), 'slide')} photographed before: {kept}")
+        raise
+    return BeadPhotographs(
+        mean_images([one.measurement for one in photographs]),
+        tuple(one.run.path for one in photographs),
+        photograph_findings(photographs),
+    )
+
+
+def _photograph_each(
+    bench: Bench,
+    slides: BeadSlides,
+    folder: Path | None,
+    control: RunControl,
+    listener: Listener,
+    photographs: list[Photograph],
+) -> None:
+    """Photograph slide after slide; ``photographs`` has those that are done, whatever happens."""
+    changer, ask = _slide_changer(bench), bench.ask
     exposure_ms: float | None = None
     shortest_ms = bench.camera.exposure_limits_ms[0]
-    photographs: list[Photograph] = []
     for number in range(slides.images):
         control.check()
         if changer is not None:
@@ -282,11 +304,6 @@ def photograph_slides(
         file = named_by_worth(taken.run.path / SLIDE_FILE, doubted=bool(taken.findings))
         write_image(file, taken.measurement, facts | {"dark": "taken off"})
         photographs.append(taken)
-    return BeadPhotographs(
-        mean_images([one.measurement for one in photographs]),
-        tuple(one.run.path for one in photographs),
-        photograph_findings(photographs),
-    )
 
 
 def calibrate_beads(

@@ -174,6 +174,7 @@ class TasksPanel(Panel):
             page.form.set_values(self._given)
             self._given = {}
         if not self.run.is_running:
+            self.run_bar.clear()
             self.run_bar.set_startable()
 
     def _made(self, name: str, task: Task) -> _Page:

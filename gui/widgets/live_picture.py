@@ -238,7 +238,7 @@ class LivePicture(QWidget):
         self.region_box = RegionBox(self.view)
         yield
         self.profile_plot = plot_widget("along the line", "counts", x_unit="pixels")
-        self._profile_curve = self.profile_plot.plot([], [], pen=curve_pen(1))
+        self._profile_curve = self.profile_plot.plot([], [], pen=curve_pen(0))
         self.profile_plot.setMaximumHeight(170)
         self.profile_plot.hide()
         yield

@@ -60,13 +60,14 @@ def plot_widget(
 
 
 _DASHES = (Qt.PenStyle.SolidLine, Qt.PenStyle.DashLine, Qt.PenStyle.DotLine, Qt.PenStyle.DashDotLine)
-"""Tell curves apart where hues cannot."""
+"""Tell curves apart where hues cannot: in the red theme, and for eyes that do not tell them."""
+_SIGNS = ("——", "– –", "···", "–·–")
+"""The same in words' lines."""
 
 
 def curve_pen(number: int = 0, width: float = 1.5) -> Any:
     """Return the pen of the ``number``-th curve of a plot."""
-    dash = _DASHES[number % len(_DASHES)] if colours().red_light_only else Qt.PenStyle.SolidLine
-    return pg.mkPen(curve_colour(number), width=width, style=dash)
+    return pg.mkPen(curve_colour(number), width=width, style=_DASHES[number % len(_DASHES)])
 
 
 def curve_colour(number: int) -> str:
@@ -82,9 +83,10 @@ def dots(colour: Any, size: int = 5) -> dict[str, Any]:
 
 
 def legend(names: Mapping[int, str]) -> str:
-    """Return the names of curves by their numbers, each with its colour, as rich text."""
+    """Return the names of curves by their numbers, each with its line and colour, as rich text."""
     return " &nbsp; ".join(
-        f'<span style="color:{curve_colour(number)}">●</span> {name}' for number, name in names.items()
+        f'<span style="color:{curve_colour(number)}"><b>{_SIGNS[number % len(_SIGNS)]}</b></span> {name}'
+        for number, name in names.items()
     )
 
 

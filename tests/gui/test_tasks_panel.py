@@ -80,6 +80,9 @@ def test_two_calibrations_are_compared_with_table_and_python_beside_the_form(
         panel.start()  # the file is there now
     assert "exists" in panel.words.toPlainText()
     assert not panel.files
+    assert panel.run_bar.words.text()
+    shown(qtbot, panel, "refocus")
+    qtbot.waitUntil(lambda: not panel.run_bar.words.text(), timeout=WAIT_MS)  # it was another task's
 
 
 def test_a_task_waits_ends_and_keeps_what_it_can(qtbot: QtBot, panel: TasksPanel) -> None:

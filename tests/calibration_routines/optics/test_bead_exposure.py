@@ -68,6 +68,9 @@ def test_a_slide_that_saturates_is_taken_shorter_and_so_are_those_after_it(
     assert taken_ms == pytest.approx([10.0, 8.0, 8.0])
     with pytest.raises(CalibrationError, match=r"taken 3 times, at 4.9 ms: dim"):
         photographed([1.0, 1.0], 0.1)
+    with pytest.raises(CalibrationError) as ended:
+        photographed([20.0, 1.0], 0.1)
+    assert ended.value.__notes__ == ["1 slide photographed before: run"]
     with pytest.raises(CalibrationError, match="taken 2 times, at 8 ms, the camera's shortest exposure: dim"):
         photographed([1.0, 1.0], 8.0)
     with pytest.raises(CalibrationError, match="taken 1 time, at 10 ms, the camera's"):
