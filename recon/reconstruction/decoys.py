@@ -61,8 +61,9 @@ FAR_ABOVE = 3.0
 noise set the prior's weight: too small a one lets every pattern explain the photograph."""
 HEAVIER = {Fit.UNTOLD: (Fit.FITS, Fit.OFF), Fit.FOREIGN: (Fit.OFF,)}
 """What may then be said where the other was."""
-MOVED_DEG = 6.0
-"""Turn up to which a foreign calibration is taken for the own one that moved: such as can be fitted."""
+MOVED_DEG, MOVED_SCALE = 6.0, 0.05
+"""Turn, such as can be fitted, and change of size up to which a calibration is taken for the own one that
+moved: another diffuser's is "8 % smaller" or 11 by chance."""
 DECOYS, MOST_DECOYS = 8, 12
 """Usually; and with farther ones on the side of a near one that is better, each twice as far: to some eight
 degrees or per cent."""
@@ -130,7 +131,7 @@ def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | Non
                 check.better, iterations=thorough, background=True
             )
             cleared = cleared and is_told(own, accuser, small.pixels)
-            stands = is_ahead(accuser, (own,), small.pixels, NEARLY)
+            stands = not _is_near(check.better) or is_ahead(accuser, (own,), small.pixels, NEARLY)
         check = again if cleared else check if stands else replace(again, fit=Fit.UNTOLD, better=None)
     left = float(np.mean(as_given(again.scores).fine)) ** 0.5
     if check.fit in HEAVIER and left > FAR_ABOVE:
@@ -161,10 +162,11 @@ class _Small:
         erasures = self.photograph.erasures
         return int(np.size(self.photograph.image) - (0 if erasures is None else np.count_nonzero(erasures)))
 
-    def resolves(self) -> bool:
-        """Tell whether the PSFs resolve :meth:`fine`."""
+    def structure(self) -> float:
+        """Return how much of :meth:`fine` the PSFs resolve: all or nothing."""
         problem = self._problem(self.calibration, background=False)
-        return lateral_resolution(problem.depths.central[problem.n_depths // 2, 0]).mean_px <= FINE_PX
+        finest = lateral_resolution(problem.depths.central[problem.n_depths // 2, 0]).mean_px
+        return self.fine() if finest <= FINE_PX else 0.0
 
     def fine(self) -> float:
         """Return the mean square of the photograph's fine structure beyond noise."""
@@ -209,6 +211,11 @@ class _Small:
         return Problem.of(self.photograph, calibration, options)
 
 
+def _is_near(how: Transformation) -> bool:
+    """Whether a decoy is the calibration itself, a little turned or enlarged."""
+    return how not in FAR and abs(how.rotation_deg) <= MOVED_DEG and abs(how.scale - 1) <= MOVED_SCALE
+
+
 def _is_certain(check: CalibrationCheck) -> bool:
     """Whether what explains a photograph better certainly does, and is no larger turn than can be fitted."""
     if check.better is None:
@@ -224,6 +231,7 @@ def _competition(small: _Small, scored: Callable[[Transformation], Score]) -> Ca
     check = check_of(scores, small.pixels)
     if check.sure:
         return check
+    structure = small.structure()
     scores[BETWEEN] = scored(BETWEEN)
     near = [how for how in decoys if how not in FAR]
     for how in _minima(scores, near, small.pixels):
@@ -232,7 +240,7 @@ def _competition(small: _Small, scored: Callable[[Transformation], Score]) -> Ca
     while scores[best].objective < scores[before].objective and len(scores) < MOST_DECOYS:
         before, best = best, Transformation(scale=best.scale**2, rotation_deg=2 * best.rotation_deg)
         scores[best] = scored(best)
-    return check_of(scores, small.pixels, small.fine(), resolved=small.resolves())
+    return check_of(scores, small.pixels, structure)
 
 
 def _minima(

@@ -209,9 +209,7 @@ def near_decoys(shape: tuple[int, int], *, sizes: bool) -> tuple[Transformation,
     return (*turned, Transformation(scale=1 + step), Transformation(scale=1 - step)) if sizes else turned
 
 
-def check_of(
-    scores: Mapping[Transformation, Score], pixels: int, structure: float = 0.0, *, resolved: bool = True
-) -> CalibrationCheck:
+def check_of(scores: Mapping[Transformation, Score], pixels: int, structure: float = 0.0) -> CalibrationCheck:
     """Judge a calibration by its score and its decoys'.
 
     Parameters
@@ -222,9 +220,7 @@ def check_of(
     pixels : int
         Valid ones.
     structure : float
-        Mean square of the photograph's own fine structure beyond the noise.
-    resolved : bool
-        Whether the PSFs resolve that: else little that they explain of it makes none foreign.
+        Mean square of the photograph's own fine structure beyond the noise; 0 where the PSF resolves none.
     """
     given = as_given(scores)
     scores = {**scores, GIVEN: given}
@@ -242,11 +238,7 @@ def check_of(
     likelier = all(score.objective > (1 + LIKELIER) * given.objective for score in far.values())
     gains = sorted(score.objective - given.objective for score in far.values())
     explained = structure + 1 - min(float(np.mean(score.fine)) for score in scores.values())
-    missing = (
-        resolved
-        and explained * pixels / 2 > STRUCTURE_NATS
-        and min(gains, default=np.inf) < OWN_SHARE * structure
-    )
+    missing = explained * pixels / 2 > STRUCTURE_NATS and min(gains, default=np.inf) < OWN_SHARE * structure
     # A pattern may be half its own mirror image: that decoy explains as much, and the others tell.
     own = structure > 0 and len(gains) > 2 and gains[1] > OTHERS * structure and gains[0] > -EQUAL * structure
     foreign = ((speaks and unlike) or missing) and not likelier and not own
