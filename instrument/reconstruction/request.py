@@ -282,6 +282,7 @@ def refocused(job: Job, z_um: float, *, beside: bool = False) -> Job:
                 "from_z_um": list(made.from_z_um),
                 "displacement_error_um": made.displacement_error_um,
                 "expected_similarity": made.expected_similarity,
+                "similarity_within": made.similarity_within,
             },
         },
     )

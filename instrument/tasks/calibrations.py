@@ -308,6 +308,7 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
                     "from_z_um": one.from_z_um,
                     "displacement_error_um": one.displacement_error_um,
                     "expected_similarity": one.expected_similarity,
+                    "similarity_within": one.similarity_within,
                 }
                 for one in made
             ]

@@ -9,12 +9,14 @@ d``, which stays as it is where the scaled PSF has it scaled: the error grows as
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.camera.camera_model import members_of_depths
+from recon.camera.depth_likeness import likeness_range
 from recon.camera.field_registration import remembered_field
 from recon.camera.grid import FAR_UM
 from recon.camera.registration import displacement, moved, register, rescaled
@@ -33,8 +35,9 @@ SAME_PLACE = 0.02
 """Places of two depths that differ by no more of the field were meant to be the same."""
 LEAST_LIKENESS = 0.5
 """Scaled neighbours less alike than this are not mixed: the mixture would be a double image."""
-_LOSS = 1.5  # power of the distance in 1/z at which a scaled pattern loses its likeness
-_LEAST_LOST = 0.003  # that is not told from noise
+_PLANES, _PAIRS = 4, 4  # nearest planes, and pairs of them, whose likeness tells how it goes with distance
+_BEYOND = 0.5  # part of what is lost beyond the calibrated depths that is not known
+_SAID = 0.01  # a range that is said as one
 TYPICAL_DEFLECTION_DEG = 0.25
 """Half width of the deflection of the dissertation's 0.5 degree diffuser (A.2), where nothing is known."""
 
@@ -56,8 +59,8 @@ class Refocused:
         Expected error of the light's place on the sensor, from the diffuser's deflection: the weighted mean
         of ``deflection * d * |1 - s|``.
     expected_similarity : float or None
-        Expected inner product with a PSF measured there: from the nearest calibrated PSFs, each predicted
-        from its own neighbours, scaled to this distance. None with fewer than three depths.
+        Expected inner product with a PSF measured there, by how alike the calibrated PSFs are. None with
+        fewer than three depths, and too far from them.
     """
 
     psf: Floats
@@ -70,6 +73,8 @@ class Refocused:
     """``(x, y)`` of the PSFs it was made of: those nearest to the axis."""
     calibrated_um: tuple[float, float] = (0.0, float("inf"))
     """Nearest and farthest calibrated depth."""
+    similarity_within: float | None = None
+    """By how much the calibrated PSFs leave the similarity open, to either side."""
 
     @property
     def extrapolated(self) -> bool:
@@ -82,8 +87,12 @@ class Refocused:
         sources = " and ".join(f"{z / 1e3:g}" for z in self.from_z_um)
         how = "mixed from the PSFs" if len(self.from_z_um) > 1 else "scaled from the PSF"
         error = f"light up to {self.displacement_error_um:.1f} um off on the sensor"
-        if self.expected_similarity is not None:
-            error += f", expected similarity {self.expected_similarity:.3f}"
+        expected, within = self.expected_similarity, self.similarity_within
+        if expected is not None and within is not None:
+            ends = sorted({f"{expected - within:.2f}", f"{expected + within:.2f}"})
+            error += f", expected similarity {' to '.join(ends) if within > _SAID else f'{expected:.3f}'}"
+        else:
+            error += ", similarity not known: it takes three calibrated depths, no farther from it than apart"
         x_mm, y_mm = (1e-3 * v for v in self.source_um)
         place = f" (x = {x_mm:.4g}, y = {y_mm:.4g} mm)" if x_mm or y_mm else ""
         return f"{how} at {sources} mm{place} (Kuo 2020, Eq. 5.2): {error}"
@@ -137,9 +146,9 @@ def refocus(
     bend_um = np.deg2rad(deflection_deg) * distance_um
     error = sum(w * bend_um * abs(1 - 1 / s) for w, s in zip(weights, mixture.scales, strict=True))
     if max(abs(s - 1) for s in mixture.scales) < SAME_DEPTH:
-        likeness: float | None = 1.0
+        likeness: tuple[float, float] | None = (1.0, 1.0)
     else:
-        likeness = _expected_similarity(depths, psfs, z_um, members, distance_um)
+        likeness = _expected_similarity(depths, psfs, z_um, mixture, distance_um)
     x_um, y_um = central_places(calibration)[members[int(np.argmax(weights))]]
     return Refocused(
         mixture.of([psfs[k] for k in members]),
@@ -147,9 +156,10 @@ def refocus(
         tuple(float(depths[k]) for k in members),
         mixture.scales,
         float(error),
-        likeness,
+        None if likeness is None else sum(likeness) / 2,
         (float(x_um), float(y_um)),
         (float(depths[0]), float(depths[-1])),
+        None if likeness is None else (likeness[1] - likeness[0]) / 2,
     )
 
 
@@ -400,57 +410,43 @@ def _likeness(first: Array, second: Array) -> float:
 
 
 def _expected_similarity(
-    depths: npt.NDArray[np.float64], psfs: Floats, z_um: float, members: tuple[int, ...], distance_um: float
-) -> float | None:
-    """Predict what a measured PSF would agree to, from calibrated PSFs left out one at a time.
+    depths: npt.NDArray[np.float64],
+    psfs: Floats,
+    z_um: float,
+    mixture: _Mixture,
+    distance_um: float,
+) -> tuple[float, float] | None:
+    """Predict between what and what a measured PSF would agree: by how alike the planes nearest to it are.
 
-    A plane mixed from planes at a distance ``D`` in 1/z misses ``1 - similarity``, which grows as
-    ``D^2`` while it is small; so it is scaled to the distance of the wanted depth.
+    None with fewer than three depths, and farther from them than they are from one another.
     """
     if len(depths) < 3:
         return None
-    if len(members) == 1:
-        return _scaled_likeness(depths, psfs, z_um, members[0], distance_um)
-    wanted = min(abs(1 / depths[k] - 1 / z_um) for k in members)
-    nearest = np.argsort(np.abs(1 / depths - 1 / z_um))[:2]
-    missed = []
-    for k in nearest:
-        rest = np.arange(len(depths)) != k
-        mixture = _mixture(depths[rest], psfs[rest], float(depths[k]), distance_um)
-        used = mixture.members
-        predicted = mixture.of([psfs[rest][j] for j in used])
-        rows, columns = displacement(psfs[k].mean(axis=0), predicted.mean(axis=0))
-        likeness = _likeness(moved(predicted, rows, columns), psfs[k])
-        gap = min(abs(1 / depths[rest][j] - 1 / depths[k]) for j in used)
-        missed.append((1 - likeness) * (wanted / gap) ** 2)
-    return float(np.clip(1 - np.mean(missed), 0.0, 1.0))
-
-
-def _scaled_likeness(
-    depths: npt.NDArray[np.float64], psfs: Floats, z_um: float, member: int, distance_um: float
-) -> float:
-    """Predict what a measured PSF would agree to with one plane that is only scaled.
-
-    That plane is scaled to a near, a middle and the farthest other plane. Caustics lose their likeness as
-    ``1 / (1 + (D / D0)^1.5 + noise)`` of the distance ``D`` in 1/z: seen on propagated light to 25 times the
-    planes' spacing (docs/decisions/0131).
-    """
-    from scipy.optimize import nnls  # costs a tenth of a second
-
-    gaps = np.abs(1 / depths - 1 / depths[member])
-    others = np.argsort(gaps)[1:]
-    chosen = sorted({int(others[0]), int(others[len(others) // 2]), int(others[-1])})
-    lost = []
-    for k in chosen:
-        predicted = refocus_psf(psfs[member], float(depths[member]), float(depths[k]), distance_um)
-        rows, columns = displacement(psfs[k].mean(axis=0), predicted.mean(axis=0))
-        lost.append(1 / max(_likeness(moved(predicted, rows, columns), psfs[k]), 1e-3) - 1)
-    reach = (gaps[chosen] / gaps[chosen].max()) ** _LOSS
-    weights = 1 / (np.array(lost) + _LEAST_LOST)
-    design = np.stack([reach, np.ones(len(chosen))], axis=1)
-    (grows, noise), _ = nnls(design * weights[:, None], np.array(lost) * weights)
-    wanted = (abs(1 / z_um - 1 / depths[member]) / gaps[chosen].max()) ** _LOSS
-    return float(1 / (1 + grows * wanted + noise))
+    nearness = 1 / depths
+    away = np.abs(nearness - 1 / z_um)
+    if len(mixture.members) == 1:  # the plane that is scaled, with a near, a middle and the farthest one
+        (member,) = mixture.members
+        others = np.argsort(np.abs(nearness - nearness[member]))[1:]
+        pairs = [(member, int(k)) for k in sorted({others[0], others[len(others) // 2], others[-1]})]
+    else:
+        pairs = list(combinations(np.argsort(away)[:_PLANES].tolist(), 2))
+        pairs.sort(key=lambda pair: abs(nearness[pair[0]] - nearness[pair[1]]))
+        if len(pairs) > _PAIRS:
+            pairs = [*pairs[: _PAIRS - 2], pairs[len(pairs) // 2], pairs[-1]]
+    apart = np.array([abs(nearness[i] - nearness[k]) for i, k in pairs])
+    distances = away[list(mixture.members)]
+    if distances.min() > apart.max():
+        return None
+    alike = []
+    for one, other in pairs:
+        scaled = refocus_psf(psfs[one], float(depths[one]), float(depths[other]), distance_um)
+        rows, columns = displacement(psfs[other].mean(axis=0), scaled.mean(axis=0))
+        alike.append(_likeness(moved(scaled, rows, columns), psfs[other]))
+    gap = abs(nearness[mixture.members[0]] - nearness[mixture.members[-1]])
+    low, high = likeness_range(apart, np.array(alike), distances, np.array(mixture.weights), float(gap))
+    if not depths[0] <= z_um <= depths[-1]:  # nothing was seen of how patterns change out there
+        low, high = 1 - (1 + _BEYOND) * (1 - low), 1 - (1 - _BEYOND) * (1 - high)
+    return max(low, 0.0), high
 
 
 def _distance_um(calibration: Calibration) -> float:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.correlation import across_field, similarity
+from recon.camera.depth_likeness import likeness_range
 from recon.camera.grid import FAR_UM
 from recon.camera.refocus import at_depth, central_psfs, paraxial_scale, refocus, refocus_psf
 from recon.camera.registration import register, rescaled
@@ -19,6 +21,7 @@ from recon.types import Calibration, Geometry
 
 WORLD = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
 GREEN = (0.0, 1.0, 0.0)
+Floats = npt.NDArray[np.float64]
 
 
 def true_psf(z_um: float, x_um: float = 0.0) -> np.ndarray:
@@ -62,7 +65,33 @@ def test_the_expected_similarity_is_that_of_the_truth() -> None:
         assert made.expected_similarity > 0.95
     for z_um in (18e3, 24e3, 400e3):  # beyond the calibrated depths
         made = refocus(calibration, z_um)
-        assert made.expected_similarity == pytest.approx(similarity(made.psf[0], true_psf(z_um)), abs=0.02)
+        assert made.similarity_within is not None
+        within = max(made.similarity_within, 0.02)
+        assert within < 0.05
+        assert made.expected_similarity == pytest.approx(similarity(made.psf[0], true_psf(z_um)), abs=within)
+    far = refocus(calibration, 10e3)
+    assert far.expected_similarity is None
+    assert "similarity not known" in str(far)
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0])
+def test_what_pairs_leave_open_is_a_range_that_holds_the_truth(power: float) -> None:
+    """Pairs of planes by a law that is known; on its plateau they tell little of nearer planes."""
+
+    def law(distance: float | Floats) -> Floats:
+        return 0.99 * (0.9 + 0.1 / (1 + (np.asarray(distance) / 3.0) ** power))
+
+    def between(apart: Floats) -> tuple[float, float, float]:
+        half, gap, shares = np.array([apart[0] / 2] * 2), float(apart[0]), np.array([0.5, 0.5])
+        true = float((law(half) * shares).sum() / np.sqrt(0.5 + 0.5 * law(gap)))
+        low, high = likeness_range(apart, law(apart), half, shares, gap)
+        assert low - 0.003 <= true <= high + 0.003
+        return low, true, high
+
+    low, _, high = between(np.array([0.5, 1.0, 2.0, 8.0]))
+    assert high - low < 0.02
+    low, _, high = between(np.array([60.0, 120.0]))
+    assert high - low > 0.02
 
 
 def test_a_line_of_motion_beside_the_axis_blurs_nothing() -> None:
