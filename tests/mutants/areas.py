@@ -13,6 +13,7 @@ _RUNS = tuple(
         "inspection",
         "interrupt",
         "log",
+        "looked_at",
         "recorder",
         "recorder_in_pieces",
         "resume",

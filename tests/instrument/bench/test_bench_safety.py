@@ -10,12 +10,13 @@ from types import SimpleNamespace
 import pytest
 
 from drivers.errors import DeviceError, DeviceLostError, LimitError, StoppedError
+from drivers.sequence import SequenceLimits
 from instrument.bench import bench as bench_module
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.bench.safety import StepsFailedError, stop_until, try_all
 from instrument.files.errors import BenchError, OperatorNeededError
-from tests.mocks.devices import MockDevice, MockWorld
+from tests.mocks.devices import MockCamera, MockDevice, MockLedArray, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")
 
@@ -379,3 +380,22 @@ def test_a_setting_that_the_camera_refuses_is_told_with_where_it_stands() -> Non
     with pytest.raises(LimitError) as caught:
         bench.open()
     assert any("The value is from [camera]" in note for note in caught.value.__notes__)
+
+
+def test_what_cannot_do_its_part_in_a_sequence_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def opened(output: int = 0) -> str:
+        bench = bench_with(extra=f'[trigger]\nsent_by = "led_array"\noutput = {output}\n')
+        assert bench.trigger_source is None
+        try:
+            with bench.open():
+                assert bench.trigger_source is bench.led_array
+        except LimitError as error:
+            return str(error)
+        return ""
+
+    assert opened().startswith("camera (mock): takes no hardware trigger, which [trigger] of")
+    monkeypatch.setattr(MockCamera, "trigger_modes", ("free", "hardware"))
+    assert opened().startswith("led_array (mock): plays no sequences with pulses, which")
+    monkeypatch.setattr(MockLedArray, "sequence_limits", SequenceLimits(8, 1.0, 2))
+    assert opened(2).startswith("led_array (mock): has trigger outputs 0 to 1, not 2, which")
+    assert opened(1) == ""
