@@ -340,3 +340,28 @@ def test_steps_in_time_that_are_known_at_a_runs_end_are_no_damage_before(tmp_pat
         with RunWriter.reopen(writer.path) as again:
             assert again.mended == ()
             again.finish(FinishReason.STOPPED)
+
+
+def test_who_looks_at_sizes_only_reads_nothing_that_is_whole(
+    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run"
+    shutil.copytree(whole, path)
+    read: list[int] = []
+    look = Run.verify
+    monkeypatch.setattr(Run, "verify", lambda run, index: read.append(index) or look(run, index))
+    assert verify(Run.open(path), read=False).is_sound
+    assert read == []
+    chunk = Run.open(path).array.chunk_path(1)
+    data = chunk.read_bytes()
+    chunk.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    assert verify(Run.open(path), read=False).is_sound  # of the right size, and not read yet
+    assert not verify(Run.open(path)).is_sound
+    read.clear()
+    assert [frame.index for frame in verify(Run.open(path), read=False).damaged] == [1]
+    assert read == [1]
+    chunk.write_bytes(data[:-1])
+    assert [frame.index for frame in verify(Run.open(path), read=False).damaged] == [1]
+    chunk.write_bytes(data)
+    assert verify(Run.open(path), read=False).is_sound
+    assert noted_damage(path) == set()
