@@ -94,15 +94,6 @@ class PreparedVideo:
         done = self.job.done()
         return [number for number in range(len(self.job.blocks)) if number not in done]
 
-    def doubt(self) -> str:
-        """Say why the calibration may be another camera's, by the first frame; empty where nothing does.
-
-        Takes about a second.
-        """
-        check = check_calibration(self.job.problem)
-        said = "" if check is None else "".join(check.sentences[:1])
-        return f"{said[:1].upper()}{said[1:]}"
-
 
 def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVideo:
     """Read the recording's first frame and the PSF, settle everything, and make the job or find it begun.
@@ -163,6 +154,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         warnings.append(f"{saturated} of {len(frames)} frames have saturated pixels: expect halos there.")
     if not has_light(picture.measurement, problem.noise):
         warnings.append("The first frame holds nothing but noise: was the scene lit?")
+    warnings += filter(None, (_doubt(problem),))
     if missing := run.n_frames - len(frames):
         warnings.append(f"{missing} of {run.n_frames} frames were lost when recording: they stay NaN.")
     notes = {**picture.notes, "Image": f"{run.path}: {len(frames)} frames"}
@@ -217,6 +209,7 @@ def finish_video(prepared: PreparedVideo) -> list[Path]:
         written.append(request.film_path)
     unlit = prepared.job.unlit()
     record = {**plain(plan.settings), "frames": len(plan.frames), "run": plan.run, "frames_unlit": unlit}
+    record["warnings"] = list(prepared.warnings)
     write_json(request.record_path, record)
     prepared.job.remove()
     return [*written, request.record_path]
@@ -391,6 +384,13 @@ def _create(request: VideoRequest, run: Run, plan: VideoPlan, problem: Problem) 
             "calibrated_px": _calibrated_px(problem, request.rotate_deg // 90),
         },
     )
+
+
+def _doubt(problem: Problem) -> str:
+    """Say why the calibration may be another camera's, by the first frame; empty where nothing does."""
+    check = check_calibration(problem)
+    said = "" if check is None else "".join(check.sentences[:1])
+    return f"{said[:1].upper()}{said[1:]}"
 
 
 def _calibrated_px(problem: Problem, quarter_turns: int) -> tuple[float, float, float, float] | None:

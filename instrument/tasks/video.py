@@ -76,8 +76,7 @@ def make_video(desk: Desk, request: VideoRequest, *, force: bool) -> Done:
     )
     blocks = f"{len(prepared.job.blocks)} blocks of {plan.block}"
     desk.fact("Video", f"{len(plan.frames)} frames in {blocks}: {how}")
-    doubt = "" if prepared.resumed else prepared.doubt()
-    for warning in (*prepared.warnings, *filter(None, (doubt,))):
+    for warning in prepared.warnings:
         desk.warn(f"Warning: {warning}")
     if prepared.resumed:
         desk.fact("Resumed", f"{_frames_done(prepared)} frames are done already")

@@ -582,16 +582,20 @@ def test_a_full_disk_is_said_with_what_is_kept_and_the_video_goes_on(
 
 
 def test_a_calibration_of_another_camera_is_said(recording: Path, tmp_path: Path) -> None:
-    assert prepare_video(request(recording, tmp_path)).doubt() == ""
+    right = prepare_video(request(recording, tmp_path))
+    assert not any("calibration" in text for text in right.warnings)
     other = tmp_path / "other.npy"
     np.save(other, np.eye(8, dtype=np.float32))
     with pytest.raises(FileError, match=r"the image [^/]*recording frame 0 is 40 x 52"):
         prepare_video(replace(request(recording, tmp_path, psf=other), out=tmp_path / "o.ome.zarr"))
     np.save(other, np.load(recording.parent / "psf.npy")[::-1, ::-1])
     wrong = replace(request(recording, tmp_path, psf=other), out=tmp_path / "o.ome.zarr")
-    doubt = prepare_video(wrong).doubt()
-    assert "calibration" in doubt
+    prepared = prepare_video(wrong)
+    (doubt,) = (text for text in prepared.warnings if "calibration" in text)
     assert doubt[0].isupper()
+    assert solve_video(prepared, lambda _: None, threading.Event())
+    finish_video(prepared)
+    assert doubt in json.loads((tmp_path / "o.json").read_text())["warnings"]
 
 
 def test_prepared_is_what_the_window_shows(recording: Path, tmp_path: Path) -> None:
