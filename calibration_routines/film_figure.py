@@ -83,7 +83,7 @@ def write_film_figure(path: Path, activity: Activity, truth: Truth, judged: Judg
     below.set_xlabel("um along the vessel")
     below.set_ylabel("seconds")
     speed = figure.add_subplot(grid[2, 1])
-    times = activity.times_s[:-1]
+    times = 0.5 * (activity.times_s[:-1] + activity.times_s[1:])  # from one frame to the next
     speed.plot(times, judged.speed_um_s, color="tab:red", lw=0.8, label="reconstructed")
     speed.plot(activity.times_s, truth.speed_um_s, "k", lw=0.7, label="true")
     speed.set_xlim(0, min(6.0, float(times[-1])))
