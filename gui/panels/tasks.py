@@ -202,9 +202,11 @@ class TasksPanel(Panel):
         if page is None or not page.form.check():
             return None
 
+        fields = page.form.fields  # without what Python alone can ask for
+
         def made() -> dict[str, object]:
             return {
-                parameter: cls(**{o.name: page.form.value(o.name) for o in offered})
+                parameter: cls(**{o.name: page.form.value(o.name) for o in offered if o.name in fields})
                 for parameter, (cls, offered) in page.task.parts.items()
             }
 

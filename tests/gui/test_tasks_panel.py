@@ -85,6 +85,21 @@ def test_two_calibrations_are_compared_with_table_and_python_beside_the_form(
     qtbot.waitUntil(lambda: not panel.run_bar.words.text(), timeout=WAIT_MS)  # it was another task's
 
 
+@pytest.mark.parametrize("name", ["video", "patterned", "activity"])
+def test_what_reconstructs_recordings_can_be_asked_for(
+    qtbot: QtBot, panel: TasksPanel, tmp_path: Path, name: str
+) -> None:
+    given = dict.fromkeys(("run", "patterned", "video"), tmp_path)
+    given["calibration"] = calibration(tmp_path / "c", 0)
+    shown(qtbot, panel, name)
+    fields = panel._pages[name].form.fields
+    panel._pages[name].form.set_values(
+        {**{n: value for n, value in given.items() if n in fields}, "out": tmp_path / "out.ome.zarr"}
+    )
+    assert panel.objects() is not None, panel._note.text()
+    assert "carry_out" in panel.as_python()
+
+
 def test_a_task_waits_ends_and_keeps_what_it_can(qtbot: QtBot, panel: TasksPanel) -> None:
     counted, go = [0], threading.Event()
 
