@@ -107,8 +107,8 @@ def moved_along(seen: Sequence[Seen], distance_um: float) -> Explanation | None:
     to, of = ("farther from", "nearer to")[apart < 0], ("farther away", "nearer")[nearer < 0]
     return _allowed(
         {
-            f"the diffuser moved, it is about {abs(apart):.3g} um {to} the sensor": float(diffuser),
-            f"the source moved, it stands about {abs(nearer):.3g} um {of} than is recorded": float(source),
+            f"the diffuser moved, it is about {abs(apart):.0f} um {to} the sensor": float(diffuser),
+            f"the source moved, it stands about {abs(nearer):.0f} um {of} than is recorded": float(source),
         },
         len(seen) - 1,
     )
