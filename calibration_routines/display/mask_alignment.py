@@ -13,7 +13,8 @@ nothing moves at first: each picture holds many spots, each computed for another
    (:mod:`~calibration_routines.display.mask_stage`).
 5. Sections of the SLM make spots of their own: their shifts give the smooth rest of the displacement, which
    stays in the model. All light of the same pictures, speckle between the spots included, then tells place,
-   depth and tilts 11 to 30 times better (:mod:`recon.holography.place`); 3 once more checks that.
+   depth and tilts 11 to 30 times better (:mod:`recon.holography.place`). A last move takes out what spots
+   could not tell, all light says where that ended, and 3 once more checks it.
 """
 
 from __future__ import annotations
@@ -35,12 +36,14 @@ from calibration_routines.display.display_io import (
 from calibration_routines.display.kept_frames import KeptFrames, kept_words
 from calibration_routines.display.mask_search import (
     ALIGNMENT_FILE,
+    STEADY_FRAMES,
     AlignmentFailedError,
     AlignmentSession,
     AlignmentSettings,
     Measured,
     fit_photographs,
     measure_sections,
+    photograph_sections,
     refine_pose,
     search_pose,
 )
@@ -57,6 +60,7 @@ from instrument.runs.run_control import EndedEarlyError, RunControl
 from recon.errors import InputError
 from recon.holography import Display
 from recon.holography.camera_map import CameraMap
+from recon.holography.place import FittedPlace
 from recon.holography.pose import NAMES, Pose
 from recon.holography.sections import SmoothField
 
@@ -64,6 +68,14 @@ __all__ = ["AlignmentFailedError", "AlignmentReport", "AlignmentSettings", "Mask
 
 Array = npt.NDArray[Any]
 
+Field = npt.NDArray[np.float64]
+
+LAST_MOVES = 2
+LAST_PICTURES = 4
+"""Photographs of sections' spots after a last move."""
+WORTH_DB = 0.02
+"""What depth has to cost a hologram to be moved against once more."""
+_DEEP = [NAMES.index(name) for name in ("z_um", "pitch_mrad", "yaw_mrad")]
 _SURE = 5.0  # standard deviations
 _APART_PX = 0.5  # mask pixels
 
@@ -185,24 +197,22 @@ class MaskAlignment:
         if stage is not None:
             session.check(found.efficiency, floor=0.15)
             found = self._move(stage, found)
-        shape = session.display.mask.shape
         smooth, _ = measure_sections(session, found.pose)
-        pose, rest = _place(found.pose, smooth, shape)
-        fitted = fit_photographs(session, pose, rest)
-        if fitted is not None:
-            smooth = fitted.field
-            pose, rest = _place(fitted.pose, replace(smooth, rest=rest + smooth.rest), shape)
+        pose, rest = _place(found.pose, smooth, session.display.mask.shape)
+        fitted, pose, rest = self._fitted(pose, rest)
+        if stage is not None and "z_um" in stage.direction and fitted is not None:
+            fitted, pose, rest = self._settled(stage, fitted, pose, rest)
         session.spots.maker.rest = rest
         last = refine_pose(session, pose, settings.refinements, quick=0)
         session.check(last.efficiency)
         # All light sees the mask's place best, then sections its displacement, and probes of the whole SLM.
-        deep = [NAMES.index(name) for name in ("z_um", "pitch_mrad", "yaw_mrad")]
+        smooth = smooth if fitted is None else fitted.field
         values, error = pose.vector(), smooth.error.copy()
         apart = float(np.hypot(*(last.pose.vector() - values)[:2]))
         if fitted is None:
-            values[deep], error[deep] = last.pose.vector()[deep], last.error[deep]
+            values[_DEEP], error[_DEEP] = last.pose.vector()[_DEEP], last.error[_DEEP]
         else:
-            error[deep] = fitted.deep_error
+            error[_DEEP] = fitted.deep_error
         pose = Pose(*(float(v) for v in values))
         scatter = session.scatter()
         return AlignmentReport(
@@ -210,7 +220,7 @@ class MaskAlignment:
             error,
             rest,
             last.efficiency,
-            self._cost.lost_db(pose, error[deep], rest, smooth.modes),
+            self._cost.lost_db(pose, error[_DEEP], rest, smooth.modes),
             self._repeatability_db,
             found_at,
             self._directions,
@@ -224,6 +234,44 @@ class MaskAlignment:
             session.log,
             session.efficiencies,
         )
+
+    def _fitted(self, pose: Pose, rest: Field) -> tuple[FittedPlace | None, Pose, Field]:
+        """Fit all light of the last pictures; returns the place, as it was where they do not tell it."""
+        fitted = fit_photographs(self.session, pose, rest)
+        if fitted is None:
+            return None, pose, rest
+        smooth = replace(fitted.field, rest=rest + fitted.field.rest)
+        return fitted, *_place(fitted.pose, smooth, self.session.display.mask.shape)
+
+    def _settled(
+        self, stage: MaskStage, fitted: FittedPlace, pose: Pose, rest: Field
+    ) -> tuple[FittedPlace, Pose, Field]:
+        """Take out what all light tells and spots did not: depth first of all.
+
+        Tilts stay: where the SLM is not flat, all light takes that for them, and they cost next to nothing.
+        """
+        session = self.session
+        for _ in range(LAST_MOVES if self.settings.moves else 0):
+            costs_db = self._cost.of_depth_db(pose, rest)
+            session.say(f"all light: {pose.z_um:+.1f} um of depth are left and cost {costs_db:.2f} dB")
+            needed = 1 + LAST_PICTURES + self.settings.refinements + STEADY_FRAMES
+            if costs_db < WORTH_DB or session.frames_left < needed:
+                break
+            error = fitted.field.error.copy()
+            error[_DEEP] = fitted.deep_error[0], np.inf, np.inf
+            expected = stage.take_out(Measured(pose, error, 1.0))
+            if expected is None:
+                break
+            session.register()
+            photograph_sections(session, expected, rest, LAST_PICTURES)
+            again, pose, rest = self._fitted(expected, rest)
+            if again is None:
+                raise AlignmentFailedError(
+                    "Alignment failed: after its last move the mask is not where the stage was asked to "
+                    "bring it. Check that the mask is fixed and the stage holds its place, and align again."
+                )
+            fitted = again
+        return fitted, pose, rest
 
     def _move(self, stage: MaskStage, at: Measured) -> Measured:
         """Take out what the stage can, as long as that promises more than its repeatability."""

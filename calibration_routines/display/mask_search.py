@@ -23,7 +23,7 @@ from instrument.files.errors import BenchError
 from recon.base.declare import RARE, option
 from recon.holography import Display
 from recon.holography.place import FittedPlace, fit_place
-from recon.holography.pose import NAMES, Pose
+from recon.holography.pose import NAMES, NODES, Pose
 from recon.holography.sections import Sections, SectionShifts, SmoothField, fit_field, fit_shifts, hypotheses
 from recon.holography.sections import response as spot_response
 from recon.holography.spots import PoseProbe, depth_um
@@ -251,6 +251,19 @@ def measure_sections(session: AlignmentSession, pose: Pose) -> tuple[SmoothField
     return field, found
 
 
+def photograph_sections(
+    session: AlignmentSession, pose: Pose, rest: npt.NDArray[np.float64], pictures: int
+) -> None:
+    """Take pictures of sections' spots about a place that is known well, for :func:`fit_photographs`."""
+    sections = Sections(session.display.slm_shape, session.settings.division.shape)
+    shifts = np.broadcast_to(hypotheses(0.45 * session.display.factor), (len(sections), 5, 2))
+    session.spots.looks.clear()
+    session.spots.maker.rest = rest
+    for _ in range(pictures):
+        session.spots.measure_sections(pose, sections, shifts)
+        session.listener.said("sections")
+
+
 def fit_photographs(
     session: AlignmentSession, pose: Pose, rest: npt.NDArray[np.float64]
 ) -> FittedPlace | None:
@@ -275,6 +288,18 @@ def fit_photographs(
         session.say("that is too little, or too far: what spots say is kept")
         return None
     return found
+
+
+def measure_again(session: AlignmentSession, pose: Pose, pictures: int = 3) -> Measured | None:
+    """Measure a pose that spots found by all light around them; None where that does not tell it."""
+    rest = np.zeros((*NODES, 2))
+    photograph_sections(session, pose, rest, pictures)
+    fitted = fit_photographs(session, pose, rest)
+    if fitted is None:
+        return None
+    error = fitted.field.error.copy()
+    error[[NAMES.index(name) for name in ("z_um", "pitch_mrad", "yaw_mrad")]] = fitted.deep_error
+    return Measured(fitted.pose.plus(fitted.field.change), error, 1.0)
 
 
 Array = npt.NDArray[Any]

@@ -15,6 +15,7 @@ from calibration_routines.display.mask_search import (
     AlignmentFailedError,
     AlignmentSession,
     Measured,
+    measure_again,
     refine_pose,
 )
 from drivers.stage import Stage
@@ -54,6 +55,11 @@ class PlacementCost:
         assert self._in_place is not None
         vector = self._in_place.pose.vector() + difference.vector()
         return psnr_db - self._in_place.psnr_db(Pose(*(float(v) for v in vector)))
+
+    def of_depth_db(self, pose: Pose, rest: npt.NDArray[np.float64]) -> float:
+        """Return what a hologram for a pose and the displacement beyond it loses to the pose's depth."""
+        hologram = self._compute(pose, rest)
+        return hologram.psnr_db(pose.with_(z_um=0.0)) - hologram.psnr_db(pose)
 
     def lost_db(
         self,
@@ -134,7 +140,7 @@ class MaskStage:
         back at its place, and by how much that differs from before: repeatability of stage and measurement
         together.
 
-        Raises AlignmentFailedError when an axis did not do what it was asked for.
+        Raises AlignmentFailedError when an axis did not do what it was asked for, by all light too.
         """
         session, here = self.session, self.position
         steps = self._test_move(at.pose)
@@ -151,15 +157,20 @@ class MaskStage:
             session.say(f"{', '.join(unlike)} moved otherwise than asked: measured again")
             moved = refine_pose(session, moved.pose, 2 * pictures, quick=1)
             unlike = self._unlike(at, moved, steps)
+        # What makes spots wrong is the light around them: that is asked before an axis is named.
+        there = measure_again(session, moved.pose) if unlike else None
         self.go(here)
         session.register()
         back = refine_pose(session, at.pose, pictures + 1, quick=0)
-        if unlike:  # what was found before may be what was wrong
+        apart = Pose(*(float(v) for v in back.pose.vector() - at.pose.vector()))
+        if unlike:
+            again = None if there is None else measure_again(session, back.pose)
+            back, moved = (back, moved) if again is None or there is None else (again, there)
             unlike = self._unlike(back, moved, steps)
         for name, (found, error) in unlike.items():
             raise AlignmentFailedError(
                 f"Axis {name} of {self.stage.name} was moved by {steps[name]:+.3g}; the spots say "
-                f"{found:+.3g} +- {error:.2g}, measured twice. Check which axis it is, its unit, and whether "
+                f"{found:+.3g} +- {error:.2g}, measured again. Check which axis it is, its unit, and whether "
                 "the mask is fixed."
             )
         before, after = self.values(back.pose), self.values(moved.pose)
@@ -169,7 +180,7 @@ class MaskStage:
             f"axes tested: {', '.join(self.direction)}"
             + (f"; reversed: {', '.join(turned)}" if turned else "")
         )
-        return back, Pose(*(float(v) for v in back.pose.vector() - at.pose.vector()))
+        return back, apart
 
     def _unlike(self, a: Measured, b: Measured, steps: Values) -> dict[str, tuple[float, float]]:
         """Return what axes did that did not do what they were asked for, and how sure that is."""
