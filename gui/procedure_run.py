@@ -371,7 +371,7 @@ class RunBar(QWidget):
             words.append(f"PAUSED{self._when_paused}")
         elif now.seconds_left is not None:
             words.append(f"{'at most ' if now.at_most else ''}{duration(now.seconds_left)} left")
-        self.words.setText(", ".join(words))
+        self.words.setText(", ".join(filter(None, words)))
 
     def clear(self) -> None:
         """Show nothing of what was carried out before."""
