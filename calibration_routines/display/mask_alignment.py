@@ -410,7 +410,7 @@ def alignment_lines(report: AlignmentReport, *, simulated: bool) -> list[str]:
         + (
             ""
             if np.isnan(report.repeatability_db)
-            else f"; stage repeatable to {report.repeatability_db:.2f} dB"
+            else f"; spots see two visits of a place {report.repeatability_db:.2f} dB apart"
         )
     )
     reversed_axes = [name for name, direction in report.directions.items() if direction < 0]
