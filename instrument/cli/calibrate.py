@@ -43,11 +43,13 @@ from instrument.bench.bench import Bench
 from instrument.bench.config_file import other_bench_for
 from instrument.bench.safety import StepsFailedError
 from instrument.cli.app import App, BenchOption, examples, load_and_say, open_and_say
+from instrument.cli.plan import rehearsal
 from instrument.cli.progress import keys, progress_bar
 from instrument.files import kept_times
 from instrument.files.errors import BenchError, duration, size
 from instrument.files.images import read_image
-from instrument.runs.acquire import free_bytes
+from instrument.runs.acquire import abilities_of, free_bytes
+from instrument.runs.rehearsal import rehearsed
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import RunState, RunStatus
@@ -69,6 +71,9 @@ _HELP = {
     "align": "Align the holographic display.",
 }
 BEADS = "beads"
+_TIME = ": about "  # what an outlook says of the time goes by earlier runs
+_SHORT = 8
+"""Plans of no more than so many times the frames of their rehearsal begin without one."""
 _LABELS = {".png": "Picture", ".tif": "Photograph"}
 
 
@@ -178,13 +183,28 @@ def carry_out(
         print_lines(console, outlook.reasons)
         if dry_run:
             print_lines(console, outlook.plan_lines or _plan_lines(outlook))
+            print_lines(console, _first_time(outlook, opened, rehearse_any=True))
             console.print("Dry run: nothing moved, no frame was taken.")
             return
+        print_lines(console, _first_time(outlook, opened))
         if not outlook.plan_lines:  # else said when the exposures are known
             print_lines(console, _plan_lines(outlook))
         with TerminalListener(console) as listener:
             done = procedure.carry_out(opened, folder, listener=listener)
         print_outcome(console, done)
+
+
+def _first_time(outlook: Outlook, bench: Bench, *, rehearse_any: bool = False) -> list[str]:
+    """Return how long a first plan on a simulated bench takes; short ones are rehearsed only if told to."""
+    if outlook.plan is None or not bench.simulated_kinds or any(_TIME in words for words in outlook.reasons):
+        return []
+    frames = 0 if outlook.cost is None else outlook.cost.frames
+    long = rehearsed(outlook.plan) * _SHORT <= frames
+    pace = rehearsal(outlook.plan, bench) if rehearse_any or long else None
+    if pace is None:
+        return ["Computing the simulated light comes on top of exposure and motion."]
+    words = pace.words(outlook.plan, abilities_of(bench))
+    return [f"{words} Homing, looking for exposures and analysis come on top."]
 
 
 def _plan_lines(outlook: Outlook) -> list[str]:

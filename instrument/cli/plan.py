@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from drivers.errors import DeviceError
+from instrument.bench.bench import Bench
 from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.cli.progress import one_task
 from instrument.files.atomic import require_new, write_text
@@ -28,7 +29,7 @@ from instrument.plan.patterns import (
     shape_from_text,
 )
 from instrument.runs.acquire import abilities_of
-from instrument.runs.pace import pace_of
+from instrument.runs.pace import Pace, pace_of
 from instrument.runs.rehearsal import rehearse
 from recon.base.declare import option
 
@@ -122,11 +123,10 @@ def show(
         wanted = replace(abilities, stage_homed=True)  # homing is the run's own first move
         _describe(plan, abilities)
         simulated = bool(opened.simulated_kinds)
-        if pace is None and simulated:
-            with suppress(BenchError, DeviceError):  # what the bench cannot do is said below
+        if pace is None:
+            with suppress(BenchError):  # what the bench cannot do is said below
                 check(plan, wanted)
-                with one_task("Rehearsing on a simulated bench of its own") as advance:
-                    pace = rehearse(plan, opened, advance)
+                pace = rehearsal(plan, opened)
     if pace is not None:
         typer.echo(pace.words(plan, abilities))
     elif simulated:
@@ -198,6 +198,18 @@ def patterns() -> None:
     In a plan: light = "half side=left na=0.3", or { kind = "half", side = "left", rgb = [0, 255, 0] }.
     """
     typer.echo(pattern_help())
+
+
+def rehearsal(plan: Plan, bench: Bench) -> Pace | None:
+    """Take some frames of a plan on a simulated bench of its own, with a bar; None: it tells nothing."""
+    if not bench.simulated_kinds:
+        return None
+    with (
+        suppress(BenchError, DeviceError),  # what the bench cannot do is said elsewhere
+        one_task("Rehearsing on a simulated bench of its own") as advance,
+    ):
+        return rehearse(plan, bench, advance)
+    return None
 
 
 def _describe(plan: Plan, abilities: BenchAbilities) -> None:

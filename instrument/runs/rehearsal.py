@@ -12,7 +12,7 @@ from typing import Any
 
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config import BenchConfig, SharedConfig
-from instrument.plan import Plan, Step, estimate
+from instrument.plan import Plan, estimate
 from instrument.runs.acquire import abilities_of, record_of
 from instrument.runs.pace import Pace
 from instrument.runs.runner import Runner, RunStatus
@@ -24,7 +24,7 @@ OF_EACH = 3
 
 @dataclass(slots=True)
 class _Kind:
-    """Frames that take equally long: under the same light, at a new place or not."""
+    """Frames that take equally long: under the same light, at a new place, a known one, or the last one."""
 
     steps: list[int]
     seconds: list[float]
@@ -79,6 +79,11 @@ def rehearse(
     return Pace(whole_s / cost.frames, f"a rehearsal of {len(todo)} of them")
 
 
+def rehearsed(plan: Plan) -> int:
+    """Return how many frames of a plan :func:`rehearse` takes."""
+    return sum(len(kind.steps[:OF_EACH]) for kind in _kinds(plan))
+
+
 def _at_once(config: BenchConfig) -> BenchConfig | None:
     """Return a bench whose simulated worlds wait for nothing; None without such a world."""
     shared = {
@@ -92,11 +97,14 @@ def _at_once(config: BenchConfig) -> BenchConfig | None:
 def _kinds(plan: Plan) -> list[_Kind]:
     """Sort a plan's steps by what takes equally long."""
     found: dict[tuple[Any, ...], _Kind] = {}
-    before: Step | None = None
+    seen: set[str] = set()
+    before: str | None = None
     for step in plan.whole_steps(None):
-        moved = before is None or (step.source_um, step.stage) != (before.source_um, before.stage)
+        place = f"{step.source_um} {step.stage}"
+        way = "stays" if place == before else "comes back" if place in seen else "goes on"
         decade = round(math.log2(step.average))
-        key = (step.part, str(step.light), step.scene_lit, moved, step.slm_image is not None, decade)
+        key = (str(step.light), step.scene_lit, way, step.slm_image is not None, decade)
         found.setdefault(key, _Kind([], [])).steps.append(step.index)
-        before = step
+        seen.add(place)
+        before = place
     return list(found.values())

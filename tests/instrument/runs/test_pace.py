@@ -14,7 +14,7 @@ from instrument.plan import SOURCE, BenchAbilities, Part, Plan, SourceGrid, esti
 from instrument.runs import rehearsal
 from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.pace import Pace, keep_pace, pace_of
-from instrument.runs.rehearsal import rehearse
+from instrument.runs.rehearsal import rehearse, rehearsed
 from instrument.runs.run import Run
 from instrument.runs.runner import Runner, RunState, RunStatus
 
@@ -122,6 +122,14 @@ def test_a_rehearsal_takes_frames() -> None:
         found = rehearse(sweep_and_scene(), bench)
     assert found is not None
     assert "a rehearsal of 10 of them" in found.run
+
+
+def test_parts_alike_are_rehearsed_once() -> None:
+    """As a stage's check has them: a part a visit, to and fro between the same places."""
+    plan = sweep_and_scene()
+    again = plan.model_copy(update={"parts": plan.parts * 20})
+    assert rehearsed(plan) == 10
+    assert rehearsed(again) <= rehearsed(plan) + 6  # what comes back to a place that is known
 
 
 def unplugged() -> BenchAbilities:
