@@ -73,7 +73,7 @@ STEPS = {
     "stage": "calibrate stage --out stages",
     "photograph": "calibrate photograph --out photographs",
     "angular": "calibrate angular --average 1 --out angles",
-    "beads": "calibrate beads --z 2.5 --binning 8 --images 2 --psfs 3x3 --out slide",
+    "beads": "calibrate beads --binning 8 --images 2 --psfs 3x3 --out slide",
     "screen bench": "new screen.toml --screen --no-look",
     "screen": "calibrate screen --bench screen.toml --pictures 4 --average 2 --binning 4 --out screens",
     "microscope bench": "new microscope.toml --microscope --no-look",

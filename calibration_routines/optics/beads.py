@@ -500,8 +500,8 @@ ROUTINES = (
         options=BeadSlides,
         procedure=BeadProcedure,
         examples=(
-            "diffuserbench calibrate beads --z 2.5 --binning 4             photographs 9 slides, then solves",
-            "diffuserbench calibrate beads --z 2.5 --binning 4 --dry-run   only says what it would do",
+            "diffuserbench calibrate beads --binning 4             photographs 9 slides, then solves",
+            "diffuserbench calibrate beads --binning 4 --dry-run   only says what it would do",
             "diffuserbench calibrate beads --z 2.5 slide-*.tif --pixel-um 11.6 --distance-mm 3.8 "
             "--window 221x221",
         ),
