@@ -336,3 +336,11 @@ def test_swapped_and_identical_images_are_refused_before_the_work(seen: tuple[Im
         reconstruct(psf, psf, erasures=psf > 15_000)
     point = np.random.default_rng(2).poisson(psf).astype(np.float32)
     assert reconstruct(point, psf, iterations=2, judged=False).is_picture  # a point's photograph is none
+
+
+@pytest.mark.parametrize(("misfit", "said"), [(20.0, False), (80.0, True)])
+def test_where_the_better_copy_explains_little_more_it_may_be_anothers(misfit: float, said: bool) -> None:
+    turned = Transformation(rotation_deg=-2.0)
+    scores = {how: Score(m, m, (m,), (m,)) for how, m in ((GIVEN, 100.0), (turned, misfit))}
+    _, what_to_do = CalibrationCheck(Fit.OFF, scores, 1000, turned).sentences
+    assert ("another diffuser's" in what_to_do) is said
