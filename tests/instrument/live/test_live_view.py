@@ -49,7 +49,7 @@ class Slow(LiveReconstructor):
         self.refined = 0
         self.settled_after = 3
 
-    def feed(self, image: np.ndarray) -> LivePicture:
+    def feed(self, image: np.ndarray, *, lit: bool) -> LivePicture:
         assert self.at_once.acquire(blocking=False)
         self.fed.append(int(image[0, 0]))
         self.refined = 0

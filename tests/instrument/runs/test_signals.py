@@ -77,7 +77,7 @@ def test_a_signal_ends_the_run_safely_and_says_where_it_is(here: Path, number: i
         rest, errors = process.communicate(timeout=60)
     finally:
         process.kill()
-    assert process.returncode == status
+    assert process.returncode == status, errors
     calls = rest.split()
     assert "led_array.set_pattern" not in calls[calls.index("led_array.off") :]
     assert calls.index("led_array.off") < calls.index("stage.stop")
