@@ -47,16 +47,26 @@ def within(
 
     The call is made in a thread of its own, which is left to itself where it hangs: nothing can end it. When
     it ends after all, or was interrupted by Ctrl-C, nobody wants what it did: ``undo`` is called after it.
-    Such a thread is put into ``left``.
+    Such a thread is put into ``left``. One that had not begun by then does not begin.
 
     Raises DeviceTimeoutError, naming the device and what it was to do.
     """
     answer: list[T] = []
     errors: list[BaseException] = []
     deciding, over = threading.Lock(), threading.Event()
-    given_up = False
+    begun = given_up = False
+    kept = [] if left is None else left
+
+    def begins() -> bool:
+        """Return whether the call was not given up before it could begin."""
+        nonlocal begun
+        with deciding:
+            begun = not given_up
+        return begun
 
     def run() -> None:
+        if not begins():
+            return
         _here.bounded = True
         try:
             answer.append(call())
@@ -79,10 +89,9 @@ def within(
         nonlocal given_up
         with deciding:
             given_up = not over.is_set()
-            if given_up:
+            if begun and given_up:
                 _given_up.add(thread)
-            if given_up and left is not None:
-                left.append(thread)
+                kept.append(thread)
         return given_up
 
     thread = threading.Thread(target=run, name=f"{device}: {what}", daemon=True)

@@ -319,6 +319,29 @@ def test_ctrl_c_during_a_move_stops_it_and_waits_for_its_call(monkeypatch: pytes
         assert not any(thread.is_alive() for thread in given_up(stage))
 
 
+@pytest.mark.parametrize("late", [True, False])
+def test_an_interruption_while_a_calls_thread_starts_is_none_of_the_threads(
+    monkeypatch: pytest.MonkeyPatch, *, late: bool
+) -> None:
+    start = threading.Thread.start
+    threads: list[threading.Thread] = []
+    left: list[threading.Thread] = []
+    called: list[int] = []
+
+    def interrupted(thread: threading.Thread) -> None:
+        threads.append(thread)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as during:
+        during.setattr(threading.Thread, "start", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            within(5.0, "a stage", "moving", lambda: called.append(1), left=left)
+    if late:
+        start(threads[0])
+        threads[0].join(5.0)
+    assert (called, left) == ([], [])
+
+
 @pytest.mark.usefixtures("mock_drivers")
 @pytest.mark.parametrize("stops", [True, False])
 def test_ctrl_c_stays_ctrl_c_where_the_stop_fails(monkeypatch: pytest.MonkeyPatch, *, stops: bool) -> None:
