@@ -42,7 +42,7 @@ driver = "simulated"
 control = "simulated"
 [simulated]
 preset = "tiny"
-time_scale = 0.0
+time_scale = 1.0
 """
 
 
