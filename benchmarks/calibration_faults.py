@@ -41,7 +41,7 @@ import numpy.typing as npt
 
 from calibration_routines.display.mask_alignment import AlignmentReport
 from calibration_routines.optics.angular_response import AngularResponse
-from calibration_routines.optics.beads import BeadSlides, photograph_slides
+from calibration_routines.optics.bead_photographs import BeadSlides, photograph_slides
 from calibration_routines.optics.dpc import DiffuserSurface
 from calibration_routines.optics.photograph import Photograph, measure_field_response
 from calibration_routines.procedure import Listener, routines

@@ -79,6 +79,8 @@ class ResumeProcedure(Procedure):
             return settled(self.run, looked, bench, control, listener)
         run, routine = Run.open(self.run), routine_of(self.run)
         home_if_needed(bench, listener, run.plan)
+        if routine is not None and routine.restore is not None:
+            routine.restore(run, bench)
         runner = prepare_resume(bench, self.run, looked, on_progress=listener.frame)
         with discarded(runner):
             listener.said(f"Found {looked}")
@@ -130,6 +132,12 @@ def lacks_result(run: Path) -> bool:
     """Whether a run's frames are those of a routine, and its result is not there yet."""
     routine = routine_of(run)
     return routine is not None and routine.purpose is not None and routine.purpose.lacks_result(run)
+
+
+def goes_on_with_frames(run: Path) -> bool:
+    """Whether a run whose frames are there is finished by taking those of further runs."""
+    routine = routine_of(run)
+    return routine is not None and routine.finish_takes_frames and lacks_result(run)
 
 
 def can_go_on(run: Run, looked: Verification) -> bool:

@@ -345,6 +345,10 @@ class Routine:
     finish: Callable[[Run, Bench | None, RunControl, Listener], Outcome] | None = None
     """Makes the result of such a complete run: takes it, the bench for retakes (or None), control and
     listener."""
+    finish_takes_frames: bool = False
+    """Whether that needs the bench, to take the frames of further runs."""
+    restore: Callable[[Run, Bench], None] | None = None
+    """Brings back what no plan tells, before such a run takes the frames that it lacks."""
     watch: Callable[[Bench, Runner, Listener], None] | None = None
     """Makes the runner of such a run that goes on look at its frames as from its beginning."""
     files: FromFiles | None = None

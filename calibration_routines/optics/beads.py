@@ -2,49 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.optics.photograph import Photograph, photograph, photograph_findings
-from calibration_routines.procedure import (
-    MM,
-    CalibrationError,
-    Checked,
-    Listener,
-    Outcome,
-    Outlook,
-    Procedure,
-    Routine,
-    Size,
+from calibration_routines.optics.bead_photographs import (
+    BEADS,
+    BEADS_FOLDER,
+    BeadSlides,
+    photograph_slides,
+    show_slide_again,
+    went_on,
 )
+from calibration_routines.procedure import CalibrationError, Listener, Outcome, Outlook, Procedure, Routine
 from calibration_routines.psf.analysis import binned
-from calibration_routines.psf.exposure import expose_scene
 from calibration_routines.psf.sampling import known
 from instrument.bench.bench import Bench
-from instrument.files.atomic import named_by_worth, require_new
+from instrument.bench.camera_settings import restore_camera
+from instrument.files.atomic import named_by_worth
 from instrument.files.calibration_file import save_calibration
-from instrument.files.errors import BenchError, OperatorNeededError, SettingsError, count
-from instrument.files.images import write_image
+from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from instrument.runs.writer import dated_name, free_name
-from recon.base.declare import RARE, option
-from recon.blind import BlindResult, BlindSettings, calibrate_from_beads
+from recon.base.declare import option
+from recon.blind import BlindResult, calibrate_from_beads
 from recon.types import Calibration, Geometry
 
 Floats = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]
 
-BEADS_FOLDER = "calibration-beads"
-"""Where the command line writes the calibration."""
-SLIDE_FILE = "beads.tif"
-"""Of a photograph of a slide, in its run's folder: no scene to reconstruct."""
 MANY_PX = 1_000_000
 """Pixels beyond which solving takes long."""
 BIN_FIRST = (
@@ -53,132 +45,7 @@ BIN_FIRST = (
 )
 
 
-@runtime_checkable
-class SlideChanger(Protocol):
-    """A shared part that can put another slide of beads before the camera: the simulated world."""
-
-    @property
-    def slide_z_um(self) -> float:
-        """How far from the diffuser its slides are."""
-
-    def change_slide(self, number: int) -> None:
-        """Show slide ``number``; each has its beads at other places."""
-
-
-_TAKES, _SHORTER = 3, 0.7
-"""Times that a slide which saturates is photographed, and the share of the exposure each time."""
-_SOLVER = BlindSettings()
 _DEFLECTION_DEG = 1.0  # by which the diffuser bends light, for the window
-
-
-@dataclass(frozen=True, kw_only=True)
-class BeadSlides(Checked):
-    """What to photograph, and how to solve it."""
-
-    z_um: float | None = option(
-        None,
-        **MM,
-        flags=("--z",),
-        above=0,
-        label="Depth",
-        help="Depth of the slide, from the diffuser.",
-        default_words="where the simulated bench has it; else it must be given",
-    )
-    images: int = option(
-        9, least=2, label="Photographs", help="Photographs to take, the slide moved by any amount in between."
-    )
-    average: int = option(4, least=1, label="Frames a photograph", help="Frames a photograph, averaged.")
-    binning: int = option(1, least=1, help="Software binning, on top of the camera's.")
-    grid: Size = option(
-        Size(*_SOLVER.grid),
-        flags=("--psfs",),
-        metavar="RxC",
-        label="PSFs",
-        help="Rows and columns of PSFs over the field.",
-        parse=Size.of,
-    )
-    rank: int = option(
-        max(_SOLVER.ranks),
-        least=1,
-        label="Highest rank",
-        help="Highest rank tried with beads on the pixel grid; raised step by step up to this.",
-    )
-    degree: int = option(
-        _SOLVER.degree,
-        least=0,
-        most=2,
-        help="How PSFs vary over the field in the end: 0 not, 1 linearly, 2 quadratically.",
-        group=RARE,
-    )
-    iterations: int = option(
-        _SOLVER.iterations,
-        least=1,
-        flags=("--iterations", "-n"),
-        help="Of each half-step.",
-        group=RARE,
-    )
-    tau: float = option(
-        _SOLVER.tau, label="Sparsity", help="Weight of the beads' sparsity, relative.", group=RARE
-    )
-    reach: float = option(_SOLVER.reach, help="Part of the sensor's field that the PSFs span.", group=RARE)
-    window_px: Size | None = option(
-        None,
-        flags=("--window",),
-        metavar="HxW",
-        label="Window",
-        help="Height and width that hold the whole pattern, binned pixels.",
-        default_words="from the aperture",
-        parse=Size.of,
-        group=RARE,
-    )
-    out: Path | None = option(
-        None,
-        flags=("--out", "-o"),
-        metavar="FOLDER",
-        label="Folder",
-        help="Where the calibration goes.",
-        default_words=f"{BEADS_FOLDER}; in the window dated, beside the runs",
-    )
-    overwrite: bool = option(False, flags=("--force",), help="Replace a calibration that exists.")
-
-    def planned(self, bench: Bench) -> BeadSlides:
-        """Return them with their depth filled in, where the simulated world knows it."""
-        changer = _slide_changer(bench)
-        return self if self.z_um is not None or changer is None else replace(self, z_um=changer.slide_z_um)
-
-    @property
-    def distance_um(self) -> float:
-        """The depth; SettingsError where nobody has said it."""
-        if self.z_um is None:
-            raise SettingsError(
-                [("z_um", "the slide's distance from the diffuser, which nothing else tells")]
-            )
-        return self.z_um
-
-    @property
-    def solver(self) -> BlindSettings:
-        """How the images are solved."""
-        return BlindSettings(
-            grid=self.grid.shape,
-            ranks=tuple(range(1, self.rank + 1)),
-            iterations=self.iterations,
-            degree=self.degree,
-            tau=self.tau,
-            reach=self.reach,
-        )
-
-    def refuse_existing(self) -> None:
-        """Refuse to write over a calibration that nobody allowed to be replaced."""
-        if self.out is not None:
-            require_new(self.out, overwrite=self.overwrite)
-
-    def record(self) -> dict[str, Any]:
-        """Return what is kept of it with a calibration."""
-        taken = {name: getattr(self, name) for name in ("z_um", "images", "average", "binning")}
-        window = None if self.window_px is None else self.window_px.shape
-        return {**taken, "window_px": window, "solver": asdict(self.solver)}
-
-
 _FILES = "With image files"
 
 
@@ -205,105 +72,6 @@ class BeadCalibration:
     """Of the photographs, each with what was solved; none where they came from files."""
     findings: tuple[str, ...] = ()
     """What is wrong with the photographs, in words."""
-
-
-@dataclass(frozen=True, slots=True)
-class BeadPhotographs:
-    """What was photographed of slides of beads."""
-
-    images: Floats
-    """(n_images, height, width): dark frame subtracted, colours averaged, binned."""
-    runs: tuple[Path, ...] = ()
-    findings: tuple[str, ...] = ()
-    """What is wrong with place and other light in them."""
-
-
-def _slide_changer(bench: Bench) -> SlideChanger | None:
-    return next((part for part in bench.shared.values() if isinstance(part, SlideChanger)), None)
-
-
-def photograph_slides(
-    bench: Bench, slides: BeadSlides, folder: Path | None, control: RunControl, listener: Listener
-) -> BeadPhotographs:
-    """Photograph a slide of beads several times, moved in between by the simulated world or the operator.
-
-    A slide that saturates is photographed again, shorter, and those after it as short: a bead's brightness is
-    free anyway. The listener is told.
-
-    Raises OperatorNeededError when the slide has to be moved by hand and nobody can be asked;
-    CalibrationError when an image saturates still, the last time or at the camera's shortest exposure.
-    """
-    if _slide_changer(bench) is None and bench.ask is None:
-        raise OperatorNeededError(
-            "The bead slide must be moved by hand between photographs, and there is no terminal to ask at. "
-            "Photograph it with snap, and give the images: calibrate beads FILE FILE ..."
-        )
-    photographs: list[Photograph] = []
-    try:
-        _photograph_each(bench, slides, folder, control, listener, photographs)
-    except BaseException as error:
-        if photographs:
-            kept = ", ".join(str(one.run.path) for one in photographs)
-            error.add_note(f"{count(len(photographs), 'slide')} photographed before: {kept}")
-        raise
-    return BeadPhotographs(
-        mean_images([one.measurement for one in photographs]),
-        tuple(one.run.path for one in photographs),
-        photograph_findings(photographs),
-    )
-
-
-def _photograph_each(
-    bench: Bench,
-    slides: BeadSlides,
-    folder: Path | None,
-    control: RunControl,
-    listener: Listener,
-    photographs: list[Photograph],
-) -> None:
-    """Photograph slide after slide; ``photographs`` has those that are done, whatever happens."""
-    changer, ask = _slide_changer(bench), bench.ask
-    exposure_ms: float | None = None
-    shortest_ms = bench.camera.exposure_limits_ms[0]
-    for number in range(slides.images):
-        control.check()
-        if changer is not None:
-            changer.change_slide(number)
-        elif ask is not None:
-            ask(f"Photograph {number + 1} of {slides.images}: move the bead slide somewhere else.")
-        if exposure_ms is None:
-            # Slides differ in brightness where beads overlap: leave room.
-            exposure_ms = expose_scene(bench, target=0.5).exposure_ms
-        for take in range(1, _TAKES + 1):
-            taken = photograph(
-                bench,
-                exposure_ms,
-                folder,
-                average=slides.average,
-                dark_frames=4,
-                binning=slides.binning,
-                control=control,
-                listener=listener,
-            )
-            shorter_ms = max(_SHORTER * exposure_ms, shortest_ms)
-            if taken.saturated_pixels == 0 or take == _TAKES or not shorter_ms < exposure_ms:
-                break
-            listener.said(
-                f"Photograph {number + 1} saturates in {taken.saturated_pixels} pixels at {exposure_ms:.4g} "
-                f"ms: it is taken again at {shorter_ms:.4g} ms, and those that follow as short."
-            )
-            exposure_ms = shorter_ms
-        if taken.saturated_pixels > 0:
-            least = ", the camera's shortest exposure" if exposure_ms <= shortest_ms else ""
-            raise CalibrationError(
-                f"Photograph {number + 1} saturates in {taken.saturated_pixels} pixels, taken {take} "
-                f"{'time' if take == 1 else 'times'}, at {exposure_ms:.4g} ms{least}: dim the light or "
-                "spread the beads, and start again. " + " ".join(taken.findings)
-            )
-        facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "binning": slides.binning}
-        file = named_by_worth(taken.run.path / SLIDE_FILE, doubted=bool(taken.findings))
-        write_image(file, taken.measurement, facts | {"dark": "taken off"})
-        photographs.append(taken)
 
 
 def calibrate_beads(
@@ -387,19 +155,6 @@ def window_for(slides: BeadSlides, geometry: Geometry, shape: tuple[int, int]) -
     return min(window[0], shape[0]), min(window[1], shape[1])
 
 
-def mean_images(frames: Sequence[npt.NDArray[Any]]) -> Floats:
-    """Stack grey or colour images of one shape as float32, colours averaged.
-
-    Raises BenchError when shapes differ.
-    """
-    grey = [image if image.ndim == 2 else image.mean(axis=-1) for image in frames]
-    shapes = {image.shape for image in grey}
-    if len(shapes) != 1:
-        found = ", ".join(f"{h} x {w}" for h, w in sorted(shapes))
-        raise BenchError(f"The images differ in size ({found}); all must come from one camera setting.")
-    return np.stack(grey).astype(np.float32)
-
-
 # Procedure -------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class BeadProcedure(Procedure):
@@ -427,22 +182,49 @@ class BeadProcedure(Procedure):
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Photograph, solve, and save the calibration."""
-        slides = self.slides.planned(bench)
-        geometry = binned(bench.geometry, slides.binning)
-        facts: dict[str, Any] = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
-        listener.step("photographing bead slides")
-        taken = photograph_slides(bench, slides, folder, control, listener)
-        listener.step("blind deconvolution")
+        return _photograph_and_solve(bench, self.slides.planned(bench), folder, control, listener)
 
-        def solving(_words: str, done: float) -> None:
-            control.check()
-            listener.share(done, 1.0)
 
-        facts |= {"runs": [run.name for run in taken.runs]}
-        solved = calibrate_beads(taken.images, slides, geometry, provenance=facts, progress=solving)
-        solved = replace(solved, runs=taken.runs, findings=taken.findings)
-        out = slides.out or free_name(folder or bench.config.data_folder, dated_name("bead calibration"))
-        return save_beads(solved, slides, out)
+def _photograph_and_solve(
+    bench: Bench,
+    slides: BeadSlides,
+    folder: Path | None,
+    control: RunControl,
+    listener: Listener,
+    begun: Run | None = None,
+) -> Outcome:
+    """Photograph the slides that are left after ``begun``, solve all, and save the calibration."""
+    geometry = binned(bench.geometry, slides.binning)
+    facts: dict[str, Any] = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
+    listener.step("photographing bead slides")
+    taken = photograph_slides(bench, slides, folder, control, listener, begun)
+    listener.step("blind deconvolution")
+
+    def solving(_words: str, done: float) -> None:
+        control.check()
+        listener.share(done, 1.0)
+
+    facts |= {"runs": [run.name for run in taken.runs]}
+    solved = calibrate_beads(taken.images, slides, geometry, provenance=facts, progress=solving)
+    solved = replace(solved, runs=taken.runs, findings=taken.findings)
+    out = slides.out or free_name(folder or bench.config.data_folder, dated_name("bead calibration"))
+    outcome = save_beads(solved, slides, out)
+    if outcome.calibration is not None:
+        went_on(taken.runs[-1], outcome.calibration)
+    return outcome
+
+
+def _finish(run: Run, bench: Bench | None, control: RunControl, listener: Listener) -> Outcome:
+    """Go on with slides whose newest photograph is whole: beside its run, with the camera as it was.
+
+    Raises CalibrationError where no bench is open.
+    """
+    if bench is None:
+        raise CalibrationError(f"{run.path} goes on with photographs: open the bench for it.")
+    slides = BEADS.read(run.path).slides
+    slides.refuse_existing()
+    restore_camera(bench.camera, run.provenance["camera"])
+    return _photograph_and_solve(bench, slides, run.path.parent, control, listener, run)
 
 
 def psf_lines(slides: BeadSlides, geometry: Geometry, shape: tuple[int, ...]) -> tuple[str, ...]:
@@ -499,6 +281,10 @@ ROUTINES = (
         "every PSF has unit light, their mean is centred.",
         options=BeadSlides,
         procedure=BeadProcedure,
+        purpose=BEADS,
+        finish=_finish,
+        restore=show_slide_again,
+        finish_takes_frames=True,
         examples=(
             "diffuserbench calibrate beads --binning 4             photographs 9 slides, then solves",
             "diffuserbench calibrate beads --binning 4 --dry-run   only says what it would do",

@@ -22,6 +22,7 @@ from calibration_routines.procedure import (
     Outcome,
     Outlook,
     Procedure,
+    Purpose,
     Routine,
     completed,
     outlook_of,
@@ -42,9 +43,9 @@ from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import DARK, sweep_plan
 from calibration_routines.scatter import STEADY, Scatter, pooled
 from instrument.bench.bench import Bench
-from instrument.files.atomic import named_by_worth
 from instrument.files.errors import SettingsError
 from instrument.files.images import write_image
+from instrument.files.record import RecordFormat, plain
 from instrument.plan import OFF, Part, Plan, check
 from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.run import Run
@@ -139,7 +140,13 @@ def photograph(
         control.check()
     listener.step("photographing")
     plan = photograph_plan(exposure_ms, average, dark_frames)
-    run = completed(acquire(bench, plan, folder, on_progress=listener.frame, control=control))
+    return photograph_of(
+        completed(acquire(bench, plan, folder, on_progress=listener.frame, control=control)), binning
+    )
+
+
+def photograph_of(run: Run, binning: int = 1) -> Photograph:
+    """Return the measurement that a complete run of :func:`photograph_plan` gives, binned in software."""
     frames = run.images("scene")
     dark = dark_model(run)
     steady = light_frames(frames, dark.at(run.metadata(0).exposure_ms), dark.hot)
@@ -292,6 +299,46 @@ def _require_whole(light: npt.NDArray[np.float32], place: Position) -> None:
 
 
 # Procedure -------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class PhotographRecord:
+    """How a photograph is made of its run's frames."""
+
+    bench: str
+    simulated: bool
+    binning: int
+
+
+PHOTOGRAPH = Purpose(
+    PhotographRecord,
+    "photograph.json",
+    PHOTOGRAPH_FILE,
+    RecordFormat(
+        "diffuserbench photograph",
+        "run of calibrate photograph",
+        restore="The frames beside it stay.",
+    ),
+)
+
+
+def _finish(run: Run, _bench: Bench | None, _control: RunControl, _listener: Listener) -> Outcome:
+    """Write the picture that ``reconstruct`` takes into the folder of a complete run."""
+    record = PHOTOGRAPH.read(run.path)
+    taken = photograph_of(run, record.binning)
+    good = taken.saturated_pixels == 0 and not taken.findings
+    file = PHOTOGRAPH.place(run.path, doubted=not good)
+    write_image(
+        file, taken.measurement, plain(record) | {"exposure_ms": taken.exposure_ms, "dark": "taken off"}
+    )
+    words = f"Photograph: {taken.exposure_ms:.4g} ms, {taken.saturated_pixels} saturated pixels"
+    return Outcome(
+        verdict=(*(f"Quality: {finding}" for finding in taken.findings), words),
+        good=good,
+        runs=(run.path,),
+        files=(file,),
+        result=taken,
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class PhotographProcedure(Checked, Procedure):
     """Photograph the lit scene for a reconstruction: exposure, frames, dark frames taken off."""
@@ -320,28 +367,16 @@ class PhotographProcedure(Checked, Procedure):
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Photograph, and write the picture that ``reconstruct`` takes into the run's folder."""
-        taken = photograph(
-            bench,
-            self.exposure_ms,
-            folder,
-            average=self.average,
-            dark_frames=self.dark_frames,
-            binning=self.binning,
-            control=control,
-            listener=listener,
-        )
-        good = taken.saturated_pixels == 0 and not taken.findings
-        file = named_by_worth(taken.run.path / PHOTOGRAPH_FILE, doubted=not good)
-        facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "binning": self.binning}
-        write_image(file, taken.measurement, facts | {"exposure_ms": taken.exposure_ms, "dark": "taken off"})
-        words = f"Photograph: {taken.exposure_ms:.4g} ms, {taken.saturated_pixels} saturated pixels"
-        return Outcome(
-            verdict=(*(f"Quality: {finding}" for finding in taken.findings), words),
-            good=good,
-            runs=(taken.run.path,),
-            files=(file,),
-            result=taken,
-        )
+        exposure_ms = self.exposure_ms
+        if exposure_ms is None:
+            listener.step("finding the exposure")
+            exposure_ms = expose_scene(bench).exposure_ms
+            control.check()
+        listener.step("photographing")
+        plan = photograph_plan(exposure_ms, self.average, self.dark_frames)
+        record = PhotographRecord(bench.label, bool(bench.simulated_kinds), self.binning)
+        runner = PHOTOGRAPH.prepare(bench, plan, folder, record, control, listener)
+        return _finish(completed(runner.execute()), bench, control, listener)
 
 
 ROUTINES = (
@@ -353,6 +388,8 @@ ROUTINES = (
         "into the run's folder.",
         options=PhotographProcedure,
         procedure=lambda options: options,
+        purpose=PHOTOGRAPH,
+        finish=_finish,
         examples=("diffuserbench calibrate photograph", "diffuserbench calibrate photograph --binning 2"),
     ),
 )

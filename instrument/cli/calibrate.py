@@ -17,12 +17,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
+from calibration_routines.optics.bead_photographs import BeadSlides, mean_images
 from calibration_routines.optics.beads import (
     BeadCalibration,
     BeadFiles,
-    BeadSlides,
     calibrate_beads,
-    mean_images,
     psf_lines,
     save_beads,
 )

@@ -100,7 +100,7 @@ def resume(
     be taken. A sweep of calibrate becomes its calibration when its last frame is there, a run of calibrate
     angular or dpc its response or surface.
     """
-    from calibration_routines.plan_procedures import ResumeProcedure, settled
+    from calibration_routines.plan_procedures import ResumeProcedure, goes_on_with_frames, settled
     from instrument.cli.calibrate import TerminalListener, carry_out_run, print_outcome
     from instrument.runs.acquire import look
     from instrument.runs.run_control import RunControl
@@ -108,9 +108,10 @@ def resume(
     with TerminalListener() as listener:
         listener.step("verifying the frames")
         found = look(run, listener.share)
-        if not found.todo:
+        takes_frames = bool(found.todo) or goes_on_with_frames(run)
+        if not takes_frames:
             outcome = settled(run, found, None, RunControl(), listener)
-    if found.todo:
+    if takes_frames:
         if bench is None and any(problem.name == BENCH_TOML for problem in found.files):
             with RunWriter.reopen(run, log_bytes=found.log_bytes) as writer:
                 for words in writer.mended:

@@ -13,7 +13,8 @@ import pytest
 
 from calibration_routines import CalibrationError, times
 from calibration_routines.optics.angular import AngularProcedure, AngularSweep
-from calibration_routines.plan_procedures import PlanProcedure, ResumeProcedure
+from calibration_routines.optics.photograph import PhotographProcedure
+from calibration_routines.plan_procedures import PlanProcedure, ResumeProcedure, left_unfinished
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, RunEndedError
 from calibration_routines.psf.sweep_options import AxialSweep, LateralSweep, VolumeSweep
 from calibration_routines.psf.sweep_procedure import SweepProcedure
@@ -21,6 +22,7 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files import kept_times
 from instrument.files.errors import SettingsError, duration
+from instrument.files.images import read_image
 from instrument.plan import Part, Plan, PlanError, estimate
 from instrument.plan.abilities import SPARE_BYTES
 from instrument.runs import acquire
@@ -223,6 +225,20 @@ def test_abort_between_two_frames_keeps_them_and_resume_makes_the_calibration(
     done = resume.carry_out(bench)
     assert done.good
     assert done.calibration == run.path / "calibration"
+
+
+def test_a_photograph_that_was_left_becomes_a_picture_when_it_goes_on(bench: Bench, tmp_path: Path) -> None:
+    control = RunControl()
+    at_five = Following(lambda status: control.abort() if status.done == 5 else None)
+    wanted = PhotographProcedure(exposure_ms=2.0, binning=2)
+    with pytest.raises(RunEndedError):
+        wanted.carry_out(bench, tmp_path, control=control, listener=at_five)
+    left = left_unfinished(tmp_path, ["photograph"])
+    assert left is not None
+    done = ResumeProcedure(left).carry_out(bench)
+    assert [file.name for file in done.files] == ["photograph.tif"]
+    assert read_image(done.files[0]).pixels.shape == (120, 160)
+    assert left_unfinished(tmp_path, ["photograph"]) is None
 
 
 def _aborted(bench: Bench, folder: Path) -> Run:
