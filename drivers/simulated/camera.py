@@ -88,6 +88,8 @@ class SimulatedCamera(SimulatedCameraSettings):
     drops_counted_by = "device frame numbers"
     longest_silence_s = 120.0
     """What it sees of a new light is computed first, on a large sensor for many seconds."""
+    coarse_first = False
+    """Whether a light that takes seconds is computed coarsely first, for :meth:`coarse`."""
     longest_birth_s = 3600.0
     """An animal's first light takes two minutes of a processor, which others may have."""
 
@@ -109,6 +111,7 @@ class SimulatedCamera(SimulatedCameraSettings):
         self._failure: DeviceError | None = None
         self._light: tuple[Any, npt.NDArray[np.float32]] | None = None
         self._looks: list[_Look] = []
+        self._coarse: tuple[Pixels, int] | None = None
         self._pattern: tuple[Any, FixedPattern] | None = None
         self._replay: tuple[npt.NDArray[np.float32], Any, list[tuple[Pixels, float]]] | None = None
 
@@ -397,7 +400,7 @@ class SimulatedCamera(SimulatedCameraSettings):
         if self._light is not None and self._light[0] == key:
             return self._light[1]
         self._looks = [look for look in self._looks if look.thread.is_alive()]
-        look = _Look(partial(self._absorbed, self._region(), self._binning, self._filters()))
+        look = _Look(partial(self._look_at, self._region(), self._binning, self._filters()))
         self._looks.append(look)
         total = None if self._abort.is_set() else look.light()
         if total is None:
@@ -406,6 +409,41 @@ class SimulatedCamera(SimulatedCameraSettings):
         unchanged = self.world.light_key() == key[0]
         self._light = (key, total) if unchanged else None
         return total
+
+    def coarse(self) -> tuple[Pixels, int] | None:
+        """Return what the frame being computed will show, coarsely, and how many pixels of it a side are one.
+
+        It is no frame: without noise, of one colour, and not taken. None while no light is computed that
+        takes seconds, and where nobody asked for it (``coarse_first``).
+        """
+        return self._coarse
+
+    def _coarsely(self, region: tuple[slice, slice], binning: int) -> tuple[Pixels, int] | None:
+        efficiency = self._spec.quantum_efficiency
+        weights = (0.0, efficiency[1], 0.0) if self.options.color else efficiency
+        found = self.world.coarse_photons_per_s(weights, binning)
+        if found is None:
+            return None
+        light, factor = found
+        rows, columns = (slice(s.start // factor, -(-s.stop // factor)) for s in region)
+        counts_per_electron = self._gain * self._full_scale / self._spec.full_well_e
+        counts = light[rows, columns] * np.float32(1e-3 * self._exposure_ms * counts_per_electron / factor**2)
+        counts = np.clip(np.rint(counts + self.black_level), 0, self._full_scale)
+        return counts.astype(np.uint8 if self.significant_bits <= 8 else np.uint16), factor
+
+    def _look_at(
+        self,
+        region: tuple[slice, slice],
+        binning: int,
+        filters: list[tuple[Rgb, npt.NDArray[np.float32] | None]],
+    ) -> npt.NDArray[np.float32]:
+        """Return the light of a region; coarsely first where somebody wants to see that."""
+        self._coarse = coarse = self._coarsely(region, binning) if self.coarse_first else None
+        try:
+            return self._absorbed(region, binning, filters)
+        finally:
+            if self._coarse is coarse:  # not that of a look that began meanwhile
+                self._coarse = None
 
     def _absorbed(
         self,

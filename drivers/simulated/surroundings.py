@@ -122,6 +122,13 @@ class Surroundings(SharedPart):
             Sensitivity to red, green and blue. The fixed pattern is not included, the angular response is.
         """
 
+    def coarse_photons_per_s(
+        self, weights: tuple[float, float, float], binning: int = 1
+    ) -> tuple[npt.NDArray[np.float32], int] | None:
+        """Return :meth:`photons_per_s` coarsely where that takes seconds, and how many pixels are one."""
+        del weights, binning
+        return None
+
     @abstractmethod
     def light_key(self) -> tuple[Any, ...]:
         """Something that changes whenever :meth:`photons_per_s` does."""

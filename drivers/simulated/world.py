@@ -108,6 +108,11 @@ CACHE_BYTES = 256 << 20
 SOURCES_KEPT = 96
 """Lights of the point source that are kept: 32 places in three bands. A stage comes back to a place within
 its play, not to the nanometre, so that old ones would only fill the memory."""
+COARSE_PIXELS = 100_000
+"""Of a coarse look, about; a sensor of less than four times as many has none."""
+COARSE = RenderSettings(
+    oversampling=1, node_tolerance=100.0, widest_spacing=1.0, fall_off_tolerance=5.0, most_nodes=9
+)
 BAND_WEIGHTS: tuple[Rgb, Rgb, Rgb] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -285,6 +290,21 @@ class SimulatedWorld(Surroundings):
                 light = picture if light is None else light + picture
         return light
 
+    def coarse_photons_per_s(self, weights: Rgb, binning: int = 1) -> tuple[Image, int] | None:
+        """Return the light of a glowing scene in large pixels, of few nodes and one wavelength.
+
+        None where that of every pixel is there, or takes no seconds.
+        """
+        height, width = (side // binning for side in self.sensor.shape)
+        factor = int((height * width / COARSE_PIXELS) ** 0.5)
+        with self._lock:
+            scene, number = self._scene, self._scene_number
+            kept = any(key[:3] == ("scene", number, None) and key[-1] == binning for key in self._cache)
+        if factor < 2 or kept or scene is None or self.animal is not None or not self.scene_lit:
+            return None
+        seen = (0.0, sum(product(self._glow(self.options.scene_rgb), weights)), 0.0)
+        return self._render(scene, seen, factor * binning, COARSE), factor
+
     def _picture(
         self, what: tuple[Any, ...], scene: Scene, leds: SceneLight | None, weights: Rgb, binning: int
     ) -> Image:
@@ -297,7 +317,9 @@ class SimulatedWorld(Surroundings):
             return self._cached((*what, weights, binning), lambda: render_in(weights))
         return self._mixed(what, weights, binning, render_in)
 
-    def _render(self, scene: Scene, weights: Rgb, binning: int) -> Image:
+    def _render(
+        self, scene: Scene, weights: Rgb, binning: int, settings: RenderSettings | None = None
+    ) -> Image:
         return render(
             scene,
             weights,
@@ -306,7 +328,7 @@ class SimulatedWorld(Surroundings):
             self.fall_off,
             layer_photons=self.preset.scene_photons_per_s_mm2_sr,
             bead_photons=self.preset.bead_photons_per_s_sr,
-            settings=RenderSettings(spectral_samples=self.options.spectral_samples),
+            settings=settings or RenderSettings(spectral_samples=self.options.spectral_samples),
         )
 
     def _alive(self, animal: Animal, seen: Rgb, binning: int) -> Image:

@@ -183,6 +183,7 @@ class LivePanel(Panel):
             return
         frame, shown = self.session.live.newest(), self.picture.frame
         if frame is None or frame is shown:
+            self._look_coarsely()
             return
         self._came_s = time.monotonic()
         self._shown_at.append(self._came_s)
@@ -194,6 +195,20 @@ class LivePanel(Panel):
         self.picture.view.set_caption(self._caption(frame))
         self.picture.view.caution_against("")
         self.under_mouse.setText(self.picture.view.under_mouse())
+
+    def _look_coarsely(self) -> None:
+        """Show a coarse picture where a simulated frame is not there soon."""
+        found = None if self.picture.is_coarse else self.session.live.coarse()
+        if found is None:
+            return
+        counts, factor = found
+        self.picture.show_coarse(counts, factor)
+        view = self.picture.view
+        view.set_caption("What the next frame will show, SIMULATED")
+        view.caution_against(
+            f"Coarse for now: {factor} × {factor} pixels are one, without noise. The frame is being computed."
+        )
+        self.under_mouse.clear()
 
     @property
     def screen_rate(self) -> float:
@@ -207,9 +222,12 @@ class LivePanel(Panel):
             return
         self._show_light()
         frame = self.picture.frame
-        if frame is not None:
+        if self.picture.is_coarse and not self.session.live.is_running and frame is not None:
+            self.picture.show_frame(frame)
+            self.picture.view.set_caption(self._caption(frame))
+        if frame is not None and not self.picture.is_coarse:
             self._judge_age(frame)
-        if self._waits() or frame is None or not self.session.is_open("camera"):
+        if self._waits() or self.picture.is_coarse or frame is None or not self.session.is_open("camera"):
             return  # the line says what is waited for, or what failed
         self.picture.measure()
         self.status.setText(self._figures(frame))
@@ -237,7 +255,7 @@ class LivePanel(Panel):
             return False
         words = f"Waiting for {'the first' if frame is None else 'a'} frame for {seconds:.0f} s."
         if self.session.state("camera").simulated:
-            words += " The simulated scene is computed once for each new light: some 10 s at 5 megapixels."
+            words += " The simulated scene is computed once for each new light, at 5 megapixels some 5 s."
         self.status.setText(words)
         return True
 

@@ -202,8 +202,9 @@ class ImageView(QWidget):
         self._fill(image, low, high, full_scale, step)
         lut = table(self._colour_map) if mapped else None
         self.item.setImage(self._indices, autoLevels=False, levels=None, lut=lut)
-        if (place := extent or (size[1] * step, size[0] * step)) != self._placed:
-            self._placed = place
+        place = extent or (size[1] * step, size[0] * step)
+        if (*place, *size) != self._placed:
+            self._placed = (*place, *size)
             self.item.setRect(QRectF(0, 0, *place))
 
     def whole(self) -> None:
@@ -270,7 +271,8 @@ class ImageView(QWidget):
         width = max(1.0, room.width() * self.devicePixelRatioF())
         height = max(1.0, room.height() * self.devicePixelRatioF())
         (left, right), (top, bottom) = self.box.viewRange()
-        step = int(min((right - left) / width, (bottom - top) / height))
+        across, down = image.shape[1] / self.extent[0], image.shape[0] / self.extent[1]
+        step = int(min((right - left) * across / width, (bottom - top) * down / height))
         return max(1, min(step, int(image.shape[0]), int(image.shape[1])))
 
     def _fill(self, image: Image, low: float, high: float, full_scale: int | None, step: int) -> None:
@@ -327,11 +329,16 @@ class ImageView(QWidget):
 
     def describe(self, column: int, row: int) -> str:
         """Return a pixel's place and value in words."""
-        assert self.image is not None
-        value = self.image[row, column]
+        value = self.value_at(column, row)
         words = " ".join(f"{v:.5g}" for v in np.atleast_1d(value))
         x, y = self.named(column, row)
         return f"x {x:.0f}  y {y:.0f}  value {words}"
+
+    def value_at(self, column: int, row: int) -> Any:
+        """Return the value that is shown at a place of the extent."""
+        assert self.image is not None
+        height, width = self.image.shape[:2]
+        return self.image[row * height // self.extent[1], column * width // self.extent[0]]
 
     def under_mouse(self) -> str:
         """Return place and value under the mouse in words, as they are now; empty outside."""
@@ -374,9 +381,7 @@ class StretchedImage(ImageView):
 
     def describe(self, column: int, row: int) -> str:
         """Return a voxel's place and value in words."""
-        assert self.image is not None
-        height, width = self.image.shape[:2]
-        value = self.image[row * height // self.extent[1], column * width // self.extent[0]]
+        value = self.value_at(column, row)
         return f"{column}, {row}: {' '.join(f'{v:.5g}' for v in np.atleast_1d(value))}"
 
 

@@ -13,10 +13,11 @@ from drivers.frame import Frame
 from gui.session import BenchSession
 from gui.theme import NAMES, colours
 from gui.widgets.building import button, choice, fill, in_row
-from gui.widgets.image_view import ImageView, whole_steps
+from gui.widgets.image_view import ImageView, usual_levels, whole_steps
 from gui.widgets.orientation import OrientationButton, follow_orientation
 from gui.widgets.plots import HistogramPlot, curve_pen, plot_widget
 from instrument.live.frame_view import (
+    Counts,
     FrameFigures,
     histogram,
     line_profile,
@@ -209,6 +210,8 @@ class LivePicture(QWidget):
     ----------
     frame : Frame or None
         What is shown.
+    is_coarse : bool
+        Whether a coarse picture of what will come is shown in its place.
     levels : (float, float)
         Counts shown darkest and brightest.
     """
@@ -219,6 +222,7 @@ class LivePicture(QWidget):
         super().__init__(parent)
         self.frame: Frame | None = None
         self._measured: Frame | None = None
+        self.is_coarse = False
         self.levels = (0.0, 1.0)
         self._session = session
 
@@ -295,14 +299,30 @@ class LivePicture(QWidget):
 
     def show_frame(self, frame: Frame) -> None:
         """Show a frame with the levels in use."""
-        self.frame = frame
+        self.frame, self.is_coarse = frame, False
         top, left = frame.metadata.roi[:2]
         self.view.naming = (left, top, frame.metadata.binning)
         self.view.show_image(frame.image, *self.levels, frame.full_scale)
 
+    def show_coarse(self, counts: Counts, factor: int) -> None:
+        """Show what a frame will show, of large pixels, where it will stand; it is no frame."""
+        self.is_coarse = True
+        height, width = (side * factor for side in counts.shape)
+        full_scale = None
+        if (frame := self.frame) is not None:
+            height, width = frame.image.shape[:2]
+            full_scale = frame.full_scale
+        levels = usual_levels(counts)
+        self.view.show_image(
+            counts,
+            *(levels if full_scale is None else not_stretched(levels, full_scale)),
+            full_scale,
+            (width, height),
+        )
+
     def measure(self) -> None:
         """Make histogram, levels and profile of the frame that is shown, once."""
-        if self.frame is None or self.frame is self._measured:
+        if self.frame is None or self.frame is self._measured or self.is_coarse:
             return
         low, high = self.levels
         self._measure(self.frame)
@@ -348,7 +368,7 @@ class LivePicture(QWidget):
             self.profile_plot.setLabel("bottom", words)
 
     def _stretch_chosen(self) -> None:
-        if self.frame is not None:  # at once, and where the frame is held as well
+        if self.frame is not None and not self.is_coarse:  # at once, and where the frame is held as well
             self._measure(self.frame)
             self.show_frame(self.frame)
 
@@ -356,7 +376,7 @@ class LivePicture(QWidget):
         self.levels = (low, high)
         with QSignalBlocker(self.stretch):
             self.stretch.setCurrentText("by hand")
-        if self.frame is not None:
+        if self.frame is not None and not self.is_coarse:
             self.show_frame(self.frame)
 
     def _by_keys(self, across: float, down: float, *, alt: bool) -> None:

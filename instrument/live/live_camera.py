@@ -13,6 +13,7 @@ from drivers.camera import Camera
 from drivers.common.stream import FrameStream
 from drivers.errors import DeviceError
 from drivers.frame import Frame
+from instrument.live.frame_view import Counts
 
 _BUFFERS = 8
 """Enough for a viewer and a preview that hold a frame each while others come."""
@@ -58,6 +59,7 @@ class LiveCamera:
             self.stop()
             assert self._camera is not None
             stream = FrameStream(self._camera, _BUFFERS)
+            self._coarse_first(True)
             stream.start()
             self._stream = stream
 
@@ -65,6 +67,7 @@ class LiveCamera:
         """End the sequence; does nothing without one."""
         with self._changing:
             stream, self._stream = self._stream, None
+            self._coarse_first(False)
             if stream is not None:
                 try:
                     stream.close()
@@ -119,6 +122,19 @@ class LiveCamera:
             return elsewhere()
         stream = self._stream
         return None if stream is None else stream.newest()
+
+    def coarse(self) -> tuple[Counts, int] | None:
+        """Return what the next frame will show, coarsely, and how many of its pixels a side are one.
+
+        Only a simulated camera can tell, and only while it computes light for seconds: None from any other.
+        """
+        coarse: Callable[[], tuple[Counts, int] | None] | None = getattr(self._camera, "coarse", None)
+        return None if coarse is None or not self.is_running else coarse()
+
+    def _coarse_first(self, on: bool) -> None:
+        """Have a simulated camera compute light coarsely first, or not: a run has nobody who looks."""
+        if hasattr(self._camera, "coarse_first"):
+            setattr(self._camera, "coarse_first", on)  # noqa: B010 - of its driver, not of every camera
 
     def status(self) -> LiveCameraStatus:
         """Return rates and losses; meant to be asked a few times a second."""

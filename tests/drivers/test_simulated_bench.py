@@ -17,6 +17,7 @@ from drivers.camera import Roi
 from drivers.common.checked import call_limit_s
 from drivers.errors import DeviceError, StoppedError
 from drivers.led_array import LedPattern
+from drivers.simulated import world
 from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.camera_settings import CameraOptions
 from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
@@ -359,6 +360,37 @@ def test_each_pixel_that_is_summed_is_read_with_its_own_noise() -> None:
         bench.camera.set_binning(binning)
         noise.append(np.std(bench.counts() - bench.counts()))
     assert noise[1] / noise[0] == pytest.approx(4, rel=0.1)
+
+
+def test_a_large_sensor_tells_coarsely_what_its_frame_will_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(world, "COARSE_PIXELS", 1200)
+    bench = Bench()
+    bench.world.scene_lit = True
+    found: list[tuple[npt.NDArray[np.float64], int] | None] = []
+    absorbed = bench.camera._absorbed
+
+    def watched(*given: object) -> npt.NDArray[np.float32]:
+        found.append(bench.camera.coarse())
+        return absorbed(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(bench.camera, "_absorbed", watched)
+    bench.camera.set_roi(Roi(0, 160, 240, 160))
+    bench.camera.set_exposure_ms(300.0)
+    bench.camera.coarse_first = True
+    frame = bench.camera.snap().image.astype(float)
+    assert bench.camera.coarse() is None  # the frame is there
+    assert found[0] is not None
+    coarse, factor = found[0]
+    assert (factor, coarse.shape) == (8, (30, 20))
+    blocks = frame.reshape(30, 8, 20, 8).mean(axis=(1, 3))
+    assert np.abs(coarse - blocks).max() < 0.1 * (blocks.max() - blocks.min())
+    bench.camera.set_roi(Roi(0, 0, 240, 320))
+    bench.camera.snap()
+    assert found[1] is None  # its light is known, whatever the region
+    bench.world.set_scene(bench.world.scene)
+    bench.camera.coarse_first = False
+    bench.camera.snap()
+    assert found[2] is None  # nobody looks
 
 
 def test_a_mosaic_separates_colours() -> None:

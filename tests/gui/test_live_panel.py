@@ -76,6 +76,29 @@ def test_the_picture_says_when_it_was_taken_in_what_light_and_when_it_is_old(
     qtbot.waitUntil(lambda: not view.caution and view.item.opacity() == 1.0, timeout=WAIT_MS)
 
 
+def test_what_comes_is_shown_coarsely_first_and_says_so(
+    qtbot: QtBot, live: LivePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view, camera = live.picture.view, live.session.live
+    frame = live.picture.frame
+    assert frame is not None
+    monkeypatch.setattr(camera, "newest", lambda: frame)
+    coarse = np.full((30, 40), 3000, np.uint16)
+    monkeypatch.setattr(camera, "coarse", lambda: (coarse, 8))
+    qtbot.waitUntil(lambda: live.picture.is_coarse, timeout=WAIT_MS)
+    assert view.caution.startswith("Coarse for now: 8 × 8 pixels are one")
+    assert view.image is coarse
+    assert view.extent == (frame.image.shape[1], frame.image.shape[0])
+    assert "value 3000" in view.describe(frame.image.shape[1] - 1, frame.image.shape[0] - 1)
+    live.count()
+    live.picture.stretch.setCurrentText("full range")
+    assert live.picture.is_coarse  # and not the frame before under its words
+    assert view.caution.startswith("Coarse for now")
+    monkeypatch.undo()
+    qtbot.waitUntil(lambda: not live.picture.is_coarse and not view.caution, timeout=WAIT_MS)
+    assert view.caption.endswith("SIMULATED")
+
+
 def test_exposure_typed_reaches_the_camera_and_is_read_back(qtbot: QtBot, live: LivePanel) -> None:
     _type(qtbot, live.form.widgets["exposure_ms"], "3.21 ms")
     qtbot.waitUntil(lambda: live.session.bench.camera.exposure_ms == 3.21, timeout=WAIT_MS)
