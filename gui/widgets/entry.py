@@ -72,10 +72,16 @@ class Entry(Refusing):
         self.setPlaceholderText(placeholder)
         self.setMinimumWidth(40)
         self.returnPressed.connect(self.check)
-        self.textEdited.connect(lambda _: self._mark(""))
+        self._written = False
+        """Whether anything was written by hand: an empty field that nobody touched is not yet wrong."""
+        self.textEdited.connect(self._edited)
 
     def _tip_now(self) -> str:
         return self._tip
+
+    def _edited(self, _text: str) -> None:
+        self._written = True
+        self._mark("")
 
     def value(self) -> Any:
         """Return what the text stands for.
@@ -98,9 +104,10 @@ class Entry(Refusing):
         return True
 
     def focusOutEvent(self, event: QFocusEvent) -> None:  # noqa: N802 - Qt's name
-        """Check when the field is left."""
+        """Check when the field is left, if there is or was something in it."""
         super().focusOutEvent(event)
-        self.check()
+        if self._written or self.text():
+            self.check()
 
 
 class PathEntry(QWidget):

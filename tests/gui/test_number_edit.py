@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QEvent, Qt
+from PySide6.QtGui import QFocusEvent
 from pytestqt.qtbot import QtBot
 
-from gui.widgets.entry import NumberEdit, grouped, quantity
+from gui.widgets.entry import Entry, NumberEdit, existing_path, grouped, quantity
 
 
 def _field(qtbot: QtBot, unit: str = "ms", value: float | None = 10.0, **limits: float) -> NumberEdit:
@@ -109,3 +110,19 @@ def test_lengths_from_a_millimetre_on_are_millimetres(qtbot: QtBot) -> None:
     assert "-60 mm to 60 mm" in long.toolTip()
     first.set_value(80.0, overwrite=True)
     assert first.text() == "80 µm", "what is filled in anew chooses its unit anew"
+
+
+def test_a_field_that_nobody_touched_is_not_refused_when_it_is_left(qtbot: QtBot) -> None:
+    field = Entry(existing_path, "A file", "file")
+    qtbot.addWidget(field)
+    field.show()
+    refused: list[str] = []
+    field.refused.connect(refused.append)
+    left = QFocusEvent(QEvent.Type.FocusOut)
+    field.focusOutEvent(left)
+    assert not refused
+    qtbot.keyClicks(field, "x")
+    qtbot.keyClick(field, Qt.Key.Key_Backspace)
+    field.focusOutEvent(left)
+    assert refused == ["A file or folder is needed here."]
+    assert not field.check()  # whoever asks for it is told, touched or not
