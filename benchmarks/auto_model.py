@@ -41,7 +41,6 @@ from recon.evaluation.scene import SceneSpec, TestScene, make_scene
 from recon.reconstruction.choice import Choice
 
 FIXED = tuple(f"{m}{b}" for m in ("convolution", "lowrank", "local") for b in ("", " + background"))
-LARGEST = "local + background"
 ITERATIONS = 150
 WITHIN_DB = 0.5
 
@@ -98,10 +97,16 @@ class Kept:
                     file.write(json.dumps(known) + "\n")
         return known
 
-    def finished(self, scene: str) -> bool:
+    def finished(self, scene: str, spec: SceneSpec) -> bool:
         """Tell whether all runs of a scene are kept."""
-        turns = [(label, 0) for label in (*FIXED, "auto")] + [("auto", 1), (LARGEST, 1)]
+        fixed = fixed_models(spec)
+        turns = [(label, 0) for label in (*fixed, "auto")] + [("auto", 1), (fixed[-1], 1)]
         return all((scene, *turn) in self.runs for turn in turns)
+
+
+def fixed_models(spec: SceneSpec) -> tuple[str, ...]:
+    """Return the models that a calibration allows, the largest last: of one PSF a depth convolutions."""
+    return FIXED if spec.grid > 1 else tuple(m for m in FIXED if m.startswith("convolution"))
 
 
 def judge(name: str, spec: SceneSpec, kept: Kept) -> dict[str, object]:
@@ -113,18 +118,19 @@ def judge(name: str, spec: SceneSpec, kept: Kept) -> dict[str, object]:
         smooth = None if model == "auto" else bool(background)
         return kept.get(name, label, turn, lambda: solve(scene(), model, smooth))
 
-    fixed = {label: run(label, 0) for label in FIXED}
+    fixed = {label: run(label, 0) for label in fixed_models(spec)}
+    largest = [*fixed][-1]
     auto = run("auto", 0)
     seconds = min(auto["s"], run("auto", 1)["s"])
-    fixed[LARGEST] |= {"s": min(fixed[LARGEST]["s"], run(LARGEST, 1)["s"])}
+    fixed[largest] |= {"s": min(fixed[largest]["s"], run(largest, 1)["s"])}
     best = max(fixed, key=lambda k: fixed[k]["dB"])
     row = {
         "scene": name,
         "best": best,
         "best_db": fixed[best]["dB"],
         "best_s": fixed[best]["s"],
-        "largest_db": fixed[LARGEST]["dB"],
-        "largest_s": fixed[LARGEST]["s"],
+        "largest_db": fixed[largest]["dB"],
+        "largest_s": fixed[largest]["s"],
         "auto": auto["choice"],
         "auto_db": auto["dB"],
         "auto_s": seconds,
@@ -237,7 +243,7 @@ def main() -> None:
     ]
     kept = Kept(arguments.keep)
     if arguments.finished:
-        scenes = [s for s in scenes if kept.finished(s[0])]
+        scenes = [s for s in scenes if kept.finished(*s)]
     rows = [judge(name, spec, kept) for name, spec in scenes]
     print(summary(rows))
     if arguments.out is not None:
