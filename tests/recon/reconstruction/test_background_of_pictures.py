@@ -11,7 +11,16 @@ import pytest
 from recon import reconstruct
 from recon.evaluation.scene import Family, TestScene, make_scene
 from recon.reconstruction import selection
-from recon.reconstruction.background import DARKEST, DARKEST_PERCENTILE, LIT_PICTURE, Trial, floor, trial_of
+from recon.reconstruction.background import (
+    DARKEST,
+    DARKEST_PERCENTILE,
+    GAIN,
+    LIT_PICTURE,
+    VOLUME,
+    Trial,
+    floor,
+    trial_of,
+)
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
@@ -117,3 +126,14 @@ def test_held_out_pixels_prove_no_stray_light_where_the_darkest_have_none():
     black = np.full((20, 20), 1.0)
     black[:3] = 0.02
     assert floor(black, DARKEST_PERCENTILE) < DARKEST < floor(black + 0.1, DARKEST_PERCENTILE)
+
+
+def test_a_background_that_is_no_light_explains_most_of_what_nothing_else_does():
+    # As of a film of an animal, which lost its cells in haze by it, and of the measured USAF target.
+    film = Trial(without=5.5, lit=5.1, light=-0.43, dark=0.94, taken=LIT_PICTURE)
+    usaf = Trial(without=7.5, lit=1.4, light=-0.3, dark=0.95, taken=VOLUME)
+    assert film.without**2 - film.lit**2 > GAIN
+    assert not film.helps
+    assert not film.explains
+    assert usaf.helps
+    assert usaf.explains
