@@ -171,6 +171,7 @@ class ChartView(QWidget):
         yield
         tip = "Settings by their best score; one that is chosen is drawn bold"
         self.table = table(["", "", ""], tip, wide=0, row_px=30)
+        self.table.setTextElideMode(Qt.TextElideMode.ElideMiddle)  # settings differ by their ends
         self.table.verticalHeader().hide()
         self.table.itemSelectionChanged.connect(self._setting_chosen)
         words = "The bold line is the front: no setting is both cheaper and better."

@@ -174,6 +174,9 @@ class TasksPanel(Panel):
             page.form.set_values(self._given)
             self._given = {}
         if not self.run.is_running:
+            if name != self._running:  # what another task found is not this one's
+                self._clear()
+                self._running = name
             self.run_bar.clear()
             self.run_bar.set_startable()
 

@@ -225,7 +225,7 @@ class OutputOptions:
         applies=_KEPT,
         group=_OUTPUT,
     )
-    force: bool = option(False, help="Overwrite files that exist.", group=_OUTPUT)
+    force: bool = option(False, help="Overwrite files that exist.", label="Overwrite", group=_OUTPUT)
     explain: bool = option(
         False,
         help="Only say what auto would choose, why, its cost, and a step up and down.",
@@ -255,6 +255,7 @@ class VideoOptions:
     block: int | None = option(
         None,
         help="Frames that hang together.",
+        label="Frames a block",
         default_words="32, with --over-time 16",
         least=1,
         applies=("video",),
@@ -263,6 +264,7 @@ class VideoOptions:
     fps: float | None = option(
         None,
         help="Frames a second of the film.",
+        label="Frames a second",
         default_words="the recording's",
         least=0.1,
         metavar="N",

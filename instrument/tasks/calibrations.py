@@ -53,13 +53,14 @@ class RefocusOptions:
     )
     z_um: tuple[float, ...] = option(
         help="Depth wanted; repeatable. inf: light that comes in parallel.",
+        label="Depths",
         unit="um",
         shown_unit="mm",
         shown_factor=1000.0,
         above=0,
         infinity=FAR_UM,
     )
-    out: Path = option(help="The new calibration.", metavar="FOLDER", flags=("--out", "-o"))
+    out: Path = option(help="The new calibration.", metavar="FOLDER", flags=("--out", "-o"), label="Result")
     deflection_deg: float = option(
         0.25, help="How far the diffuser typically bends light.", unit="deg", above=0
     )

@@ -124,6 +124,7 @@ class HologramChart:
     z_mm: tuple[float, ...] = option(
         (),
         help="Depth of each target behind the focal plane; once a target.",
+        label="Depth",
         default_words="0",
         unit="mm",
         group="Hologram",
@@ -145,6 +146,7 @@ class HologramChart:
     slm: tuple[int, int] | None = option(
         None,
         help="Other SLM pixels than the bench's: few, for a quick chart.",
+        label="SLM",
         metavar="HxW",
         parse=size_of,
         group="Hologram",

@@ -48,6 +48,7 @@ class EtendueOptions:
     slm: tuple[int, int] = option(
         (540, 960),
         help="SLM pixels, height x width.",
+        label="SLM",
         default_words="540x960",
         metavar="HxW",
         parse=size,
@@ -57,10 +58,17 @@ class EtendueOptions:
     expansion: float | None = option(
         None, help="Only this expansion.", default_words="1, 4, 16, 36", least=1, flags=("--expansion", "-q")
     )
-    f1_mm: float = option(75.0, help="Focal length of the Fourier lens.", unit="mm", above=0)
-    f2_mm: float = option(75.0, help="Focal length of the eyepiece.", unit="mm", above=0)
+    f1_mm: float = option(
+        75.0, help="Focal length of the Fourier lens.", unit="mm", above=0, label="Fourier lens"
+    )
+    f2_mm: float = option(75.0, help="Focal length of the eyepiece.", unit="mm", above=0, label="Eyepiece")
     fov_deg: float | None = option(
-        None, help="Say the eyebox left at this width of field.", unit="deg", above=0, flags=("--fov",)
+        None,
+        help="Say the eyebox left at this width of field.",
+        unit="deg",
+        above=0,
+        flags=("--fov",),
+        label="Field of view",
     )
     eyebox_mm: float | None = option(None, help="Say the field left with this eyebox.", unit="mm", above=0)
     figure: Path | None = option(None, help="Also a page: eyebox against field of view (.png, .pdf, .svg).")
@@ -76,7 +84,7 @@ class TableOptions:
     """How much of the table is made, and where it goes."""
 
     slm: tuple[int, int] = option(
-        (135, 240), help="SLM pixels.", default_words="135x240", metavar="HxW", parse=size
+        (135, 240), help="SLM pixels.", default_words="135x240", metavar="HxW", label="SLM", parse=size
     )
     expansion: tuple[int, ...] = option(
         (4, 16, 36),

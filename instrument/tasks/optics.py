@@ -18,9 +18,12 @@ class OpticsFiles:
     """Where the comparison goes."""
 
     out: Path = option(
-        Path("optics.png"), help="The page (.png, .pdf, .svg); a table (.csv) beside.", flags=("--out", "-o")
+        Path("optics.png"),
+        help="The page (.png, .pdf, .svg); a table (.csv) beside.",
+        flags=("--out", "-o"),
+        label="Result",
     )
-    force: bool = option(False, help="Overwrite files that exist.")
+    force: bool = option(False, help="Overwrite files that exist.", label="Overwrite")
 
 
 @task(

@@ -73,9 +73,10 @@ class ExportOptions:
         help="File ending in .ome.tif, .tif, .h5, .npy, .mp4, .gif or .csv, or a folder for PNG files. "
         "A picture: .tif, .npy, .png; a volume: .tif, .npy, .ome.zarr; a video: .mp4, .gif, .csv, .ome.zarr.",
         metavar="TARGET",
+        label="Target",
         positional=True,
     )
-    label: str | None = option(None, help="Only steps of this label.", applies=("run",))
+    label: str | None = option(None, help="Only steps of this label.", label="Steps' label", applies=("run",))
     frames: slice | None = option(
         None,
         help="Only frames A to B - 1; A:B:C every C-th.",
@@ -86,6 +87,7 @@ class ExportOptions:
     frames_per_s: float | None = option(
         None,
         help="Frames a second of an MP4 or GIF.",
+        label="Frames a second",
         least=0.1,
         flags=("--fps",),
         applies=("run", "film"),

@@ -42,6 +42,7 @@ class HologramInputs:
     z_mm: tuple[float, ...] = option(
         (),
         help="Depth of each target behind the focal plane; once a target.",
+        label="Depth",
         default_words="0",
         unit="mm",
         group="Files",

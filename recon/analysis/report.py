@@ -89,6 +89,7 @@ class AnalysisSettings:
     z_um: float | None = option(
         None,
         help="Depth to analyse.",
+        label="Depth",
         default_words="the middle in 1/z",
         unit="um",
         shown_unit="mm",

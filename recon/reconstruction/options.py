@@ -294,6 +294,7 @@ class ReconstructionOptions:
     memory_gib: float | None = option(
         None,
         help="Memory that may be taken.",
+        label="Memory",
         default_words="what is free",
         unit="GiB",
         above=0,
@@ -306,6 +307,7 @@ class ReconstructionOptions:
     scratch: Path | None = option(
         None,
         help="Where to keep what does not fit into memory, on a fast disk.",
+        label="Scratch folder",
         metavar="FOLDER",
         group=_COMPUTE,
         recorded=False,

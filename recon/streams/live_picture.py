@@ -118,7 +118,8 @@ class LivePicture:
         A doubt comes first.
         """
         pixels = "all pixels" if self.binning == 1 else f"binned {self.binning} x {self.binning}"
-        steps = f"{self.iterations} iterations ({self.total_iterations} in all)"
+        many = "" if self.iterations == 1 else "s"
+        steps = f"{self.iterations} iteration{many} ({self.total_iterations} in all)"
         if not self.method:
             return self.doubt
         how = "Wiener filter" if self.method == "wiener" else steps

@@ -83,6 +83,8 @@ def test_two_calibrations_are_compared_with_table_and_python_beside_the_form(
     assert panel.run_bar.words.text()
     shown(qtbot, panel, "refocus")
     qtbot.waitUntil(lambda: not panel.run_bar.words.text(), timeout=WAIT_MS)  # it was another task's
+    assert not panel.words.toPlainText()  # and so was what it found
+    assert not panel._tables.count()
 
 
 @pytest.mark.parametrize("name", ["video", "patterned", "activity"])
