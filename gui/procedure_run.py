@@ -332,7 +332,10 @@ class RunBar(QWidget):
         self.start_button = button(words, clicked=self.start, shortcut="Ctrl+Return", primary=True)
         self.pause_button = button("Pause", tips[0], checkable=True)
         self.pause_button.clicked.connect(lambda on: run.pause() if on else run.resume())
-        self.abort_button = button("Abort", tips[1], run.abort)
+        self.abort_button = button("Abort", tips[1], self._abort)
+        self._run = run
+        self._ending = False
+        """Whether it was aborted, and goes on to where it can end."""
         self.bar = share_bar(_STEPS)
         self.words = label(role="dim", wraps=True, yields=True)
         buttons = in_row((self.start_button, 2), self.pause_button, self.abort_button)
@@ -342,6 +345,11 @@ class RunBar(QWidget):
         self._when_paused = ", light off" if tips is _TIPS else ""
         self.set_running(False)
 
+    def _abort(self) -> None:
+        self._ending = True
+        self.abort_button.setEnabled(False)
+        self._run.abort()
+
     def set_startable(self, why_not: str = "") -> None:
         """Let the start button be pressed, or say why not."""
         self._why_not = why_not
@@ -349,6 +357,7 @@ class RunBar(QWidget):
 
     def set_running(self, running: bool) -> None:
         """Show the buttons for a procedure that runs, or for none."""
+        self._ending = False
         self.pause_button.setEnabled(running)
         self.abort_button.setEnabled(running)
         self.pause_button.setChecked(False)
@@ -367,7 +376,9 @@ class RunBar(QWidget):
             words.append(f"{now.done:.0f} of {'at most ' if now.at_most else ''}{now.total:.0f}")
         elif now.total:
             words.append(f"{now.done / now.total:.0%}")
-        if now.paused:
+        if self._ending:
+            words.append("ENDING as soon as it can")
+        elif now.paused:
             words.append(f"PAUSED{self._when_paused}")
         elif now.seconds_left is not None:
             words.append(f"{'at most ' if now.at_most else ''}{duration(now.seconds_left)} left")

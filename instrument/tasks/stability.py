@@ -84,11 +84,15 @@ def stability(desk: Desk, options: StabilityOptions) -> Done:
     log = CellLog(out)
     jobs = {s.name: cells_of(s, size, wanted[s.name]) for s in chosen}
     pictures = [out / f"{s.name}.png" for s in chosen]
+    done, total = 0, sum(map(len, jobs.values()))
+
+    def kept() -> str:
+        return f"{done} of {total} cells are kept: what asks for the same goes on from there." if done else ""
+
     with (
-        saying_what_is_left(out / RESULT, *pictures),
-        desk.step("stability", sum(map(len, jobs.values()))) as advance,
+        saying_what_is_left(out / RESULT, *pictures, kept=kept),
+        desk.step("stability", total) as advance,
     ):
-        done = 0
         for stress, picture in zip(chosen, pictures, strict=True):
             asked = set(jobs[stress.name])
             made = [c for c in log.of(stress, size) if (c.method, c.ix, c.iy) in asked]

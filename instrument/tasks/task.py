@@ -288,14 +288,18 @@ def _paths(values: object, called: str = "") -> Iterator[tuple[str, Path]]:
 
 
 @contextmanager
-def saying_what_is_left(*files: Path) -> Iterator[None]:
-    """Let an interruption (Ctrl-C, SIGTERM, a button) say which of the files to be written are there."""
+def saying_what_is_left(*files: Path, kept: Callable[[], str] = str) -> Iterator[None]:
+    """Let an interruption (Ctrl-C, SIGTERM, a button) say which of the files to be written are there.
+
+    ``kept`` says what else is, to go on with.
+    """
     before = {file: _changed_ns(file) for file in files}
     try:
         yield
     except (KeyboardInterrupt, SystemExit) as interruption:
         written = [str(file) for file in files if _changed_ns(file) != before[file]]
-        interruption.add_note(f"Written: {', '.join(written)}." if written else "Nothing was written.")
+        words = f"Written: {', '.join(written)}." if written else "Nothing was written."
+        interruption.add_note(kept() or words)
         raise
 
 

@@ -24,7 +24,7 @@ from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import Progress
 from recon.streams.detail import Detail, ladder
 from recon.streams.fit import CalibrationWatch
-from recon.streams.live_picture import DARK, NOISE_ONLY, ComingLevel, Level, LiveOptions, LivePicture
+from recon.streams.live_picture import DARK, NOISE_ONLY, UNLIT, ComingLevel, Level, LiveOptions, LivePicture
 from recon.streams.pace import Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch
 from recon.streams.video import require_steps, stream_problem
@@ -157,7 +157,8 @@ class LiveReconstructor:
             Counts. Of the PSF's pixels, or of a whole multiple of them, which is then binned to them.
         lit : bool
             Whether something was lit, as far as is known. Where nothing was and the frame holds noise only,
-            its picture is black and costs nothing; what is lit and looks like noise may be a dim point.
+            or nothing that the calibration explains, its picture is black and costs nothing; what is lit and
+            looks like noise may be a dim point.
         """
         began = _now()
         frame = self._measured(np.asarray(image))
@@ -169,7 +170,7 @@ class LiveReconstructor:
         cut = self._scene is SceneState.NEW and not self._greeted
         too_slow = affordable < 1 and self._scene is not SceneState.STILL
         self._greeted = self._scene is SceneState.NEW
-        if self._dark and not lit:
+        if not lit and (self._dark or self._fit.doubt):
             self._follows, self._settled = False, True
             return self._picture(level, np.zeros_like(self._as_given(small))[None], None, began)
         solver = level.solver
@@ -454,8 +455,11 @@ class LiveReconstructor:
             else f"brightest of {of}"
             if plane is None
             else f"depth {plane} of {of}",
-            doubt=DARK if done is None else NOISE_ONLY if self._dark else self._fit.doubt,
+            doubt=self._unlit() if done is None else NOISE_ONLY if self._dark else self._fit.doubt,
         )
+
+    def _unlit(self) -> str:
+        return DARK if self._dark else UNLIT
 
 
 def _now() -> Spent:

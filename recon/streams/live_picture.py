@@ -35,6 +35,9 @@ NOISE_ONLY = "Noise only, no light of a scene"
 DARK = "Dark, nothing was lit: no picture is made"
 """Doubt of the black picture of a frame that was taken with nothing lit and holds noise only."""
 
+UNLIT = "Nothing was lit, and nothing in the frame is the calibration's pattern: no picture is made"
+"""Doubt of the black picture of such a frame: what a dark frame was not, once many are averaged."""
+
 _LIVE = "Live pictures"
 
 

@@ -132,8 +132,13 @@ def test_a_task_waits_ends_and_keeps_what_it_can(qtbot: QtBot, panel: TasksPanel
             time.sleep(0.01)
 
     run.start("Counting", hard)
+    panel.run_bar.set_running(True)
     qtbot.waitUntil(lambda: run._desk is not None, timeout=WAIT_MS)
     with qtbot.waitSignal(run.ended_early, timeout=WAIT_MS):
+        panel.run_bar.abort_button.click()
+        assert not panel.run_bar.abort_button.isEnabled()
+        panel.run_bar.show_situation(run._desk.situation)  # type: ignore[union-attr]
+        assert "ENDING" in panel.run_bar.words.text()
         run.abort()
         run.pause()  # of what is ended: it does not wait
     assert issubclass(JobCancelledError, KeyboardInterrupt)  # what a task in the terminal sees

@@ -9,8 +9,9 @@ import pytest
 
 from recon import Calibration, InputError, NoiseModel, reconstruct
 from recon.base.metrics import psnr
+from recon.streams.fit import CalibrationWatch
 from recon.streams.live import LiveReconstructor
-from recon.streams.live_picture import DARK, NOISE_ONLY, Level, LivePicture
+from recon.streams.live_picture import DARK, NOISE_ONLY, UNLIT, Level, LivePicture
 from recon.streams.pace import HOLD, Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch, has_light
 
@@ -534,7 +535,7 @@ def test_pace_tells_from_wiener_pictures_that_there_is_time_again() -> None:
     assert pace.affordable(1, 33) == 2
 
 
-def test_a_frame_of_noise_is_called_so_and_one_with_light_is_not() -> None:
+def test_a_frame_of_noise_is_called_so_and_one_with_light_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     reconstructor = live(budget_ms=AMPLE_MS, coarsest=2)
     dark = [np.round(20 + rng.normal(0, 2, SHAPE)).astype(np.uint16) for _ in range(8)]
@@ -565,6 +566,11 @@ def test_a_frame_of_noise_is_called_so_and_one_with_light_is_not() -> None:
     assert not black.image.any()
     assert reconstructor.refine() is None, "there is nothing to go on with"
     assert reconstructor.feed(photograph(0, 1), lit=False).doubt == "", "a lamp that nobody told of is seen"
+    monkeypatch.setattr(CalibrationWatch, "doubt", "Any PSF would explain it as well")
+    unlit = reconstructor.feed(photograph(0, 2), lit=False)  # a sensor's own pattern, say
+    assert unlit.quality == unlit.doubt == UNLIT
+    assert not unlit.image.any()
+    assert reconstructor.feed(photograph(0, 3)).image.any(), "what is lit is shown with its doubt"
 
 
 @pytest.mark.parametrize("side", [16, 24])
