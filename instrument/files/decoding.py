@@ -36,6 +36,24 @@ _MOST_PICTURE_BYTES = 1 << 28
 _MOST_HEADER, _MOST_LISTING = 1 << 16, 1 << 20
 
 
+_RAW = (
+    "is a camera's raw file, whose pixels are not read (a thumbnail at most). Make a linear 16-bit TIFF "
+    "of it: dcraw -D -4 -T FILE, or rawpy.imread(FILE).raw_image, saved by numpy.save."
+)
+_RAW_SUFFIXES = (".arw", ".cr2", ".cr3", ".crw", ".dng", ".nef", ".orf", ".pef", ".raf", ".raw", ".rw2")
+_TEXT_SUFFIXES = (".csv", ".dat", ".tsv", ".txt")
+
+
+def _unreadable(path: Path) -> str:
+    """Say of a file that begins as none which is read what it may be, and what to do."""
+    suffix = path.suffix.lower()
+    if suffix in _RAW_SUFFIXES:
+        return _RAW
+    if suffix in _TEXT_SUFFIXES:
+        return "is text, no image. Make an array of its numbers: numpy.save('NAME.npy', numpy.loadtxt(FILE))."
+    return f"is no image that can be read, or is damaged. Readable: {READABLE}."
+
+
 def decode(path: Path, inside: str = "") -> Decoded:
     """Return a file's array; its content, not its name, tells the format.
 
@@ -59,7 +77,9 @@ def decode(path: Path, inside: str = "") -> Decoded:
         raise FileError(path, f"is no HDF5 or MATLAB file, so that nothing in it is called {inside}.")
     known = (b"\x93NUMPY", b"PK", *_TIFF_MAGIC, *_OPENCV_MAGIC)
     if beginning and not beginning.startswith(known):  # before its size, which may be huge, is read
-        raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
+        raise FileError(path, _unreadable(path))
+    if beginning[8:10] == b"CR" and beginning[:4] in _TIFF_MAGIC:  # Canon's, a TIFF of its thumbnail
+        raise FileError(path, _RAW)
     if beginning.startswith(b"\x93NUMPY"):
         require_npy(path)
         with path.open("rb") as file:
@@ -176,6 +196,8 @@ def _decode_tiff(path: Path) -> Decoded:
             reading.require_plausible(path, series.size * series.dtype.itemsize, reading.stored_bytes(path))
             page: Any = series.keyframe
             _require_parts(path, series)
+            if page.is_reduced and page.subifds:  # DNG, NEF, ARW: the sensor's pixels lie further in
+                raise FileError(path, _RAW)
             notes = []
             if page.photometric == tifffile.PHOTOMETRIC.PALETTE:
                 return _decode_with_opencv(path, reading.read_bytes(path, _MOST_PICTURE_BYTES))

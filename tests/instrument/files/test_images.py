@@ -151,6 +151,13 @@ def make_bad_files(folder: Path) -> None:
     (folder / "no.npz").write_bytes(b"PK\x03\x04 nonsense")
     cv2.imwrite(str(folder / "good.png"), np.zeros((64, 64), np.uint8) + 3)
     (folder / "folder.tif").mkdir()
+    (folder / "table.csv").write_text("1,2\n3,4\n")
+    (folder / "canon.cr2").write_bytes(b"II*\0\x10\0\0\0CR\2\0" + bytes(200))
+    (folder / "canon.cr3").write_bytes(b"\0\0\0\x18ftypcrx " + bytes(200))
+    thumbnail, sensor = np.full((8, 8), 9, np.uint8), np.full((64, 64), 900, np.uint16)
+    with tifffile.TiffWriter(folder / "nikon.nef") as tiff:  # as NEF, DNG and ARW: the pixels lie further in
+        tiff.write(thumbnail, subfiletype=1, subifds=1, metadata=None)
+        tiff.write(sensor, metadata=None)
 
 
 BAD = {
@@ -166,6 +173,10 @@ BAD = {
     "line.npy": r"shape \(9,\)",
     "void.npy": "empty array",
     "no.npz": "npz",
+    "table.csv": "text, no image.*loadtxt",
+    "canon.cr2": "camera's raw file.*16-bit TIFF",
+    "canon.cr3": "camera's raw file.*16-bit TIFF",
+    "nikon.nef": "camera's raw file.*16-bit TIFF",
 }
 
 
