@@ -266,7 +266,7 @@ def after_all(config: BenchConfig, facts: Facts) -> Step:
         return replace(steps[-2], words="The pattern is on the SLM: photograph it, or compute another.")
     if result is None:
         return replace(steps[-1], words=f"All is done: {steps[-1].name.lower()} again, or go on.")
-    words = f"All is done; the newest result is {result.name}."
+    words = f"All is done; the newest result is {result.stem}."
     return Step("", True, words, "Look at it", "reconstructions", OwnFiles(result=result))
 
 

@@ -257,7 +257,7 @@ def photograph_slides(
     except BaseException as error:
         if series.photographs:
             before = count(len(series.photographs), "slide")
-            error.add_note(f"{before} photographed before. Go on with: diffuserbench resume {series.newest}")
+            error.add_note(f"{before} photographed before. To go on: diffuserbench resume {series.newest}")
         raise
     return BeadPhotographs(
         mean_images([one.measurement for one in series.photographs]),

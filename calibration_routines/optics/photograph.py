@@ -310,7 +310,7 @@ class PhotographRecord:
 
 PHOTOGRAPH = Purpose(
     PhotographRecord,
-    "photograph.json",
+    "photograph_run.json",  # photograph.json would be the record of a reconstruction of that name
     PHOTOGRAPH_FILE,
     RecordFormat(
         "diffuserbench photograph",

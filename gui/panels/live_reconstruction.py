@@ -27,7 +27,7 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import OrientationButton, follow_orientation
 from instrument.bench.kept import KeptWithBench
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
-from instrument.files.errors import BenchError, duration
+from instrument.files.errors import BenchError, count, duration
 from instrument.live.light_log import NOTHING_LIT
 from instrument.live.live import LiveResult
 from instrument.reconstruction.job import find_calibration
@@ -324,7 +324,7 @@ class LiveReconstructionPanel(Panel):
         how = self.follower.status
         self._log_new(() if how is None else how.warnings)
         rate = "" if how is None or not how.pictures_per_s > 0 else f", {how.pictures_per_s:.1f} pictures/s"
-        passed = "" if how is None else f", {how.passed_over} frames passed over"
+        passed = "" if how is None else f", {count(how.passed_over, 'frame')} passed over"
         self.view.caution_against(self._doubt(result))
         self.view.set_caption(self._caption(result.metadata))
         self.status.setText(f"latency {result.latency_ms:.0f} ms{rate}{passed}\n{result.picture.quality}")

@@ -82,9 +82,7 @@ def test_a_slide_that_saturates_is_taken_shorter_and_so_are_those_after_it(
         photographed([1.0, 1.0], 0.1)
     with pytest.raises(CalibrationError) as ended:
         photographed([20.0, 1.0], 0.1)
-    assert ended.value.__notes__[0].startswith(
-        "1 slide photographed before. Go on with: diffuserbench resume"
-    )
+    assert ended.value.__notes__[0].startswith("1 slide photographed before. To go on: diffuserbench resume")
     with pytest.raises(CalibrationError, match="taken 2 times, at 8 ms, the camera's shortest exposure: dim"):
         photographed([1.0, 1.0], 8.0)
     with pytest.raises(CalibrationError, match="taken 1 time, at 10 ms, the camera's"):
