@@ -41,7 +41,7 @@ from instrument.display.hologram import bench_display, prepare_target
 from instrument.files.sample_images import load_sample
 from recon.holography import DcTerm, Display, HologramModel, compute_hologram
 from recon.holography.camera_map import register_camera
-from recon.holography.pose import NAMES, Pose, nodes_of
+from recon.holography.pose import NAMES, NODES, Pose, nodes_of
 from recon.holography.sections import split_field
 
 ITERATIONS = 30
@@ -59,6 +59,9 @@ KINDS = {
 
 SLM = (360, 640)
 """Of the template, pixels; it shows two by two as one, behind which are four by four of the mask."""
+FINER = 8
+FINE = tuple(FINER * (n - 1) + 1 for n in NODES)
+"""Places at which displacements are compared: between nodes they are straight, a distortion is not."""
 
 
 def draw(seed: int, kind: str = "all", slm: tuple[int, int] = SLM) -> dict[str, str]:
@@ -127,10 +130,10 @@ def true_pose(world: DisplayWorld) -> Pose:
 
 
 def true_displacement(world: DisplayWorld, mask_shape: tuple[int, int]) -> np.ndarray:
-    """Return the true displacement field on nodes, distorted as the simulated relay does it."""
+    """Return the true displacement, distorted as the simulated relay does it, as :func:`everywhere`."""
     options = world.options
-    field = true_pose(world).displacement(mask_shape)
-    y, x = nodes_of(mask_shape)
+    field = everywhere(true_pose(world).displacement(mask_shape))
+    y, x = nodes_of(mask_shape, FINE)
     centre_x, centre_y = (c / options.mask_pitch_um for c in options.relay_centre_um)
     across, down = x + field[..., 1] - centre_x, y + field[..., 0] - centre_y
     cubic = options.relay_distortion_um / options.mask_pitch_um / (0.5 * np.hypot(*mask_shape)) ** 3
@@ -138,9 +141,16 @@ def true_displacement(world: DisplayWorld, mask_shape: tuple[int, int]) -> np.nd
     return field + np.stack([stretch * down, stretch * across], axis=-1)
 
 
+def everywhere(field: np.ndarray) -> np.ndarray:
+    """Return a displacement between its nodes as well, where it is straight: as holograms are made with."""
+    from scipy.ndimage import zoom
+
+    return np.asarray(zoom(field, [*(n / m for n, m in zip(FINE, NODES, strict=True)), 1], order=1))
+
+
 def residual(world: DisplayWorld, found: np.ndarray, mask_shape: tuple[int, int]) -> float:
     """Return the rms distance between true and found displacement over the mask, mask pixels."""
-    difference = true_displacement(world, mask_shape) - found
+    difference = true_displacement(world, mask_shape) - everywhere(found)
     return float(np.sqrt(np.mean(np.sum(difference**2, axis=-1))))
 
 
@@ -153,7 +163,7 @@ def hologram(display: Display, target: object) -> np.ndarray:
 def pulls(world: DisplayWorld, report: AlignmentReport, mask_shape: tuple[int, int]) -> dict[str, float]:
     """Return each parameter's error over the uncertainty that was stated for it."""
     true, _ = split_field(true_displacement(world, mask_shape), mask_shape)
-    found, _ = split_field(report.displacement(mask_shape), mask_shape)
+    found, _ = split_field(everywhere(report.displacement(mask_shape)), mask_shape)
     deep = [NAMES.index(name) for name in ("z_um", "pitch_mrad", "yaw_mrad")]
     true[deep], found[deep] = true_pose(world).vector()[deep], report.pose.vector()[deep]
     known = zip(NAMES, found - true, report.error, strict=True)
@@ -225,7 +235,7 @@ def one_start(
         (world,) = bench.shared.values()
         assert isinstance(world, DisplayWorld)
         io = DisplayBench(bench, config.display.slm_binning)
-        exact = replace(known, displacement=true_displacement(world, known.mask.shape))
+        exact = replace(known, displacement=true_displacement(world, known.mask.shape)[::FINER, ::FINER])
         io.show(np.ones(known.slm_shape, complex))
         across = known.wavelength_nm * known.focal_mm / known.mask_pitch_um / bench.camera.pixel_pitch_um
         camera = register_camera(io.photograph(10.0), known, across)

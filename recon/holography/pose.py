@@ -79,9 +79,11 @@ NODES = (13, 23)
 """Of displacement fields, from edge to edge of the mask; they hold a third-order field to a few per mille."""
 
 
-def nodes_of(mask_shape: tuple[int, int]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def nodes_of(
+    mask_shape: tuple[int, int], count: tuple[int, int] = NODES
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return y and x of the nodes of displacement fields, mask pixels from the centre."""
-    y, x = ((np.linspace(0, 1, n) - 0.5) * size for n, size in zip(NODES, mask_shape, strict=True))
+    y, x = ((np.linspace(0, 1, n) - 0.5) * size for n, size in zip(count, mask_shape, strict=True))
     grid_y, grid_x = np.meshgrid(y, x, indexing="ij")
     return grid_y, grid_x
 

@@ -237,7 +237,7 @@ def split_field(
     field: npt.NDArray[np.float64], mask_shape: tuple[int, int]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Split a small displacement field into shift, rotation and scale (as a pose's vector) and the rest."""
-    y, x = nodes_of(mask_shape)
+    y, x = nodes_of(mask_shape, (field.shape[0], field.shape[1]))
     dy, dx = field[..., 0], field[..., 1]
     shift_y, shift_x = float(dy.mean()), float(dx.mean())
     square = float((y**2 + x**2).sum())
