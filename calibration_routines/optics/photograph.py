@@ -135,7 +135,7 @@ def photograph(
     """
     control, listener = control or RunControl(), listener or Listener()
     if exposure_ms is None:
-        listener.step("finding the exposure")
+        listener.step("finding the scene's exposure")
         exposure_ms = expose_scene(bench).exposure_ms
         control.check()
     listener.step("photographing")
@@ -369,7 +369,7 @@ class PhotographProcedure(Checked, Procedure):
         """Photograph, and write the picture that ``reconstruct`` takes into the run's folder."""
         exposure_ms = self.exposure_ms
         if exposure_ms is None:
-            listener.step("finding the exposure")
+            listener.step("finding the scene's exposure")
             exposure_ms = expose_scene(bench).exposure_ms
             control.check()
         listener.step("photographing")

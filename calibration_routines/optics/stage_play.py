@@ -386,7 +386,7 @@ class StageProcedure(Procedure):
         """Home, move to and fro, and save what was found in the run's folder."""
         record = planned(bench, self.asked)
         home_if_needed(bench, listener)
-        listener.step("finding the exposure")
+        listener.step("finding the source's exposure")
         assert bench.stage is not None
         bench.stage.move_to(record.place)
         exposure_ms = expose_source(bench, target=0.6).exposure_ms

@@ -187,9 +187,13 @@ def open_and_say(bench: BenchConfig | Path | None, *, as_is: bool = False) -> Be
     with one_task("Reading the bench's file"):
         config = load_and_say(bench) if bench is None or isinstance(bench, Path) else bench
     # Whichever command: its devices take the time. A run that goes on has the same text elsewhere.
-    kept_times.about(f"{config.bench.name} {crc32(config.text.encode()):08x}")
+    of = f"{config.bench.name} {crc32(config.text.encode()):08x}"
+    kept_times.about(of)
     with one_task("Opening the bench"):
         opened = open_bench(config, ask=_taken_for_done if as_is else operator())
+    if "camera" in opened.simulated_kinds:
+        height, width = opened.camera.sensor_shape
+        kept_times.about(of, simulated_megapixels=1e-6 * height * width)
     typer.echo(f"Bench: {opened.label}", err=True)
     return opened
 

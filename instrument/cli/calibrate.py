@@ -255,8 +255,8 @@ class TerminalListener(Listener):
     def _begin(self, words: str) -> None:
         self._words = words
         bar = self._open.enter_context(progress_bar())
-        said, expected_s = words[:1].upper() + words[1:], kept_times.expected_s(words)
-        self._bar = bar, bar.add_task(said, total=None, note="", expected_s=expected_s)
+        said, expected = words[:1].upper() + words[1:], kept_times.expected(words)
+        self._bar = bar, bar.add_task(said, total=None, note="", expected=expected)
         bar.tasks[0].start_time = self._began_s
 
     def pause(self) -> None:

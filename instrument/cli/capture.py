@@ -183,7 +183,8 @@ def _expose(bench: Bench, light: LightState) -> None:
             dark = bench.camera.snap()
             hot = hot_pixels(dark.image, dark.full_scale)
         switch_light(bench, light)
-    with one_task("Finding the exposure"):
+    whose = "source" if light is LightState.SOURCE else "scene"  # wave optics of a scene take longest
+    with one_task(f"Finding the {whose}'s exposure"):
         found = auto_expose(bench.camera, hot=hot)
     typer.echo(found.message)
 

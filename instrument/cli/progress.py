@@ -1,7 +1,7 @@
 """Long commands: a progress bar on stderr with the time left (none where it is no terminal), Ctrl-C, keys.
 
-A step that cannot say how far it is goes by what it took last time (:mod:`instrument.files.kept_times`).
-What is compiled is said beside the bar.
+A step that cannot say how far it is goes by what it took last time, or takes elsewhere
+(:mod:`instrument.files.kept_times`). What is compiled is said beside the bar.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class _Count(MofNCompleteColumn):
 
 
 class _Left(TimeRemainingColumn):
-    """The time left: by what is done; else by what such a step took last time."""
+    """The time left: by what is done; else by what such a step took last time, or takes elsewhere."""
 
     def render(self, task: Task) -> Text:
         if task.total is not None:
@@ -60,12 +60,12 @@ class _Left(TimeRemainingColumn):
                 left_s = task.elapsed * (task.total / task.completed - 1)
                 return Text(f"left about {duration(left_s)}")
             return Text("left ") + super().render(task)
-        expected_s = task.fields.get("expected_s")
-        if expected_s is None or task.elapsed is None:
+        expected: kept_times.Expected | None = task.fields.get("expected")
+        if expected is None or task.elapsed is None:
             return Text()
-        if task.elapsed > expected_s:
-            return Text(f"longer than last time, {duration(expected_s)}")
-        return Text(f"about {duration(expected_s - task.elapsed)} left, as last time")
+        if task.elapsed > expected.seconds:
+            return Text(f"longer than {expected.by}, {duration(expected.seconds)}")
+        return Text(f"about {duration(expected.seconds - task.elapsed)} left, as {expected.by}")
 
 
 class _Note(ProgressColumn):
@@ -104,7 +104,7 @@ def _listen() -> None:
 def progress_bar() -> Progress:
     """Return a bar to be used as a context.
 
-    Tasks have a field ``note``, shown at the end of the line, and may have ``expected_s``: how long they will
+    Tasks have a field ``note``, shown at the end of the line, and may have ``expected``: how long they will
     take where they do not say how far they are.
     """
     console = Console(stderr=True)
@@ -148,8 +148,8 @@ def one_task(
     Without a total it takes as long as last time.
     """
     with progress_bar() as bar, kept_times.kept(description) if total is None else nullcontext():
-        expected_s = kept_times.expected_s(description) if total is None else None
-        task = bar.add_task(description, total=total, completed=done, note=note, expected_s=expected_s)
+        expected = kept_times.expected(description) if total is None else None
+        task = bar.add_task(description, total=total, completed=done, note=note, expected=expected)
 
         def advance(done: float, total: float | None = None, *, note: str | None = None) -> None:
             bar.update(task, completed=done, total=total)

@@ -30,14 +30,14 @@ def test_a_step_is_expected_to_take_as_long_as_last_time(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept_times.about("snap")
-    assert kept_times.expected_s("reading") is None
+    assert kept_times.expected("reading") is None
     with kept_times.kept("reading"):
         time.sleep(0.02)
-    told = kept_times.expected_s("reading")
+    told = kept_times.expected("reading")
     assert told is not None
-    assert told >= 0.02
+    assert told.seconds >= 0.02
     kept_times.about("another command")
-    assert kept_times.expected_s("reading") is None
+    assert kept_times.expected("reading") is None
     kept_times.about("snap")
     with pytest.raises(OSError, match="lost"), kept_times.kept("reading"):
         raise OSError("lost")
@@ -45,11 +45,29 @@ def test_a_step_is_expected_to_take_as_long_as_last_time(
     monkeypatch.setattr(kept_times, "_window", False)  # a test of the window may have been before
     with kept_times.kept("reading"):
         time.sleep(0.05)
-    assert kept_times.expected_s("reading") == told, "nobody saw it"
+    assert kept_times.expected("reading") == told, "nobody saw it"
     numbers = ("[0, 1]", '"soon"', "NaN", "Infinity", "-5", f"1{400 * '0'}")
     for damaged in ("", "[]", 90_000 * "[", *(f'{{"snap: reading": {number}}}' for number in numbers)):
         cache.write_text(damaged)
-        assert kept_times.expected_s("reading") is None
+        assert kept_times.expected("reading") is None
+
+
+def test_the_first_time_a_simulated_scene_is_exposed_goes_by_other_machines(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    step = "Finding the scene's exposure"
+    monkeypatch.setattr(kept_times, "WORTH_S", 0.5)
+    kept_times.about("real bench")
+    assert kept_times.expected(step) is None
+    kept_times.about("small", simulated_megapixels=0.08)
+    assert kept_times.expected(step) is None, "not worth a word"
+    kept_times.about("large", simulated_megapixels=5.5)
+    told = kept_times.expected(step)
+    assert told is not None
+    assert 2 < told.seconds < 20
+    assert told.by != "last time"
+    kept_times.remember("large: " + step, 4.0)
+    assert kept_times.expected(step) == (4.0, "last time")
 
 
 def test_the_oldest_times_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,7 +75,7 @@ def test_the_oldest_times_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None
     for name in ("a", "b", "a", "c"):
         with kept_times.kept(name):
             pass
-    assert [kept_times.expected_s(name) is None for name in ("a", "b", "c")] == [False, True, False]
+    assert [kept_times.expected(name) is None for name in ("a", "b", "c")] == [False, True, False]
 
 
 def test_a_terminal_is_told_that_a_command_is_on_its_way(
@@ -73,10 +91,10 @@ def test_a_bar_says_what_is_left_and_what_is_compiled() -> None:
 
     clock_s = [100.0]
     bar = Progress(get_time=lambda: clock_s[0])
-    bar.add_task("Finding the exposure", total=None, note="", expected_s=60.0)
+    bar.add_task("Finding the exposure", total=None, note="", expected=kept_times.Expected(60.0, "last time"))
     task = bar.tasks[0]
     assert str(_Left().render(task)).endswith(" left, as last time")
-    task.fields["expected_s"] = 1.0
+    task.fields["expected"] = kept_times.Expected(1.0, "last time")
     clock_s[0] += 2
     assert "longer than last time" in str(_Left().render(task))
     bar.update(task.id, total=10, completed=0)
