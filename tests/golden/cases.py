@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.golden import adapter, inputs
+from tests.golden import adapter, inputs, steps
 
 SINGLE = 2e-5
 """Relative norm of differences allowed to results of float32 arithmetic. Another order of summation changes a
@@ -360,6 +360,13 @@ _add(
     refinements=2,
     background=1.0,
 )
+
+# Solvers and operators by themselves, in float64 but for what is float32 by its nature ---------------------
+for name, way in steps.STEPS.items():
+    _add(f"steps-{name}", way, within=DOUBLE)
+for name, applied in steps.OPERATORS.items():
+    within_float32 = name in ("beads", "in-space", "responding")
+    _add(f"operator-{name}", applied, within=SINGLE if within_float32 else DOUBLE)
 
 # Holograms -----------------------------------------------------------------------------------------------
 SLM = (32, 40)
