@@ -332,7 +332,7 @@ def test_a_signal_during_an_exposure_ends_it_at_once_and_says_what_is_left(
     number: signal.Signals, status: int, told: str, tmp_path: Path
 ) -> None:
     (tmp_path / "bench.toml").write_text(
-        '[camera]\ndriver = "simulated"\nexposure_ms = 20000\n[simulated]\npreset = "tiny"\n'
+        '[camera]\ndriver = "simulated"\nexposure_ms = 20000\n[simulated]\npreset = "tiny"\ntime_scale = 20\n'
     )
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, "snap", "--as-is", "--out", "photo.tif"],
@@ -345,7 +345,7 @@ def test_a_signal_during_an_exposure_ends_it_at_once_and_says_what_is_left(
         assert process.stderr is not None
         assert process.stderr.readline().startswith("Bench:")
         process.send_signal(number)
-        _, error = process.communicate(timeout=15)
+        _, error = process.communicate(timeout=250)
     finally:
         process.kill()
     assert process.returncode == status

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -74,7 +73,7 @@ def test_a_signal_ends_the_run_safely_and_says_where_it_is(here: Path, number: i
     until(process, "camera.snap", 3)
     process.send_signal(number)
     try:
-        rest, errors = process.communicate(timeout=60)
+        rest, errors = process.communicate(timeout=250)
     finally:
         process.kill()
     assert process.returncode == status, errors
@@ -110,14 +109,14 @@ def test_a_program_that_forgets_to_close_its_bench_leaves_no_light_on(here: Path
         + "bench = open_bench('bench.toml')\nbench.source_on()\n"
     )
     process = program(code, here)
-    out, _ = process.communicate(timeout=60)
+    out, _ = process.communicate(timeout=250)
     calls = out.split()
     assert "led_array.off" in calls[calls.index("led_array.set_pattern") :]
     assert process.returncode == 0
 
 
 def test_stop_does_not_wait_for_the_exposure(here: Path) -> None:
-    """An exposure that would last for a minute; benchmarks/latency.py measures how soon STOP comes."""
+    """An exposure that would outlast the test's limit; benchmarks/latency.py measures how soon STOP comes."""
     code = (
         SETUP
         + """
@@ -130,7 +129,7 @@ ended = threading.Event()
 started = threading.Event()
 def snap(self):
     started.set()
-    ended.wait(60)
+    ended.wait(600)
     raise StoppedError(self.name, "stopped")
 def stop_sequence(self):
     ended.set()
@@ -139,22 +138,21 @@ with open_bench("bench.toml") as bench:
     runner = prepare(bench, load_plan("plan.toml"))
     thread = threading.Thread(target=runner.execute)
     thread.start()
-    started.wait(30)
+    started.wait()
     ended.clear()
-    begun = time.perf_counter()
     runner.stop()
-    dark = bench.led_array.pattern.is_dark
-    print("TOOK", time.perf_counter() - begun, dark, runner.status.reason)
+    print("ENDED", bench.led_array.pattern.is_dark, runner.status.reason)
     thread.join()
 """
     )
     process = program(code, here)
-    begun = time.monotonic()
-    out, errors = process.communicate(timeout=60)
-    assert time.monotonic() - begun < 50, "it waited for the exposure"
+    try:
+        out, errors = process.communicate(timeout=250)  # of a machine that does much else, too
+    finally:
+        process.kill()
     assert process.returncode == 0, errors
-    (line,) = [line for line in out.splitlines() if line.startswith("TOOK")]
-    assert line.split()[2:] == ["True", "stopped"]
+    (line,) = [line for line in out.splitlines() if line.startswith("ENDED")]
+    assert line.split()[1:] == ["True", "stopped"]
 
 
 def test_an_object_half_made_when_interrupted_shows_no_traceback(here: Path) -> None:
@@ -172,7 +170,7 @@ snap.snap_app.registered_commands[0].callback = lambda: Handle()
 sys.exit(main(["snap"]))
 """
     process = program(code, here)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=250)
     assert process.returncode == 130
     assert "interrupted." in errors
     assert "Traceback" not in errors
