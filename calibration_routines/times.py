@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from calibration_routines.procedure import Outlook, Procedure
     from instrument.bench.bench import Bench
 
+IN_ALL = "In all, "
+"""What a sentence begins with that tells the time of a whole procedure."""
 _NO_MATTER = ("out", "overwrite")
 
 
@@ -32,7 +34,7 @@ def took_before(procedure: Procedure, bench: Bench, outlook: Outlook) -> tuple[s
             expected_s = took_s * now_s / planned_s
     except (LookupError, TypeError, ValueError, ZeroDivisionError):
         return ()
-    return (f"In all, by what it took last time: about {duration(expected_s)}.",)
+    return (f"{IN_ALL}by what it took last time: about {duration(expected_s)}.",)
 
 
 def took(procedure: Procedure, bench: Bench, outlook: Outlook, seconds: float) -> None:

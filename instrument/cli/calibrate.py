@@ -38,12 +38,14 @@ from calibration_routines.procedure import (
 from calibration_routines.psf.sweep_plan import SweepExposures
 from calibration_routines.psf.sweep_procedure import event_lines, event_note, exposure_lines
 from calibration_routines.psf.sweep_watch import SweepEvent
+from calibration_routines.rehearsal import rehearse_whole
+from calibration_routines.times import IN_ALL
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import other_bench_for
 from instrument.bench.safety import StepsFailedError
 from instrument.cli.app import App, BenchOption, examples, load_and_say, open_and_say
 from instrument.cli.plan import rehearsal
-from instrument.cli.progress import keys, progress_bar
+from instrument.cli.progress import keys, one_task, progress_bar
 from instrument.files import kept_times
 from instrument.files.errors import BenchError, duration, size
 from instrument.files.images import read_image
@@ -182,7 +184,7 @@ def carry_out(
         print_lines(console, outlook.reasons)
         if dry_run:
             print_lines(console, outlook.plan_lines or _plan_lines(outlook))
-            print_lines(console, _first_time(outlook, opened, rehearse_any=True))
+            print_lines(console, _rehearsed(routine, options, outlook, opened))
             console.print("Dry run: nothing moved, no frame was taken.")
             return
         print_lines(console, _first_time(outlook, opened))
@@ -193,17 +195,27 @@ def carry_out(
         print_outcome(console, done)
 
 
-def _first_time(outlook: Outlook, bench: Bench, *, rehearse_any: bool = False) -> list[str]:
-    """Return how long a first plan on a simulated bench takes; short ones are rehearsed only if told to."""
+def _rehearsed(routine: Routine, options: Any, outlook: Outlook, bench: Bench) -> Sequence[str]:
+    """Return how long all of a routine takes on a simulated bench that it was not carried out on before."""
+    if any(IN_ALL in words for words in outlook.reasons) or not bench.simulated_kinds:
+        return []
+    with one_task("Rehearsing all of it on a simulated bench of its own") as advance:
+        return rehearse_whole(routine, options, bench, advance)
+
+
+def _first_time(outlook: Outlook, bench: Bench) -> list[str]:
+    """Return how long the frames of a first plan take on a simulated bench; short ones are not rehearsed."""
     if outlook.plan is None or not bench.simulated_kinds or any(_TIME in words for words in outlook.reasons):
         return []
     frames = 0 if outlook.cost is None else outlook.cost.frames
     long = rehearsed(outlook.plan) * _SHORT <= frames
-    pace = rehearsal(outlook.plan, bench) if rehearse_any or long else None
+    pace = rehearsal(outlook.plan, bench) if long else None
     if pace is None:
-        return ["Computing the simulated light comes on top of exposure and motion."]
+        return [
+            "Computing the simulated light comes on top of exposure and motion; --dry-run tells all of it."
+        ]
     words = pace.words(outlook.plan, abilities_of(bench))
-    return [f"{words} Homing, looking for exposures and analysis come on top."]
+    return [f"{words} Homing, looking for exposures and analysis come on top; --dry-run tells all of it."]
 
 
 def _plan_lines(outlook: Outlook) -> list[str]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -46,9 +47,6 @@ def rehearse(
     to light. ``on_progress`` gets frames taken and to take. None where a device is not simulated, or there is
     no plan for it to say about. Exceptions are those of a run.
     """
-    config = _at_once(bench.config)
-    if config is None or len(bench.simulated_kinds) < len(bench.devices):
-        return None
     kinds = _kinds(plan)
     todo = sorted(index for kind in kinds for index in kind.steps[:OF_EACH])
     ends: list[float] = []
@@ -59,13 +57,16 @@ def rehearse(
             if on_progress is not None:
                 on_progress(len(ends), len(todo))
 
-    with TemporaryDirectory(prefix="diffuserbench-rehearsal-") as folder, open_bench(config) as twin:
+    with twin_of(bench) as made:
+        if made is None:
+            return None
+        twin, folder = made
         if twin.stage is not None:
             twin.stage.home()
         rehearsed = plan.model_copy(
             update={"parts": tuple(p.model_copy(update={"interval_s": 0.0}) for p in plan.parts)}
         ).on(twin.led_array)
-        writer = RunWriter.create(Path(folder), label=plan.label, bench=record_of(twin), plan=rehearsed)
+        writer = RunWriter.create(folder, label=plan.label, bench=record_of(twin), plan=rehearsed)
         begun = time.perf_counter()
         Runner(twin, rehearsed, writer, todo=todo, on_progress=taken).execute()
     took = dict(
@@ -74,9 +75,33 @@ def rehearse(
     for kind in kinds:
         kind.seconds.extend(took[index] for index in kind.steps[:OF_EACH])
     cost = estimate(plan, abilities_of(bench))
-    scale = max(getattr(shared.options, "time_scale", 1.0) for shared in bench.config.shared.values())
-    whole_s = sum(kind.all_s for kind in kinds) + (scale - 1) * cost.seconds
+    whole_s = sum(kind.all_s for kind in kinds) + (time_scale(bench) - 1) * cost.seconds
     return Pace(whole_s / cost.frames, f"a rehearsal of {len(todo)} of them")
+
+
+@contextmanager
+def twin_of(bench: Bench) -> Iterator[tuple[Bench, Path] | None]:
+    """Open a simulated bench like an open one that waits for nothing, with a folder that goes at the end.
+
+    None where a device is not simulated. Exceptions are those of opening a bench.
+    """
+    config = _at_once(bench.config)
+    if config is None or len(bench.simulated_kinds) < len(bench.devices):
+        yield None
+        return
+    with TemporaryDirectory(prefix="diffuserbench-rehearsal-") as folder, open_bench(config) as twin:
+        yield twin, Path(folder)
+
+
+def time_scale(bench: Bench) -> float:
+    """Return the real seconds that a simulated second of a bench takes."""
+    return max(getattr(shared.options, "time_scale", 1.0) for shared in bench.config.shared.values())
+
+
+def not_waited_s(twin: Bench) -> float:
+    """Return the simulated seconds that a bench of :func:`twin_of` did not wait for."""
+    clocks = (getattr(part, "clock", None) for part in twin.shared.values())
+    return max((float(getattr(clock, "now_s", 0.0)) for clock in clocks), default=0.0)
 
 
 def rehearsed(plan: Plan) -> int:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from calibration_routines import rehearsal
 from instrument.cli import main
 from instrument.files.calibration_file import load_calibration
 
@@ -126,12 +127,14 @@ def test_a_dry_run_says_what_it_would_do_and_writes_nothing(
     assert "4 files, read and found alike" in said
     assert "5 x 5 PSFs of 21 x 21 pixels at z = 2.5 mm, over 80% of the field of 48 x 48 pixels" in said
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(rehearsal, "ENOUGH_S", 0.0)
     (tmp_path / "bench.toml").write_text(BENCH + "scene_distance_mm = 3.1\n")
     assert main(["calibrate", "beads", "--dry-run", "--out", out]) == 0
     said = capsys.readouterr().out
     assert "at z = 3.1 mm" in said  # where that bench has its slides
     assert "9 photographs of 4 frames" in said
     assert "take long to solve" in said
+    assert 'Up to the end of "photographing bead slide"' in said
     assert not (tmp_path / "runs").exists()
     assert not Path(out).exists()
 

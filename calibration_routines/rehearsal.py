@@ -1,0 +1,114 @@
+"""How long a routine takes in all before its first run: it is carried out on a simulated bench of its own."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from calibration_routines.procedure import Listener, Routine
+from calibration_routines.times import IN_ALL
+from drivers.errors import DeviceError
+from instrument.files.errors import BenchError, duration
+from instrument.runs.rehearsal import not_waited_s, time_scale, twin_of
+from instrument.runs.run_control import RunControl
+
+if TYPE_CHECKING:
+    from instrument.bench.bench import Bench
+    from instrument.runs.runner import RunStatus
+
+ENOUGH_S = 20.0
+_ENOUGH_OF_IT = 0.1
+"""After so many seconds a rehearsal ends in the next step of which so much is done."""
+_OF_SEVERAL = re.compile(r"\s*(\d+) of (\d+)$")
+
+
+def rehearse_whole(
+    routine: Routine, options: Any, bench: Bench, on_progress: Callable[[float, float], object]
+) -> tuple[str, ...]:
+    """Say how long a routine takes on a simulated bench: homing, exposures, frames, analysis, files.
+
+    All of it is done on a bench like the open one that waits for nothing, and what waiting would take is
+    added. A long one is ended on the way, and told by how far it came. ``on_progress`` gets the seconds that
+    it has gone on and :data:`ENOUGH_S`. Nothing where a device is not simulated, where frames that were kept
+    are seen again, and where it cannot be done there.
+    """
+    if getattr(options, "again", None) is not None:
+        return ()
+    with suppress(BenchError, DeviceError), twin_of(bench) as made:
+        if made is None:
+            return ()
+        twin, folder = made
+        if getattr(options, "out", None) is not None:
+            options = replace(options, out=folder / options.out.name)
+        procedure, control = routine.procedure(options), RunControl()
+        watch = _Watch(control, lambda: time_scale(bench) * not_waited_s(twin), on_progress)
+        try:
+            with control.procedure(twin):
+                procedure.perform(twin, folder, control, watch)
+        except BenchError:
+            if control.ending is None:
+                raise
+        return (watch.words(),)
+    return ()
+
+
+class _Watch(Listener):
+    """Takes the time of the steps; ends a rehearsal that has gone on for long enough."""
+
+    def __init__(
+        self,
+        control: RunControl,
+        waiting_s: Callable[[], float],
+        on_progress: Callable[[float, float], object],
+    ) -> None:
+        self._control, self._waiting_s, self._on_progress = control, waiting_s, on_progress
+        self._began_s = time.perf_counter()
+        self._step, self._step_began_s = "", 0.0
+        self._done, self._total, self._at_most, self._several = 0.0, 0.0, False, False
+
+    def _now_s(self) -> float:
+        return time.perf_counter() - self._began_s + self._waiting_s()
+
+    def step(self, words: str) -> None:
+        """Begin another step; of several alike, as slides are, they are counted and not their frames."""
+        several = _OF_SEVERAL.search(words)
+        name = words[: several.start()] if several else words
+        if name != self._step:
+            self._step, self._step_began_s = name, self._now_s()
+            self._done = self._total = 0.0
+        self._several = several is not None
+        if several is not None:
+            self._see(int(several[1]) - 1, int(several[2]), at_most=False)
+
+    def frame(self, status: RunStatus) -> None:
+        """Count the frames of a plan."""
+        self.share(status.done, status.total)
+
+    def share(self, done: float, total: float, *, at_most: bool = False) -> None:
+        """Note how much of a step is done."""
+        if not self._several:
+            self._see(done, total, at_most=at_most)
+
+    def _see(self, done: float, total: float, *, at_most: bool) -> None:
+        seconds = time.perf_counter() - self._began_s
+        self._on_progress(min(seconds, ENOUGH_S), ENOUGH_S)
+        if self._control.ending is None:
+            self._done, self._total, self._at_most = done, total, at_most
+            self._seen_s = self._now_s()
+            if seconds > ENOUGH_S and _ENOUGH_OF_IT * total <= done < total:
+                self._control.abort()
+
+    def words(self) -> str:
+        """Say how long all of it takes, or what it was told by."""
+        if self._control.ending is None:
+            return f"{IN_ALL}by a rehearsal on a simulated bench of its own: about {duration(self._now_s())}."
+        step_s = (self._seen_s - self._step_began_s) * self._total / self._done
+        most = "at most " if self._at_most else "about "
+        return (
+            f'Up to the end of "{self._step}", by a rehearsal up to {self._done / self._total:.0%} of it: '
+            f"{most}{duration(self._step_began_s + step_s)}. What follows it comes on top."
+        )

@@ -1,0 +1,148 @@
+"""A routine's first run told beforehand: carried out on a simulated bench of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from calibration_routines import rehearsal
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine
+from calibration_routines.rehearsal import ENOUGH_S, rehearse_whole
+from drivers.errors import DeviceError
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config
+from instrument.runs.run_control import RunControl
+from instrument.runs.runner import RunState, RunStatus
+
+TINY = """
+[camera]
+driver = "simulated"
+[stage]
+driver = "simulated"
+[simulated]
+preset = "tiny"
+time_scale = 1.0
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """Options of a routine."""
+
+    out: Path | None = None
+    again: Path | None = None
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with open_bench(parse_config(TINY, None)) as opened:
+        yield opened
+
+
+class Hands:
+    """A clock that only goes on when told."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def hands(monkeypatch: pytest.MonkeyPatch) -> Hands:
+    made = Hands()
+    monkeypatch.setattr(rehearsal, "time", SimpleNamespace(perf_counter=made.perf_counter))
+    return made
+
+
+Deed = Callable[[Bench, RunControl, Listener, Asked], None]
+
+
+def routine(deed: Deed) -> Routine:
+    @dataclass(frozen=True, slots=True)
+    class Doing(Procedure):
+        asked: Asked
+
+        def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+            return Outlook()
+
+        def perform(
+            self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener
+        ) -> Outcome:
+            deed(bench, control, listener, self.asked)
+            return Outcome((), good=True)
+
+    return Routine(name="deed", title="Deed", help="Do.", options=Asked, procedure=Doing)
+
+
+def told(deed: Deed, bench: Bench, asked: Asked | None = None) -> tuple[str, ...]:
+    return rehearse_whole(routine(deed), asked or Asked(), bench, lambda done, total: None)
+
+
+def test_all_of_it_is_told_with_the_waiting_that_was_left_out(
+    bench: Bench, hands: Hands, tmp_path: Path
+) -> None:
+    """Homing is not waited for there, and nothing is done or written here."""
+
+    def deed(twin: Bench, _control: RunControl, listener: Listener, asked: Asked) -> None:
+        assert twin.stage is not None
+        listener.step("homing the stage")
+        twin.stage.home()
+        twin.stage.move_to({"x_um": 1000.0})
+        hands.now_s += 2.0
+        listener.step("analysing")
+        hands.now_s += 3.0
+        assert asked.out is not None
+        asked.out.write_text("result")
+
+    (words,) = told(deed, bench, Asked(out=tmp_path / "result.json"))
+    assert words.startswith("In all, by a rehearsal")
+    seconds = float(words.split("about ")[1].split(" s")[0])
+    assert seconds > 5.05  # 5 of computing, and the stage's way
+    assert bench.stage is not None
+    assert not bench.stage.is_homed
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_long_one_is_ended_and_told_by_how_far_it_came(bench: Bench, hands: Hands) -> None:
+    def deed(_twin: Bench, control: RunControl, listener: Listener, _asked: Asked) -> None:
+        hands.now_s += 4.0
+        listener.step("solving")
+        for done in range(1, 101):
+            hands.now_s += ENOUGH_S / 10
+            listener.share(done, 100)
+            control.check()
+
+    (words,) = told(deed, bench)
+    assert f"about {(4 + 10 * ENOUGH_S) / 60:.0f} min" in words
+    assert "comes on top" in words
+    assert hands.now_s < 2 * ENOUGH_S
+
+
+def test_slides_are_counted_and_not_their_frames(bench: Bench, hands: Hands) -> None:
+    def deed(_twin: Bench, control: RunControl, listener: Listener, _asked: Asked) -> None:
+        for number in range(9):
+            listener.step(f"photographing slide {number + 1} of 9")
+            control.check()
+            for done in range(10):
+                listener.frame(RunStatus(RunState.RUNNING, done, 10))
+            hands.now_s += ENOUGH_S
+
+    (words,) = told(deed, bench)
+    assert f"about {9 * ENOUGH_S / 60:.0f} min" in words
+    assert '"photographing slide"' in words
+
+
+def test_what_cannot_be_rehearsed_is_not_told(bench: Bench, tmp_path: Path) -> None:
+    """Kept frames that are seen again would be added to; what fails there is said where it is done."""
+
+    def fails(_twin: Bench, _control: RunControl, _listener: Listener, _asked: Asked) -> None:
+        raise DeviceError("camera", "does not answer")
+
+    assert told(fails, bench) == ()
+    assert told(lambda *_: pytest.fail("It was carried out."), bench, Asked(again=tmp_path)) == ()
