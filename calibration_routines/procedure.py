@@ -25,7 +25,7 @@ from instrument.plan import Plan, PlanEstimate, Step, estimate
 from instrument.runs.acquire import abilities_of, prepare
 from instrument.runs.pace import keep_pace, pace_of
 from instrument.runs.run import Run, RunCondition
-from instrument.runs.run_control import RunControl
+from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import Runner, RunStatus, discarded
 from instrument.runs.timed import TimedSteps
 from instrument.runs.writer import dated_name, free_name
@@ -231,7 +231,11 @@ class Procedure(ABC):
         control = control or RunControl()
         with control.procedure(bench):
             began_s = time.monotonic()
-            outcome = self.perform(bench, folder, control, listener or Listener())
+            try:
+                outcome = self.perform(bench, folder, control, listener or Listener())
+            except (KeyboardInterrupt, SystemExit, EndedEarlyError) as interruption:
+                _note_kept(interruption, control.run)
+                raise
             if control.ending is None and outcome.whole:
                 took(self, bench, outlook, time.monotonic() - began_s)
                 for run in outcome.runs[:1]:
@@ -241,6 +245,15 @@ class Procedure(ABC):
     @abstractmethod
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Do what was checked: ``control`` has the bench, and is asked between steps whether to go on."""
+
+
+def _note_kept(interruption: BaseException, run: Path | None) -> None:
+    """Say how the result of a run is made whose frames are there; nothing where that is said already."""
+    notes = getattr(interruption, "__notes__", ())
+    if run is None or any("diffuserbench resume" in note for note in notes):
+        return
+    if any(one.purpose is not None and one.purpose.lacks_result(run) for one in routines.values()):
+        interruption.add_note(f"Its frames are kept. For its result: diffuserbench resume {run}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,13 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from calibration_routines import CalibrationError, times
+from calibration_routines.optics import photograph
 from calibration_routines.optics.angular import AngularProcedure, AngularSweep
 from calibration_routines.optics.photograph import PhotographProcedure
 from calibration_routines.plan_procedures import PlanProcedure, ResumeProcedure, left_unfinished
@@ -239,6 +241,19 @@ def test_a_photograph_that_was_left_becomes_a_picture_when_it_goes_on(bench: Ben
     assert [file.name for file in done.files] == ["photograph.tif"]
     assert read_image(done.files[0]).pixels.shape == (120, 160)
     assert left_unfinished(tmp_path, ["photograph"]) is None
+
+
+def test_who_interrupts_the_analysis_is_told_how_the_result_is_made(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All frames are there then, of which a run says nothing any more."""
+    with monkeypatch.context() as patched:
+        patched.setattr(photograph, "write_image", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt) as caught:
+            PhotographProcedure(exposure_ms=2.0, binning=2).carry_out(bench, tmp_path)
+    (note,) = caught.value.__notes__
+    run = Path(note.removeprefix("Its frames are kept. For its result: diffuserbench resume "))
+    assert [file.name for file in ResumeProcedure(run).carry_out(bench).files] == ["photograph.tif"]
 
 
 def _aborted(bench: Bench, folder: Path) -> Run:
