@@ -12,7 +12,10 @@ import numpy as np
 import pytest
 
 import diffuserbench as db
+from instrument.files.errors import BenchError
+from instrument.files.images import write_image
 from recon.base.declare import options_of
+from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.options import ReconstructionOptions
 from tests.test_tutorials import code_of
@@ -124,6 +127,26 @@ def test_what_a_notebook_shows_is_short() -> None:
     ):
         assert repr(shown).startswith(said)
         assert len(repr(shown)) < 200
+
+
+def test_what_a_mask_of_numpys_hides_is_not_used(scene: tuple[np.ndarray, np.ndarray]) -> None:
+    photo, psf = plain(scene)
+    hidden = np.zeros(photo.shape, bool)
+    hidden[3:6, 4] = True
+    wrong = np.where(hidden, 10 * photo.max(), photo)
+    given = {"iterations": 5, "judged": False}
+    found = db.reconstruct(np.ma.masked_array(wrong, hidden), psf, **given)
+    assert "3 pixels of the measurement are NaN or masked: they are erased." in found.warnings
+    np.testing.assert_array_equal(found.image, db.reconstruct(photo, psf, erasures=hidden, **given).image)
+    with pytest.raises(InputError, match="PSF holds 1 values that are not finite"):
+        db.reconstruct(photo, np.ma.masked_greater_equal(psf, psf.max()), **given)
+
+
+def test_refusals_name_options_as_python_does(scene: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    write_image(tmp_path / "photo.tif", np.uint16(scene[0]))
+    photo = db.read(tmp_path / "photo.tif")
+    with pytest.raises(BenchError, match=r"\(diffuserbench snap --dark\), or leave `dark` out"):
+        db.reconstruct(photo, scene[1], dark=photo)
 
 
 def test_nan_pixels_are_erased_and_said(scene: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:

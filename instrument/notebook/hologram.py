@@ -26,7 +26,7 @@ from instrument.display.hologram_files import HologramFiles, hologram_figure
 from instrument.files.images import ImageFile, read_image
 from instrument.files.sample_images import SAMPLES
 from instrument.notebook.reconstruct import bench_config
-from instrument.notebook.result import figure_png, show_figure
+from instrument.notebook.result import figure_png, in_python, show_figure
 from recon.base.declare import with_overrides
 from recon.holography import HologramOptions, HologramRecord
 
@@ -129,7 +129,7 @@ def hologram(
     depths = [float(z) for z in np.broadcast_to(np.asarray(z_mm, float), (len(pictures),))]
     pixels = [_pixels(one) for one in pictures]
     if said := next(filter(None, (crop_words(p, options.fit) for p in pixels)), ""):
-        warnings.warn(said, stacklevel=2)
+        warnings.warn(in_python(said, HologramOptions), stacklevel=2)
     targets = [prepare_target(p, display, options, z_mm=z) for p, z in zip(pixels, depths, strict=True)]
     found = compute_and_judge(display, targets, options, callback=on_progress, cancel=cancel)
     files = HologramFiles(Path("slm.png"), config.display.slm_binning, options, [display])

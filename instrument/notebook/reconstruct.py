@@ -21,14 +21,15 @@ from instrument.bench.source_and_scene import Ask
 from instrument.files.calibration_file import is_calibration, load_calibration
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, read
-from instrument.notebook.result import Result
+from instrument.notebook.result import Result, in_python
 from instrument.reconstruction.job import Job, find_calibration, job_from_files, job_with
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import refocused, volume_job
 from instrument.runs.run import Run
 from instrument.runs.run_files import is_run
-from recon.base.checks import as_channels
+from recon.base.checks import as_channels, plain_array
 from recon.base.declare import options_of, require, require_known, with_overrides
+from recon.errors import InputError
 from recon.reconstruction import reconstruct as one_door
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
@@ -139,6 +140,9 @@ def reconstruct(
             )
         found = one_door.reconstruct(image, psf, options, **further, **overrides)  # type: ignore[arg-type]
         return Result.of(found, _job_of_arrays(image, psf))
+    except (BenchError, InputError) as error:
+        error.args = tuple(in_python(said) if isinstance(said, str) else said for said in error.args)
+        raise
     finally:
         if isinstance(told, _Told):
             told.end()
@@ -158,7 +162,7 @@ def _opened(given: Any, name: str) -> ImageFile:
         raise BenchError(
             "A Measurement goes with a Calibration or an array, not with a file: db.read(...).pixels is one."
         )
-    pixels = np.asarray(given)
+    pixels = plain_array(given)
     if pixels.dtype.kind not in "uifb" or pixels.ndim < 2:
         raise BenchError(
             f"The {name} is a file, an image of db.read, or an array (height, width) of real numbers, "
@@ -196,7 +200,7 @@ def _job(image: ImageFile, psf: Any, inputs: InputOptions, options: Reconstructi
 
 def _job_of_arrays(image: Any, psf: Any) -> Job:
     """Return what arrays were reconstructed from."""
-    pixels = np.asarray(image.image if isinstance(image, Measurement) else image, np.float32)
+    pixels = plain_array(image.image if isinstance(image, Measurement) else image).astype(np.float32)
     if not isinstance(psf, Calibration):
         psf = Calibration(as_channels(psf, "PSF")[None], np.full((1, 3), np.nan))
     simulated = bool(psf.provenance.get("simulated"))

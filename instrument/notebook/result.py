@@ -58,15 +58,13 @@ class Result(Reconstruction):
 
     def facts(self) -> Mapping[str, str]:
         """Return what is known of it, in words: what was read, chosen, and how far it can be trusted."""
-        from instrument.reconstruction.options import InputOptions
         from instrument.reconstruction.stored_result import StoredResult
 
         record = reconstruction_record(self, self.job, volume=not self.is_picture)
         pixels = self.image if self.is_picture else self.volume
         said = StoredResult(Path(), pixels, None, record).facts()
         notes = {**dict(self.job.notes), **{name: text for name, text in said if name != "Made"}}
-        options = (*options_of(ReconstructionOptions), *options_of(InputOptions))
-        return {name: in_other_words(text, options, lambda o: f"`{o.name}`") for name, text in notes.items()}
+        return {name: in_python(text) for name, text in notes.items()}
 
     def seen(self, *, rotate_deg: int = 0) -> Shown:
         """Return the picture for a screen, 8 bit; of a volume the brightest over depth, coloured by depth."""
@@ -168,6 +166,14 @@ class Result(Reconstruction):
             f"<img style='max-width:100%;min-width:256px' src='data:image/png;base64,{picture}'/>"
             f"<details><summary>How it was made</summary><table>{rows}</table></details>{doubts}"
         )
+
+
+def in_python(text: str, *classes: type) -> str:
+    """Return a message with options named as Python names them; those of reconstructions without a class."""
+    from instrument.reconstruction.options import InputOptions
+
+    options = [o for cls in classes or (ReconstructionOptions, InputOptions) for o in options_of(cls)]
+    return in_other_words(text, options, lambda o: f"`{o.name}`")
 
 
 def _turns(rotate_deg: int) -> int:

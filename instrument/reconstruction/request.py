@@ -244,7 +244,7 @@ def refocused(job: Job, z_um: float, *, beside: bool = False) -> Job:
     require_distance(z_um)
     calibration, asked = job.calibration, depth_in_words(z_um)
     z = calibration.source_positions_um[:, 2]
-    as_it_is = "Leave the distance (--z-mm, z_um) out to take the PSF as it is, or give a calibration"
+    as_it_is = "Leave the distance (--z-mm) out to take the PSF as it is, or give a calibration"
     if not bool((z > 0).all()):
         raise BenchError(
             f"The PSF is not known to be of any depth, so it cannot be brought to {asked}. {as_it_is} with "

@@ -36,13 +36,22 @@ DETAILS = ((0.1, 0.25), (0.02, 0.06))
 """Spatial frequencies of details and of coarser structure, cycles a pixel."""
 
 
+def plain_array(given: npt.ArrayLike) -> npt.NDArray[Any]:
+    """Return an array of anything; NaN where NumPy's masks hide a value: they are not seen elsewhere."""
+    if isinstance(given, np.ma.MaskedArray) and np.ma.is_masked(given):
+        plain = np.array(given.data, np.result_type(given.dtype, np.float32))
+        plain[np.ma.getmaskarray(given)] = np.nan
+        return plain
+    return np.asarray(given)
+
+
 def as_channels(image: npt.ArrayLike, name: str) -> npt.NDArray[np.float32]:
     """Return an image (height, width[, n_channels]) of any numeric dtype as float32, channels first.
 
     Raises InputError when it has another number of axes, is empty, is no array of real numbers, or is not
     finite.
     """
-    array = np.asarray(image)
+    array = plain_array(image)
     if array.dtype.kind not in "uifb":
         raise InputError(f"The {name} must hold real numbers, not {array.dtype}.")
     if array.ndim not in (2, 3):

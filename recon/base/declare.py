@@ -280,11 +280,14 @@ def option(default: Any = dataclasses.MISSING, **declaration: Any) -> Any:
     return dataclasses.field(default=default, metadata={_KEY: Declaration(**declaration)})
 
 
-_FLAG = re.compile(r"--[a-z][\w-]*")
+_FLAG = re.compile(r"diffuserbench [^.,;:()]*|--[a-z][\w-]*")
 
 
 def in_other_words(text: str, options: Iterable[Option], named: Callable[[Option], str]) -> str:
-    """Return a message with what the options are ``named`` elsewhere in place of the terminal's flags."""
+    """Return a message with what the options are ``named`` elsewhere in place of the terminal's flags.
+
+    A whole command ("diffuserbench snap --dark") stays as it is typed.
+    """
     names = {option.flag: named(option) for option in options}
     return _FLAG.sub(lambda flag: names.get(flag[0], flag[0]), text)
 

@@ -9,7 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.brief import brief
-from recon.base.checks import as_channels, require_finite, require_noise, saturated_share, select_psf
+from recon.base.checks import (
+    as_channels,
+    plain_array,
+    require_finite,
+    require_noise,
+    saturated_share,
+    select_psf,
+)
 from recon.base.noise import NoiseModel, estimate_deviation
 from recon.camera.camera_model import Depths, members_of_depths, one_depth, sort_by_depth
 from recon.camera.field_registration import one_psf
@@ -63,8 +70,8 @@ class Measurement:
         return 1 if self.patterns is None else len(np.asarray(self.patterns))
 
     def with_holes_erased(self) -> tuple[Measurement, str]:
-        """Return it with its NaN pixels erased, and that in words; itself and no words without any."""
-        image = np.asarray(self.image)
+        """Return it with NaN and masked pixels erased, and that in words; itself and no words without any."""
+        image = plain_array(self.image)
         if self.patterns is not None or image.dtype.kind != "f" or not (holes := np.isnan(image)).any():
             return self, ""
         erased = np.asarray(self.erasures if self.erasures is not None else False)
@@ -73,7 +80,8 @@ class Measurement:
         if holes.all() or erased.ndim not in (0, image.ndim):
             return self, ""  # which is refused in words of its own
         filled = np.where(holes, np.median(image[~holes]), image)
-        said = f"{np.count_nonzero(holes)} pixels of the measurement are NaN: they are erased."
+        masked = " or masked" if np.ma.is_masked(self.image) else ""
+        said = f"{np.count_nonzero(holes)} pixels of the measurement are NaN{masked}: they are erased."
         return replace(self, image=filled, erasures=np.maximum(erased, holes)), said
 
     def channels(self) -> Floats:

@@ -440,7 +440,7 @@ def test_a_psf_image_has_no_distance(capsys: pytest.CaptureFixture[str]) -> None
         assert "--z-mm must be a number, above 0 (mm), or inf, not" in capsys.readouterr().err
     for z_mm in ("40", "inf"):
         assert main([*words, "--z-mm", z_mm]) == 2
-        assert "Leave the distance (--z-mm, z_um) out" in capsys.readouterr().err
+        assert "Leave the distance (--z-mm) out" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("here")
