@@ -54,6 +54,7 @@ ON_GRID = np.array([(y, x) for y in (-6.0, 0.5, 6.0) for x in (-5.0, 5.0)])
 SCATTERED = ON_GRID + 3 * RNG.random(ON_GRID.shape)
 PSFS = RNG.random((2, len(ON_GRID), 1, 9, 8)) ** 4 * np.linspace(1, 2, len(ON_GRID))[:, None, None, None]
 START = RNG.random((1, N_Z, 40, 40))
+PICTURE_START = START[:, 0, : PICTURE.grid_shape[0], : PICTURE.grid_shape[1]]
 
 TV = TotalVariation(0.02, tolerance=1e-6) + NonNegativity()
 SPARSE = L1(0.05) + NonNegativity()
@@ -135,6 +136,12 @@ def of_sensor(
     return way(solver, iterations, then)
 
 
+def anew(prior: Prior) -> Result:
+    """Follow the exact-data ADMM of a prior known by its prox from a picture on, and anew from zero."""
+    solver = SensorAdmm(PICTURE, lit(PICTURE), prior, initial=PICTURE_START, data_steps=2)
+    return way(solver, 7, lambda s: s.restart(lit(PICTURE, 1)))  # type: ignore[attr-defined]
+
+
 def of_volume(
     kind: Any, prior: Prior, *, restraint: float | None = None, iterations: int = 14, **options: Any
 ):
@@ -169,9 +176,10 @@ def of_any(model: Any, prior: Prior, **options: Any) -> Result:
 
 def in_one_step(enough: int = 60) -> Result:
     """Deconvolve by Wiener's filter, its regularisation given and not."""
-    camera = masked()
-    data = lit(camera)
-    found = wiener(camera, data)
+    valid = VALID.copy()
+    valid[:, 3:15, 5:16] = False  # no valid pixel is near
+    camera = masked(valid)
+    found = wiener(camera, lit(camera))
     return {
         "image": found.solution,
         "tau": float(found.tau or 0),
@@ -187,7 +195,7 @@ STEPS: dict[str, Callable[[], Result]] = {
             PICTURE,
             lit(PICTURE),
             TotalVariation(0.02, isotropic=True) + L1(0.01) + NonNegativity(),
-            initial=START[:, 0, : PICTURE.domain_shape[1], : PICTURE.domain_shape[2]],
+            initial=PICTURE_START,
             penalties=Penalties(0.2, 0.7, 0.4),
         )
     ),
@@ -197,6 +205,7 @@ STEPS: dict[str, Callable[[], Result]] = {
     "sensor-background": lambda: of_sensor(0.3),
     "sensor-sparse": lambda: of_sensor(None, SPARSE, data_steps=2),
     "sensor-other": lambda: of_sensor(None, OTHER + L1(0.01) + Box(0, 2), iterations=26, data_steps=3),
+    "sensor-anew": lambda: anew(OTHER + TV),
     "fista": lambda: way(Fista(masked(), lit(masked()), TV), 30),
     "fista-isotropic": lambda: way(
         Fista(PICTURE, lit(PICTURE), TotalVariation(0.2, isotropic=True) + Box(0, 2), restart="function"), 30
@@ -226,6 +235,7 @@ STEPS: dict[str, Callable[[], Result]] = {
         VolumeAdmm,
         TotalVariation.of_volume(0.02, isotropic=True) + OTHER + Box(0, 2),
         tuning=Tuning(first=2.0),
+        iterations=70,
     ),
     "volume-sparse": lambda: of_volume(volume_solver, SPARSE, restraint=0.2),
     "volume-signed": lambda: of_volume(
@@ -263,6 +273,18 @@ def supported(model: Any, points: Any = ON_GRID, **options: Any) -> Result:
     return applied(varying(model, points, support=support, grid_shape=(36, 36), **options))
 
 
+def beside() -> Result:
+    """Apply varying cameras whose PSFs are dark at their edges: part of the field casts nothing."""
+    dark = np.zeros((1, len(ON_GRID), 1, 19, 18))
+    dark[..., 8:11, 7:12] = PSFS[:1, ..., 2:5, 1:6]
+    points = 2 * ON_GRID
+    result: Result = {}
+    for name, psfs in (("dark edges", dark), ("nothing", np.zeros_like(dark))):
+        camera = local_convolution([FieldOfPsfs(psfs[0], points)], SENSOR, dtype=np.float64)
+        result |= {f"{name}: {what}": value for what, value in applied(camera).items()}
+    return result
+
+
 def backgrounds() -> Result:
     """Take smooth backgrounds out, and fit them."""
     rng = np.random.default_rng(2)
@@ -291,7 +313,7 @@ def beads() -> Result:
     camera = PointImages(psfs, functions, (40, 37))
     points = Points(places, np.array([3.0, 5.0, 4.0, 2.0, 6.0, 0.4, 3.5]))
     image = camera.image(points) + rng.normal(0, 0.02, (40, 37)).astype(np.float32)
-    first = Points(places[:5] + rng.uniform(-0.4, 0.4, (5, 2)), points.light[:5] * 1.2)
+    first = Points(places[:5] + rng.uniform(-1.2, 1.2, (5, 2)), points.light[:5] * 1.2)
     fitted, left = refine(camera, image, first)
     found = overlooked(camera, left, fitted, 0.02)
     twice = Points(np.concatenate([places, places[:2] + 0.3]), np.append(points.light, [1.0, 2.0]))
@@ -353,6 +375,7 @@ OPERATORS: dict[str, Callable[[], Result]] = {
     "local-scattered": lambda: supported(local_convolution, SCATTERED),
     "lowrank": lambda: applied(varying(low_rank)),
     "lowrank-part": lambda: supported(low_rank, SCATTERED, rank=3),
+    "beside": beside,
     "backgrounds": backgrounds,
     "beads": beads,
     "in-space": in_space,
