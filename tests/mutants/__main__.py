@@ -1,6 +1,6 @@
 """Change the program a little, again and again, and see whether a test notices: ``make mutants``.
 
-    python -m tests.mutants                       a sample of every area, 30 minutes at most
+    python -m tests.mutants                       a sample of every area, within 30 minutes
     python -m tests.mutants solvers --sample 50   so many of each area that is named
     python -m tests.mutants --list                what can be changed, and do nothing
     python -m tests.mutants safety --sample 999 --only checked.py --tests tests/drivers/test_checked.py
@@ -81,10 +81,10 @@ def main() -> int:
     """Try mutants as the command line says; 1 when too few were noticed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("area", nargs="*", choices=[*AREAS, []], help="what is changed [default: all]")
-    parser.add_argument("--sample", type=int, default=60, help="mutants of each area")
+    parser.add_argument("--sample", type=int, default=40, help="mutants of each area")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--minutes", type=float, default=30.0, help="no mutant is begun after so long")
-    parser.add_argument("--most", type=float, default=60.0, help="seconds of tests of a mutant, as watched")
+    parser.add_argument("--minutes", type=float, default=25.0, help="no mutant is begun after so long")
+    parser.add_argument("--most", type=float, default=30.0, help="seconds of tests of a mutant, as watched")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     parser.add_argument("--only", default="", help="only mutants in whose name this stands")
     parser.add_argument("--tests", nargs="+", default=[], help="only these [default: those of the areas]")

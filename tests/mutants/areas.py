@@ -110,6 +110,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/recon/live",
             "tests/instrument/live",
             "tests/instrument/video/test_video.py",
+            "tests/golden/test_golden.py",
         ),
     ),
     "units": (
@@ -175,6 +176,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "recon/camera/varying_psfs.py",
         ),
         (
+            "tests/recon/auto/test_auto_rules.py",
             "tests/recon/camera",
             "tests/recon/blind/test_points.py",
             "tests/recon/test_bayer_and_noise.py",
