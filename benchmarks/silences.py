@@ -31,7 +31,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 TIME = re.compile(
-    r"left (about )?\d|about [\d.]+ ?\w+ (left|in all)|in all|longer than last time|\d+ of \d+|at most"
+    r"left (about )?\d|about [\d.]+ ?\w+ (left|in all)|in all|"
+    r"longer than (last time|on another machine)|\d+ of \d+|at most"
 )
 """Words that tell a time, or how much of how much is done."""
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
