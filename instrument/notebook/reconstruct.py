@@ -200,7 +200,9 @@ def _job(image: ImageFile, psf: Any, inputs: InputOptions, options: Reconstructi
 
 def _job_of_arrays(image: Any, psf: Any) -> Job:
     """Return what arrays were reconstructed from."""
-    pixels = plain_array(image.image if isinstance(image, Measurement) else image).astype(np.float32)
+    pixels = plain_array(image.image if isinstance(image, Measurement) else image).astype(
+        np.float32, copy=False
+    )
     if not isinstance(psf, Calibration):
         psf = Calibration(as_channels(psf, "PSF")[None], np.full((1, 3), np.nan))
     simulated = bool(psf.provenance.get("simulated"))
