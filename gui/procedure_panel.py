@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtWidgets import QScrollArea, QStackedWidget, QWidget
 
-from calibration_routines.plan_procedures import ResumeProcedure, left_unfinished
+from calibration_routines.plan_procedures import ResumeProcedure, left_unfinished, routine_of
 from calibration_routines.procedure import Outcome, Outlook, Procedure, Routine
 from gui.background import NewestOnly
 from gui.forms.options_form import OptionsForm
@@ -32,6 +32,7 @@ _CHECK_MS = 250
 _SLOW_MS = 700
 """A check that takes longer than this is shown to go on: what was said of other values must not stay."""
 _FORM_WIDTH_PX = 400
+_MOST_RUNS = 3
 
 
 class _Forms(QStackedWidget):
@@ -136,6 +137,8 @@ class ProcedurePanel(Panel):
         self.way_on = WayOn(self.session, self)
         self.way_on.go_on.connect(self.resume)
         self._left = NewestOnly(self.jobs, "Looking for runs that did not end")
+        self._offered: tuple[Path | None, str] = (None, "")
+        """A run of an earlier day that did not end, and its routine's name."""
         self._result: Path | None = None
         yield
         left, self.right = QWidget(), QWidget()
@@ -405,20 +408,34 @@ class ProcedurePanel(Panel):
 
     def resume(self, run: Path) -> None:
         """Go on with a run that did not end, here."""
-        if not self.run.is_running:
-            self.carry_out(f"Resuming {run.name}", ResumeProcedure(run))
+        if self.run.is_running:
+            return
+        if run == self._offered[0]:  # of an earlier day: its routine's form may not be in front
+            self.take(self._offered[1])
+        self.carry_out(f"Resuming {run.name}", ResumeProcedure(run))
 
     def _look_for_unfinished(self) -> None:
         """Offer the newest run of these routines where it did not end, of an earlier day as well."""
         folder, names = self.session.runs_folder, [routine.name for routine in self.routines]
-        self._left.ask(lambda: left_unfinished(folder, names), self._offer_unfinished)
 
-    def _offer_unfinished(self, run: Path | None) -> None:
-        if run is not None and not self.run.is_running:
-            self.way_on.offer(run, f"Go on with {run.name}, which did not end")
+        def read() -> tuple[Path, str] | None:
+            if (run := left_unfinished(folder, names)) is None:
+                return None
+            routine = routine_of(run)
+            return run, "plan" if routine is None else routine.name
+
+        self._left.ask(read, self._offer_unfinished)
+
+    def _offer_unfinished(self, found: tuple[Path, str] | None) -> None:
+        if found is not None and not self.run.is_running:
+            self._offered = found
+            self.way_on.offer(found[0], f"Go on with {found[0].name}, which did not end")
 
     def _succeeded(self, outcome: Outcome) -> None:
-        where = [str(path) for path in (*outcome.runs, outcome.calibration, *outcome.files) if path]
+        runs = [str(run) for run in outcome.runs]
+        if len(runs) > _MOST_RUNS:  # one beside the other in Runs
+            runs = [runs[0], f"and {count(len(runs) - 1, 'run')} after it"]
+        where = [*runs, *(str(path) for path in (outcome.calibration, *outcome.files) if path)]
         self._end_with("\n".join((*outcome.verdict, *where)), wrong=not outcome.good)
         pictures = [file for file in outcome.files if file.suffix == ".tif"]
         self._result = outcome.calibration or next(iter(pictures), None)
