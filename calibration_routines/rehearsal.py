@@ -67,8 +67,9 @@ class _Watch(Listener):
     ) -> None:
         self._control, self._waiting_s, self._on_progress = control, waiting_s, on_progress
         self._began_s = time.perf_counter()
-        self._step, self._step_began_s = "", 0.0
+        self._step = ""
         self._done, self._total, self._at_most, self._several = 0.0, 0.0, False, False
+        self._first, self._first_s, self._seen_s = 0.0, 0.0, 0.0
 
     def _now_s(self) -> float:
         return time.perf_counter() - self._began_s + self._waiting_s()
@@ -78,8 +79,8 @@ class _Watch(Listener):
         several = _OF_SEVERAL.search(words)
         name = words[: several.start()] if several else words
         if name != self._step:
-            self._step, self._step_began_s = name, self._now_s()
-            self._done = self._total = 0.0
+            self._step = name
+            self._done = self._total = self._first = 0.0
         self._several = several is not None
         if several is not None:
             self._see(int(several[1]) - 1, int(several[2]), at_most=False)
@@ -99,16 +100,19 @@ class _Watch(Listener):
         if self._control.ending is None:
             self._done, self._total, self._at_most = done, total, at_most
             self._seen_s = self._now_s()
-            if seconds > ENOUGH_S and _ENOUGH_OF_IT * total <= done < total:
+            if self._first == 0.0:
+                self._first, self._first_s = done, self._seen_s
+            if seconds > ENOUGH_S and max(_ENOUGH_OF_IT * total, self._first) < done < total:
                 self._control.abort()
 
     def words(self) -> str:
         """Say how long all of it takes, or what it was told by."""
         if self._control.ending is None:
             return f"{IN_ALL}by a rehearsal on a simulated bench of its own: about {duration(self._now_s())}."
-        step_s = (self._seen_s - self._step_began_s) * self._total / self._done
+        each_s = (self._seen_s - self._first_s) / (self._done - self._first)  # the first may load and compile
+        whole_s = self._first_s + each_s * (self._total - self._first)
         most = "at most " if self._at_most else "about "
         return (
             f'Up to the end of "{self._step}", by a rehearsal up to {self._done / self._total:.0%} of it: '
-            f"{most}{duration(self._step_began_s + step_s)}. What follows it comes on top."
+            f"{most}{duration(whole_s)}. What follows it comes on top."
         )
