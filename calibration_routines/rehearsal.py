@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from calibration_routines.procedure import Listener, Routine
@@ -21,8 +22,9 @@ if TYPE_CHECKING:
     from instrument.runs.runner import RunStatus
 
 ENOUGH_S = 20.0
-_ENOUGH_OF_IT = 0.1
-"""After so many seconds a rehearsal ends in the next step of which so much is done."""
+"""After so many seconds a rehearsal ends in the next step of which as much is left, by its share."""
+_PARTS = 5
+"""Of a step, before that is judged: one of two or three that is slow would stand for all."""
 _OF_SEVERAL = re.compile(r"\s*(\d+) of (\d+)$")
 
 
@@ -69,7 +71,8 @@ class _Watch(Listener):
         self._began_s = time.perf_counter()
         self._step = ""
         self._done, self._total, self._at_most, self._several = 0.0, 0.0, False, False
-        self._first, self._first_s, self._seen_s = 0.0, 0.0, 0.0
+        self._paces_s: list[float] = []
+        self._seen_s = 0.0
 
     def _now_s(self) -> float:
         return time.perf_counter() - self._began_s + self._waiting_s()
@@ -80,7 +83,8 @@ class _Watch(Listener):
         name = words[: several.start()] if several else words
         if name != self._step:
             self._step = name
-            self._done = self._total = self._first = 0.0
+            self._done = self._total = 0.0
+            self._paces_s = []
         self._several = several is not None
         if several is not None:
             self._see(int(several[1]) - 1, int(several[2]), at_most=False)
@@ -98,21 +102,23 @@ class _Watch(Listener):
         seconds = time.perf_counter() - self._began_s
         self._on_progress(min(seconds, ENOUGH_S), ENOUGH_S)
         if self._control.ending is None:
-            self._done, self._total, self._at_most = done, total, at_most
-            self._seen_s = self._now_s()
-            if self._first == 0.0:
-                self._first, self._first_s = done, self._seen_s
-            if seconds > ENOUGH_S and max(_ENOUGH_OF_IT * total, self._first) < done < total:
+            now_s = self._now_s()
+            if 0 < self._done < done:
+                self._paces_s.append((now_s - self._seen_s) / (done - self._done))
+            self._done, self._total, self._at_most, self._seen_s = done, total, at_most, now_s
+            if seconds > ENOUGH_S and len(self._paces_s) >= _PARTS and self._left_s() > ENOUGH_S:
                 self._control.abort()
+
+    def _left_s(self) -> float:
+        """Return what is left of the step: as most of its parts were, of which one may load and compile."""
+        return median(self._paces_s) * (self._total - self._done)
 
     def words(self) -> str:
         """Say how long all of it takes, or what it was told by."""
         if self._control.ending is None:
             return f"{IN_ALL}by a rehearsal on a simulated bench of its own: about {duration(self._now_s())}."
-        each_s = (self._seen_s - self._first_s) / (self._done - self._first)  # the first may load and compile
-        whole_s = self._first_s + each_s * (self._total - self._first)
         most = "at most " if self._at_most else "about "
         return (
             f'Up to the end of "{self._step}", by a rehearsal up to {self._done / self._total:.0%} of it: '
-            f"{most}{duration(whole_s)}. What follows it comes on top."
+            f"{most}{duration(self._seen_s + self._left_s())}. What follows it comes on top."
         )

@@ -125,6 +125,21 @@ def test_a_long_one_is_ended_and_told_by_how_far_it_came(bench: Bench, hands: Ha
     assert hands.now_s < 13 * ENOUGH_S
 
 
+def test_one_slow_part_is_not_taken_for_all(bench: Bench, hands: Hands) -> None:
+    """As of an SLM's table, whose third picture computes what all others find."""
+
+    def deed(_twin: Bench, control: RunControl, listener: Listener, _asked: Asked) -> None:
+        listener.step("measuring")
+        for done in range(1, 42):
+            hands.now_s += 2 * ENOUGH_S if done == 3 else 0.1
+            listener.share(done, 41)
+            control.check()
+
+    (words,) = told(deed, bench)
+    assert words.startswith("In all")
+    assert f"about {2 * ENOUGH_S + 4:.1f} s" in words
+
+
 def test_slides_are_counted_and_not_their_frames(bench: Bench, hands: Hands) -> None:
     def deed(_twin: Bench, control: RunControl, listener: Listener, _asked: Asked) -> None:
         for number in range(9):
