@@ -338,9 +338,8 @@ def _window(crop: Crop | None, image: ImageFile) -> tuple[int, int]:
 def _refuse_constant(image: ImageFile) -> None:
     lowest, highest = float(np.nanmin(image.pixels)), float(np.nanmax(image.pixels))
     if lowest == highest:
-        raise FileError(
-            image.path, f"the image is constant (every pixel is {highest:g}).", "Was the scene lit?"
-        )
+        hint = "Was the scene lit?" if highest <= 0 else "Was the scene lit? At full scale, expose shorter."
+        raise FileError(image.path, f"the image is constant (every pixel is {highest:g}).", hint)
 
 
 def _converted(psf: ImageFile, image: ImageFile) -> tuple[str, ...]:

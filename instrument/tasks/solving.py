@@ -133,7 +133,7 @@ def reconstruct_patterns(
                 advance(record.iteration, note=f"change {record.change:.1e}")
 
             result = solve_patterned(prepared, watch=show, cancel=cancel)
-        _tell_end(desk, result)
+        _tell(desk, result)
         write_reconstruction(outputs, result, job, rotate_deg=int(output.rotate_deg))
     return _ended(outputs, result, "picture")
 

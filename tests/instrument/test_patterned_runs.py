@@ -86,7 +86,9 @@ def files(tmp_path: Path) -> tuple[Path, Path, Path]:
     )
 
 
-def test_one_picture_of_all_patterns(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
+def test_one_picture_of_all_patterns(
+    files: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run, sheet, calibration = files
     out = tmp_path / "picture.tif"
     status = main(
@@ -101,6 +103,9 @@ def test_one_picture_of_all_patterns(files: tuple[Path, Path, Path], tmp_path: P
     gain = float(np.vdot(image, truth) / np.vdot(image, image))
     assert psnr(gain * image, truth) > 22
     record = json.loads(out.with_suffix(".json").read_text())
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert record["warnings"]
+    assert all(" ".join(warning.split()) in said for warning in record["warnings"])
     assert record["simulated"]
     assert record["inputs"]["sheet"] == str(sheet)
     assert record["provenance"]["patterns"] == 3
