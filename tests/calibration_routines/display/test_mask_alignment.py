@@ -181,7 +181,7 @@ def test_from_the_command_line_to_a_photographed_hologram(
     assert all(error > 0 for name, error in found.error.items() if name != "cubic")
     facts = json.loads(Path("alignment.json").read_text())
     assert facts["axis_directions"] == {"x_um": 1, "y_um": 1, "z_um": 1, "roll_mrad": 1}
-    assert 0 < facts["psnr_lost_db"] < 3
+    assert -1e-3 < facts["psnr_lost_db"] < 3  # next to nothing is left, of either sign
     assert 0 <= facts["repeatability_db"] < 3
     assert found.pose.cubic == 0
     assert np.abs(found.rest).max() < 1.5
