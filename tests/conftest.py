@@ -10,7 +10,9 @@ import os
 import signal
 import threading
 import time
+import zlib
 from collections.abc import Iterator
+from typing import Any
 
 # A window that matplotlib opens beside the program's own would wait for somebody to close it.
 os.environ["MPLBACKEND"] = "agg"
@@ -22,6 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -46,6 +49,28 @@ except ImportError:
     pass  # tests/gui says so, test by test
 else:
     pytest_plugins = ["pytestqt.plugin"]
+
+
+def _begin_random_numbers(module: object, name: str) -> None:
+    """Start every generator that a module of tests shares anew, for ``name``."""
+    for number, shared in enumerate(vars(module).values()):
+        if isinstance(shared, np.random.Generator):
+            seed = zlib.crc32(f"{name} {number}".encode())
+            shared.bit_generator.state = type(shared.bit_generator)(seed).state
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any], request: pytest.FixtureRequest) -> None:
+    """Random numbers of a fixture are its own, whichever tests ran before in this process."""
+    if (module := getattr(request, "module", None)) is not None:
+        _begin_random_numbers(module, f"{fixturedef.argname} {getattr(request, 'param', '')}")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_call(item: pytest.Item) -> None:
+    """Random numbers of a test are its own, whichever tests ran before in this process."""
+    if (module := getattr(item, "module", None)) is not None:
+        _begin_random_numbers(module, item.nodeid)
 
 
 @pytest.fixture(autouse=True)

@@ -78,6 +78,7 @@ def test_axes_of_imagej_and_ome(tmp_path: Path) -> None:
 
 def test_colour_of_floats_is_imagejs_and_comes_back(tmp_path: Path) -> None:
     picture = RNG.random((8, 6, 3), np.float32)
+    picture[0, 0] = 0.97, 0.98, 0.99
     said = {"simulated": True, "pitch": "5 µm"}
     write_image(tmp_path / "p.tif", np.rot90(picture), said)
     with tifffile.TiffFile(tmp_path / "p.tif") as tiff:

@@ -89,18 +89,19 @@ def test_who_overexposed_is_not_told_to_give_more_light() -> None:
     assert "More light" in " ".join(judge.verdict_on(evidence(1, 0.03, saturated=1e-3), "admm tv").sentences)
 
 
-def of_volumes(*, bad: bool) -> Evidence:
-    """Grainy and hazy where bad, and alike in all else."""
-    grain = RNG.uniform(0.9, 1.1, 3)
+def of_volumes(*, bad: bool, spread: float = 0) -> Evidence:
+    """Grainy and hazy where bad, and alike in all else; with no spread, the typical one of its kind."""
+    grain = 1 + spread * RNG.uniform(-0.1, 0.1, 3)
     points = (2.0, 40.0, 1.6) if bad else (20.0, 3.0, 0.4)
     height, peaks, ends = (float(g * p) for g, p in zip(grain, points, strict=True))
     numbers = {"height": height, "peaks": peaks, "ends": ends, "planes": 4, "similarity": 0.7}
-    return evidence(float(RNG.uniform(18, 26)), 0.03, saturated=float(RNG.choice([0, 0.1])), **numbers)
+    detail, saturated = 22 + spread * RNG.uniform(-4, 4), spread * float(RNG.choice([0, 0.1]))
+    return evidence(float(detail), 0.03, saturated=saturated, **numbers)
 
 
 def volumes() -> Chances:
     bad = [bool(k % 2) for k in range(60)]
-    return learned([of_volumes(bad=b) for b in bad], bad)
+    return learned([of_volumes(bad=b, spread=1) for b in bad], bad)
 
 
 def test_who_overexposed_a_volume_is_not_told_to_give_more_light() -> None:
