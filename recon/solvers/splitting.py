@@ -36,6 +36,7 @@ class SensorSystem:
     nothing.
 
     The preconditioner ``C F^-1 1 / (1 + q / 2) F C^T`` is the inverse for a sensor that covers half the grid.
+    Smooth light of which a restrained background leaves little hardly bends: it is its own.
 
     Parameters
     ----------
@@ -169,8 +170,10 @@ class SensorSystem:
         self.steps = 0
         while float(xp.linalg.norm(residual)) > target and self.steps < self.max_steps:
             z = self._filtered(residual, self._preconditioner)
-            if self._taken < 1:  # smooth light hardly bends: it is its own
-                z += self._smooth(residual)
+            if self._taken < 1:
+                smooth = self._smooth(residual)
+                # On valid pixels only, as all else: light that no pixel measures would have to be taken back.
+                z += smooth if self._mask is None else smooth * self._mask
             rho, rho_before = float(xp.vdot(residual, z)), rho
             if not rho > 0:  # what is left is less than the arithmetic can tell
                 break

@@ -362,12 +362,8 @@ _add(
 )
 
 # Solvers and operators by themselves, in float64 but for what is float32 by its nature ---------------------
-COMPILED = 5e-3
-"""Ways that part by up to 1.1e-3 of the object from one compilation of the same kernels to another (others by
-1e-11 at most): measured in three clones on one machine, 2026-11-25. Why is not known yet."""
-OF_COMPILATION = ("volume-any", "volume-sparse", "volume-tv-background")
 for name, way in steps.STEPS.items():
-    _add(f"steps-{name}", way, within=COMPILED if name in OF_COMPILATION else DOUBLE)
+    _add(f"steps-{name}", way, within=DOUBLE)
 for name, applied in steps.OPERATORS.items():
     within_float32 = name in ("beads", "in-space", "responding")
     _add(f"operator-{name}", applied, within=SINGLE if within_float32 else DOUBLE)

@@ -237,7 +237,7 @@ STEPS: dict[str, Callable[[], Result]] = {
         tuning=Tuning(first=2.0),
         iterations=70,
     ),
-    "volume-sparse": lambda: of_volume(volume_solver, SPARSE, restraint=0.2),
+    "volume-sparse": lambda: of_volume(volume_solver, SPARSE, restraint=0.05),
     "volume-signed": lambda: of_volume(
         volume_solver, L1(0.05), initial=START[..., : VOLUME.grid_shape[0], : VOLUME.grid_shape[1]]
     ),
