@@ -56,7 +56,7 @@ class AlignmentSettings(SeenAgain, Checked):
     depth_um: float = option(1000.0, unit="um", above=0, help="Largest distance to look for.")
     moves: int = option(4, least=0, label="Stage moves", help="Stage moves at most; 0: nothing moves.")
     max_frames: int = option(
-        100, least=1, label="Frames", help="Frames at most: gives up rather than take more."
+        80, least=1, label="Frames", help="Frames at most: gives up rather than take more."
     )
     division: Size = option(
         Size(3, 5),
