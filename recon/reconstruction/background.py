@@ -15,6 +15,7 @@ from recon.reconstruction.options import Overrides
 from recon.reconstruction.part import expects_background
 from recon.reconstruction.pilot import held_out, pilot
 from recon.reconstruction.problem import Problem
+from recon.reconstruction.weights import kind_of
 
 ITERATIONS, PLAIN_ITERATIONS = 20, 120
 """Of a trial's passes. The splitting of one convolution without a background begins far from the data, in a
@@ -28,10 +29,11 @@ MOST = 0.5
 """And by this share, where the background is no light: of a model that misses by far anything takes so many
 units. On the USAF target it fell by 96 %; on the film of an animal (5.5 without, 5.1 with) by 14 %, at -43 %
 of the light, which left every other cell's course lost in haze."""
-LIGHT = 0.11
+LIGHT = 0.08
 """Stray light is weak beside noise and hides in dark objects: a background that is light, this share of the
 data's or more, is taken where the mean square error falls by ``Taken.fall``. Beads under stray light: 0.26
-and 0.73, and 4.5 dB gained; of 24 scenes without any a background came to 0.07 at most, mostly below zero."""
+and 0.73, and 4.5 dB gained, under a fifth as much light as theirs 0.09 to 0.12, and up to 2.4 gained; of
+scenes without any a background came to 0.07 at most, mostly below zero, of many beads to 0.13."""
 SURE = 0.5
 """Share of ``GAIN`` that the pass without a background is brought down to, where it stops early: what is left
 of three channels is their mean."""
@@ -58,11 +60,13 @@ class Taken:
 
 
 VOLUME, LIT_PICTURE, POINTS = Taken(0.1), Taken(0.3, 0.68, 0.18), Taken(0.1, 0.93, 0.32)
-"""Volumes, pictures by priors that do not mind an even object, and pictures by l1. The second's background
-is light by what it is expected to be: dense pictures and textures without stray light fell by 11 to 23 % and
-lost 2.6 to 4.6 dB with one; text and gradients under stray light of twice theirs fell by 32 and 37 %. Text,
-threads, lights and strokes come out 0.66 dark and more, leaves and textures at most 0.65. With l1 these come
-to 0.92, and text loses by a background as well: points, strokes and most threads come to 0.93 and more."""
+"""Volumes but by l1, pictures by priors that do not mind an even object, and what l1 shows. The second's
+background is light by what it is expected to be: dense pictures and textures without stray light fell by
+11 to 23 % and lost 2.6 to 4.6 dB with one; text and gradients under stray light of twice theirs fell by 32
+and 37 %. Text, threads, lights and strokes come out 0.66 dark and more, leaves and textures at most 0.65.
+With l1 these come to 0.92, and text loses by a background as well: points, strokes and most threads come
+to 0.93 and more. Of volumes those by l1 are points (0239): dark for 0.97 and more, without stray light up
+to 0.29 of the light."""
 FLOOR, FLOOR_PERCENTILE = 0.08, 10
 """Of a picture through one PSF, where nothing else is chosen: a trial is made where this percentile of its
 block means has this share of the mean (the measured hand 0.07, under half as much stray light 0.25 and
@@ -151,8 +155,9 @@ def _tried(problem: Problem, *, whole: bool) -> Trial:
     rows, columns = problem.window
     picture = lit.solution[0, :, rows, columns]
     dark = float(np.mean(picture < BLACK * np.percentile(picture, BRIGHTEST)))
-    lit_picture, volume = expects_background(problem), problem.n_planes > 1
-    taken = VOLUME if volume else LIT_PICTURE if lit_picture else POINTS
+    taken = LIT_PICTURE if expects_background(problem) else POINTS
+    if problem.n_planes > 1 and kind_of(problem.prior_name) != "l1":
+        taken = VOLUME
     trial = Trial(np.inf, error(lit.left), light, dark, taken)
     plain = replace(coarse, smooth=False)
     # One prior for both: less light has less of it.

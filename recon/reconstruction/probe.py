@@ -20,7 +20,9 @@ Array = npt.NDArray[Any]
 COARSE_PX = 96
 """Longest side that the coarse pass works on, pixels, about. Depths are told apart by a pixel's shift at the
 pattern's edge: on fewer pixels all depths look alike."""
-COARSE_ITERATIONS, WITHIN_ITERATIONS = 40, 20
+COARSE_ITERATIONS, WITHIN_ITERATIONS = 40, 120
+"""The second until the passes have settled: after 20 of them held-out pixels asked for objects that are shut
+in where that cost 7 dB under weak stray light; after 120 they asked against it, and on films as before."""
 ACCEPTED = 0.005
 """Brightness, relative to the axis, below which the sensor counts as accepting nothing."""
 LIGHT_LOST = 2e-4

@@ -112,8 +112,12 @@ def with_background(problem: Problem, calibration: Calibration) -> Problem:
     return replace(problem, warnings=(*problem.warnings, said_so))
 
 
-def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
-    """Choose what to reconstruct a problem with; errors as :func:`choose`."""
+def choice_for(problem: Problem, on_stage: Stage | None = None, *, film: bool = False) -> Choice:
+    """Choose what to reconstruct a problem with; errors as :func:`choose`.
+
+    Of a ``film`` held-out pixels also say whether its object is shut in where PSFs were measured: in
+    photographs that gains nothing that they can tell (docs/decisions/0239-films-alone-are-shut-in.md).
+    """
     began = time.perf_counter()
     tell = on_stage or (lambda *_: None)
     tell(0.0, "choosing: camera models")
@@ -169,7 +173,7 @@ def choice_for(problem: Problem, on_stage: Stage | None = None) -> Choice:
     haze = stray and not given and not (estimated and kind == "l1")
     plain = picture and model == "convolution" and not estimated
     within = None
-    if overrides.field is None and model in ("local", "lowrank") and coarse:
+    if film and overrides.field is None and model in ("local", "lowrank") and coarse:
         tell(0.7, "choosing: the field")
         prior = _trial_prior(problem)
         within = within_of([coarse_copy(c, model, prior, background=estimated) for c in coarse])

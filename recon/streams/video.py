@@ -125,7 +125,7 @@ def _chosen(
     )  # fmt: skip
     posed = Problem.of(mean, calibration, replace(options, choose=asked))
     require_two_images(posed)
-    choice = choice_for(posed)
+    choice = choice_for(posed, film=True)
     extent = None
     if choice.model != "convolution":
         extent = Extent(choice.psf_window, choice.acceptance_px, choice.margin)

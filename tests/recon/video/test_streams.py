@@ -13,9 +13,10 @@ from scipy.signal import fftconvolve
 
 from recon import InputError, Measurement, solve
 from recon.evaluation.scene import make_scene
+from recon.reconstruction import selection
 from recon.reconstruction.options import Overrides, ReconstructionOptions
 from recon.reconstruction.part import Part
-from recon.reconstruction.probe import MARGIN
+from recon.reconstruction.probe import MARGIN, Within
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.selection import choose
 from recon.solvers import memory
@@ -153,11 +154,11 @@ def test_a_video_has_the_background_that_a_photograph_would_have() -> None:
     assert told == [False, True]
 
 
-def test_a_film_s_object_is_shut_in_as_a_photograph_s_is_and_says_so() -> None:
-    scene = make_scene(
-        "sparse-picture", size=48, grid=3, aberration=2.0, background=1.0, photons=8000.0, field=0.4,
-        grid_field=0.5, seed=3,
-    )  # fmt: skip
+def test_a_film_s_object_is_shut_in_where_pixels_held_out_ask_for_it_and_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(selection, "within_of", lambda _: Within(1.0, 0.97))
+    scene = make_scene("sparse-picture", size=48, grid=3, aberration=2.0, photons=8000.0, seed=3)
     shut = stream_problem(scene.measurement, scene.calibration)
     assert shut.extent.margin == MARGIN
     assert "the object lies where PSFs were measured" in shut.reason
