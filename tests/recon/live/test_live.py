@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 
 import numpy as np
 import pytest
@@ -68,8 +69,10 @@ def test_a_frame_gets_the_iterations_that_its_time_allows() -> None:
     reconstructor = live(budget_ms=AMPLE_MS, average=1)
     iterated(reconstructor, photograph(0, 1))
     taking(reconstructor, 1.0, AMPLE_MS / 20)
+    began = time.monotonic()
     moved = [reconstructor.feed(photograph(0.7 * k, k)) for k in (1, 2)]
     assert moved[-1].iterations > 5, [str(picture.scene) for picture in moved]
+    assert 0 < sum(picture.work_ms for picture in moved) <= 1e3 * (time.monotonic() - began)
 
 
 def test_a_still_scene_converges_to_the_reconstruction() -> None:

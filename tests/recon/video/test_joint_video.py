@@ -17,6 +17,7 @@ from recon.streams.joint import (
     LowRankPlusSparse,
     OverTimeName,
     TemporalTotalVariation,
+    require_joint,
     solve_together,
 )
 from recon.streams.video import stream_problem
@@ -161,6 +162,8 @@ def test_time_helps_where_frames_are_alike() -> None:
 def test_colour_and_single_frames_are_refused() -> None:
     frames = np.random.default_rng(0).random((3, 20, 20, 3)).astype(np.float32)
     camera = stream_problem(frames[0], frames[0, ..., 0] ** 4)
+    with pytest.raises(InputError, match="take grey frames; reconstruct each channel on its own"):
+        require_joint(camera)
     with pytest.raises(InputError, match="grey"):
         solve_together(camera, frames, "tv")
     grey = stream_problem(frames[0, ..., 0], frames[0, ..., 0] ** 4)
