@@ -156,6 +156,8 @@ class Problem:
         model, reason = options.model, ""
         if model != "auto":
             model, reason = choose_model(depths, model)
+            if measurement.patterns is not None and model == "convolution":
+                reason = "patterned light takes one PSF a depth where no other model is asked for"
         asked = True if options.positive_background else options.estimate_background
         deviation = measurement.deviations(counts).astype(np.float32)
         problem = cls(

@@ -107,6 +107,8 @@ def test_patterned_light_is_a_camera_and_goes_with_what_other_cameras_go_with() 
     frames = np.stack([cast(scene() * pattern) for pattern in lit]) + 50.0
     plain = reconstruct(Measurement(frames, background=50.0, patterns=lit), psf(), iterations=60)
     assert plain.solver == "fista"
+    problem = Problem.of(Measurement(frames, background=50.0, patterns=lit), psf())
+    assert problem.reason.startswith("patterned light")  # nobody asked for its model
     assert plain.image.shape == SHAPE
     assert plain.verdict is None
     assert any("Not judged" in text for text in plain.warnings)
