@@ -88,6 +88,17 @@ def test_it_is_found_to_a_hundredth_of_a_pixel_and_the_uncertainty_holds(noise: 
     assert np.angle(found.dc) == pytest.approx(0.6, abs=0.1)
 
 
+def test_steps_go_on_until_none_moves_by_what_it_is_uncertain_by():
+    """Three steps, whatever they moved, ended up to 9 uncertainties off."""
+    seen = looks(3, noise=0.02)
+    found = fit_place(DISPLAY, seen, START.with_(z_um=-30.0), REST)
+    again = fit_place(DISPLAY, seen, found.pose.plus(found.field.change), REST + found.field.rest)
+    moved = [
+        getattr(again.pose, name) - getattr(found.pose, name) for name in ("z_um", "pitch_mrad", "yaw_mrad")
+    ]
+    assert (np.abs(moved) < 0.2 * found.deep_error).all()
+
+
 def test_another_display_is_not_explained():
     other = replace(DISPLAY, mask=random_mask(DISPLAY.mask.shape, seed=4))
     assert fit_place(other, looks(2), START, REST).after > 0.7  # what shade the field has, any does
