@@ -189,8 +189,13 @@ class OptionsForm(QWidget):
         self.set_values({name: value for name, value in values.items() if name in empty})
 
     def in_its_words(self, text: str) -> str:
-        """Return a message with the fields' labels where the terminal's has flags."""
-        return in_other_words(text, self._offered, lambda option: f"“{bare_label(option)}”")
+        """Return a message with labels where the terminal's has flags, another form's as words."""
+        return in_other_words(
+            text,
+            self._offered,
+            lambda option: f"“{bare_label(option)}”",
+            lambda flag: f"“{flag[2:].replace('-', ' ')}”",
+        )
 
     # What applies --------------------------------------------------------------------------------
     def applies(self, name: str) -> bool:

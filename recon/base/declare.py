@@ -280,16 +280,27 @@ def option(default: Any = dataclasses.MISSING, **declaration: Any) -> Any:
     return dataclasses.field(default=default, metadata={_KEY: Declaration(**declaration)})
 
 
-_FLAG = re.compile(r"diffuserbench [^.,;:()]*|--[a-z][\w-]*")
+_FLAG = re.compile(r"(?:diffuserbench|dask) [^.,;:()]*|--[a-z][\w-]*")
 
 
-def in_other_words(text: str, options: Iterable[Option], named: Callable[[Option], str]) -> str:
+def in_other_words(
+    text: str,
+    options: Iterable[Option],
+    named: Callable[[Option], str],
+    otherwise: Callable[[str], str] = lambda flag: flag,
+) -> str:
     """Return a message with what the options are ``named`` elsewhere in place of the terminal's flags.
 
-    A whole command ("diffuserbench snap --dark") stays as it is typed.
+    A whole command ("diffuserbench snap --dark") stays as it is typed; ``otherwise`` names a flag of none.
     """
-    names = {option.flag: named(option) for option in options}
-    return _FLAG.sub(lambda flag: names.get(flag[0], flag[0]), text)
+    names: dict[str, str] = {}
+    for option in options:
+        on_off = [flag.split("/") for flag in option.flags if flag.startswith("--")]
+        names |= {off: f"{named(option)} off" for _, *offs in on_off for off in offs}
+        names |= {on: named(option) for on, *_ in on_off}
+    return _FLAG.sub(
+        lambda flag: names.get(flag[0]) or (otherwise(flag[0]) if flag[0][0] == "-" else flag[0]), text
+    )
 
 
 def options_of(declared: type | object) -> tuple[Option, ...]:

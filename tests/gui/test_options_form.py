@@ -181,3 +181,21 @@ def test_a_form_is_made_a_field_at_a_time(qtbot: QtBot) -> None:
     assert made[0] == 1
     assert len(made) >= 2 * len(form.fields), "each field, then each row"
     assert form.values() == OptionsForm([Wanted]).values()
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        ("--count 7: take --far-mm.", "“Number” 7: take “Far”."),
+        (
+            "Leave --no-both out, or give --slm-calibration FILE.",
+            "Leave “Both” off out, or give “slm calibration” FILE.",
+        ),
+        (
+            "Run dask scheduler --host 127.0.0.1, then --count.",
+            "Run dask scheduler --host 127.0.0.1, then “Number”.",
+        ),
+    ],
+)
+def test_messages_name_fields_and_no_flags(form: OptionsForm, said: str, shown: str) -> None:
+    assert form.in_its_words(said) == shown
