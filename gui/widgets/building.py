@@ -159,16 +159,19 @@ class Hint(QWidget):
         self.words.setContentsMargins(0, 0, 0, 0)
         self.button = button(answer, words, lambda: clicked())
         parts: list[Part] = [self.words, in_row(None, self.button, None)]
+        self._buttons = [self.button]
         if other is not None:
             self.other = button(other[0], words, lambda: other[1]())
             self.other.setFlat(True)
+            self._buttons.append(self.other)
             parts.append(in_row(None, self.other, None))
         fill(self, None, *parts, None, margins=(16, 8, 16, 8), spacing=10)
 
     def say(self, words: str, *, busy: bool = False) -> None:
         """Say something else; ``busy``: nothing is to be done here meanwhile, and there is no button."""
         self.words.setText(words)
-        self.button.setToolTip(words)
+        for one in self._buttons:
+            one.setToolTip(words)
         self.button.setVisible(not busy)
 
 
