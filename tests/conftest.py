@@ -63,7 +63,7 @@ def _begin_random_numbers(module: object, name: str) -> None:
 def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any], request: pytest.FixtureRequest) -> None:
     """Random numbers of a fixture are its own, whichever tests ran before in this process."""
     if (module := getattr(request, "module", None)) is not None:
-        _begin_random_numbers(module, f"{fixturedef.argname} {getattr(request, 'param', '')}")
+        _begin_random_numbers(module, f"{fixturedef.argname} {getattr(request, 'param_index', 0)}")
 
 
 @pytest.hookimpl(tryfirst=True)
