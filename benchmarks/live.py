@@ -258,6 +258,7 @@ def main() -> None:
     parser.add_argument("--cameras", nargs="+", default=["one PSF"], choices=["one PSF", *CAMERAS])
     parser.add_argument("--work", action="store_true", help="of other cameras, what a picture takes")
     parser.add_argument("--seconds", type=float, default=15.0)
+    parser.add_argument("--budget-ms", type=float, help="time allowed a picture (by default by size)")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--out", type=Path, help="also as CSV")
     options = parser.parse_args()
@@ -273,7 +274,8 @@ def main() -> None:
                 set_threads(1)
                 work(height, width, kind)
                 continue
-            budget_ms = BUDGETS_MS.get((height, width), 100.0) if kind == "one PSF" else 200.0
+            usual_ms = BUDGETS_MS.get((height, width), 100.0) if kind == "one PSF" else 200.0
+            budget_ms = options.budget_ms or usual_ms
             rows.append(run(height, width, options.seconds, budget_ms, kind))
             print(rows[-1], flush=True)
     if options.out:

@@ -9,13 +9,14 @@ A convolution makes that system diagonal but for the crop. Here nothing is known
 ``forward`` and ``adjoint``, and each conjugate gradient step costs one of each, so the preconditioner
 matters: that of the camera whose PSF is everywhere the central one. Few steps an iteration suffice,
 warm-started. Without wrap-around, cosine transforms along every axis invert T (which is the identity for l1,
-where this is Douglas-Rachford splitting).
+where this is Douglas-Rachford splitting). That makes kappa free to change: the penalties of total variation
+and of the pixels are each balanced by their own residuals, as those of pictures are.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import IterationRecord
 from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
 from recon.solvers.moving import move
-from recon.solvers.prior_splits import ProxSplit, split_prior
+from recon.solvers.prior_splits import ProxSplit, balancing, split_prior
 from recon.solvers.splitting import Room, SensorData, Tuning, squares
 from recon.solvers.volume_admm import ExactAdmm
 
@@ -39,6 +40,10 @@ FIRST_ITERATIONS = 4
 FIRST_STEPS, STEPS = 8, 4
 """Conjugate gradient steps of these, and of others; each costs as much as the rest of the iteration. With 4,
 warm-started, an iteration gains what it gains with 8."""
+LEAST_PIXELS = 0.15
+"""Penalty of the pixels below which balancing does not take it beside total variation, relative to the mean
+power of a plane's PSF. Where hardly a pixel is held by a bound, its residuals say nothing, and it would fall
+without end."""
 
 
 class OperatorAdmm(ExactAdmm):
@@ -66,7 +71,7 @@ class OperatorAdmm(ExactAdmm):
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
-        "x", "S", "e", "penalty", "_used_penalty", "_misfit", "system.tolerance",
+        "x", "S", "e", "penalty", "kappa", "_used_penalty", "_misfit", "system.tolerance",
     )  # fmt: skip
 
     def __init__(
@@ -92,16 +97,14 @@ class OperatorAdmm(ExactAdmm):
         if initial is not None:
             self.x[...] = xp.asarray(initial)
         self.splits = tuple(ProxSplit(term, self.x) for term in (self.separable, *others))
-        # What the splits of x itself add to T.
-        self._pixels = float(self.kappa) * len(self.splits)
-        weights = None if tv is None else tv.axis_weights
-        self._eigenvalues = None if weights is None else self._laplacian(weights)
-        self._cosines = xp.empty_like(self.x[0] if weights is not None else self.x[:0])
+        self._weights = None if tv is None else tv.axis_weights
+        self._cosines = xp.empty_like(self.x[0] if tv else self.x[:0])
         self._psi = tv.differences(self.x) if tv else None
         self.S = xp.zeros(0, dtype) if self._psi is None else self._psi.forward(self.x)
-        power = xp.asarray(central.power()[0])
-        self._q = power / self._lateral_eigenvalues(weights)
-        self._begin(tv, self.system.masked(camera.forward(self.x)[0]), power)
+        self._power = xp.asarray(central.power()[0])
+        self._invert_anew()
+        self._begin(tv, self.system.masked(camera.forward(self.x)[0]), self._power)
+        self._least_pixels = LEAST_PIXELS * float(self._power.mean()) / camera.domain_shape[1]
 
     def step(self) -> IterationRecord:
         """Do one iteration; the first ones solve their data term better."""
@@ -119,6 +122,27 @@ class OperatorAdmm(ExactAdmm):
         """Move object and dual variables."""
         super().move(rows, columns)
         move(self.x, rows, columns)
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint, with its kappa."""
+        super().restore(state)
+        self._invert_anew()
+
+    def _rebalance(self, residuals: float, sums: Array) -> None:
+        """Adapt both penalties, each to its own residuals; the only one, without total variation."""
+        if self._weights is None:
+            super()._rebalance(residuals, sums)
+            return
+        pixels = self.penalty * float(self.kappa) * balancing(*sums[5:])
+        self.penalty *= balancing(*sums[1:5])
+        self.kappa = self.camera.dtype.type(max(pixels, self._least_pixels) / self.penalty)
+        self._invert_anew()
+
+    def _invert_anew(self) -> None:
+        """Make what T depends on follow kappa."""
+        self._pixels = float(self.kappa) * len(self.splits)  # what the splits of x itself add to T
+        self._eigenvalues = None if self._weights is None else self._laplacian(self._weights)
+        self._q = self._power / self._lateral_eigenvalues(self._weights)
 
     def _laplacian(self, weights: Array) -> Array:
         """Eigenvalues of T under cosine transforms."""

@@ -87,12 +87,7 @@ class ProxSplit:
         """Return a penalty that balances the residuals; the guess, as long as nothing is known of them."""
         if not any(self.sums):
             return guess
-        primal, change, norm, multiplier = self.sums
-        moving = primal > SETTLED**2 * norm or change > SETTLED**2 * multiplier
-        if not moving or not all(v > 0 and np.isfinite(v) for v in self.sums):
-            return self.mu
-        factor = (primal / change * (multiplier / norm)) ** 0.25
-        return self.mu * float(np.clip(factor, 1 / LARGEST_STEP, LARGEST_STEP))
+        return self.mu * balancing(*self.sums)
 
     def set_penalty(self, mu: float) -> None:
         """Change the penalty; split variable and (unscaled) multiplier stay what they are."""
@@ -298,6 +293,19 @@ class PriorSplits:
         weights = np.array([[self.tv.weight if self.tv else 0.0], [self.separable.weight]])
         thresholds: Array = np.divide(weights, self.mu, out=np.zeros_like(self.mu), where=self.mu > 0)
         return thresholds
+
+
+def balancing(primal: float, change: float, norm: float, multiplier: float) -> float:
+    """Return by what a penalty is to be multiplied so that relative residuals become equal (Wohlberg 2017).
+
+    Squared norms: primal residual, change of the split variable, size of the variable, multiplier / penalty.
+    1 where nothing moves any more, or nothing is known.
+    """
+    moving = primal > SETTLED**2 * norm or change > SETTLED**2 * multiplier
+    if not moving or not all(v > 0 and np.isfinite(v) for v in (primal, change, norm, multiplier)):
+        return 1.0
+    factor = (primal / change * (multiplier / norm)) ** 0.25
+    return float(np.clip(factor, 1 / LARGEST_STEP, LARGEST_STEP))
 
 
 def is_plain(tv: TotalVariation) -> bool:

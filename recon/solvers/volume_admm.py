@@ -16,7 +16,8 @@ that leave the minimiser as it is:
 An iteration makes the right-hand side r from x, its transform R and the sum over planes of ``conj(g) R``,
 solves once on the sensor plane, and updates ``X <- T^-1 R + g E``, where ``g = T^-1 M^H``. Only the common
 penalty mu is adapted, by balancing the relative residuals (Wohlberg 2017): it scales ``g`` and ``q`` and
-costs nothing. kappa, the ratio of the other splits' penalties to TV's, is fixed.
+costs nothing. kappa, the ratio of the other splits' penalties to TV's, is fixed for volumes of one PSF a
+depth.
 """
 
 from __future__ import annotations
@@ -185,11 +186,14 @@ class ExactAdmm(VolumeSplitting):
         objective = self._misfit + self.weight * float(tv) + self._value()
         self._misfit = 0.5 * float(self.xp.vdot(self.e, self.e))
         if self.balance and is_due(self.iteration) and dual_residual > 0:
-            ratio = np.sqrt(primal_residual / dual_residual)
-            self.penalty *= float(np.clip(ratio, 0.2, 5.0))
+            self._rebalance(primal_residual / dual_residual, sums)
         change = float(np.sqrt(dual_p / max(xx, 1e-300)))
         data = residual_norm(self.e)
         return IterationRecord(0, 0.0, objective, data, primal_residual, dual_residual, change)
+
+    def _rebalance(self, residuals: float, sums: Array) -> None:
+        """Adapt the penalty to the ratio of primal to dual residual; ``sums`` as of :meth:`_sweep`."""
+        self.penalty *= float(np.clip(np.sqrt(residuals), 0.2, 5.0))
 
     def _value(self) -> float:
         """Value of the priors other than total variation, of their split variables."""
