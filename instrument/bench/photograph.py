@@ -198,6 +198,7 @@ def snapshot_facts(bench: Bench, taken: Snapshot, light: LightState) -> dict[str
         "average": taken.average,
         "full_scale": taken.full_scale,
         "noise": plain(noise),
+        "pixel_pitch_um": bench.camera.pixel_pitch_um * taken.metadata.binning,
         **plain(taken.metadata),
     }
 

@@ -22,7 +22,7 @@ from instrument.files.errors import FileError, size
 from instrument.files.named_arrays import is_hdf5, is_matlab, ordered, read_hdf5, read_matlab
 from instrument.files.tiff_pages import open_tiff
 
-READABLE = "TIFF, PNG, JPEG, BMP, .npy, .npz with one array, HDF5, MATLAB, OME-Zarr"
+READABLE = "TIFF, PNG, JPEG, BMP, .npy, .npz, HDF5, MATLAB, OME-Zarr"
 Decoded = tuple[npt.NDArray[Any], tuple[str, ...]]
 """An array as its file has it, stack first and colour last, and what was noticed in words."""
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -57,7 +57,7 @@ def _unreadable(path: Path) -> str:
 def decode(path: Path, inside: str = "") -> Decoded:
     """Return a file's array; its content, not its name, tells the format.
 
-    ``inside`` names one of several arrays of an HDF5 or MATLAB file.
+    ``inside`` names one of several arrays of an HDF5, MATLAB or .npz file.
 
     Raises FileError.
     """
@@ -73,9 +73,11 @@ def decode(path: Path, inside: str = "") -> Decoded:
         return read_hdf5(path, inside, of_matlab=beginning.startswith(b"MATLAB"))
     if is_matlab(beginning):
         return read_matlab(path, inside)
+    if beginning.startswith(b"PK"):
+        return _decode_npz(path, inside)
     if inside:
-        raise FileError(path, f"is no HDF5 or MATLAB file, so that nothing in it is called {inside}.")
-    known = (b"\x93NUMPY", b"PK", *_TIFF_MAGIC, *_OPENCV_MAGIC)
+        raise FileError(path, f"is no HDF5, MATLAB or .npz file, so that nothing in it is called {inside}.")
+    known = (b"\x93NUMPY", *_TIFF_MAGIC, *_OPENCV_MAGIC)
     if beginning and not beginning.startswith(known):  # before its size, which may be huge, is read
         raise FileError(path, _unreadable(path))
     if beginning[8:10] == b"CR" and beginning[:4] in _TIFF_MAGIC:  # Canon's, a TIFF of its thumbnail
@@ -84,8 +86,6 @@ def decode(path: Path, inside: str = "") -> Decoded:
         require_npy(path)
         with path.open("rb") as file:
             return _decode_npy(path, file, n_bytes)
-    if beginning.startswith(b"PK"):
-        return _decode_npz(path)
     if beginning[:4] in _TIFF_MAGIC:
         return _decode_tiff(path)
     return _decode_with_opencv(path, reading.read_bytes(path, _MOST_PICTURE_BYTES))
@@ -144,14 +144,19 @@ def _require_listing(path: Path) -> None:
             raise FileError(path, f"is a damaged .npz: its list of members has {size(listed)}.")
 
 
-def _decode_npz(path: Path) -> Decoded:
+def _decode_npz(path: Path, inside: str) -> Decoded:
     _require_listing(path)
     try:
         with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
-            if len(members) != 1:
-                listed = ", ".join(member.filename.removesuffix(".npy") for member in members[:8]) or "none"
-                raise FileError(path, f"holds {len(members)} arrays ({listed}); one image is expected.")
+            arrays = {one.filename.removesuffix(".npy"): one for one in archive.infolist()}
+            listed = ", ".join(list(arrays)[:8]) or "none"
+            if inside and inside not in arrays:
+                raise FileError(path, f"holds no array called {inside}; there are: {listed}.")
+            if not inside and len(arrays) != 1:
+                remedy = f"Name one: {path}::NAME." if arrays else ""
+                problem = f"holds {len(arrays)} arrays ({listed}); one image is expected."
+                raise FileError(path, problem, remedy)
+            members = [arrays[inside]] if inside else list(arrays.values())
             said = members[0].file_size
             reading.require_plausible(path, said, reading.stored_bytes(path))
             with archive.open(members[0]) as member:

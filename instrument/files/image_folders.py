@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ MICRO_MANAGER = "metadata.txt"
 def images_in(folder: Path) -> list[Path]:
     """Return a folder's image files as people count: numbers by their value, 2 before 10."""
     found = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
-    return sorted(found, key=lambda path: _natural(path.name))
+    plain = {_parts(path.name)[0] for path in found}
+    return sorted(found, key=lambda path: _natural(path.name, plain))
 
 
 def in_order(folder: Path, paths: Sequence[Path]) -> tuple[list[Path], tuple[float, ...]]:
@@ -49,13 +50,26 @@ def order_in_words(paths: Sequence[Path], depths_um: Sequence[float]) -> str:
     return words
 
 
-def _natural(name: str) -> tuple[list[tuple[int, float, str]], str]:
+def _parts(name: str) -> tuple[tuple[str, ...], list[float]]:
+    """Return the texts before, between and after a name's numbers, and the numbers."""
+    texts = tuple(text.casefold() for text in _NUMBER.split(name))
+    return texts, [float(number) for number in _NUMBER.findall(name)]
+
+
+def _natural(name: str, plain: Container[tuple[str, ...]]) -> tuple[list[tuple[int, float, str]], str]:
+    """Return what a name is sorted by.
+
+    A dash before a number is a minus where another name, whose texts ``plain`` has, is the same but for it.
+    """
+    texts, numbers = _parts(name)
+    for i, text in enumerate(texts[:-1]):
+        without = (*texts[:i], text[:-1], *texts[i + 1 :])
+        if text.endswith("-") and without in plain:
+            texts, numbers[i] = without, -numbers[i]
     parts: list[tuple[int, float, str]] = []
-    place = 0
-    for found in _NUMBER.finditer(name):
-        parts += [(1, 0.0, name[place : found.start()].casefold()), (0, float(found[0]), "")]
-        place = found.end()
-    return [*parts, (1, 0.0, name[place:].casefold())], name
+    for text, number in zip(texts, numbers, strict=False):
+        parts += [(1, 0.0, text), (0, number, "")]
+    return [*parts, (1, 0.0, texts[-1])], name
 
 
 def _depth(name: str) -> float | None:

@@ -24,6 +24,15 @@ from instrument.files.decoding import READABLE, decode
 from instrument.files.errors import BenchError, FileError
 from instrument.files.image_folders import images_in, in_order, order_in_words
 from instrument.files.named_arrays import is_zarr, read_zarr
+from instrument.files.ome_tiff import (
+    MICROMETRES,
+    depths_in_words,
+    depths_um,
+    facts_of,
+    is_ome_name,
+    photograph_fields,
+    resolution,
+)
 from instrument.files.seen import as_seen, levels_of, png_bytes
 from instrument.files.tiff_pages import open_tiff
 
@@ -142,8 +151,8 @@ def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str
 
     The suffix chooses the format: ``.tif`` and ``.npy`` keep any dtype, ``.png`` takes uint8 and uint16.
     Colour of float32 is stored channel by channel, as ImageJ has it, with the levels that it is shown with.
-    ``metadata`` goes into a TIFF's description (ImageJ's info of such colour), otherwise into a JSON file
-    beside the image.
+    ``.ome.tif`` is an OME-TIFF, where ``metadata`` stand in OME's fields and a map annotation. They go into
+    another TIFF's description (ImageJ's info of such colour), otherwise into a JSON file beside the image.
 
     Raises FileError when the suffix or the dtype does not fit, or the folder cannot be written to; OSError
     when the disk is full.
@@ -159,8 +168,10 @@ def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str
             np.save(temporary, image, allow_pickle=False)
         elif suffix == ".png":
             _write_png(temporary, image)
+        elif is_ome_name(path) and image.ndim < 4:
+            _write_ome_tiff(temporary, image, metadata or {})
         else:
-            _write_tiff(temporary, image, text)
+            _write_tiff(temporary, image, text, (metadata or {}).get("pixel_pitch_um"))
     if text is not None and suffix in (".png", ".npy"):
         write_text(side_car(path), text + "\n")
 
@@ -197,6 +208,9 @@ def image_metadata(path: Path) -> dict[str, Any]:
                 pattern = bytes(page.tags.valueof(_CFA_PATTERN, b""))
                 if len(pattern) == 4 and max(pattern) < 3:
                     said = {"pixel_format": "Bayer" + "".join(_COLOURS[c] for c in pattern[:2])}
+                said |= _depths(tiff)
+                if tiff.is_ome:
+                    return said | facts_of(page.description)
                 text = (tiff.imagej_metadata or {}).get("Info") or page.description
         else:
             text = reading.read_bytes(side_car(path)).decode()
@@ -204,6 +218,17 @@ def image_metadata(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, TypeError, FileError, tifffile.TiffFileError):
         return said  # another program's description, or none: the pixels were read all the same
     return {**said, **metadata} if isinstance(metadata, dict) else said
+
+
+def _depths(tiff: tifffile.TiffFile) -> dict[str, Any]:
+    """Return where the planes of a stack lie, as OME or ImageJ tell it; micrometres."""
+    if tiff.ome_metadata is not None:
+        told = depths_um(tiff.ome_metadata)
+    else:
+        stack = tiff.imagej_metadata or {}
+        unit, step = MICROMETRES.get(str(stack.get("unit", "?"))), stack.get("spacing")
+        told = [unit * float(step) * z for z in range(int(stack.get("slices", 0)))] if unit and step else []
+    return {"depths_um": told} if told else {}
 
 
 # Folders -----------------------------------------------------------------------------------------
@@ -218,7 +243,9 @@ def _read_folder(folder: Path, leave_out: Path | None) -> ImageFile:
         inside = [path for path in sorted(folder.iterdir()) if path.is_dir() and images_in(path)]
         remedy = f"Folders in it that do: {', '.join(map(str, inside[:4]))}." if inside else ""
         raise FileError(folder, f"holds no images ({READABLE}).", remedy)
-    paths, depths_um = in_order(folder, paths)
+    if len(paths) == 1:  # Micro-Manager's folders may hold one file of all planes
+        return read_stack(paths[0])
+    paths, depths = in_order(folder, paths)
     first = read_image(paths[0])
     images = [first.pixels]
     for path in paths[1:]:
@@ -227,8 +254,8 @@ def _read_folder(folder: Path, leave_out: Path | None) -> ImageFile:
             raise FileError(path, f"is {image.describe()}, but {first.path.name} is {first.describe()}.")
         images.append(image.pixels)
     stack: Pixels = np.stack(images)  # type: ignore[assignment]
-    metadata = {"files": [path.name for path in paths], "depths_um": list(depths_um)}
-    return ImageFile(folder, stack, (order_in_words(paths, depths_um), *first.notes), metadata)
+    metadata = {"files": [path.name for path in paths], "depths_um": list(depths)}
+    return ImageFile(folder, stack, (order_in_words(paths, depths), *first.notes), metadata)
 
 
 def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> ImageFile:
@@ -242,7 +269,10 @@ def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> Im
     else:
         raise FileError(path, f"holds an array of shape {array.shape}; a stack of images is expected.")
     pixels, converted = _standard_dtype(path, array)
-    return ImageFile(path, pixels, (*notes, *more, *converted))
+    depths = image_metadata(path).get("depths_um", []) if path.is_file() else []
+    told = {"depths_um": depths} if len(depths) == len(pixels) > 1 else {}
+    words = (depths_in_words(depths),) if told else ()
+    return ImageFile(path, pixels, (*notes, *more, *converted, *words), told)
 
 
 def _decoded(path: Path) -> tuple[Path, npt.NDArray[Any], tuple[str, ...]]:
@@ -328,7 +358,24 @@ def _refuse_non_finite(path: Path, array: npt.NDArray[Any], *, holes: bool) -> N
 _BIG_TIFF_BYTES = 3_900_000_000
 
 
-def _write_tiff(path: Path, image: npt.NDArray[Any], text: str | None) -> None:
+def _write_ome_tiff(path: Path, image: npt.NDArray[Any], facts: Mapping[str, Any]) -> None:
+    """Write an OME-TIFF of an image or stack; floats in colour channel by channel: few know RGB of them."""
+    colour = image.ndim == 3 and image.shape[-1] == 3
+    if split := colour and image.dtype.kind == "f":
+        image = np.moveaxis(image, -1, 0)
+    fields = {"axes": "CYX" if split else "YXS" if colour else "ZYX"[3 - image.ndim :]}
+    fields |= photograph_fields(facts, 3 if split else 1 if image.ndim == 2 or colour else len(image))
+    tifffile.imwrite(
+        path,
+        np.ascontiguousarray(image),
+        ome=True,
+        photometric="rgb" if colour and not split else "minisblack",
+        metadata=fields,
+        **resolution(facts.get("pixel_pitch_um")),
+    )
+
+
+def _write_tiff(path: Path, image: npt.NDArray[Any], text: str | None, pitch_um: float | None) -> None:
     """Write a TIFF; ImageJ knows colour of floats only as channels, and no TIFF of over 4 GB."""
     colour = image.ndim >= 3 and image.shape[-1] == 3
     known = image.ndim <= 4 and image.dtype == np.float32 and image.nbytes < _BIG_TIFF_BYTES
@@ -343,7 +390,12 @@ def _write_tiff(path: Path, image: npt.NDArray[Any], text: str | None) -> None:
         return
     photometric = "rgb" if colour else "minisblack"
     tifffile.imwrite(
-        path, np.ascontiguousarray(image), photometric=photometric, description=text, metadata=None
+        path,
+        np.ascontiguousarray(image),
+        photometric=photometric,
+        description=text,
+        metadata=None,
+        **resolution(pitch_um),
     )
 
 

@@ -122,6 +122,12 @@ def _chosen(
     listed = ", ".join(f"{name} {found[name]}" for name in images[:8]) or "none"
     if inside and inside not in found:
         raise FileError(path, f"holds no array called {inside}; images could be: {listed}.")
+    if not found:
+        raise FileError(
+            path,
+            "holds no array of numbers by itself.",
+            "Structures and cells are not read: save their arrays.",
+        )
     if not inside and len(images) != 1:
         raise FileError(
             path, f"holds {len(images)} arrays that could be images: {listed}.", f"Name one: {path}::NAME."
@@ -145,6 +151,18 @@ def is_zarr(folder: Path) -> bool:
     return any((folder / name).is_file() for name in ("zarr.json", ".zgroup", ".zarray"))
 
 
+def _only_series(folder: Path, group: Any) -> tuple[Any, str]:
+    """Return the image of a collection of series that bioformats2raw made, where there is one.
+
+    Raises FileError where there are several, with their paths.
+    """
+    series = sorted((name for name in group.group_keys() if name.isdecimal()), key=int)
+    if len(series) != 1:
+        paths = ", ".join(str(folder / name) for name in series[:4])
+        raise FileError(folder, f"holds {len(series)} image series.", f"Name one: {paths}." if series else "")
+    return group[series[0]], f"its image series {series[0]} taken"
+
+
 def read_zarr(folder: Path) -> Read:
     """Read an OME-Zarr image (0.4 or 0.5) at its finest level, or a Zarr array.
 
@@ -156,13 +174,16 @@ def read_zarr(folder: Path) -> Read:
         group: Any = zarr.open(folder, mode="r")
         axes, notes = "", []
         if not isinstance(group, zarr.Array):
+            if group.attrs.get("ome", group.attrs).get("bioformats2raw.layout") is not None:
+                group, said = _only_series(folder, group)
+                notes.append(said)
             facts = group.attrs.get("ome", group.attrs)["multiscales"][0]
             axes = "".join(str(a["name"] if isinstance(a, dict) else a) for a in facts.get("axes", "tczyx"))
             scales = facts["datasets"][0].get("coordinateTransformations", [{}])[0].get("scale", [])
             units = [a.get("unit", "") if isinstance(a, dict) else "" for a in facts.get("axes", ())]
             if "z" in axes and len(scales) == len(units) == len(axes):
                 z = axes.index("z")
-                notes.append(f"planes every {scales[z]:g} {units[z] or 'of no unit'} as it says")
+                notes += [f"planes every {scales[z]:g} {units[z]} as it says"] if units[z] else []
             group = group[facts["datasets"][0]["path"]]
         reading.require_plausible(folder, group.nbytes, reading.folder_bytes(folder, group.nbytes))
         array = np.asarray(group[...])

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import whole_file, whole_folder
 from instrument.files.errors import FileError
+from instrument.files.ome_tiff import resolution
 from instrument.files.reading import folder_bytes, require_file, require_plausible, stored_bytes
 from instrument.files.tiff_pages import open_tiff
 
@@ -170,7 +171,8 @@ def write_volume_tiff(
     stored = (shape[0], shape[3], *shape[1:3]) if colour else shape
     big = 4 * int(np.prod(shape)) > _BIG_TIFF_BYTES
     with whole_file(path) as temporary, tifffile.TiffWriter(temporary, ome=True, bigtiff=big) as tiff:
-        tiff.write(pages, shape=stored, dtype=np.float32, photometric="minisblack", metadata=metadata)
+        size = resolution(sizes.get("PhysicalSizeX"))
+        tiff.write(pages, shape=stored, dtype=np.float32, photometric="minisblack", metadata=metadata, **size)
 
 
 def voxel_um(grid: Grid) -> dict[str, float]:

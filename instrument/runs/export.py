@@ -18,6 +18,8 @@ from instrument.files.atomic import check_writable, require_new, whole_file
 from instrument.files.errors import BenchError, FileError, ranges
 from instrument.files.films import as_shown, write_mp4
 from instrument.files.images import write_image
+from instrument.files.ome_tiff import annotation, resolution
+from instrument.files.record import plain
 from instrument.runs.frame_facts import z_steps_um
 from instrument.runs.run import Run
 from instrument.runs.run_files import RunError
@@ -112,9 +114,8 @@ def _tiff(run: Run, path: Path, indices: list[int], images: Iterator[Image], *, 
             shape=shape,
             dtype=array.dtype,
             photometric="rgb" if array.is_colour else "minisblack",
-            resolution=(1e4 / pitch_um, 1e4 / pitch_um),
-            resolutionunit="CENTIMETER",
             metadata=metadata,
+            **resolution(pitch_um),
         )
 
 
@@ -142,18 +143,20 @@ def _ome_facts(run: Run, indices: list[int], noted: list[FrameMetadata], axis: s
     elif run.frame_period_s:
         facts |= {"TimeIncrement": run.frame_period_s, "TimeIncrementUnit": "s"}
     told = ("pixel_format", "black_level", "gain", "binning", "roi", "led_pattern", "slm_image_hash")
-    facts["MapAnnotation"] = {
-        "Namespace": "diffuserbench",
-        **{name: _told([str(getattr(one, name)) for one in noted]) for name in told},
-        "simulated": str(run.is_simulated).lower(),
-        "frames": ranges(indices),
-    }
+    facts["MapAnnotation"] = annotation(
+        {
+            **{name: _told([plain(getattr(one, name)) for one in noted]) for name in told},
+            "significant_bits": first.significant_bits,
+            "simulated": run.is_simulated,
+            "frames": ranges(indices),
+        }
+    )
     return facts
 
 
-def _told(values: list[str]) -> str:
+def _told(values: list[Any]) -> Any:
     """Return the value of all frames; where they differ, each frame's, in their order."""
-    return values[0] if len(set(values)) == 1 else "; ".join(values)
+    return values[0] if all(one == values[0] for one in values) else "; ".join(map(str, values))
 
 
 def _hdf5(run: Run, path: Path, indices: list[int], images: Iterator[Image]) -> None:

@@ -91,13 +91,16 @@ def test_a_channels_first_array_is_colour(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_image(tmp_path / "a.npy").pixels, image)
 
 
-def test_one_array_in_an_npz_is_read_and_two_are_refused(tmp_path: Path) -> None:
+def test_one_array_in_an_npz_is_read_and_of_two_the_one_that_is_named(tmp_path: Path) -> None:
     image = sample("uint8", colour=False)
     np.savez(tmp_path / "one.npz", psf=image)
     np.testing.assert_array_equal(read_image(tmp_path / "one.npz").pixels, image)
     np.savez(tmp_path / "two.npz", a=image, b=image)
     with pytest.raises(FileError, match=r"2 arrays \(a, b\)"):
         read_image(tmp_path / "two.npz")
+    np.testing.assert_array_equal(read_image(f"{tmp_path / 'two.npz'}::b").pixels, image)
+    with pytest.raises(FileError, match="holds no array called c; there are: a, b"):
+        read_image(f"{tmp_path / 'two.npz'}::c")
 
 
 def test_planar_and_compressed_tiffs(tmp_path: Path) -> None:

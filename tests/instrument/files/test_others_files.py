@@ -34,6 +34,8 @@ PICTURE = STACK[0]
         (["z60mm.tif", "z60.5mm.tif", "z68mm.tif", "z115mm.tif"], (6e4, 6.05e4, 6.8e4, 1.15e5)),
         (["psf z-50um.tif", "psf z-8um.tif", "psf z0um.tif", "psf z10um.tif"], (-50.0, -8.0, 0.0, 10.0)),
         (["2026-11-02_a.tif", "2026-11-10_a.tif"], ()),
+        (["z-20.tif", "z-2.5.tif", "z0.tif", "z2.5.tif"], ()),
+        (["psf-1.tif", "psf-2.tif", "psf-10.tif"], ()),
         (["10x_1mm.tif", "10x_2mm.tif", "10x_10mm.tif"], (1e3, 2e3, 1e4)),
     ],
 )  # fmt: skip
@@ -104,6 +106,96 @@ def test_colour_of_floats_is_imagejs_and_comes_back(tmp_path: Path) -> None:
     write_image(tmp_path / "counts.tif", (255 * picture).astype(np.uint8))
     with tifffile.TiffFile(tmp_path / "counts.tif") as tiff:
         assert (tiff.is_imagej, tiff.series[0].axes) == (False, "YXS")
+
+
+def test_a_folder_of_one_stack_is_that_stack(tmp_path: Path) -> None:
+    (tmp_path / "psf_MMStack_Pos0_metadata.txt").write_text("{}")
+    said = {"PositionZ": [4.0, 2.0, 0.0, -2.0, -4.0], "PositionZUnit": ["µm"] * 5}
+    tifffile.imwrite(
+        tmp_path / "psf_MMStack_Pos0.ome.tif", STACK, ome=True, metadata={"axes": "ZYX", "Plane": said}
+    )
+    write_image(tmp_path / "photo.tif", PICTURE)
+    stack = read_stack(tmp_path, leave_out=tmp_path / "photo.tif")
+    np.testing.assert_array_equal(stack.pixels, STACK)
+    assert stack.metadata == {"depths_um": said["PositionZ"]}
+
+
+def test_series_of_bioformats2raw(tmp_path: Path) -> None:
+    group = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=2)
+    group.attrs["bioformats2raw.layout"] = 3
+    axes = [{"name": name, "type": "space"} for name in "zyx"]
+    said = [{"version": "0.4", "axes": axes, "datasets": [{"path": "0"}]}]
+    for number in (0, 1):
+        series = group.create_group(str(number))
+        series.attrs["multiscales"] = said
+        series.create_array("0", shape=STACK.shape, dtype=STACK.dtype)[...] = STACK
+        if not number:
+            stack = read_stack(tmp_path / "a.zarr")
+            np.testing.assert_array_equal(stack.pixels, STACK)
+            assert stack.notes == ("its image series 0 taken",)
+    with pytest.raises(FileError, match=r"holds 2 image series\. Name one: .*a\.zarr/0, .*a\.zarr/1\."):
+        read_stack(tmp_path / "a.zarr")
+    np.testing.assert_array_equal(read_stack(tmp_path / "a.zarr" / "1").pixels, STACK)
+
+
+def test_depths_that_a_stack_tells_are_said_and_kept(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, STACK, imagej=True, metadata={"axes": "ZYX", "spacing": 0.5, "unit": "mm"})
+    stack = read_stack(path)
+    assert stack.metadata == {"depths_um": [0.0, 500.0, 1000.0, 1500.0, 2000.0]}
+    assert stack.notes == ("planes every 500 um as it says",)
+    places = [2000.0, 2250.0, 2571.4, 3000.0, 3600.0]
+    said = {"PositionZ": places, "PositionZUnit": ["µm"] * 5}
+    tifffile.imwrite(path, STACK, ome=True, metadata={"axes": "ZYX", "PhysicalSizeZ": 250, "Plane": said})
+    stack = read_stack(path)
+    assert stack.metadata == {"depths_um": places}
+    assert stack.notes == ("planes at 2 to 3.6 mm as it says, not evenly spaced",)
+    tifffile.imwrite(
+        path, STACK, ome=True, metadata={"axes": "ZYX", "PhysicalSizeZ": 5, "PhysicalSizeZUnit": "nm"}
+    )
+    assert read_stack(path).metadata == {"depths_um": pytest.approx([0, 0.005, 0.01, 0.015, 0.02])}
+    tifffile.imwrite(path, STACK, ome=True, metadata={"axes": "TYX", "TimeIncrement": 1.0})
+    assert (read_stack(path).metadata, read_stack(path).notes) == ({}, ())
+
+
+def test_a_photograph_called_ome_tif_is_one(tmp_path: Path) -> None:
+    ome_types = pytest.importorskip("ome_types")
+    facts = {
+        "camera": "12345",
+        "light": "true",
+        "simulated": True,
+        "exposure_ms": 2.5,
+        "pixel_format": "BayerRG12",
+        "significant_bits": 12,
+        "black_level": 32.5,
+        "utc": "2026-11-25T21:37:19.647770+00:00",
+        "stage_position": {"x_um": 1.0, "z_um": -2.0},
+        "noise": {"read_noise_counts": 0.5},
+        "pixel_pitch_um": 6.5,
+    }
+    path = tmp_path / "photo.ome.tif"
+    write_image(path, PICTURE, facts)
+    read_back = read_image(path)
+    np.testing.assert_array_equal(read_back.pixels, PICTURE)
+    assert read_back.metadata == facts
+    assert mosaic_of(read_back) == "RGGB"
+    image = ome_types.from_tiff(path).images[0]
+    assert (image.pixels.significant_bits, image.pixels.physical_size_x) == (12, 6.5)
+    assert (image.pixels.planes[0].exposure_time, image.pixels.planes[0].position_z) == (0.0025, -2.0)
+    assert str(image.acquisition_date) == "2026-11-25 21:37:19"
+    colour = RNG.random((8, 6, 3), np.float32)
+    write_image(path, colour, {"simulated": True})
+    with tifffile.TiffFile(path) as tiff:
+        assert tiff.series[0].axes == "CYX"
+    np.testing.assert_array_equal(read_image(path).pixels, colour)
+    assert read_image(path).is_simulated
+
+
+@pytest.mark.parametrize("name", ["photo.tif", "photo.ome.tif"])
+def test_a_photograph_tells_its_pixels_size_to_who_knows_no_ome(tmp_path: Path, name: str) -> None:
+    write_image(tmp_path / name, PICTURE, {"pixel_pitch_um": 5.0})
+    with tifffile.TiffFile(tmp_path / name) as tiff:
+        assert tiff.pages.first.get_resolution("MICROMETER") == pytest.approx((0.2, 0.2))
 
 
 def _lying(upright: npt.NDArray[np.uint8], orientation: int) -> npt.NDArray[np.uint8]:

@@ -1,0 +1,137 @@
+"""What OME-TIFF says of an image beside its pixels: the format's own fields, and the rest by name.
+
+Facts for which OME has no field stand in a map annotation of the namespace ``diffuserbench``, each as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files import reading
+
+SUFFIXES = (".ome.tif", ".ome.tiff")
+"""Names that ask for OME-TIFF."""
+NAMESPACE = "diffuserbench"
+MICROMETRES = {
+    "": 1.0, "nm": 1e-3, "um": 1.0, "µm": 1.0, "μm": 1.0, "\\u00B5m": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6,
+    "micron": 1.0, "microns": 1.0, "micrometer": 1.0, "nanometer": 1e-3, "millimeter": 1e3,
+}  # fmt: skip
+"""Units of length; none is a micrometre, which is what OME takes then."""
+
+
+def is_ome_name(path: Path) -> bool:
+    """Whether a name asks for OME-TIFF."""
+    return path.name.lower().endswith(SUFFIXES)
+
+
+def annotation(facts: Mapping[str, Any]) -> dict[str, str]:
+    """Return facts as tifffile writes them into a map annotation; :func:`facts_of` brings them back."""
+    return {"Namespace": NAMESPACE, **{name: _text(value) for name, value in facts.items()}}
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, str) and _value(value) == value:
+        return value
+    return json.dumps(value, default=str, ensure_ascii=False)
+
+
+def _value(text: str) -> Any:
+    try:
+        return reading.parse_json(text)
+    except ValueError:
+        return text
+
+
+def facts_of(description: str) -> dict[str, Any]:
+    """Return the facts that :func:`annotation` told, of an OME-TIFF's description; empty where it tells none.
+
+    Raises ValueError when it is no XML.
+    """
+    for told in _parts(description, "MapAnnotation"):
+        if told.get("Namespace") == NAMESPACE:
+            return {str(one.get("K")): _value(one.text or "") for one in _parts(told, "M")}
+    return {}
+
+
+def photograph_fields(facts: Mapping[str, Any], planes: int = 1) -> dict[str, Any]:
+    """Return OME's fields of one photograph of so many planes, as tifffile takes them, and all its facts.
+
+    ``facts`` are those of :func:`instrument.bench.photograph.snapshot_facts`, as far as they are there.
+    """
+    fields: dict[str, Any] = {"MapAnnotation": annotation(facts)}
+    plane: dict[str, float | str] = {}
+    if (exposure_ms := _number(facts.get("exposure_ms"))) is not None:
+        plane |= {"ExposureTime": exposure_ms / 1e3, "ExposureTimeUnit": "s"}
+    place = facts.get("stage_position")
+    for axis in "xyz":
+        if isinstance(place, Mapping) and (at := _number(place.get(f"{axis}_um"))) is not None:
+            plane |= {f"Position{axis.upper()}": at, f"Position{axis.upper()}Unit": "µm"}
+    if plane:
+        fields["Plane"] = {name: [value] * planes for name, value in plane.items()}
+    if isinstance(utc := facts.get("utc"), str):
+        fields["AcquisitionDate"] = utc[:19]
+    if isinstance(bits := facts.get("significant_bits"), int):
+        fields["SignificantBits"] = bits
+    if (pitch_um := _number(facts.get("pixel_pitch_um"))) is not None:
+        for side in "XY":
+            fields |= {f"PhysicalSize{side}": pitch_um, f"PhysicalSize{side}Unit": "µm"}
+    return fields
+
+
+def resolution(pitch_um: float | None) -> dict[str, Any]:
+    """Return the TIFF's own words for pixels of this size, for programs that know no OME."""
+    if pitch_um is None or not (np.isfinite(pitch_um) and pitch_um > 0):
+        return {}
+    return {"resolution": (1e4 / pitch_um, 1e4 / pitch_um), "resolutionunit": "CENTIMETER"}
+
+
+def depths_um(description: str) -> list[float]:
+    """Return where an OME-TIFF says its planes are along z, in their order; empty where it does not.
+
+    By the planes' own places, else by their step, counted from the first. Raises ValueError when it is no
+    XML.
+    """
+    pixels = next(iter(_parts(description, "Pixels")), None)
+    n_z = 0 if pixels is None else int(pixels.get("SizeZ", "1"))
+    if pixels is None or not 1 < n_z <= reading.MOST_TEXT_BYTES:
+        return []
+    places: dict[int, float] = {}
+    for plane in _parts(pixels, "Plane"):
+        unit = MICROMETRES.get(plane.get("PositionZUnit", ""))
+        if unit is not None and "PositionZ" in plane.attrib:
+            places.setdefault(int(plane.get("TheZ", "0")), unit * float(plane.attrib["PositionZ"]))
+    if sorted(places) == list(range(n_z)):
+        return [places[z] for z in range(n_z)]
+    unit, step = MICROMETRES.get(pixels.get("PhysicalSizeZUnit", "")), pixels.get("PhysicalSizeZ")
+    return [] if unit is None or step is None else [unit * float(step) * z for z in range(n_z)]
+
+
+def depths_in_words(depths: Sequence[float] | npt.NDArray[np.float64]) -> str:
+    """Say at which depths a file's planes are; micrometres."""
+    steps = np.diff(depths)
+    if not len(steps) or not np.isfinite(steps).all():
+        return ""
+    if np.ptp(steps) <= 1e-3 * abs(steps[0]):
+        every = f"planes every {abs(steps[0]):g} um as it says"
+        return every if depths[0] == 0 else f"{every}, {depths[0] / 1e3:g} to {depths[-1] / 1e3:g} mm"
+    return f"planes at {depths[0] / 1e3:g} to {depths[-1] / 1e3:g} mm as it says, not evenly spaced"
+
+
+def _parts(where: str | ElementTree.Element, name: str) -> list[ElementTree.Element]:
+    try:
+        root = ElementTree.fromstring(where) if isinstance(where, str) else where
+    except ElementTree.ParseError as error:
+        raise ValueError(f"no XML: {error}") from None
+    return [part for part in root.iter() if part.tag.rpartition("}")[2] == name]
+
+
+def _number(value: Any) -> float | None:
+    known = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+    return float(value) if known else None
