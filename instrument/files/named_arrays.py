@@ -175,8 +175,8 @@ def read_zarr(folder: Path) -> Read:
         axes, notes = "", []
         if not isinstance(group, zarr.Array):
             if group.attrs.get("ome", group.attrs).get("bioformats2raw.layout") is not None:
-                group, said = _only_series(folder, group)
-                notes.append(said)
+                group, taken = _only_series(folder, group)
+                notes.append(taken)
             facts = group.attrs.get("ome", group.attrs)["multiscales"][0]
             axes = "".join(str(a["name"] if isinstance(a, dict) else a) for a in facts.get("axes", "tczyx"))
             scales = facts["datasets"][0].get("coordinateTransformations", [{}])[0].get("scale", [])
