@@ -262,7 +262,7 @@ BAD = {
     "wiener": (["--method", "wiener", "--iterations", "3"], "one shot"),
     "iterations": (["--iterations", "0"], "--iterations"),
     "time": (["--time", "-1"], "--time"),
-    "out suffix": (["--out", "out.jpg"], "out.jpg: a reconstruction is written as float32 TIFF"),
+    "out suffix": (["--out", "out.jpg"], "out.jpg: a picture is written as float32 TIFF"),
     "out folder": (["--out", "absent/out.tif"], "absent does not exist"),
     "out is folder": (["--out", "folder"], "folder"),
     "out taken": (["--out", "taken.tif"], "taken.tif: exists already"),
