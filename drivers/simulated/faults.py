@@ -1,4 +1,4 @@
-"""What is wrong with a simulated bench on purpose: light that flickers and drifts, a table that shakes.
+"""What is wrong with a simulated bench on purpose: light that flickers or drifts, a table that shakes.
 
 Every frame has its own draw, by the world's seed and the frame's number; what changes with time goes by
 the world's clock, also where nothing is waited for. Play, lost steps and wrong scales are options of the
@@ -40,6 +40,11 @@ class FaultOptions(DriverOptions):
         description="Standard deviation of the picture's place on the sensor from frame to frame, along each "
         "axis, unbinned pixels.",
     )
+    creep_px_per_min: float = Field(
+        0.0,
+        description="How far the picture goes over the sensor in a simulated minute, along each axis, "
+        "unbinned pixels.",
+    )
     ambient_e_per_s: float = Field(
         0.0, ge=0, description="Other light that comes and goes: electrons a second in a pixel at its most."
     )
@@ -67,7 +72,8 @@ def disturbed(light: Image, faults: FaultOptions, frame: tuple[int, int], at_s: 
     """
     rng = np.random.default_rng((_DRAWS, *frame))
     level = (1 + faults.flicker * rng.standard_normal()) * (1 + faults.drift_per_min * at_s / 60)
-    rows, columns = rng.normal(0.0, faults.vibration_px, 2) / binning if faults.vibration_px else (0.0, 0.0)
+    shaken = rng.normal(0.0, faults.vibration_px, 2) if faults.vibration_px else np.zeros(2)
+    rows, columns = (shaken + faults.creep_px_per_min * at_s / 60) / binning
     seen = light * np.float32(max(level, _LEAST_LIGHT))
     if rows or columns:
         place = np.array([[1, 0, columns], [0, 1, rows]])
@@ -79,7 +85,13 @@ def disturbed(light: Image, faults: FaultOptions, frame: tuple[int, int], at_s: 
 
 def disturbs(faults: FaultOptions) -> bool:
     """Whether frames are another thing than the light that would fall on the pixels."""
-    return bool(faults.flicker or faults.drift_per_min or faults.vibration_px or faults.ambient_e_per_s)
+    return bool(
+        faults.flicker
+        or faults.drift_per_min
+        or faults.vibration_px
+        or faults.creep_px_per_min
+        or faults.ambient_e_per_s
+    )
 
 
 def with_late_hot(pattern: FixedPattern, faults: FaultOptions, seed: int) -> FixedPattern:
