@@ -27,9 +27,11 @@ from calibration_routines.procedure import (
     completed,
     outlook_of,
 )
-from calibration_routines.psf.analysis import dark_model, full_scale, light_of
+from calibration_routines.psf.analysis import DarkModel, ambient_findings, dark_model, full_scale, light_of
 from calibration_routines.psf.exposure import expose_light
-from calibration_routines.scatter import Scatter, pooled
+from calibration_routines.psf.stage_fit import MAX_PLACE_DRIFT_PX
+from calibration_routines.psf.sweep_plan import DARK
+from calibration_routines.scatter import Scatter, compare, pooled
 from drivers.led_array import LedArray
 from instrument.bench.bench import Bench
 from instrument.files.atomic import named_by_worth, whole_file
@@ -54,6 +56,8 @@ LEAST_LEDS = 24
 """Inside the objective's aperture: fewer, and slopes show in steps, as single LEDs cross the pupil's edge."""
 BANDS = ("red", "green", "blue")
 HEIGHT_FILE = "height_um.npy"
+AGAIN = "again"
+"""Label of the first half's frames once more, after the others."""
 _TARGET = 0.6  # of full scale: halves differ in brightness where the sample deflects
 _COLOURS = ("#00798c", "#d1495b")
 _EDGE_QUANTILE = 0.999  # the largest deflection, less the outliers that noise makes
@@ -124,22 +128,27 @@ def half_width_deg(deflection_deg: npt.NDArray[np.float64]) -> float:
 
 
 def dpc_plan(array: LedArray, setup: DpcSetup, exposure_ms: float) -> Plan:
-    """Return the plan: dark frames, then the four halves.
+    """Return the plan: the four halves, and the first one again, between two halves of the dark frames.
 
     Raises BenchError when the array does not reach beyond the objective's aperture.
     """
     na, rgb = _illumination_na(array, setup), _rgb(setup)
-    lights = [Light.of(HalfCircle(side, na).on(array, rgb)) for side in SIDES]
-    return Plan(
-        label="dpc",
-        parts=(
-            Part(label="dark", light=(OFF,), exposures_ms=(exposure_ms,), repeats=setup.dark_frames),
-            *(
-                Part(label=side, light=(light,), exposures_ms=(exposure_ms,), repeats=setup.average)
-                for side, light in zip(SIDES, lights, strict=True)
-            ),
-        ),
+    late = setup.dark_frames // 2
+    before, after = (
+        (Part(label=DARK, light=(OFF,), exposures_ms=(exposure_ms,), repeats=n),) if n else ()
+        for n in (setup.dark_frames - late, late)
     )
+    shown = {side: side for side in SIDES} | {AGAIN: SIDES[0]}
+    lit = (
+        Part(
+            label=label,
+            light=(Light.of(HalfCircle(side, na).on(array, rgb)),),
+            exposures_ms=(exposure_ms,),
+            repeats=setup.average,
+        )
+        for label, side in shown.items()
+    )
+    return Plan(label="dpc", parts=(*before, *lit, *after))
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,8 +184,14 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     listener.step("analysing")
     record = DPC.read(run.path)
     optics, index = record.optics, record.setup.index
-    halves, scatter = _halves(run)
-    findings = replace(scatter, flicker=0.0).findings("half")  # each half is brought to its own mean
+    dark = dark_model(run)
+    halves, scatter = _halves(run, dark)
+    first = halves[SIDES[0]]
+    findings = (  # each half is brought to its own mean: flicker is none
+        *replace(scatter, flicker=0.0).findings("half"),
+        *ambient_findings(dark.brightening_per_ms * record.exposure_ms / max(float(first.mean()), 1e-9)),
+        *(_moved(run, dark, first) if scatter.averages else ()),  # else noise hides the pictures
+    )
     phase = phase_from_halves(halves, optics)
     height = (phase * (1e-3 * optics.wavelength_nm / (2 * np.pi * (index - 1)))).astype(np.float32)
     slope = slopes_deg(height, optics.pitch_um)
@@ -195,6 +210,7 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
         "height_file": height_file.name,
         "pitch_um": surface.pitch_um,
         "figures": surface.figures,
+        "scatter": plain(scatter),
         "findings": list(findings),
     }
     _RESULT.write(file, facts)
@@ -249,8 +265,7 @@ def _rgb(setup: DpcSetup) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _halves(run: Run) -> tuple[dict[str, Image], Scatter]:
-    dark = dark_model(run)
+def _halves(run: Run, dark: DarkModel) -> tuple[dict[str, Image], Scatter]:
     halves, scatters = {}, []
     for side in SIDES:
         if np.any((run.images(side) >= full_scale(run)).any(axis=0) & ~dark.hot):
@@ -259,6 +274,22 @@ def _halves(run: Run) -> tuple[dict[str, Image], Scatter]:
         halves[side] = steady.mean
         scatters.append(steady.scatter)
     return halves, pooled(scatters)
+
+
+def _moved(run: Run, dark: DarkModel, first: Image) -> tuple[str, ...]:
+    """Return what the first half, taken again, says of the time between; nothing of runs without it."""
+    steps = run.steps(AGAIN)
+    if not steps:
+        return ()
+    change = compare(light_of(run, [step.index for step in steps], dark).mean, first)
+    if change.shift_px <= MAX_PLACE_DRIFT_PX:
+        return ()
+    where = f"lies {change.shift_px:.1f} pixels from where it was"
+    seen = where if np.isfinite(change.shift_px) else "is another picture"
+    return (
+        f"the {SIDES[0]} half, taken again after the others, {seen} (up to {MAX_PLACE_DRIFT_PX:g} expected): "
+        "sample, objective or camera moved, and halves differ by that. Clamp them, and take it again.",
+    )
 
 
 # Procedure -------------------------------------------------------------------------------------------

@@ -84,6 +84,21 @@ def test_a_run_that_was_cut_off_is_resumed_to_its_surface(
     assert "Height" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("creep", [0.0, 600.0])
+def test_what_moves_meanwhile_is_told_by_the_first_half_taken_again(tmp_path: Path, creep: float) -> None:
+    """Frames of one half do not tell it: they are as near in time as they lie."""
+    world = "[simulated_led_microscope]"
+    assert world in SMALL
+    text = SMALL.replace(world, f"{world}\ncreep_px_per_min = {creep}")
+    with small_bench(text) as bench:
+        done = DpcProcedure(replace(SETUP, average=2, dark_frames=2)).carry_out(bench, tmp_path)
+    told = [words for words in done.verdict if "taken again after the others, lies" in words]
+    assert bool(told) == bool(creep)
+    assert done.good == (not creep)
+    assert done.files[0].name == ("doubtful_dpc.json" if creep else "dpc.json")
+    assert json.loads(done.files[0].read_text())["scatter"]["frames"] == 2
+
+
 def weak_phase(shape: tuple[int, int], amplitude: float) -> npt.NDArray[np.float64]:
     rng = np.random.default_rng(4)
     ky, kx = np.fft.fftfreq(shape[0])[:, None], np.fft.fftfreq(shape[1])
