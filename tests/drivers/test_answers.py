@@ -189,6 +189,8 @@ def test_a_camera_that_hangs_ends_a_live_view_and_every_reader_that_waits(
             pass
     with pytest.raises(DeviceTimeoutError, match="hangs: its driver has not come back"):
         stream.reader().next_frame()
+    with pytest.raises(DeviceTimeoutError, match="hangs: its driver has not come back"):
+        stream.wait_newer(stream.newest(), 0.0)
     camera.let_go.set()
     stream.close()
     let_go, stopped = threading.Event(), threading.Event()
@@ -229,7 +231,7 @@ def test_a_stream_that_is_given_up_lets_go_of_its_readers_and_frames(monkeypatch
     with pytest.raises(DeviceTimeoutError, match="ending its sequence"):
         stream.close()
     assert stream.newest() is None
-    assert not any(t.name.startswith("subscri") and t.is_alive() for t in threading.enumerate())
+    assert not any(t.name == "stream callback" for t in threading.enumerate())
     let_go.set()
     monkeypatch.undo()
     camera.stop_sequence()

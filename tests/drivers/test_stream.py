@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from drivers.common.stream import BufferPool, FrameStream
+from drivers.common.stream_reader import StreamStatus
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from tests.mocks.free_running import FreeRunningCamera
@@ -46,6 +47,10 @@ class _Paced(FreeRunningCamera):
     def snap_metadata(self, number: int) -> FrameMetadata:
         assert self.ahead.acquire(timeout=60)
         return super().snap_metadata(number)
+
+    def stop_sequence(self) -> None:
+        self.ahead.release(60)  # whatever waits there ends
+        super().stop_sequence()
 
 
 def test_a_reader_that_keeps_up_gets_every_frame_once() -> None:
@@ -384,3 +389,173 @@ def test_a_drivers_mistake_reaches_those_who_read(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(camera, "next_frame_into", broken)
     with FrameStream(camera, 4) as stream, pytest.raises(DeviceError, match="wrong shape"):
         stream.reader().next_frame(5.0)
+
+
+def test_a_stream_has_three_buffers_at_least_and_runs_from_its_start_on() -> None:
+    with pytest.raises(ValueError, match="at least 3 buffers, not 2"):
+        FrameStream(finite(3), 2)
+    stream = FrameStream(finite(3), 3)
+    assert not stream.is_running
+    with stream:
+        assert stream.is_running
+    assert not stream.is_running
+
+
+def test_silence_is_counted_from_the_last_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Given up is a camera that was silent for longer than it may be, however often it was asked."""
+    camera, now_s, asked = finite(3), [0.0], []
+    monkeypatch.setattr("drivers.common.stream.time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    monkeypatch.setattr(FreeRunningCamera, "longest_wait_s", 10.0)
+    answers = iter([*"....", "a frame", *"..........", "another", *"..........."])
+
+    def answer(*_: object) -> FrameMetadata:
+        asked.append(next(answers))
+        if asked[-1] == ".":
+            now_s[0] += 1.0
+            raise DeviceTimeoutError(camera.name, "no frame.")
+        return camera.snap_metadata(0)
+
+    monkeypatch.setattr(camera, "next_frame_into", answer)
+    stream = FrameStream(camera, 4)
+    reader = stream.reader()
+    with stream:
+        assert reader.next_frame(20.0) is not None
+        assert reader.next_frame(20.0) is not None
+        with pytest.raises(DeviceTimeoutError, match=r"no frame for 11\.0 s"):
+            reader.next_frame(20.0)
+    assert len(asked) == 27
+    assert next(answers, None) is None
+
+
+def test_a_triggered_camera_may_be_silent_for_as_long_as_it_likes(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera, now_s = finite(3), [0.0]
+    monkeypatch.setattr("drivers.common.stream.time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    monkeypatch.setattr(type(camera), "trigger_mode", "software")
+    silent = iter(range(50))
+
+    def answer(*_: object) -> FrameMetadata:
+        now_s[0] += 10.0
+        if next(silent, None) is not None:
+            raise DeviceTimeoutError(camera.name, "no frame.")
+        return camera.snap_metadata(0)
+
+    monkeypatch.setattr(camera, "next_frame_into", answer)
+    stream = FrameStream(camera, 4)
+    reader = stream.reader()
+    with stream:
+        assert reader.next_frame(20.0) is not None
+
+
+def test_the_end_of_a_stream_is_told_to_who_waits_and_its_thread_is_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    camera, asked, threads = finite(3), threading.Event(), []
+
+    def answer(*_: object) -> FrameMetadata:
+        threads.append(threading.current_thread())
+        asked.set()
+        time.sleep(0.3)
+        raise StoppedError(camera.name, "stopped.")
+
+    monkeypatch.setattr(camera, "next_frame_into", answer)
+    stream = FrameStream(camera, 4)
+    found: list[Frame | None] = []
+    reader = stream.reader()
+    with stream:
+        waiting = threading.Thread(target=lambda: found.append(reader.next_frame(60.0)), daemon=True)
+        waiting.start()
+        assert asked.wait(20)
+    (thread,) = threads
+    assert not thread.is_alive()
+    assert thread.daemon, "it would keep a program that forgets to close its stream"
+    waiting.join(20)
+    assert found == [None]
+
+
+def test_a_stream_counts_from_its_first_frame_and_its_last_is_the_newest() -> None:
+    camera = finite(9)
+    camera.drop = {2, 3}
+    stream = FrameStream(camera, 4)
+    reader = stream.reader()
+    with stream:
+        while reader.next_frame(0.5) is not None:
+            pass
+        newest = stream.newest()
+        assert newest is not None
+        assert number_of(newest) == 8
+        assert stream.wait_newer(newest, 0.0) is None
+    assert (stream.acquired, stream.dropped) == (7, 2)
+
+
+def test_who_waits_for_a_newer_frame_is_told_that_the_camera_failed() -> None:
+    camera = FreeRunningCamera()
+    camera.fail_at = 3
+    with FrameStream(camera, 4) as stream, pytest.raises(DeviceError, match="unplugged"):
+        seen = None
+        while True:
+            seen = stream.wait_newer(seen, 20.0)
+
+
+def test_who_comes_late_has_an_account_of_its_own() -> None:
+    camera = _Paced()
+    camera.drop = {1, 2, 20, 21, 22}
+    stream = FrameStream(camera, 32)
+    early = stream.reader()
+    with stream:
+        for _ in range(10):
+            assert early.next_frame(60.0) is not None
+        while stream.acquired < 14:  # as far as it exposes ahead
+            time.sleep(0.001)
+        late = stream.reader()
+        assert late.status == StreamStatus(0, 0, 0, 0, 0)
+        for _ in range(44):
+            camera.ahead.release()
+        first = late.next_frame(60.0)
+        assert first is not None
+        assert (number_of(first), first.metadata.dropped_before, late.missed) == (16, 0, (0, 0))
+        while stream.acquired < 55:
+            time.sleep(0.001)
+        late.skip_to_newest()
+        assert late.status == StreamStatus(41, 1, 39, 1, 3)
+        last = late.next_frame(60.0)
+        assert last is not None
+        assert (number_of(last), last.metadata.dropped_before, late.missed) == (59, 42, (3, 39))
+        late.skip_to_newest()
+        assert late.status == StreamStatus(41, 2, 39, 0, 3)
+
+
+def test_a_subscription_ends_when_it_is_cancelled_and_is_waited_for() -> None:
+    stream = FrameStream(FreeRunningCamera(), 4).start()
+    entered, seen = threading.Event(), []
+
+    def slow(frame: Frame) -> None:
+        seen.append(number_of(frame))
+        entered.set()
+        time.sleep(0.2)
+
+    subscription = stream.subscribe(slow)
+    (thread,) = (thread for thread in threading.enumerate() if thread.name == "stream callback")
+    assert entered.wait(20)
+    subscription.cancel()
+    subscription.join()
+    assert not thread.is_alive()
+    assert thread.daemon, "it would keep a program that forgets to close its stream"
+    assert len(seen) == 1
+    stream.close()
+
+
+@pytest.mark.parametrize("newest_only", [False, True])
+def test_a_subscription_gets_every_frame_or_skips_to_the_newest(newest_only: bool) -> None:
+    stream = FrameStream(finite(30), 32)
+    seen: list[int] = []
+
+    def slow(frame: Frame) -> None:
+        seen.append(number_of(frame))
+        while stream.acquired < 30:
+            time.sleep(0.001)
+
+    with stream:
+        subscription = stream.subscribe(slow, newest_only=newest_only)
+        while stream.acquired < 30 or subscription.status.waiting:
+            time.sleep(0.001)
+    assert seen == ([seen[0], 29] if newest_only else list(range(seen[0], 30)))

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -134,8 +135,16 @@ def test_before_the_first_frame_the_view_waits_and_does_not_spin(monkeypatch: py
 
     monkeypatch.setattr(StreamReader, "next_frame", next_frame)
     with LiveView(FrameStream(camera, 3), Slow(0.0)) as view:
-        assert view.wait_newer(None, 5.0) is not None
-    assert waits[0] > 0
+        assert view._thread is not None
+        assert view._thread.daemon, "it would keep a program that forgets to close its view"
+        seen = None
+        while seen is None or seen.picture.total_iterations < 3 or len(waits) < 6:
+            seen = view.wait_newer(seen, 5.0) or seen
+    came = waits.index(0.0)
+    assert came > 0
+    assert min(waits[:came]) > 0
+    assert set(waits[came : came + 4]) == {0.0}, "while there is something to refine it does not wait"
+    assert min(waits[came + 4 :], default=1.0) > 0
 
 
 def test_iterating_shows_every_picture_and_ends_with_the_view() -> None:
@@ -231,3 +240,40 @@ def test_a_bench_shows_its_scene_live() -> None:
     assert result is not None
     assert result.picture.budget_ms == 50.0
     assert result.picture.image.ndim == n_axes
+
+
+def test_a_picture_is_dated_by_its_frames_arrival_and_the_first_is_in_no_statistics(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_ms = [0]
+    clock = SimpleNamespace(monotonic_ns=lambda: 1_000_000 * now_ms[0])
+    monkeypatch.setattr("instrument.live.live.time", clock)
+    slow, camera = Slow(0.0), FreeRunningCamera()
+    view = LiveView(FrameStream(camera, 3), slow)
+    assert (view.status.pictures, view.status.passed_over, view.is_running) == (0, 0, False)
+    frame = Frame(np.zeros((2, 2), np.uint16), replace(camera.snap_metadata(0), host_time_ns=10**9))
+    for now, passed_over in ((1900, 4), (1010, 2), (1010, 0), (1035, None), (1060, 1)):
+        if now == 1060:
+            assert np.isnan(view.status.pictures_per_s), "two at the same moment"
+        now_ms[0] = now
+        view._publish(slow._picture(0), frame, passed_over)
+        result = view.newest()
+        assert result is not None
+        assert (result.latency_ms, result.passed_over) == (now - 1000, passed_over or 0)
+        assert result.refined == (passed_over is None)
+    status = view.status
+    assert (status.pictures, status.passed_over, status.latency_median_ms) == (4, 7, 10.0)
+    assert status.pictures_per_s == pytest.approx(2 / 0.05)
+    assert status.latency_p99_ms == pytest.approx(59.0)
+
+
+def test_a_refinement_gives_way_to_a_frame_that_waits_and_to_the_end() -> None:
+    view = LiveView(FrameStream(FreeRunningCamera(), 3), Slow(0.0))
+    reader: Any = SimpleNamespace(status=SimpleNamespace(waiting=0))
+    view._reader = reader
+    assert not view._is_wanted_elsewhere()
+    reader.status.waiting = 1
+    assert view._is_wanted_elsewhere()
+    reader.status.waiting = 0
+    view.end()
+    assert view._is_wanted_elsewhere()
