@@ -490,10 +490,15 @@ def test_a_stream_counts_from_its_first_frame_and_its_last_is_the_newest() -> No
 def test_who_waits_for_a_newer_frame_is_told_that_the_camera_failed() -> None:
     camera = FreeRunningCamera()
     camera.fail_at = 3
-    with FrameStream(camera, 4) as stream, pytest.raises(DeviceError, match="unplugged"):
+    stream = FrameStream(camera, 4)
+
+    def watch() -> None:
         seen = None
         while True:
             seen = stream.wait_newer(seen, 20.0)
+
+    with stream, pytest.raises(DeviceError, match="unplugged"):
+        watch()
 
 
 def test_who_comes_late_has_an_account_of_its_own() -> None:
