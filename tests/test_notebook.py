@@ -56,6 +56,7 @@ def test_the_ten_lines_of_the_readme_run(
     assert (tmp_path / "scene.png").exists()
     assert "counts from both" in names["tv"].job.notes["Dark"]
     assert names["tv"].image.shape == (48, 48)
+    np.testing.assert_array_equal(np.asarray(names["tv"]), names["tv"].image)
     assert names["l1"].prior == "l1"
     facts = names["tv"].facts()
     assert "`dark` FILE or COUNTS to give it" in facts["Dark"]
@@ -175,6 +176,7 @@ def test_a_stack_of_psfs_gives_a_volume_in_colours_of_depth(
     assert repr(found).startswith("<Volume 2 x 48 x 48")
     assert found.seen().shape == (48, 48, 3)
     assert db.read(tmp_path / "psfs.npy").is_stack
+    np.testing.assert_array_equal(np.asarray(found), found.volume)
 
 
 def own_prior() -> type[db.Prior]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import fields, replace
 from pathlib import Path
@@ -41,6 +41,7 @@ from calibration_routines.psf.sweep_watch import SweepEvent
 from calibration_routines.rehearsal import rehearse_whole
 from calibration_routines.times import IN_ALL
 from instrument.bench.bench import Bench
+from instrument.bench.config import BenchConfig
 from instrument.bench.config_file import other_bench_for
 from instrument.bench.safety import StepsFailedError
 from instrument.cli.app import App, BenchOption, examples, load_and_say, open_and_say
@@ -128,10 +129,15 @@ def _function(routine: Routine) -> Callable[..., None]:
     ) -> None:
         _of_files_or_bench(routine, options, files, given, dry_run, out, bench)
 
-    function: Callable[..., None] = with_file if routine.file else with_run
+    def needs_another_bench(given: Mapping[str, Any]) -> None:
+        _config_for(routine, given["bench"])
+
+    function: Callable[..., Any] = with_file if routine.file else with_run
     if routine.files is not None:
         function = with_files
         function.__annotations__["files"] = routine.files.options
+    else:
+        function.before_mistakes = needs_another_bench  # type: ignore[attr-defined]
     function.__annotations__["options"] = routine.options
     return function
 
@@ -176,10 +182,7 @@ def carry_out(
     """Say what a routine will do and why, then do it and say how good it is; a dry run ends before that."""
     console = Console()
     procedure = routine.procedure(options)
-    config = load_and_say(bench)
-    if wrong := other_bench_for(config, ("camera", *routine.needs), routine.tried_on):
-        raise BenchError(wrong)
-    with open_and_say(config) as opened:
+    with open_and_say(_config_for(routine, bench)) as opened:
         outlook = procedure.foretold(opened, folder)
         print_lines(console, outlook.reasons)
         if dry_run:
@@ -193,6 +196,14 @@ def carry_out(
         with TerminalListener(console) as listener:
             done = procedure.carry_out(opened, folder, listener=listener)
         print_outcome(console, done)
+
+
+def _config_for(routine: Routine, bench: Path | None) -> BenchConfig:
+    """Read the bench; BenchError where the routine cannot be tried on it, with the command that gives one."""
+    config = load_and_say(bench)
+    if wrong := other_bench_for(config, ("camera", *routine.needs), routine.tried_on):
+        raise BenchError(wrong)
+    return config
 
 
 def _rehearsed(routine: Routine, options: Any, outlook: Outlook, bench: Bench) -> Sequence[str]:

@@ -129,7 +129,12 @@ def _row(o: Option) -> tuple[str, str]:
 
 
 def flat(function: Callable[..., None]) -> Callable[..., None]:
-    """Return a function for typer: each declared field of its options objects is a parameter of its own."""
+    """Return a function for typer: each declared field of its options objects is a parameter of its own.
+
+    A function's own ``before_mistakes`` is called with the other values where an option is wrong or missing,
+    and may raise what is to be said instead.
+    """
+    before_mistakes: Callable[[Mapping[str, Any]], None] | None = getattr(function, "before_mistakes", None)
     hints = typing.get_type_hints(function, include_extras=True)
     objects: dict[str, tuple[type, dict[str, Option]]] = {}
     declared: dict[str, Option] = {}
@@ -156,7 +161,12 @@ def flat(function: Callable[..., None]) -> Callable[..., None]:
         named = {
             key: _as_named(o, context.meta[_WORDS]) if key in given else o for key, o in declared.items()
         }
-        read_values = _read(named, given)
+        try:
+            read_values = _read(named, given)
+        except BenchError:
+            if before_mistakes is not None:
+                before_mistakes(values)
+            raise
         for name, (cls, keys) in objects.items():
             values[name] = cls(**{o.name: read_values[key] for key, o in keys.items() if key in read_values})
         if wants_given:

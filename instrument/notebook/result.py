@@ -56,6 +56,11 @@ class Result(Reconstruction):
         """Return a reconstruction with what it was made of."""
         return cls(**{f.name: getattr(found, f.name) for f in fields(Reconstruction)}, job=job)
 
+    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        """Return the picture's pixels, (height, width) or with colours last; of a volume all its planes."""
+        pixels: npt.NDArray[Any] = self.image if self.is_picture else self.volume
+        return np.array(pixels, dtype, copy=copy)
+
     def facts(self) -> Mapping[str, str]:
         """Return what is known of it, in words: what was read, chosen, and how far it can be trusted."""
         from instrument.reconstruction.stored_result import StoredResult

@@ -271,6 +271,7 @@ def test_snap_exposes_by_itself_unless_it_is_told_how(here: Path, capsys: pytest
         (["calibrate", "slm"], "display"),
         (["align", "mask"], "display"),
         (["calibrate", "dpc", "--na", "0.1", "--magnification", "4"], "microscope"),
+        (["calibrate", "dpc"], "microscope"),  # before what is missing
         (["calibrate", "screen"], "screen"),
     ],
 )
