@@ -26,6 +26,7 @@ from instrument.bench.bench import Bench
 from instrument.display.hologram import bench_display, load_alignment
 from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
+from instrument.files.record import plain
 from instrument.files.slm_image import SlmCorrection
 from instrument.runs.run_control import RunControl
 from recon.base.declare import option
@@ -37,8 +38,9 @@ from recon.holography.slm_response import MODES, flatness_jacobian, mode, phases
 Array = npt.NDArray[Any]
 SLM_FILE = "slm-calibration.json"
 """Where the command line writes it."""
-MAX_PHASE_ERROR_RAD = 0.008
-"""Standard deviation of a phase beyond which no table is made: its worst level is within 0.02 then."""
+MAX_PHASE_ERROR_RAD = 0.004
+"""Standard deviation of a phase beyond which no table is made. What flickers with the phase's own cosine
+bends the whole table: its worst level is within five times this, 0.02, in 19 of 20 tables then."""
 _REFERENCE_EVERY = 8  # levels between two pictures of level 0
 _FLATNESS_FRAMES = 22
 """Of a flatness measurement, at most."""
@@ -101,8 +103,8 @@ def measure_look_up_table(io: DisplayBench, *, n_levels: int = 33, seed: int = 0
             "light, mask or camera are not steady, or the SLM flickers: look for saturation, loose mounts.",
         )
         raise CalibrationError(
-            f"The SLM's table would be wrong by {error:.3f} rad (one standard deviation; at most "
-            f"{MAX_PHASE_ERROR_RAD:g} is kept): {' '.join(words)}"
+            f"The SLM's table would be wrong by {error:.4f} rad (one standard deviation; at most "
+            f"{MAX_PHASE_ERROR_RAD:g} is kept): {' '.join(words)} More grey levels (--levels) lessen it, too."
         )
     from scipy.interpolate import PchipInterpolator
 
@@ -113,27 +115,37 @@ def measure_look_up_table(io: DisplayBench, *, n_levels: int = 33, seed: int = 0
 def _phases(frames: Array, references: Array, before: Array) -> tuple[Array, float, Scatter]:
     """Return the levels' phases, their error, and how the pictures of level 0 scatter.
 
-    The pictures as they are, and divided by the brightness between two of the references: what lies better on
-    one ellipse counts.
+    The pictures as they are, and divided by the brightness between two of the references: what is known
+    better counts. Where references flicker they bend the table by it, as slowly as phases go.
     """
     changes = [NO_CHANGE, *(compare(picture, references[0]) for picture in references[1:])]
     levels = np.array([change.brightness for change in changes])
     scatter, _ = scatter_of(references)
     scatter = replace(scatter, frames=1)  # a level has one picture
-    tries = [frames]
+    tries = [(frames, 0.0)]
     if np.isfinite(levels).all() and (levels > 0).all():
         at = np.interp(np.arange(len(frames)), before, levels)
-        tries.append(frames / at[:, None, None])
+        tries.append((frames / at[:, None, None], _flicker(levels, before) * float(np.sqrt(2 / len(levels)))))
     found = []
-    for pictures in tries:
+    for pictures, added in tries:
         try:
-            found.append(phases_from_frames(pictures))
+            phases, error = phases_from_frames(pictures)
+            found.append((phases, float(np.hypot(error, added))))
         except InputError:
             if words := scatter.causes():
                 raise CalibrationError(f"The SLM's table cannot be measured: {' '.join(words)}") from None
             raise
     phases, error = min(found, key=lambda one: one[1])
     return phases, error, scatter
+
+
+def _flicker(levels: npt.NDArray[np.float64], at: npt.NDArray[np.float64]) -> float:
+    """Return the relative standard deviation of brightness beyond what changes evenly; 0 of two visits."""
+    share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
+    beside = levels[1:-1] - (1 - share) * levels[:-2] - share * levels[2:]
+    if not len(beside):
+        return 0.0
+    return float(np.sqrt(np.mean(beside**2 / (1 + share**2 + (1 - share) ** 2))) / levels.mean())
 
 
 def measure_flatness(
@@ -258,6 +270,7 @@ class SlmProcedure(SeenAgain, Checked, Procedure):
                 found = measure_flatness(io, display, place.pose, found, rest=place.rest)
             bench.stop()
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "frames": found.frames}
+        facts |= {"phase_error_rad": found.phase_error_rad, "scatter": plain(found.steadiness)}
         found.correction.save(out, facts)
         return Outcome(
             verdict=tuple(slm_lines(found, simulated=bool(bench.simulated_kinds))),
