@@ -257,6 +257,7 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
         bench=record.bench,
         simulated=record.simulated,
     )
+    response = replace(response, scatter=scatter)
     file = save_response(response, ANGULAR.place(run.path, doubted=bool(response.findings)))
     picture = file.with_suffix(".png")
     save_figure(response_figure(response), picture)

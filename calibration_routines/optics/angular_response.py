@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from calibration_routines.procedure import CalibrationError
 from calibration_routines.psf.sampling import Position
+from calibration_routines.scatter import STEADY, Scatter
 from instrument.files.record import RecordFormat, plain, value_of
 from recon.camera.registration import Registration, aligned, expected_shift, register
 from recon.optics.fall_off import FallOff
@@ -104,6 +105,8 @@ class AngularResponse:
     """What is to be doubted; empty when all went well."""
     bench: str = ""
     simulated: bool = False
+    scatter: Scatter = STEADY
+    """Of the frames that were averaged, all places together."""
 
     def fall_off(self) -> FallOff:
         """Return the response as a function of the tangents along y and x.

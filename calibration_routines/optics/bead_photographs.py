@@ -30,11 +30,12 @@ from calibration_routines.procedure import (
     completed,
 )
 from calibration_routines.psf.exposure import expose_scene
+from calibration_routines.scatter import STEADY, Scatter, pooled
 from instrument.bench.bench import Bench
 from instrument.files.atomic import named_by_worth, require_new
 from instrument.files.errors import BenchError, OperatorNeededError, SettingsError, count
 from instrument.files.images import write_image
-from instrument.files.record import RecordFormat
+from instrument.files.record import RecordFormat, plain
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from recon.base.declare import RARE, option
@@ -220,6 +221,8 @@ class BeadPhotographs:
     runs: tuple[Path, ...] = ()
     findings: tuple[str, ...] = ()
     """What is wrong with place and other light in them."""
+    scatter: Scatter = STEADY
+    """Of their frames, all photographs together."""
 
 
 def _slide_changer(bench: Bench) -> SlideChanger | None:
@@ -263,6 +266,7 @@ def photograph_slides(
         mean_images([one.measurement for one in series.photographs]),
         tuple(one.run.path for one in series.photographs),
         photograph_findings(series.photographs),
+        pooled([one.scatter for one in series.photographs]),
     )
 
 
@@ -346,7 +350,7 @@ class _Series:
         """Count a slide as done, and write its mean for whoever solves it otherwise."""
         bench = self._bench
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
-        facts |= {"binning": self._slides.binning, "dark": "taken off"}
+        facts |= {"binning": self._slides.binning, "dark": "taken off", "scatter": plain(taken.scatter)}
         file = named_by_worth(taken.run.path / SLIDE_FILE, doubted=bool(taken.findings), overwrite=True)
         write_image(file, taken.measurement, facts)
         self.photographs.append(taken)

@@ -27,6 +27,7 @@ from instrument.bench.bench import Bench
 from instrument.bench.camera_settings import restore_camera
 from instrument.files.atomic import named_by_worth
 from instrument.files.calibration_file import save_calibration
+from instrument.files.record import plain
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from instrument.runs.writer import dated_name, free_name
@@ -206,7 +207,9 @@ def _photograph_and_solve(
 
     facts |= {"runs": [run.name for run in taken.runs]}
     solved = calibrate_beads(taken.images, slides, geometry, provenance=facts, progress=solving)
-    solved = replace(solved, runs=taken.runs, findings=taken.findings)
+    kept = {"scatter": plain(taken.scatter), "findings": list(taken.findings), "good": not taken.findings}
+    calibration = replace(solved.calibration, quality={**solved.calibration.quality, **kept})
+    solved = replace(solved, calibration=calibration, runs=taken.runs, findings=taken.findings)
     out = slides.out or free_name(folder or bench.config.data_folder, dated_name("bead calibration"))
     outcome = save_beads(solved, slides, out)
     if outcome.calibration is not None:

@@ -239,7 +239,9 @@ def test_a_photograph_that_was_left_becomes_a_picture_when_it_goes_on(bench: Ben
     assert left is not None
     done = ResumeProcedure(left).carry_out(bench)
     assert [file.name for file in done.files] == ["photograph.tif"]
-    assert read_image(done.files[0]).pixels.shape == (120, 160)
+    kept = read_image(done.files[0])
+    assert kept.pixels.shape == (120, 160)
+    assert kept.metadata["scatter"]["frames"] == 4
     assert left_unfinished(tmp_path, ["photograph"]) is None
 
 

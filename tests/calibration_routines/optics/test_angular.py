@@ -77,6 +77,7 @@ def test_the_response_and_its_cut_offs_are_the_sensors(bench: Bench, tmp_path: P
         assert min(curve.seen) < 0.5  # the sensor's edge cut patterns, and it made no difference
     loaded = load_response(file)
     assert loaded == response
+    assert loaded.scatter.frames == 2
     tan_y, tan_x = (np.tan(np.deg2rad(v)) for v in np.meshgrid([-6.0, 0, 4], [-5.0, 0, 7], indexing="ij"))
     np.testing.assert_allclose(loaded.fall_off()(tan_y, tan_x), world.fall_off(tan_y, tan_x), atol=0.03)
 

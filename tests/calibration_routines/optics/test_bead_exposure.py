@@ -17,6 +17,7 @@ from calibration_routines.optics.bead_photographs import BEADS, BeadSlides, phot
 from calibration_routines.optics.beads import BeadProcedure
 from calibration_routines.plan_procedures import ResumeProcedure, goes_on_with_frames, left_unfinished
 from calibration_routines.procedure import Listener, Size
+from calibration_routines.scatter import STEADY
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.calibration_file import load_calibration
@@ -53,8 +54,9 @@ def photographed(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[list[fl
             taken_ms.append(exposure_ms)
             many = 7 if exposure_ms > saturate_ms[slide[0]] else 0
             run = SimpleNamespace(path=Path("run"))
+            picture = np.ones((4, 4), np.float32)
             return SimpleNamespace(
-                saturated_pixels=many, findings=(), run=run, measurement=np.ones((4, 4), np.float32)
+                saturated_pixels=many, findings=(), run=run, measurement=picture, scatter=STEADY
             )
 
         monkeypatch.setattr(beads._Series, "_take", photograph)
@@ -154,6 +156,9 @@ def test_slides_that_were_left_go_on_wherever_they_were_left(tmp_path: Path) -> 
     assert [BEADS.read(run).number for run in whole] == [0, 1, 2]
     assert set(done.runs) == set(whole)
     assert all(len(Run.open(run).records) == 5 for run in whole)
-    assert load_calibration(done.calibration).psfs.shape[0] == 1
+    kept = load_calibration(done.calibration)
+    assert kept.psfs.shape[0] == 1
+    assert kept.quality["good"]
+    assert kept.quality["scatter"]["frames"] == 1
     assert left_unfinished(folder, ["beads"]) is None
     assert not any(BEADS.lacks_result(run) for run in runs)
