@@ -80,7 +80,7 @@ def stream_problem(
     known, options = given(overrides, options)
     measurement = frame if isinstance(frame, Measurement) else Measurement(frame)
     measurement = replace(measurement, **known)
-    doubt, reason = "", ""
+    doubt, reason, chosen = "", "", False
     wishes = options.choose or Overrides()
     if wishes != Overrides(field=wishes.field):
         raise InputError(
@@ -88,13 +88,14 @@ def stream_problem(
             "and --background say the rest."
         )
     if options.model == "auto":
-        doubt = _by_one_psf(calibration, options)
+        doubt, reason = _by_one_psf(calibration, options)
         if doubt and choosing and isinstance(calibration, Calibration):
             options, extent, reason, doubt = _chosen(measurement, others, calibration, options)
+            chosen = True
         else:
             options = replace(options, model="convolution", choose=None)
     problem = Problem.of(measurement, calibration, options, extent=extent)
-    if choosing and not reason:
+    if choosing and not chosen:
         require_two_images(problem)
         if isinstance(calibration, Calibration):
             problem = with_background(problem, calibration)
@@ -140,17 +141,21 @@ def _chosen(
     return settled, extent, reason, said
 
 
-def _by_one_psf(calibration: Calibration | npt.ArrayLike, options: ReconstructionOptions) -> str:
-    """Say what one PSF for the whole field does not tell of a calibration; empty where it is enough."""
+def _by_one_psf(calibration: Calibration | npt.ArrayLike, options: ReconstructionOptions) -> tuple[str, str]:
+    """Say what one PSF for the whole field does not tell of a calibration, and why it is taken.
+
+    The first is empty where it tells enough.
+    """
     if not isinstance(calibration, Calibration) or len(calibration.psfs) == 1:
-        return ""
+        return "", "there is one PSF"
     model, why = choose_model(depths_of(calibration, options)[1], "auto")
     if model == "convolution":
-        return ""
-    return (
+        return "", why
+    doubt = (
         f"One PSF serves the whole field, as is quickest: {why}. "
         f"--model {model} takes all of them, in several times the time."
     )
+    return doubt, "one PSF a depth, as is quickest"
 
 
 class VideoSolver:

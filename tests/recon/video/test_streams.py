@@ -55,6 +55,15 @@ def test_a_still_video_becomes_what_a_photograph_becomes(name: str, erased: bool
     assert np.linalg.norm(picture - alone) < 0.03 * np.linalg.norm(alone)
 
 
+def test_what_nobody_asked_for_is_not_said_to_be_asked_for() -> None:
+    scene = make_scene("sparse-picture", size=24, grid=3, photons=2000.0)
+    middle = scene.calibration.psfs[len(scene.calibration.psfs) // 2]
+    assert stream_problem(scene.measurement, middle).reason == "there is one PSF"
+    assert stream_problem(scene.measurement, middle, model="convolution").reason == "as asked"
+    live = stream_problem(scene.measurement, scene.calibration, choosing=False)
+    assert live.reason == "one PSF a depth, as is quickest"
+
+
 @pytest.mark.parametrize("solver", ["admm", "admm-sensor"])
 def test_where_no_depth_was_left_out_nothing_takes_part_again(solver: str) -> None:
     scene = make_scene("sparse-picture", size=24, grid=3, photons=2000.0)
