@@ -57,7 +57,7 @@ def test_a_still_video_becomes_what_a_photograph_becomes(name: str, erased: bool
 
 def test_what_nobody_asked_for_is_not_said_to_be_asked_for() -> None:
     scene = make_scene("sparse-picture", size=24, grid=3, photons=2000.0)
-    middle = scene.calibration.psfs[len(scene.calibration.psfs) // 2]
+    middle = scene.calibration.psfs[len(scene.calibration.psfs) // 2][0]
     assert stream_problem(scene.measurement, middle).reason == "there is one PSF"
     assert stream_problem(scene.measurement, middle, model="convolution").reason == "as asked"
     live = stream_problem(scene.measurement, scene.calibration, choosing=False)
