@@ -106,15 +106,20 @@ class StopCheck:
     rules: StoppingRules
     _calm: int = field(default=0, init=False)
 
-    def __call__(self, record: IterationRecord) -> StopReason | None:
-        """Return the reason to stop after this iteration, or None."""
+    def __call__(
+        self, record: IterationRecord, confirm: Callable[[], bool] = lambda: True
+    ) -> StopReason | None:
+        """Return the reason to stop after this iteration, or None.
+
+        ``confirm`` is asked where the run looks converged; what it denies leaves the other rules in force.
+        """
         rules = self.rules
         if not np.isfinite(record.change) or np.isinf([record.data_residual, record.objective]).any():
             return StopReason.NOT_FINITE
         if rules.noise_norm is not None and record.data_residual <= rules.noise_norm:
             return StopReason.NOISE_LEVEL
         self._calm = self._calm + 1 if record.unrest < rules.tolerance else 0
-        if rules.tolerance > 0 and self._calm >= rules.patience:
+        if rules.tolerance > 0 and self._calm >= rules.patience and confirm():
             return StopReason.CONVERGED
         if rules.time_s is not None and record.seconds >= rules.time_s:
             return StopReason.TIME
@@ -245,9 +250,7 @@ class Solver(ABC):
         history = [] if keeper is None else list(keeper.resume(part, self))
         reason: StopReason | None = None
         for record in history:
-            reason = check(record)
-        if reason is StopReason.CONVERGED and not self.confirm():
-            reason = None
+            reason = check(record, self.confirm if record is history[-1] else lambda: True)
         seconds = history[-1].seconds if history else 0.0
         while reason is None:
             began = time.perf_counter()
@@ -256,9 +259,7 @@ class Solver(ABC):
             seconds += time.perf_counter() - began
             record = replace(known, iteration=self.iteration, seconds=seconds)
             history.append(record)
-            reason = check(record)
-            if reason is StopReason.CONVERGED and not self.confirm():
-                reason = None
+            reason = check(record, self.confirm)
             if callback is not None:
                 callback(self, record)
             if keeper is not None:
