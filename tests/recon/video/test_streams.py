@@ -19,7 +19,8 @@ from recon.reconstruction.part import Part
 from recon.reconstruction.probe import MARGIN, Within
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.selection import choose
-from recon.solvers import memory
+from recon.solvers import SensorAdmm, memory
+from recon.solvers.base import IterationRecord, Solver, StoppingRules
 from recon.solvers.moving import move, move_spectra
 from recon.streams.joint import solve_together
 from recon.streams.motion import Panning
@@ -274,3 +275,94 @@ def test_depths_move_with_the_scene_and_take_new_data_at_once(prior: str) -> Non
         best = VideoSolver(posed, cold_iterations=120).next(moved)
         apart.append(np.linalg.norm(picture - best) / np.linalg.norm(best))
     assert apart[0] < 0.5 * apart[1]
+
+
+class OtherMoves(Solver):
+    """A solver whose changes are given; it solves nothing."""
+
+    solution = np.zeros(1)
+
+    def __init__(self, *changes: float, confirms: bool = True) -> None:
+        self.changes, self.confirms, self.asked = list(changes), confirms, 0
+
+    def step(self) -> IterationRecord:
+        raise NotImplementedError
+
+    def advance(self) -> IterationRecord:
+        self.asked += 1
+        return IterationRecord(self.asked, 0.0, change=self.changes.pop(0))
+
+    def confirm(self) -> bool:
+        return self.confirms
+
+
+class Moves(OtherMoves, SensorAdmm):
+    """One of pictures, as :meth:`VideoSolver.advance` tells them apart."""
+
+
+def video_of(*solvers: OtherMoves, **counts: int) -> VideoSolver:
+    scene = make_scene("sparse-picture", size=24, grid=3)
+    video = VideoSolver(stream_problem(scene.measurement, scene.calibration), **counts)
+    video.solvers = list(solvers)
+    return video
+
+
+def test_a_frame_of_pictures_is_at_rest_when_its_largest_change_is_below_what_settles_it() -> None:
+    video = video_of(Moves(0.5, 0.1, 0.0, 0.09), Moves(0.01, 0.01, 0.1, 0.0))
+    assert [video.advance(0.1) for _ in range(4)] == [False, False, False, True]
+    assert video.iterations == 4
+    assert video_of(Moves(0.0)).advance(0.1)
+
+
+def test_other_solvers_are_at_rest_when_they_are_calm_for_long_and_still_move() -> None:
+    calm, still = 0.01, 0.0
+    patience = StoppingRules().patience
+    for solvers in ([OtherMoves], [OtherMoves, Moves]):
+        changes = [*[calm] * (patience - 1), 0.2, *[calm] * (patience - 1), still, *[calm] * (patience + 1)]
+        video = video_of(*(kind(*changes) for kind in solvers))
+        told = [video.advance(0.1) for _ in changes]
+        assert told == [False] * (len(changes) - 2) + [True, True]
+
+
+def test_a_frame_has_its_iterations_and_as_many_again_where_a_depth_takes_part_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(VideoSolver, "take", lambda *_: None)
+    monkeypatch.setattr(VideoSolver, "picture", lambda _: "a picture")
+    for cold, confirms, changes, asked in (
+        (True, True, [1.0] * 50, 5),
+        (False, True, [1.0] * 50, 3),
+        (True, False, [1.0] * 50, 10),
+        (False, True, [1.0, 1e-5, 1.0], 2),
+        (False, False, [1.0, 1e-5, 1.0, 1e-5], 4),
+    ):
+        solver = Moves(*changes, confirms=confirms)
+        video = video_of(solver, cold_iterations=5, warm_iterations=3)
+        video._cold = cold
+        assert video.next(np.zeros((24, 24), np.float32)) == "a picture"
+        assert solver.asked == asked
+    calm = OtherMoves(*[0.01] * 9, confirms=False)
+    video = video_of(calm)
+    assert [video.advance(0.1) for _ in range(3)][-1]
+    assert not video.confirm()
+    assert [video.advance(0.1) for _ in range(3)] == [False, False, True], "calm is counted anew"
+    calm.confirms = True
+    assert video.confirm()
+    assert video.advance(0.1)
+
+
+def test_iterations_are_counted_from_the_last_frame_that_began_cold() -> None:
+    scene = make_scene("sparse-picture", size=24, grid=3, photons=2000.0)
+    problem = stream_problem(scene.measurement, scene.calibration)
+    with pytest.raises(InputError, match="got 1 cold and 0 warm"):
+        VideoSolver(problem, cold_iterations=1, warm_iterations=0)
+    video = VideoSolver(problem, cold_iterations=1, warm_iterations=1)
+    assert video.iterations == 0
+    counts = []
+    for begins in (False, False, False, True, False):
+        if begins:
+            video.begin()
+        video.take(scene.measurement)
+        video.advance(0.0)
+        counts.append(video.iterations)
+    assert counts == [1, 2, 3, 1, 2]
