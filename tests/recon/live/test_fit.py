@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import threading
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
 from recon.streams import fit
@@ -57,3 +61,80 @@ def test_nothing_is_checked_before_pictures_have_come_for_a_while(monkeypatch: p
     monkeypatch.setattr(fit, "FIRST_S", 3600.0)
     watched.watch = CalibrationWatch()
     assert watched.see(SceneState.STILL, 1) == 0
+
+
+def test_checks_take_a_tenth_of_the_time_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    watched, now_s = Watched(monkeypatch), [0.0]
+    monkeypatch.setattr(fit, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    monkeypatch.setattr(fit, "_found", lambda *_: fit._Found("", "", 2.0))
+    watched.watch = CalibrationWatch()
+    counts = []
+    for at_s in (0.1, 0.2, 18.1, 18.3, 18.4, 36.3, 36.5):  # what a check took is known when it is looked for
+        now_s[0] = at_s
+        counts.append(watched.see(SceneState.MOVING, 1))
+    assert counts == [1, 1, 1, 2, 2, 2, 3]
+
+
+def test_pictures_do_not_wait_for_a_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit, "FIRST_S", 0.0)
+    pictures_go_on, found = threading.Event(), []
+
+    def takes_long(*_: object) -> fit._Found:
+        found.append(pictures_go_on.wait(20))
+        return fit._Found("a doubt", "", 0.0)
+
+    monkeypatch.setattr(fit, "_found", takes_long)
+    watch, problem = CalibrationWatch(), SimpleNamespace()
+    for _ in range(3):
+        watch.see(lambda: problem, 1, SceneState.MOVING, 1)  # type: ignore[arg-type, return-value]
+        assert watch.doubt == ""
+    pictures_go_on.set()
+    watch.wait()
+    assert watch.doubt == "a doubt"
+    assert found == [True]
+
+
+@pytest.mark.parametrize("stray", [False, True])
+@pytest.mark.parametrize("known", ["calibration", "PSF alone", "with a background"])
+def test_stray_light_is_looked_for_where_a_photograph_would_have_a_background_for_it(
+    known: str, stray: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked, judged, now_s = [], [], iter((5.0, 7.5))
+    monkeypatch.setattr(fit, "time", SimpleNamespace(monotonic=lambda: next(now_s)))
+
+    def with_background(problem: SimpleNamespace, calibration: object) -> SimpleNamespace:
+        looked.append((problem.options.solver, calibration))
+        return SimpleNamespace(smooth=stray)
+
+    def check(problem: SimpleNamespace) -> SimpleNamespace:
+        judged.append(problem.smooth)
+        return SimpleNamespace(sentences=("it does not fit.", "Nor does this."))
+
+    monkeypatch.setattr(fit, "replace", lambda what, **new: SimpleNamespace(**{**vars(what), **new}))
+    monkeypatch.setattr(fit, "reduced_calibration", lambda calibration, binning, planes: (binning, planes))
+    monkeypatch.setattr(fit, "with_background", with_background)
+    monkeypatch.setattr(fit, "check_calibration", check)
+    posed: Any = SimpleNamespace(
+        smooth=known == "with a background", options=SimpleNamespace(solver="admm-sensor")
+    )
+    calibration: Any = None if known == "PSF alone" else SimpleNamespace()
+    found = fit._found(posed, calibration, 3)
+    asked = known == "calibration"
+    assert looked == ([("auto", (3, None))] if asked else [])
+    assert judged == [stray if asked else posed.smooth]
+    assert ("--background" in found.advice) == (asked and stray)
+    assert (found.doubt, found.seconds) == ("It does not fit.", 2.5)
+
+
+def test_what_cannot_be_checked_is_said_and_what_fits_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    posed: Any = SimpleNamespace(smooth=False)
+    monkeypatch.setattr(fit, "check_calibration", lambda _: None)
+    assert fit._found(posed, None, 1).doubt == ""
+    monkeypatch.setattr(fit, "check_calibration", lambda _: SimpleNamespace(sentences=()))
+    assert fit._found(posed, None, 1).doubt == ""
+
+    def breaks(_: object) -> None:
+        raise ArithmeticError("no light")
+
+    monkeypatch.setattr(fit, "check_calibration", breaks)
+    assert fit._found(posed, None, 1).doubt == "Whether the calibration fits could not be found out: no light"
