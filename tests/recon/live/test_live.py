@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import time
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from recon.streams.live import LiveReconstructor
 from recon.streams.live_picture import DARK, NOISE_ONLY, UNLIT, Level, LivePicture
 from recon.streams.pace import HOLD, Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch, has_light
+from recon.streams.video import VideoSolver
 
 SHAPE = (64, 96)
 AMPLE_MS = 5000.0
@@ -609,3 +612,88 @@ def test_a_calibration_that_does_not_fit_is_said_of_every_picture(psf: np.ndarra
     assert says in picture.doubt
     assert bool(says) == bool(picture.doubt)
     assert not says or re.match("(The|This|What|It|A) [a-z]", picture.doubt), picture.doubt
+
+
+# What fits into a budget, by a clock that only pictures turn ------------------------------------------
+@pytest.fixture
+def _clocked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An iteration takes 10 ms, 8 of them work, a picture of it 5 and 4, a filter's 2 and 1."""
+    now_ms = [1e6, 1e5]
+    clock = SimpleNamespace(perf_counter=lambda: now_ms[0] / 1e3, thread_time=lambda: now_ms[1] / 1e3)
+    monkeypatch.setattr("recon.streams.live.time", clock)
+
+    def takes(wall_ms: float, work_ms: float, owner: type, name: str) -> None:
+        of_itself = getattr(owner, name)
+
+        def call(*args: Any) -> Any:
+            now_ms[0] += wall_ms
+            now_ms[1] += work_ms
+            result = of_itself(*args)
+            return False if name == "advance" else result  # never settled
+
+        monkeypatch.setattr(owner, name, call)
+
+    takes(10, 8, VideoSolver, "advance")
+    takes(5, 4, VideoSolver, "volume")
+    takes(2, 1, Level, "filtered")
+
+
+@pytest.mark.usefixtures("_clocked")
+def test_iterations_are_those_that_fit_into_the_budget() -> None:
+    reconstructor = live(budget_ms=100.0, average=1)
+    first = reconstructor.feed(photograph(0, 0))
+    assert (first.method, first.iterations, first.total_iterations) == ("wiener", 0, 0)
+    assert first.work_ms == pytest.approx(2)
+    assert first.volume is None
+    refined = reconstructor.refine()
+    assert refined is not None
+    assert (refined.iterations, refined.total_iterations) == (11, 11), "what one takes was not known"
+    assert refined.work_ms == pytest.approx(115)
+    assert refined.volume is None
+    total, frames = 11, iter(range(1, 99))
+
+    def moved(budget_ms: float) -> LivePicture:
+        reconstructor.budget_ms = budget_ms
+        n = next(frames)
+        picture = reconstructor.feed(photograph(0.7 * n, n))
+        assert picture.scene is SceneState.MOVING
+        return picture
+
+    for budget_ms, iterations in ((100.0, 2), (104.0, 9), (95.0, 9), (94.0, 8), (25.0, 2), (24.0, 1)):
+        picture = moved(budget_ms)
+        total += iterations
+        assert (picture.method, picture.iterations) == ("admm-sensor", iterations)
+        assert picture.total_iterations == total, "each goes on from the one before"
+        assert picture.work_ms == pytest.approx(10 * iterations + 5)
+        cost = reconstructor._pace.cost(1)
+        assert cost is not None
+        took = (cost.fixed.wall_ms, cost.fixed.work_ms, cost.step.wall_ms, cost.step.work_ms)
+        assert took == pytest.approx((5, 4, 10, 8))
+    for budget_ms, iterations in ((94.0, 9), (92.6, 9), (92.4, 8), (91.5, 8), (82.6, 8), (10.0, 1)):
+        reconstructor.budget_ms = budget_ms
+        refined = reconstructor.refine()
+        assert refined is not None
+        assert refined.iterations == iterations, "the next one and half of a picture must fit as well"
+    rough = moved(14.0)
+    assert (rough.method, rough.iterations, rough.total_iterations) == ("wiener", 0, 0)
+    assert rough.work_ms == pytest.approx(2)
+    reconstructor.budget_ms = 100.0
+    anew = reconstructor.refine()
+    assert anew is not None
+    assert anew.total_iterations == anew.iterations
+
+
+@pytest.mark.parametrize(("at_once", "binning"), [(700, 3), (800, 3), (1535, 3), (1536, 2), (6144, 1), (90, 4)])
+def test_the_first_picture_is_the_finest_that_takes_no_time_to_speak_of(
+    at_once: int, binning: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recon.streams.live.AT_ONCE", at_once)
+    reconstructor = live(coarsest=8)
+    assert reconstructor._pace.levels == (1, 2, 3, 4), "below 16 pixels no binning goes"
+    assert reconstructor._first_detail().binning == binning
+
+
+def test_a_known_background_is_taken_off() -> None:
+    frame = photograph(0, 0).astype(np.float32)
+    less = live(background=None).feed(frame - 20)
+    np.testing.assert_allclose(live().feed(frame).image, less.image, atol=1e-5 * float(less.image.max()))

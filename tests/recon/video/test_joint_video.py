@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from recon import InputError
+from recon import InputError, Measurement
 from recon.camera.convolution import Convolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers import SensorAdmm
 from recon.streams.joint import (
+    OVER_TIME,
     JointAdmm,
     LowRankPlusSparse,
     OverTimeName,
@@ -169,3 +172,74 @@ def test_colour_and_single_frames_are_refused() -> None:
     grey = stream_problem(frames[0, ..., 0], frames[0, ..., 0] ** 4)
     with pytest.raises(InputError, match="two frames"):
         solve_together(grey, frames[:1, ..., 0], "tv")
+
+
+def test_a_changed_penalty_leaves_the_multiplier_over_time_as_it_is() -> None:
+    camera, data = problem()
+    joint = JointAdmm(camera, data, NonNegativity(), TemporalTotalVariation(0.5))
+    mu = joint._mu_time
+    assert mu == pytest.approx(float(np.mean(joint._mu[1])), rel=1e-12)
+    rng = np.random.default_rng(0)
+    joint._t_time[...], joint._split[...] = (rng.standard_normal(joint._t_time.shape) for _ in range(2))
+    multiplier = mu * (joint._t_time - joint._split)
+    joint._splits.set_penalties(3.0 * joint._mu)
+    joint._adapt()
+    assert joint._mu_time == pytest.approx(3 * mu)
+    np.testing.assert_allclose(joint._mu_time * (joint._t_time - joint._split), multiplier, rtol=1e-9)
+    kept = joint._t_time.copy()
+    joint._adapt()  # as it is already
+    np.testing.assert_array_equal(joint._t_time, kept)
+
+
+@pytest.mark.parametrize("erased", [False, True])
+@pytest.mark.parametrize("weight", [None, 2.5])
+def test_weights_over_time_are_those_of_the_noise_that_valid_pixels_pass_on(
+    weight: float | None, erased: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Any] = []
+
+    class Given:
+        """Notes what it is given, and is solved at once."""
+
+        def __init__(self, operator: Any, data: np.ndarray, prior: Any, over_time: Any) -> None:
+            made.append((operator, data, over_time))
+            self.solution = np.ones(operator.domain_shape, np.float32)
+            self.advances = 0
+
+        def advance(self) -> None:
+            made.append("an iteration")
+
+    monkeypatch.setattr("recon.streams.joint.JointAdmm", Given)
+    rng = np.random.default_rng(0)
+    frames = rng.random((3, 20, 26)).astype(np.float32)
+    gone = rng.random((20, 26)) < 0.4 if erased else None
+    camera = stream_problem(Measurement(frames[0], erasures=gone, noise=0.1), frames[0] ** 6)
+    expected = (1.0 if weight is None else weight) * float(np.sqrt(camera.valid.mean()))
+    assert (camera.valid.mean() < 0.8) == erased
+    for name in OVER_TIME:
+        made.clear()
+        found = solve_together(camera, frames, name, weight=weight, iterations=4)
+        assert found is not None
+        assert made[1:] == ["an iteration"] * 4
+        np.testing.assert_array_equal(found, np.full((3, 20, 26), camera.image_scale[0], np.float32))
+        operator, data, over_time = made[0]
+        assert isinstance(operator, Convolution) != erased
+        np.testing.assert_array_equal(data, [camera.with_data(frame).data[0] for frame in frames])
+        if isinstance(over_time, LowRankPlusSparse):
+            pixels = (20 * 26) ** 0.5
+            weights = (over_time.weight_rank, over_time.weight_sparse, over_time.rounds)
+            assert weights == pytest.approx((0.03 * expected * pixels, 0.3 * expected, 2))
+        else:
+            assert over_time.weight == pytest.approx(expected)
+    left = iter([False, False, True])
+    assert solve_together(camera, frames, "tv", ended=lambda: next(left)) is None
+    assert next(left, None) is None
+
+
+def test_what_a_prior_over_time_has_no_way_for_is_refused() -> None:
+    frames = np.random.default_rng(0).random((3, 20, 20)).astype(np.float32)
+    asked = stream_problem(frames[0], frames[0] ** 4, solver="admm")
+    with pytest.raises(InputError, match="a solver of its own"):
+        require_joint(asked)
+    with pytest.raises(InputError, match="two frames"):
+        solve_together(stream_problem(frames[0], frames[0] ** 4), frames[0], "tv")
