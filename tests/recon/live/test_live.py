@@ -697,3 +697,68 @@ def test_a_known_background_is_taken_off() -> None:
     frame = photograph(0, 0).astype(np.float32)
     less = live(background=None).feed(frame - 20)
     np.testing.assert_allclose(live().feed(frame).image, less.image, atol=1e-5 * float(less.image.max()))
+
+
+def test_what_the_calibration_is_checked_by_and_what_is_advised_is_said_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: list[Any] = []
+
+    class Looked:
+        doubt = ""
+
+        def __init__(self, calibration: Calibration | None = None) -> None:
+            self.calibration, self.advice, self.seen = calibration, "", []
+            made.append(self)
+
+        def see(self, posed: Any, binning: int, scene: SceneState, frames: int) -> None:
+            self.seen.append((binning, scene, frames, posed()))
+
+    monkeypatch.setattr("recon.streams.live.CalibrationWatch", Looked)
+    psf_alone = live()
+    assert made.pop().calibration is None
+    psf_alone.restart()
+    assert made.pop().calibration is None
+    calibration = Calibration(spots_psf()[None, None], np.array([[0.0, 0.0, 1000.0]]))
+    reconstructor = LiveReconstructor(
+        calibration, background=20.0, noise=NOISE, budget_ms=AMPLE_MS, coarsest=1
+    )
+    frames = [photograph(0, n) for n in range(3)]
+    for frame in frames[:2]:
+        reconstructor.feed(frame)
+    (watch,) = made
+    assert watch.calibration is calibration
+    assert [seen[:3] for seen in watch.seen] == [(1, SceneState.NEW, 1), (1, SceneState.STILL, 2)]
+    of_the_mean = reconstructor._level.whole.with_data(  # type: ignore[union-attr]
+        np.mean(frames[:2], axis=0, dtype=np.float32) - 20
+    )
+    np.testing.assert_allclose(watch.seen[1][3].data, of_the_mean.data, rtol=1e-4, atol=1e-4)
+    before = reconstructor.warnings
+    watch.advice = "a lens cap"
+    for frame in frames:
+        reconstructor.feed(frame)
+    assert reconstructor.warnings == (*before, "a lens cap")
+    reconstructor.restart()
+    assert made[1].calibration is calibration
+    assert reconstructor.warnings == before
+
+
+def test_what_was_settled_on_noise_is_made_anew_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+    make = LiveReconstructor._make
+
+    def counted(self: LiveReconstructor, *given: Any) -> None:
+        made.append(given)
+        make(self, *given)
+
+    monkeypatch.setattr(LiveReconstructor, "_make", counted)
+    reconstructor = live(budget_ms=AMPLE_MS)
+    rng = np.random.default_rng(0)
+    dark = [np.round(20 + rng.normal(0, 2, SHAPE)).astype(np.uint16) for _ in range(2)]
+    for n, frame in enumerate([*dark, *[photograph(0, seed) for seed in range(4)]]):
+        reconstructor.feed(frame)
+        if reconstructor._coming is not None:
+            reconstructor._coming.wait()
+        assert len(made) == (n >= 2)
+    reconstructor._settled = True
+    assert reconstructor.refine() is None
