@@ -683,7 +683,9 @@ def test_iterations_are_those_that_fit_into_the_budget() -> None:
     assert anew.total_iterations == anew.iterations
 
 
-@pytest.mark.parametrize(("at_once", "binning"), [(700, 3), (800, 3), (1535, 3), (1536, 2), (6144, 1), (90, 4)])
+@pytest.mark.parametrize(
+    ("at_once", "binning"), [(700, 3), (800, 3), (1535, 3), (1536, 2), (6144, 1), (90, 4)]
+)
 def test_the_first_picture_is_the_finest_that_takes_no_time_to_speak_of(
     at_once: int, binning: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
