@@ -1,0 +1,76 @@
+"""What solvers and priors refuse, in words, and what lies just within."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from recon.camera.convolution import Convolution
+from recon.errors import StructureError
+from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation
+from recon.priors.base import Separable, require_weight
+from recon.priors.total_variation import Differences
+from recon.solvers.douglas_rachford import SparseDouglasRachford
+from recon.solvers.prior_splits import ratio, require_exact, soft_pair
+from recon.solvers.splitting import SensorData
+
+PSFS = np.random.default_rng(0).random((2, 1, 5, 6))
+DATA = np.ones((1, 8, 9))
+
+
+def volume(prior: Separable, channels: int = 1) -> SparseDouglasRachford:
+    camera = Convolution(PSFS, (8, 9), n_channels=channels, dtype=np.float64)
+    return SparseDouglasRachford(camera, SensorData(DATA.repeat(channels, 0), np.ones((8, 9), bool)), prior)
+
+
+WITHIN: list[Callable[[], object]] = [
+    lambda: volume(L1(0.1)),
+    lambda: volume(L1(0.1) + NonNegativity()),
+    lambda: Box(1.0, 1.0),
+    lambda: L1(0.0),
+    lambda: Differences((1, 4, 5), (1, 1, 1)),
+    lambda: Differences((1, 3, 4, 5), np.ones((3, 3)), (True, False, True)),
+]
+REFUSED: list[tuple[Callable[[], object], type[Exception], str]] = [
+    (lambda: volume(L1(0.1), channels=2), ValueError, "One channel at a time, not 2"),
+    (lambda: volume(Box(-1.0, 1.0)), StructureError, "for l1 and non-negativity alone"),
+    (lambda: volume(Separable(0.1, lower=-1.0)), StructureError, "for l1 and non-negativity alone"),
+    (lambda: require_exact(L1(0.1), HaarTotalVariation(0.1)), StructureError, "HaarTotalVariation is only"),
+    (lambda: L1(-0.1), ValueError, "must not be negative; got -0.1"),
+    (lambda: require_weight(float("nan")), ValueError, "must not be negative; got nan"),
+    (lambda: TotalVariation(-1.0), ValueError, "must not be negative"),
+    (lambda: Box(2.0, 1.0), ValueError, "lower limit 2 is above its upper limit 1"),
+    (lambda: Box(float("nan"), 1.0), ValueError, "lower limit nan"),
+    (lambda: Differences((4, 5), (1, 1, 1)), ValueError, "Weights (3,) do not fit an object of shape (4, 5)"),
+    (lambda: Differences((1, 3, 4, 5), np.ones((2, 3))), ValueError, "Weights (2, 3) do not fit"),
+    (lambda: Differences((4, 5), np.ones((4, 2))), ValueError, "Weights (4, 2) do not fit"),
+    (lambda: Differences((1, 4, 5), (1, 1), (True,)), ValueError, "wrap has 1 entries for 2 weights"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("number", range(len(REFUSED)))
+def test_it_is_refused_in_words(number: int) -> None:
+    call, kind, says = REFUSED[number]
+    with pytest.raises(kind, match=re.escape(says)):
+        call()
+
+
+@pytest.mark.parametrize("number", range(len(WITHIN)))
+def test_what_lies_just_within_is_taken(number: int) -> None:
+    assert WITHIN[number]() is not None
+
+
+def test_residuals_are_relative_and_nothing_of_nothing_is_none() -> None:
+    assert (ratio(0.0, 0.0), ratio(2.0, 0.0), ratio(0.0, 3.0)) == (0.0, 1.0, 0.0)
+    assert ratio(2.0, 8.0) == 0.5
+
+
+def test_a_pair_of_differences_is_shrunk_by_its_length_or_each_by_itself() -> None:
+    tx, ty = np.array([3.0, 0.3, 0.0]), np.array([-4.0, 0.4, 0.0])
+    together = soft_pair(tx, ty, 1.0, isotropic=True)
+    np.testing.assert_allclose(together, [[2.4, 0, 0], [-3.2, 0, 0]])
+    each = soft_pair(tx, ty, 0.35, isotropic=False)
+    np.testing.assert_allclose(each, [[2.65, 0, 0], [-3.65, 0.05, 0]], atol=1e-12)
