@@ -40,11 +40,14 @@ class CalibrationWatch:
     ----------
     advice : str
         What pictures lack, in words; empty where nothing is known to.
+    is_known : bool
+        Whether a check of frames in this light has ended.
     """
 
     def __init__(self, calibration: Calibration | None = None) -> None:
         self._calibration = calibration
         self.advice = self._doubt = ""
+        self.is_known = False
         self._running: Future[_Found] | None = None
         self._not_before = time.monotonic() + FIRST_S
         self._frames = 0
@@ -76,6 +79,11 @@ class CalibrationWatch:
         self._running = pool.submit(_found, posed, self._calibration, binning)
         pool.shutdown(wait=False)
 
+    def in_another_light(self) -> None:
+        """Forget what was found: it is not of the frames to come, and they are looked at soon."""
+        self._running, self._doubt, self.is_known = None, "", False
+        self._frames, self._not_before = 0, time.monotonic() + FIRST_S
+
     def wait(self) -> None:
         """Wait until the check that runs is over."""
         if self._running is not None:
@@ -90,7 +98,7 @@ class CalibrationWatch:
     def _look(self) -> None:
         if self._running is not None and self._running.done():
             self._doubt, self.advice, seconds = self._running.result()
-            self._running = None
+            self._running, self.is_known = None, True
             self._not_before = time.monotonic() + seconds * (1 / SHARE - 1)
 
 

@@ -24,7 +24,16 @@ from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import Progress
 from recon.streams.detail import Detail, ladder
 from recon.streams.fit import CalibrationWatch
-from recon.streams.live_picture import DARK, NOISE_ONLY, UNLIT, ComingLevel, Level, LiveOptions, LivePicture
+from recon.streams.live_picture import (
+    DARK,
+    NOISE_ONLY,
+    UNLIT,
+    UNLIT_SO_FAR,
+    ComingLevel,
+    Level,
+    LiveOptions,
+    LivePicture,
+)
 from recon.streams.pace import Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch
 from recon.streams.video import require_steps, stream_problem
@@ -124,6 +133,7 @@ class LiveReconstructor:
         """Whether the newest scene was shown by a Wiener filter already."""
         self._settled = False
         self._dark = False
+        self._lit = True
         self._fit = CalibrationWatch(self._given if isinstance(self._given, Calibration) else None)
 
     def _checked(self) -> Problem:
@@ -157,20 +167,24 @@ class LiveReconstructor:
             Counts. Of the PSF's pixels, or of a whole multiple of them, which is then binned to them.
         lit : bool
             Whether something was lit, as far as is known. Where nothing was and the frame holds noise only,
-            or nothing that the calibration explains, its picture is black and costs nothing; what is lit and
-            looks like noise may be a dim point.
+            or nothing that the calibration is known to explain, its picture is black and costs nothing; what
+            is lit and looks like noise may be a dim point. What was found of frames in the other state is
+            forgotten.
         """
         began = _now()
         frame = self._measured(np.asarray(image))
         level = self._level_for(frame)
         small = block_mean(frame, level.binning, about_axis=True)
         self._scene = self._watch.see(small)
+        if lit is not self._lit:
+            self._lit = lit
+            self._fit.in_another_light()
         self._dark = not self._sees_light(level, frame)
         affordable = self._pace.affordable(level.detail.coarseness, self.budget_ms)
         cut = self._scene is SceneState.NEW and not self._greeted
         too_slow = affordable < 1 and self._scene is not SceneState.STILL
         self._greeted = self._scene is SceneState.NEW
-        if not lit and (self._dark or self._fit.doubt):
+        if not lit and (self._dark or self._fit.doubt or not self._fit.is_known):
             self._follows, self._settled = False, True
             return self._picture(level, np.zeros_like(self._as_given(small))[None], None, began)
         solver = level.solver
@@ -459,7 +473,7 @@ class LiveReconstructor:
         )
 
     def _unlit(self) -> str:
-        return DARK if self._dark else UNLIT
+        return DARK if self._dark else UNLIT if self._fit.doubt else UNLIT_SO_FAR
 
 
 def _now() -> Spent:

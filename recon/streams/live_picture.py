@@ -38,6 +38,9 @@ DARK = "Dark, nothing was lit: no picture is made"
 UNLIT = "Nothing was lit, and nothing in the frame is the calibration's pattern: no picture is made"
 """Doubt of the black picture of such a frame: what a dark frame was not, once many are averaged."""
 
+UNLIT_SO_FAR = "Nothing was lit, as far as is known: whether there is light all the same is being found out"
+"""Doubt of the black picture of such a frame until the calibration was held against it."""
+
 _LIVE = "Live pictures"
 
 

@@ -56,6 +56,18 @@ def test_what_a_check_found_is_told_without_another_picture(monkeypatch: pytest.
     assert watched.watch.advice == "advice"
 
 
+def test_what_was_found_in_another_light_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    watched = Watched(monkeypatch, "it does not fit")
+    watched.see(SceneState.STILL, 8)
+    assert watched.watch.doubt
+    assert watched.watch.is_known
+    watched.watch._not_before += 3600.0  # the check took long on a busy machine
+    watched.watch.in_another_light()
+    assert not watched.watch.doubt
+    assert not watched.watch.is_known
+    assert watched.see(SceneState.STILL, 8) == 2, "and looked at soon"
+
+
 def test_nothing_is_checked_before_pictures_have_come_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
     watched = Watched(monkeypatch)
     monkeypatch.setattr(fit, "FIRST_S", 3600.0)

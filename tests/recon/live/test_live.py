@@ -14,7 +14,7 @@ from recon import Calibration, InputError, NoiseModel, reconstruct
 from recon.base.metrics import psnr
 from recon.streams.fit import CalibrationWatch
 from recon.streams.live import LiveReconstructor
-from recon.streams.live_picture import DARK, NOISE_ONLY, UNLIT, Level, LivePicture
+from recon.streams.live_picture import DARK, NOISE_ONLY, UNLIT, UNLIT_SO_FAR, Level, LivePicture
 from recon.streams.pace import HOLD, Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch, has_light
 from recon.streams.video import VideoSolver
@@ -566,11 +566,20 @@ def test_a_frame_of_noise_is_called_so_and_one_with_light_is_not(monkeypatch: py
     assert psnr(picture.image, reference.image) > 40
     for frame in dark[4:]:
         assert reconstructor.feed(frame).doubt == NOISE_ONLY
+    reconstructor._fit._doubt = "Found when something was lit"
     black = reconstructor.feed(dark[4], lit=False)
     assert black.quality == black.doubt == DARK
     assert black.image.shape == refined.image.shape
     assert not black.image.any()
     assert reconstructor.refine() is None, "there is nothing to go on with"
+    untold = reconstructor.feed(photograph(0, 1), lit=False)
+    assert untold.quality == untold.doubt == UNLIT_SO_FAR, (
+        "what was found of frames in another light is not said"
+    )
+    assert not untold.image.any()
+    reconstructor._fit._not_before = 0.0  # at once
+    reconstructor.feed(photograph(0, 1), lit=False)
+    reconstructor._fit.wait()
     assert reconstructor.feed(photograph(0, 1), lit=False).doubt == "", "a lamp that nobody told of is seen"
     monkeypatch.setattr(CalibrationWatch, "doubt", "Any PSF would explain it as well")
     unlit = reconstructor.feed(photograph(0, 2), lit=False)  # a sensor's own pattern, say
