@@ -22,6 +22,8 @@ _ELSEWHERE = {
     "devices": "“New bench from what is connected” on the start page",
 }
 """What is no task of its own in the panel Files."""
+_AGAIN = re.compile(r"\b(?:[Rr]un the|[Tt]he) same command\b")
+"""What goes on where it stopped, as a form's button does."""
 _REST = r"(?:\s+(?:--[a-z][a-z-]*|[A-Z]{3,}|mask|slm|illumination|(?:/|[A-Za-z]:\\)\S*[^\s.,;:]))*"
 """Of a command: its sub-command, options, places and paths."""
 
@@ -29,7 +31,8 @@ _REST = r"(?:\s+(?:--[a-z][a-z-]*|[A-Z]{3,}|mask|slm|illumination|(?:/|[A-Za-z]:
 def in_the_window(text: str) -> str:
     """Return a message with the window's own ways in place of the terminal's commands."""
     ways, command = _ways()
-    return command.sub(lambda found: ways[found[1] or found[2]], text)
+    text = command.sub(lambda found: ways[found[1] or found[2]], text)
+    return _AGAIN.sub("“Start”", text)
 
 
 @functools.cache

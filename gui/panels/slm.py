@@ -86,6 +86,11 @@ class SlmPanel(DevicePanel):
         ]
         return on_bench(self.session.config.path, lines, imports, [f"correction = {loaded}"])
 
+    def take(self, what: Path) -> None:
+        """Put a picture's name into the field; a click shows it."""
+        self.file.setText(str(what))
+        self.load_button.setFocus()
+
     # What is on it -------------------------------------------------------------------------------
     def look(self) -> None:
         """Show what is on the SLM, whoever put it there."""

@@ -11,6 +11,7 @@ from PySide6.QtCore import Qt, QUrl
 from PySide6.QtGui import QDesktopServices, QFontDatabase, QImage, QPixmap
 from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QVBoxLayout, QWidget
 
+from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
 from gui.forms.fields import Behaviour
 from gui.forms.options_form import OptionsForm, SuggestedName
@@ -35,6 +36,7 @@ from gui.widgets.building import (
 from gui.widgets.sweep_views import Picture
 from gui.widgets.tab_order import tab_in_order
 from gui.words import in_the_window
+from instrument.files.calibration_file import newest_calibration
 from instrument.tasks import CHARTS, TASKS, VIDEOS
 from instrument.tasks.task import WRITTEN, Desk, Done, Task
 from recon.base.declare import Imports, Option, expression
@@ -43,6 +45,7 @@ _FOLDERS = ("FOLDER", "RUN", "CALIBRATION", "OLD", "NEW", "VIDEO|RUN", "RUN|RESU
 """What an option is called that names a folder."""
 _PICTURES = (".png", ".jpg", ".svg")
 _ROW_PX = 26
+_CALIBRATION = "calibration"
 
 
 class _Page(NamedTuple):
@@ -62,6 +65,7 @@ class TasksPanel(Panel):
         self._pages: dict[str, _Page] = {}
         self._loader = NewestOnly(session.jobs, "Preparing a form", lambda why: self.refused(None, why))
         self._reader = NewestOnly(session.jobs, "Reading a picture")
+        self._newest = NewestOnly(session.jobs, "Looking for the newest calibration")
         self._given: dict[str, Path] = {}
         self.files: tuple[Path, ...] = ()
 
@@ -185,6 +189,8 @@ class TasksPanel(Panel):
         out = next((o for o in options if o.name == "out"), None)
         place = task.out or (None if out is None or not isinstance(out.default, Path) else out.default)
         needed = (*task.needed, *(() if place is None else ("out",)))  # what has a name in the terminal
+        if place is None and out is not None and out.is_required and out.declaration.metavar == "FOLDER":
+            place = Path(name)  # a folder of its own: nothing hangs on what it is called
         special = {o.name: _behaviour(o, needed=o.name in needed) for o in options if _names_files(o)}
         form = OptionsForm(options, special)
         if task.subject:
@@ -197,7 +203,26 @@ class TasksPanel(Panel):
             names = SuggestedName(self.jobs, form, self.session.runs_folder / "results", suffix)
             form.set_values({"out": None})
             names.suggest(place.name.partition(".")[0])
+        if (field := form.fields.get(_CALIBRATION)) is not None and (
+            field.option.is_required or _CALIBRATION in task.needed
+        ):
+            folder = self.session.runs_folder
+            self._newest.ask(
+                lambda: newest_calibration(folder), lambda newest: self._offer_calibration(name, newest), name
+            )
         return _Page(task, form, names)
+
+    def _offer_calibration(self, name: str, newest: Path | None) -> None:
+        """Begin with the newest calibration where none was named."""
+        form = self._pages[name].form
+        if newest is None or str(form.fields[_CALIBRATION].raw()).strip():
+            return
+        form.set_values({_CALIBRATION: newest})
+        if name == self.name and not self.run.is_running:
+            called = newest.parent.name if newest.name == SWEEP.result else newest.name
+            self.run_bar.words.setText(
+                f"Calibration: {called}, the newest of this bench, for none was chosen."
+            )
 
     def objects(self) -> dict[str, object] | None:
         """Return the options objects that the form asks for; None, and fields marked, where it cannot be."""
@@ -253,6 +278,7 @@ class TasksPanel(Panel):
 
     def _clear(self) -> None:
         self.words.setPlainText("")
+        self.results.setCurrentIndex(0)  # a picture comes to the front once there is one
         mark(self.words, "refused", False)
         while (item := self._tables.takeAt(0)) is not None:
             if (widget := item.widget()) is not None:
@@ -308,8 +334,11 @@ class TasksPanel(Panel):
         self.use_button.setEnabled(any(map(self._panel_for, done.files)))
         self.run_bar.show_end("Ended early" if done.kept else "Done", complete=not done.kept)
         pictures = [path for path in done.files if path.suffix in _PICTURES]
+        previews = [
+            path for path in pictures if path.stem.endswith("-preview")
+        ]  # of a pattern that says little
         if pictures:
-            self._show(pictures[0])
+            self._show([*previews, *pictures][0])
 
     def _failed(self, why: str) -> None:
         self._ended(self._pages[self._running].form.in_its_words(in_the_window(why)))
@@ -341,6 +370,8 @@ class TasksPanel(Panel):
             return "charts"
         if path.name.endswith(".ome.zarr") and TASKS[self._running].group == VIDEOS:
             return "films"
+        if self._running == "spots" and path.suffix == ".png" and "slm" in self.session.kinds:
+            return "slm"
         return "reconstructions" if path in self._calibrations else ""
 
     def _open(self, path: Path) -> None:
@@ -360,8 +391,8 @@ class TasksPanel(Panel):
         """End the task."""
         super().shutdown()
         self.run.abort()
-        self._loader.forget()
-        self._reader.forget()
+        for each in (self._loader, self._reader, self._newest):
+            each.forget()
 
 
 def _names_files(o: Option) -> bool:

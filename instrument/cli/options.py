@@ -118,7 +118,7 @@ class GroupedCommand(TyperCommand):
 def _row(o: Option) -> tuple[str, str]:
     """Return flags and help; of the long flags the first is shown, the others are old names."""
     if o.declaration.positional:
-        return metavar(o), help_text(o)
+        return metavar(o), help_text(o, choices=bool(o.words))
     short = [flag for flag in o.flags if not flag.startswith("--")]
     names = ", ".join([*short, next(flag for flag in o.flags if flag.startswith("--"))])
     if bool in o.kinds:

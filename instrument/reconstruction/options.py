@@ -88,6 +88,7 @@ class SourceOptions:
         None,
         help="One picture of RUN, lit by patterns in turn; SHEET: its plan run on a sheet.",
         metavar="SHEET",
+        label="Run on a sheet",
         applies=("patterned picture",),
         group=_FILES,
     )

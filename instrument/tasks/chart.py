@@ -48,14 +48,20 @@ class ChartFiles:
     )
 
 
+def _scenes() -> tuple[str, ...]:
+    from recon.evaluation.scene import FAMILIES
+
+    return FAMILIES
+
+
 @dataclass(frozen=True, kw_only=True)
 class SceneChart:
     """Which simulated scene."""
 
     name: str = option(
-        help="dense-picture, sparse-picture, beads, dense-volume, microscope, text, filaments, gradient, "
-        "texture, lights.",
+        help="Which kind of scene.",
         metavar="NAME",
+        choices=_scenes,
         label="Scene",
         positional=True,
         group="Scene",

@@ -156,6 +156,8 @@ def table(cls: type) -> str:
 def _row(o: Option, said: Declaration) -> str:
     switch = bool in o.kinds
     typed = "" if not o.flags else f"`{', '.join(o.flags)}{'' if switch else f' {metavar(o)}'}`"
+    if o.declaration.positional and o.words:
+        typed = f"`{'|'.join(o.words)}`"
     default = "required" if o.is_required else said.default_words or f"`{expression(o.default)}`"
     limits = f" ({', '.join(o.limits())})" if o.limits() else ""
     applies = f" Of a {', '.join(said.applies)}." if said.applies else ""

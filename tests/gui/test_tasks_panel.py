@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
 from gui.jobs import JobCancelledError
@@ -19,7 +20,7 @@ from instrument.files.calibration_file import save_calibration
 from instrument.tasks import TASKS
 from instrument.tasks.task import Desk, Done
 from recon.types import Calibration, Geometry
-from tests.gui.conftest import WAIT_MS
+from tests.gui.conftest import BENCH, WAIT_MS
 
 
 @pytest.fixture
@@ -57,9 +58,57 @@ def test_every_task_has_a_form_of_its_own_declarations(qtbot: QtBot, panel: Task
         ]
         assert not [words for words in told if "--" in words], "fields are called by their labels"
         needed = panel._pages[name].task.needed
-        required = [n for n, field in form.fields.items() if field.option.is_required or n in needed]
+        required = [
+            n
+            for n, field in form.fields.items()
+            if (field.option.is_required or n in needed) and not field.option.words and field.read()[1]
+        ]
         assert panel.objects() is None if required else panel.objects() is not None
         assert panel.as_python().startswith("#") == bool(required)
+
+
+def test_what_was_found_comes_to_the_front_and_a_picture_when_there_is_one(
+    qtbot: QtBot, panel: TasksPanel, tmp_path: Path
+) -> None:
+    old, new = calibration(tmp_path / "old", 0), calibration(tmp_path / "new", 1)
+    shown(qtbot, panel, "compare", old=old, new=new, figure=tmp_path / "page.png")
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        panel.start()
+    qtbot.waitUntil(lambda: panel.results.currentWidget() is panel.picture, timeout=WAIT_MS)
+    shown(qtbot, panel, "etendue")
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        panel.start()
+    assert panel.results.currentIndex() == 0, "its table, and no place for a picture that there is not"
+    assert panel._tables.count()
+
+
+def test_forms_begin_with_the_newest_calibration_and_a_place_for_the_result(
+    qtbot: QtBot, panel: TasksPanel
+) -> None:
+    runs = panel.session.runs_folder
+    newest = calibration(runs / "2026-11-25_21-38-03_axial-sweep" / "calibration", 0)
+    shown(qtbot, panel, "refocus")
+    form = panel._pages["refocus"].form
+    qtbot.waitUntil(lambda: form.fields["calibration"].raw() == str(newest), timeout=WAIT_MS)
+    assert "axial-sweep, the newest of this bench" in panel.run_bar.words.text()
+    assert form.value("out") == runs / "results" / "refocus"
+    shown(qtbot, panel, "analyze", calibration=runs.parent / "mine")
+    qtbot.waitUntil(lambda: panel._newest._job is None, timeout=WAIT_MS)
+    assert panel._pages["analyze"].form.fields["calibration"].raw() == str(runs.parent / "mine")
+
+
+def test_a_hologram_of_spots_is_previewed_and_goes_on_to_the_slm(qtbot: QtBot, panel: TasksPanel) -> None:
+    assert panel.session.config.path is not None
+    panel.session.config.path.write_text(BENCH)
+    shown(qtbot, panel, "spots", spots="2x2", iterations=2)
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        panel.start()
+    pattern = panel.session.runs_folder / "results" / "slm.png"
+    assert panel.files[0] == pattern, panel.words.toPlainText()
+    handed: list[object] = []
+    panel.session.handed_on.connect(lambda *what: handed.extend(what))
+    qtbot.mouseClick(panel.use_button, Qt.MouseButton.LeftButton)
+    assert handed == ["slm", pattern]
 
 
 def test_two_calibrations_are_compared_with_table_and_python_beside_the_form(

@@ -30,6 +30,8 @@ _IN_WINDOW = ("recon", "instrument", "calibration_routines")
         ("Make one: diffuserbench align mask", "Make one: Alignment"),
         ("is no video of 'reconstruct --video'.", "is no video of “Reconstruct a recording” in Files."),
         ("install diffuserbench again", "install diffuserbench again"),
+        ("3 settings: run the same command again to go on.", "3 settings: “Start” again to go on."),
+        ("The same command goes on with the rest.", "“Start” goes on with the rest."),
     ],
 )
 def test_commands_are_the_windows_own_ways(said: str, shown: str) -> None:
