@@ -308,7 +308,6 @@ def _reconstructions(window: MainWindow, out: Path) -> None:
             raise SystemExit(panel._note.toolTip())
         _wait(lambda: panel.result is not None, "the reconstruction")
         if kind == CALIBRATION:
-            window.session.keep("orientation", "results", {"quarters": 2})  # upright
             _grab(window, out / f"{shot}.png")
             continue
         _wait(lambda: panel.volume.projections is not None, "the projections")

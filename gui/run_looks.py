@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy.typing as npt
 
+from calibration_routines.optics.photograph import PHOTOGRAPH
 from calibration_routines.plan_procedures import can_go_on
 from calibration_routines.psf.sweep_plan import SWEEP
 from drivers.frame import FrameMetadata
@@ -31,8 +32,8 @@ class Opened:
     stored: list[int]
     about: list[str]
     can_resume: bool
-    is_usable: bool
-    """Whether it holds a calibration, or is a photograph."""
+    to_use: Path | None
+    """The calibration or the photograph that it holds or is; None where it is neither."""
 
     @property
     def folder(self) -> Path:
@@ -55,15 +56,15 @@ def look_into(path: Path, *, read: bool = False, on_progress: Progress | None = 
     """Read a run, with ``read`` every frame of it, or a photograph; the reason where it cannot be read."""
     try:
         if path.is_file():
-            return Opened(path, None, [0], _about_photograph(path), False, True)
+            return Opened(path, None, [0], _about_photograph(path), False, path)
         run = Run.open(path)
         looked = verify(run, on_progress, read=read)
         about = _about_run(run, looked)
         if read:
-            about.insert(2, f"{looked.frames} frames read back: {'sound' if looked.is_sound else 'DAMAGED'}")
-        return Opened(
-            path, run, sorted(run.records), about, can_go_on(run, looked), SWEEP.kept(path).is_dir()
-        )
+            about.insert(1, f"{looked.frames} frames read back: {'sound' if looked.is_sound else 'DAMAGED'}")
+        held = (SWEEP.kept(path), PHOTOGRAPH.kept(path))
+        to_use = next((each for each in held if each.exists()), None)
+        return Opened(path, run, sorted(run.records), about, can_go_on(run, looked), to_use)
     except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is shown
         return str(error)
 
@@ -78,7 +79,9 @@ def read_frame(opened: Opened, index: int) -> Picture | str:
         image, metadata = run.frame(index), run.metadata(index)
     except Exception as error:  # noqa: BLE001 - a damaged file is named, whatever it raises
         return str(error)
-    return _picture(f"Frame {index} of {run.n_frames}", image, metadata)
+    steps = run.steps() if run.plan is not None else []
+    what = f" ({steps[index].label})" if index < len(steps) else ""
+    return _picture(f"Frame {index} of {run.n_frames}{what}", image, metadata)
 
 
 def _picture(what: str, image: npt.NDArray[Any], metadata: FrameMetadata) -> Picture:
@@ -87,7 +90,7 @@ def _picture(what: str, image: npt.NDArray[Any], metadata: FrameMetadata) -> Pic
         what,
         f"{metadata.utc.astimezone():%Y-%m-%d %H:%M:%S}",
         f"{metadata.exposure_ms:.4g} ms",
-        metadata.led_pattern or "",
+        f"LEDs: {metadata.led_pattern}" if metadata.led_pattern else "",
     ]
     place = ", ".join(_axis_words(axis, value) for axis, value in (metadata.stage_position or {}).items())
     return Picture(
@@ -109,17 +112,17 @@ def _about_photograph(path: Path) -> list[str]:
     """Return what is known of a photograph, a line each."""
     image = read_image(path)
     said = image.metadata
-    lines = [str(path), image.describe() + ("  SIMULATED" if image.is_simulated else "")]
+    lines = [image.describe() + ("  SIMULATED" if image.is_simulated else "")]
     names = {"bench": "Bench", "camera": "Camera", "light": "Light", "average": "Frames averaged"}
     lines += [f"{name}: {said[key]}" for key, name in names.items() if said.get(key) not in (None, "")]
     share = said.get("saturated_fraction")
-    return [*lines, f"Saturated: {percent(share)} of its pixels"] if share else lines
+    return [*lines, *([f"Saturated: {percent(share)} of its pixels"] if share else []), str(path)]
 
 
 def _about_run(run: Run, looked: Verification) -> list[str]:
     """Return what is known of a run, a line each."""
-    lines = [str(run.path), f"{run.condition}: {len(run.records)} of {run.n_frames} frames"]
-    lines[1] += "  SIMULATED" if run.is_simulated else ""
+    lines = [f"{run.condition}: {len(run.records)} of {run.n_frames} frames"]
+    lines[0] += "  SIMULATED" if run.is_simulated else ""
     if run.error:
         lines.append(run.error)
     lines += [f"DAMAGED: {line}" for line in looked.lines()]
@@ -134,7 +137,7 @@ def _about_run(run: Run, looked: Verification) -> list[str]:
         lines += [f"{kind}: {identity}" for kind, identity in devices.items()]
     if SWEEP.is_of(run.path):
         lines += _calibration_lines(run.path)
-    return lines
+    return [*lines, str(run.path)]
 
 
 def _calibration_lines(run: Path) -> list[str]:

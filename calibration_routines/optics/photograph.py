@@ -326,8 +326,10 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, _listener: Lis
     taken = photograph_of(run, record.binning)
     good = taken.saturated_pixels == 0 and not taken.findings
     file = PHOTOGRAPH.place(run.path, doubted=not good)
-    facts = {"exposure_ms": taken.exposure_ms, "dark": "taken off", "scatter": plain(taken.scatter)}
-    write_image(file, taken.measurement, plain(record) | facts)
+    first = run.metadata(run.steps("scene")[0])
+    facts = {"exposure_ms": taken.exposure_ms, "dark": "taken off", "scatter": taken.scatter}
+    facts |= {"light": "scene", "utc": first.utc}
+    write_image(file, taken.measurement, plain(record) | plain(facts))
     words = f"Photograph: {taken.exposure_ms:.4g} ms, {taken.saturated_pixels} saturated pixels"
     return Outcome(
         verdict=(*(f"Quality: {finding}" for finding in taken.findings), words),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import datetime
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -115,7 +116,9 @@ class ReconstructionsPanel(Panel):
         self.tabs.currentChanged.connect(lambda _: self._say_what_is_next())
         self.viewers.addWidget(self.empty)
         ends = (self.refine_button, self.keep_button, self.export_button)
-        fill(top, in_row(self.heading, (self.place, 1), *ends), (self.viewers, 1))
+        self.caption = label(role="dim", selectable=True, wraps=True, yields=True)
+        self.caption.hide()
+        fill(top, in_row(self.heading, (self.place, 1), *ends), self.caption, (self.viewers, 1))
         yield
         self.picture = PictureView(session)
         self.viewers.addWidget(self.picture)
@@ -136,6 +139,7 @@ class ReconstructionsPanel(Panel):
         below.setSizes([330, 330])
         yield
         session.run_finished.connect(lambda _: self.refresh())
+        session.kept_changed.connect(self._say_what_is_shown)
         folder = self.session.runs_folder / "reconstructions"
         self._names = SuggestedName(self.jobs, self.form.options, folder, ".tif")
         self._suggest_out()
@@ -191,8 +195,9 @@ class ReconstructionsPanel(Panel):
         self.accepted()
         self._close_result()
         self.result = result
-        self.heading.setText(f"<b>{result.path.name}</b>")
+        self.heading.setText(f"<b>{escape(result.path.name)}</b>")
         self.heading.setToolTip(str(result.path))
+        self._say_what_is_shown()
         warnings = [self.in_its_words(warning) for warning in result.warnings]
         facts = [(name, self.in_its_words(value)) for name, value in result.facts()]
         self.facts.show_facts(facts, warnings, simulated=result.simulated)
@@ -211,9 +216,19 @@ class ReconstructionsPanel(Panel):
             beside = {"Deviation": result.deviation, "Residual": result.residual}
             self.picture.show_picture(result.image, pitch_um=result.pitch_um, beside=beside)
 
+    def _say_what_is_shown(self) -> None:
+        """Say over a result when its photograph was taken and in which light, and how it is turned."""
+        result, words = self.result, []
+        if result is not None:
+            turned = self.picture.orientation.words if result.image is not None else ""
+            words = list(filter(None, (result.taken, "SIMULATED" if result.simulated else "", turned)))
+        self.caption.setText(", ".join(words))
+        self.caption.setVisible(bool(words))
+
     def _close_result(self) -> None:
         self.volume.release()
         self.result = None
+        self._say_what_is_shown()
         self.refine_button.hide()
         self.keep_button.hide()
         self.export_button.setEnabled(False)

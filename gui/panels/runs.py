@@ -11,7 +11,6 @@ from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import QSlider, QTableWidget, QWidget
 
 from calibration_routines.plan_procedures import ResumeProcedure
-from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
 from gui.panel import Panel
 from gui.procedure_run import ProcedureRun, RunBar, script
@@ -130,8 +129,9 @@ class RunsPanel(Panel):
         self.folder_button.setEnabled(True)
         run = opened.run
         self.verify_button.setEnabled(run is not None)
-        self.use_button.setEnabled(opened.is_usable)
-        self.use_button.setText("Reconstruct with it…" if run is not None else "Reconstruct it…")
+        self.use_button.setEnabled(opened.to_use is not None)
+        is_photograph = opened.to_use is not None and opened.to_use.suffix == ".tif"
+        self.use_button.setText("Reconstruct it…" if is_photograph else "Reconstruct with it…")
         self.play_button.setEnabled(run is not None and run.plan is None and bool(opened.stored))
         self.export_button.setEnabled(run is not None and bool(opened.stored))
         self._show_frame(middle)
@@ -258,6 +258,7 @@ class RunsPanel(Panel):
                 self._close_run(f"{listed.path}: {listed.problem}")
             else:
                 self.open_run(listed.path)
+                self.bar.clear()  # how another one ended
 
     def _close_run(self, why: str) -> None:
         self._reader.forget()
@@ -292,9 +293,8 @@ class RunsPanel(Panel):
             self.frame_words.setText(frame.words)
 
     def _use(self) -> None:
-        if (opened := self.opened) is not None:
-            what = opened.path if opened.run is None else SWEEP.kept(opened.path)
-            self.session.handed_on.emit("reconstructions", what)
+        if self.opened is not None:
+            self.session.handed_on.emit("reconstructions", self.opened.to_use)
 
     def _play(self) -> None:
         if self.opened is not None:

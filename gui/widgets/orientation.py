@@ -15,9 +15,21 @@ Kind = Literal["frames", "results"]
 _KEPT = "orientation"
 
 
+def usual_orientation(session: BenchSession, kind: Kind) -> Orientation:
+    """Return how pictures of a kind are turned where nobody has said it.
+
+    What a camera's lens or diffuser makes of a scene lies upside down on the sensor. Of the simulated camera
+    it is known that nothing turns it back; others may be mounted any way.
+    """
+    camera = session.config.devices.get("camera")
+    is_simulated = camera is not None and camera.driver_name == "simulated"
+    return Orientation(2) if kind == "results" and is_simulated else AS_IT_IS
+
+
 def orientation_of(session: BenchSession, kind: Kind) -> Orientation:
     """Return how pictures of a kind are turned."""
-    return Orientation.of(session.kept.of(_KEPT).get(kind))
+    kept = session.kept.of(_KEPT).get(kind)
+    return usual_orientation(session, kind) if kept is None else Orientation.of(kept)
 
 
 def follow_orientation(session: BenchSession, kind: Kind, show: Callable[[Orientation], object]) -> None:
@@ -54,7 +66,7 @@ class OrientationButton(QPushButton):
             ("Turn right", lambda now: now.turned(3)),
             ("Mirror left and right", lambda now: now.flipped(upright=False)),
             ("Mirror top and bottom", lambda now: now.flipped(upright=True)),
-            ("As it is", lambda _: AS_IT_IS),
+            ("As on the sensor", lambda _: AS_IT_IS),
         ):
             menu.addAction(words).triggered.connect(partial(self._turn, turn))
         self.setMenu(menu)
@@ -63,10 +75,11 @@ class OrientationButton(QPushButton):
     def _turn(self, turn: Callable[[Orientation], Orientation], _checked: bool = False) -> None:
         made = turn(self.orientation)
         kept = {"quarters": made.quarters, "mirrored": made.mirrored}
-        self._session.keep(_KEPT, self._kind, kept if made != AS_IT_IS else None)
+        usual = usual_orientation(self._session, self._kind)
+        self._session.keep(_KEPT, self._kind, kept if made != usual else None)
 
     def _show(self, orientation: Orientation) -> None:
         self.orientation = orientation
-        now = orientation.words or "as it is"
+        now = orientation.words or "as on the sensor"
         self.setToolTip(f"{self._tip} Kept with the bench. Now: {now}.")
         self.setChecked(orientation != AS_IT_IS)

@@ -72,7 +72,7 @@ class PictureView(QWidget):
         self.image = _ScaledImage()
         self.levels = LevelsBar()
         self.levels.changed.connect(self._show)
-        tip = "Turn and mirror pictures, exports alike; one on the sensor's grid is upside down."
+        tip = "Turn and mirror pictures, exports alike; on the sensor's grid a scene stands upside down."
         self.turn = OrientationButton(session, "results", tip)
         tip = "Show the whole picture (the wheel zooms, dragging moves)"
         self.whole = button("Whole", tip, self.image.whole)

@@ -412,9 +412,11 @@ def describe_window(crop: Crop | None, asked: int | None, factor: int, result: F
 
 
 def source_record(file: ImageFile) -> dict[str, Any]:
-    """Return what tells an image from others."""
+    """Return what tells an image from others: its pixels, when it was taken and in which light."""
     digest = hashlib.sha256(np.ascontiguousarray(file.pixels).data).hexdigest()
-    return {"path": str(file.path.resolve()), "pixels": file.describe(), "pixels_sha256": digest}
+    taken = {name: file.metadata[name] for name in ("utc", "exposure_ms", "light") if name in file.metadata}
+    told = {"path": str(file.path.resolve()), "pixels": file.describe(), "pixels_sha256": digest}
+    return told | ({"taken": taken} if taken else {})
 
 
 def dark_record(dark: Dark) -> dict[str, Any]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +69,18 @@ class StoredResult:
         values = named.values() if isinstance(named, Mapping) else ()
         named = [value.get("path") if isinstance(value, Mapping) else value for value in values]
         return [self.path, *(Path(value) for value in named if isinstance(value, str) and value)]
+
+    @property
+    def taken(self) -> str:
+        """When its photograph was taken, how long it was exposed and what was lit, as far as is known."""
+        image = self.record.get("inputs", {}).get("image")
+        told = image.get("taken", {}) if isinstance(image, Mapping) else {}
+        words = []
+        with contextlib.suppress(KeyError, ValueError):
+            words.append(f"{datetime.fromisoformat(str(told['utc'])).astimezone():%Y-%m-%d %H:%M:%S}")
+        with contextlib.suppress(KeyError, ValueError):
+            words.append(f"{float(told['exposure_ms']):.4g} ms")
+        return ", ".join([*words, f"light: {told['light']}"] if "light" in told else words)
 
     @property
     def simulated(self) -> bool:
@@ -201,6 +215,8 @@ class StoredResult:
         for name, key in (("Photograph", "image"), ("PSF", "psf"), ("Calibration", "calibration")):
             if value := inputs.get(key):
                 facts.append((name, str(value["path"]) if isinstance(value, Mapping) else str(value)))
+                if key == "image" and self.taken:
+                    facts.append(("Taken", self.taken))
         if dark := inputs.get("dark"):
             facts.append(("Dark", str(dark.get("from"))))
         if erased := inputs.get("erased"):

@@ -11,6 +11,7 @@ from pytestqt.qtbot import QtBot
 from drivers.simulated.world import SimulatedWorld
 from gui.main_window import MainWindow
 from gui.panels.reconstructions import ReconstructionsPanel
+from gui.panels.runs import RunsPanel
 from gui.panels.sweeps import SweepsPanel
 from instrument.files.images import read_image
 
@@ -103,3 +104,25 @@ def test_calibrate_photograph_and_reconstruct_by_mouse_alone(qtbot: QtBot, windo
     assert found.shape == truth.shape
     assert np.corrcoef(found.ravel(), truth.ravel())[0, 1] > 0.7  # the photograph itself: about 0
     assert abs(np.corrcoef(photograph.ravel(), truth.ravel())[0, 1]) < 0.5
+    # On the sensor's grid it is upside down, as in any camera; it is shown as people would see the scene.
+    shown = reconstructions.picture.shown
+    assert shown is not None
+    assert np.corrcoef(shown.ravel(), truth[::-1, ::-1].ravel())[0, 1] > 0.7
+    assert "light: scene, SIMULATED, turned 180°" in reconstructions.caption.text()
+    # The photograph stands in Runs, says what its frames are, and goes to be reconstructed from there, too.
+    click_tab(qtbot, window, "runs")
+    runs = window.panel("runs")
+    assert isinstance(runs, RunsPanel)
+    qtbot.waitUntil(lambda: runs.table.rowCount() == 2, timeout=WAIT_MS)
+    for row, name, words in ((1, "axial-sweep", "(psf)"), (0, "photograph", "(scene)")):
+        place = runs.table.visualItemRect(runs.table.item(row, 0)).center()
+        qtbot.mouseClick(runs.table.viewport(), LEFT, pos=place)
+        qtbot.waitUntil(lambda words=words: words in runs.frame_words.text(), timeout=WAIT_MS)  # type: ignore[misc]
+        assert runs.opened is not None
+        assert runs.opened.path.name.endswith(name)
+        assert not runs.bar.words.text(), "how another run ended"
+        runs.bar.show_end("Done", complete=True)
+    handed: list[object] = []
+    session.handed_on.connect(lambda *what: handed.extend(what))
+    qtbot.mouseClick(runs.use_button, LEFT)
+    assert handed == ["reconstructions", file]
