@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy import fft, ndimage
 
 from calibration_routines.psf.exposure import hot_pixels
-from calibration_routines.psf.mount_fit import MountFit, fit_mount
+from calibration_routines.psf.mount_fit import MountFit, fit_mount, with_pitch
 from calibration_routines.psf.psf_quality import (
     PsfQuality,
     measure_psf,
@@ -185,6 +185,7 @@ def analyse_sweep(
         scatter.brightness_error,
         [stacked[i] for i in central],
     )
+    mount = with_pitch(mount, stages, binned(geometry, binning))
     return SweepAnalysis(
         psfs=stacked,
         background=removed_in_all / np.float32(len(psfs)),

@@ -10,7 +10,7 @@ diffuser bends (:func:`_bent`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 from calibration_routines.psf.psf_quality import MAX_CLIPPED, PsfQuality
+from calibration_routines.psf.stage_fit import StageFit
 from calibration_routines.scatter import compare, growth, reduction
 from recon.base.blocks import block_mean
 from recon.camera.refocus import paraxial_scale
@@ -58,6 +59,53 @@ class MountFit:
     """``d`` by the pattern's growth over the configured one, and the standard deviation of that; None where d
     is not known, or the planes do not tell."""
     findings: tuple[str, ...] = ()
+    pitch: tuple[float, float] | None = None
+    """The pixel pitch by the shifts across, with that ``d``, over the configured one, and the standard
+    deviation of that; None where they do not tell."""
+
+    def line(self, geometry: Geometry) -> str:
+        """Return what was fitted, each with its standard deviation; ``geometry`` is of the PSFs' pixels."""
+        farther, error = self.farther_um / 1e3, self.farther_error_um / 1e3
+        words = (
+            f"{abs(farther):.2f} +- {error:.2f} mm {'farther' if farther >= 0 else 'nearer'} than recorded"
+        )
+        if self.beside_um is not None:
+            x, y = (value / 1e3 for value in self.beside_um)
+            words += f", x = {x:+.2f} and y = {y:+.2f} mm (+- {self.beside_error_um / 1e3:.2f}) off the axis"
+        for told, configured, name, unit in (
+            (self.distance, geometry.diffuser_distance_mm, "d", "mm"),
+            (self.pitch, geometry.pixel_pitch_um, "pixels of", "um"),
+        ):
+            if told is not None and configured is not None:
+                found, off = (configured * value for value in told)
+                words += f"; {name} {found:.4g} +- {off:.2g} {unit}, {configured:.4g} configured"
+        return f"Fitted: the source stands {words}."
+
+
+def with_pitch(mount: MountFit | None, stages: Sequence[StageFit], geometry: Geometry) -> MountFit | None:
+    """Let the shifts across tell the pixel pitch, once the pattern's growth has told ``d``.
+
+    A pattern moves by ``d / z / pitch`` pixels a micrometre of the source.
+    """
+    gains = [(one.gain_error, one.gain_error_std, one.z_um) for one in stages if one.gain_error is not None]
+    if mount is None or mount.distance is None or geometry.pixel_pitch_um is None or not gains:
+        return mount
+    of_d, of_d_error = mount.distance
+    found = [of_d * z / (z + mount.farther_um) / (1 + gain) for gain, _, z in gains]
+    ratio = float(np.median(found))
+    near = min(z for _, _, z in gains)
+    of_shifts = float(np.median([std for _, std, _ in gains]))
+    shares = (of_d_error / of_d, mount.farther_error_um / near, of_shifts)
+    error = ratio * float(np.sqrt(np.square(shares).sum()))
+    findings = mount.findings
+    if abs(ratio - 1) > max(_SURE_OF_D * error, _WRONG_D):
+        pitch_um = geometry.pixel_pitch_um
+        findings += (
+            f"the shifts across, with d as the pattern grows, are those of pixels of {ratio * pitch_um:.3g} "
+            f"+- {error * pitch_um:.2g} um, not {pitch_um:.4g}: check pixel_pitch_um of [geometry], the "
+            "camera's binning, and the stage's steps per millimetre across.",
+        )
+    return replace(mount, pitch=(ratio, error), findings=findings)
 
 
 def fit_mount(

@@ -389,8 +389,8 @@ def _held_against_stage(
     if gain_error is not None and abs(gain_error) > MAX_GAIN_ERROR:
         findings.append(
             f"z = {z_um / 1e3:.4g} mm: the pattern moves {abs(gain_error):.1%} too "
-            f"{'far' if gain_error > 0 else 'little'} for d/z: check d, the source's distance, and the "
-            "stage's steps per millimetre."
+            f"{'far' if gain_error > 0 else 'little'} for d/z: check d, the source's distance, the pixel "
+            "pitch, and the stage's steps per millimetre."
         )
     if abs(rotation_mrad) > MAX_ROTATION_MRAD:
         findings.append(

@@ -30,6 +30,7 @@ from calibration_routines.psf.analysis import (
     light_of,
     optical_binning,
 )
+from calibration_routines.psf.mount_fit import MountFit
 from calibration_routines.psf.psf_quality import PsfQuality, place_of
 from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.stage_fit import Drift, StageFit
@@ -92,6 +93,8 @@ class SweepCalibration:
     """Pixels that turned hot during the sweep; they were replaced like the others."""
     source_width_px: float = 0.0
     """Of the source's image from the nearest depth; 0 where its size is not known."""
+    mount: MountFit | None = None
+    """Where the source stands by light, place and growth, with d and pitch; None where too little tells."""
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -335,6 +338,7 @@ class _TakenSweep:
             analysis.findings,
             self.dark.late_hot,
             source_width_px(record.source_size_um, calibration.geometry, sweep.depths_um[0]),
+            analysis.mount,
         )
 
     def _provenance(self, exposures: SweepExposures, reference_ms: float) -> dict[str, Any]:

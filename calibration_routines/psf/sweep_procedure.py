@@ -131,8 +131,11 @@ def quality_lines(done: SweepCalibration) -> list[str]:
             f"turned by {stage.rotation_mrad:+.1f} mrad; single points are off by "
             f"{stage.residual_median_px:.3f} (median) and {stage.residual_95_px:.3f} (95 %) pixels."
         )
-        if words := stage.distance_words(done.calibration.geometry.diffuser_distance_mm):
+        words = stage.distance_words(done.calibration.geometry.diffuser_distance_mm)
+        if words and len(done.stages) == 1:  # several depths tell more: below
             lines.append(words)
+    if done.mount is not None:
+        lines.append(done.mount.line(done.calibration.geometry))
     if done.drift is not None and not done.drift.findings:
         known = done.drift.brightness_error
         taken = f"each known to {known:.1%}" if known > TOLERATED else "taken out of the PSFs"

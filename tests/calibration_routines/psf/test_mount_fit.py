@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from calibration_routines.psf.mount_fit import fit_mount, off_middle
+from calibration_routines.psf.mount_fit import MountFit, fit_mount, off_middle, with_pitch
 from calibration_routines.psf.psf_quality import PsfQuality
+from calibration_routines.psf.stage_fit import StageFit
 from calibration_routines.psf.sweep_plan import size_findings
 from recon.camera.refocus import paraxial_scale
 from recon.camera.registration import moved, rescaled
@@ -91,6 +93,29 @@ def test_a_wrong_distance_is_told_by_the_patterns_growth_whatever_the_pitch() ->
     grown = fit_mount(planes(), light(), GEOMETRY, psfs=alike)  # a pattern that does not grow tells no d
     assert grown is not None
     assert grown.distance is None
+
+
+@pytest.mark.parametrize(("d", "pitch", "farther_um"), [(1.0, 1.0, 0.0), (1.1, 1.0, 0.0), (1.0, 1.1, 2e3)])
+def test_shifts_tell_the_pixel_pitch_once_growth_has_told_d(
+    d: float, pitch: float, farther_um: float
+) -> None:
+    """``d`` and ``pitch`` are what is configured over what is true."""
+    seen = MountFit(farther_um, 100.0, None, 0.0, 0.0, (1 / d, 0.015))
+    stages = [
+        StageFit(z, 9, z / (z + farther_um) * pitch / d - 1, 0.0, 0.1, 0.2, (), 5e-4) for z in (60e3, 90e3)
+    ]
+    geometry = Geometry(pixel_pitch_um=13.0 * pitch, diffuser_distance_mm=8.9 * d, aperture_mm=(1.5, 2.0))
+    found = with_pitch(seen, stages, geometry)
+    assert found is not None
+    assert found.pitch is not None
+    assert found.pitch[0] == pytest.approx(1 / pitch, abs=1e-6)
+    assert found.pitch[1] == pytest.approx(0.015 / pitch, rel=0.2)
+    said = " ".join(found.findings)
+    assert ("those of pixels of 13 +- 0.2 um, not 14.3: check pixel_pitch_um" in said) == (pitch != 1)
+    assert re.search(rf"; pixels of 13 \+- 0\.\d+ um, {13 * pitch:g} configured", found.line(geometry))
+    unknown = replace(seen, distance=None)
+    assert with_pitch(unknown, stages, geometry) == unknown
+    assert with_pitch(seen, [], geometry) == seen
 
 
 def test_where_light_or_noise_does_not_tell_no_distance_is_accused() -> None:
