@@ -24,7 +24,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from instrument.files.errors import BenchError
+from instrument.files.errors import BenchError, count
 from instrument.reconstruction.video_files import VideoPictures
 from instrument.reconstruction.video_job import VideoJob
 from instrument.runs.run import Run
@@ -35,6 +35,7 @@ from recon.streams.joint import solve_together
 from recon.streams.stillness import has_light
 from recon.streams.video import VideoSolver
 
+_log = logging.getLogger(__name__)
 _kept = threading.local()
 """A thread's last job with its solver, whose arrays are dear to make."""
 
@@ -200,17 +201,33 @@ def on_cluster(
 ) -> None:
     """Solve blocks on a Dask cluster whose workers see the same files; raises as :func:`in_process`.
 
-    A block whose worker is lost is solved by another.
+    A block whose worker is lost is solved by another, and the loss is logged. Raises BenchError where every
+    worker that took a block was lost.
     """
     work = partial(solve_block, str(job), str(output), threads=1)
     # Not pure: a block is worked on again whatever the cluster has seen before.
     futures = [client.submit(work, block, pure=False, retries=_RETRIES) for block in blocks]
     left = set(futures)
+    crew: set[str] = set()
     try:
         while left:
+            here = set(client.scheduler_info(n_workers=-1)["workers"])
+            if lost := len(crew - here):
+                _log.warning(
+                    "%s ended or cannot be reached: blocks begun there begin anew on another. Where it "
+                    "happens again, memory may be short: take fewer.",
+                    count(lost, "worker"),
+                )
+            crew = here
             finished = {future for future in left if future.done()}
             for future in finished:
-                on_progress(future.result())
+                try:
+                    on_progress(future.result())
+                except importlib.import_module("distributed").KilledWorker:
+                    raise BenchError(
+                        "Every worker that took one of the blocks was lost, as when memory is short. Take "
+                        "fewer workers or shorter blocks (--workers, --block); the same command goes on."
+                    ) from None
             left -= finished
             if cancel.wait(_POLL_S):
                 raise CancelledError
@@ -279,8 +296,11 @@ def _dask() -> Any:
         raise BenchError(
             "Workers need Dask, which is not installed: pip install 'diffuserbench[cluster]'."
         ) from error
-    # Its own configuration says INFO; silence_logs of a local cluster is taken back too early.
+    # Its own configuration says INFO; silence_logs of a local cluster is taken back too early. What becomes
+    # of workers is told in our own words.
     logging.getLogger("distributed").setLevel(logging.WARNING)
+    for quiet in ("nanny", "scheduler"):
+        logging.getLogger(f"distributed.{quiet}").setLevel(logging.ERROR)
     return distributed
 
 

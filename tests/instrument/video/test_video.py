@@ -339,7 +339,9 @@ def test_a_cluster_here_takes_work_from_its_owner_only() -> None:
 
 
 @pytest.mark.slow
-def test_the_same_on_a_cluster_that_loses_a_worker(recording: Path, video: Path, tmp_path: Path) -> None:
+def test_the_same_on_a_cluster_that_loses_a_worker(
+    recording: Path, video: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     pytest.importorskip("cryptography", reason="a cluster's keys need cryptography")
     wanted = request(recording, tmp_path)
     prepared = prepare_video(wanted)
@@ -356,8 +358,44 @@ def test_the_same_on_a_cluster_that_loses_a_worker(recording: Path, video: Path,
     assert sorted(report.block for report in reports) == [0, 1, 2]
     assert sum(report.written for report in reports) <= 10
     assert not prepared.left
+    assert not [record for record in caplog.records if record.name.startswith("distributed")]
     finish_video(prepared)
     assert_same(pictures(tmp_path), pictures(video))
+
+
+def test_workers_that_are_lost_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    distributed = pytest.importorskip("distributed")
+
+    class Future:
+        asked = 0
+
+        def done(self) -> bool:
+            self.asked += 1
+            return self.asked > 2
+
+        def result(self) -> BlockReport:
+            raise distributed.KilledWorker("block", None, 3)
+
+    class Client:
+        crews = iter([{"a", "b"}, {"b", "c"}, {"c"}])
+        cancelled: list[object] | None = None
+
+        def submit(self, *_: object, **__: object) -> Future:
+            return Future()
+
+        def scheduler_info(self, n_workers: int) -> dict[str, set[str]]:
+            return {"workers": next(self.crews)}
+
+        def cancel(self, left: list[object]) -> None:
+            self.cancelled = left
+
+    client = Client()
+    with pytest.raises(BenchError, match="Every worker that took one of the blocks was lost"):
+        on_cluster(client, tmp_path, tmp_path, [0], lambda _: None, threading.Event())
+    assert len(client.cancelled or ()) == 1
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == [
+        "1 worker ended or cannot be reached"
+    ] * 2
 
 
 def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
