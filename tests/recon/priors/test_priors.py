@@ -157,3 +157,76 @@ def test_sums_that_are_not_known_are_refused():
                 prior(weight)
     with pytest.raises(ValueError, match="above its upper"):
         Box(1, 0)
+
+
+def beck_teboulle(prior, x, step, iterations, dual):
+    """Beck & Teboulle 2009, written out: the prox after so many steps from a dual variable, and the last."""
+    strength = prior.weight * step
+    rate = 1 / (strength * (2 * np.sqrt(np.sum(prior.axis_weights**2))) ** 2)
+    wy, wx = prior.axis_weights
+
+    def forward(p):
+        return np.stack([wy * (np.roll(p, -1, -2) - p), wx * (np.roll(p, -1, -1) - p)])
+
+    def adjoint(d):
+        return wy * (np.roll(d[0], 1, -2) - d[0]) + wx * (np.roll(d[1], 1, -1) - d[1])
+
+    def project(d):
+        return d / np.maximum(1, np.sqrt(np.sum(d**2, axis=0))) if prior.isotropic else np.clip(d, -1, 1)
+
+    ahead, t = dual, 1.0
+    for _ in range(iterations):
+        p = prior.separable.prox(x - strength * adjoint(ahead), step)
+        new = project(ahead + rate * forward(p))
+        t_next = (1 + np.sqrt(1 + 4 * t**2)) / 2
+        ahead = new + (t - 1) / t_next * (new - dual)
+        dual, t = new, t_next
+    return p, dual
+
+
+@pytest.mark.parametrize("isotropic", [False, True])
+def test_the_prox_of_total_variation_goes_the_papers_way_from_where_it_was(isotropic):
+    x = np.random.default_rng(4).standard_normal((2, 6, 7))
+    prior = TotalVariation(0.4, isotropic=isotropic, axis_weights=(0.5, 1.0), tolerance=0.0, max_inner=7)
+    prior = prior + L1(0.1) + NonNegativity()
+    dual = np.zeros((2, *x.shape))
+    for moved in (x, x + 0.1):
+        expected, dual = beck_teboulle(prior, moved, 0.8, 7, dual)
+        np.testing.assert_allclose(prior.prox(moved, 0.8), expected, atol=1e-12)
+        np.testing.assert_allclose(prior.memory, dual, atol=1e-12)
+    for other in (x[:1], x.astype(np.float32)):  # of another shape or precision nothing is known
+        fresh, _ = beck_teboulle(prior, other.astype(np.float64), 0.8, 7, np.zeros((2, *other.shape)))
+        np.testing.assert_allclose(prior.prox(other, 0.8), fresh, atol=1e-5)
+        assert prior.memory.dtype == other.dtype
+    x[0, 0, 0] = np.nan
+    prior.prox(x, 0.8)
+    assert prior.memory is None
+
+
+@pytest.mark.parametrize("isotropic", [False, True])
+def test_the_prox_ends_at_every_fifth_step_once_its_gap_is_small_enough(isotropic):
+    x = np.random.default_rng(4).standard_normal((1, 6, 7))
+
+    def found(**when):
+        prior = TotalVariation(0.4, isotropic=isotropic, axis_weights=(0.5, 1.0), separable=L1(0.1), **when)
+        return prior.prox(x, 0.8)
+
+    plain = TotalVariation(0.4, isotropic=isotropic, axis_weights=(0.5, 1.0), separable=L1(0.1))
+    third, *steps = (beck_teboulle(plain, x, 0.8, n, np.zeros((2, *x.shape)))[0] for n in (3, 5, 10, 15, 20))
+    np.testing.assert_allclose(found(tolerance=1.0), steps[0], atol=1e-12)
+    np.testing.assert_allclose(found(tolerance=1.0, max_inner=3), third, atol=1e-12)
+
+    def objective(p):
+        return 0.8 * plain.value(p) + 0.5 * float(np.sum((p - x) ** 2))
+
+    best = objective(found(tolerance=1e-14, max_inner=20_000))
+    size = 0.5 * float(np.sum(x**2))
+    off = [(objective(step) - best) / size for step in steps]
+    assert off == sorted(off, reverse=True)
+    # The gap is a bound: what is accepted is as good as asked, and the gap of the first four is no more than
+    # several times what is left.
+    for tolerance in (1e-3, 1e-5, 1e-7):
+        accepted = found(tolerance=tolerance, max_inner=5000)
+        assert (objective(accepted) - best) / size <= tolerance
+    loose = found(tolerance=30 * off[1], max_inner=5000)
+    assert any(np.allclose(loose, step, atol=1e-12) for step in steps[:2])
