@@ -23,7 +23,7 @@ from recon.holography import (
     random_mask,
 )
 from recon.holography.learned import Learned
-from recon.holography.limit import COLUMNS, DENSE, _below_least, _gap, gain_of_frames, limited_by
+from recon.holography.limit import COLUMNS, DENSE, STEPS, _below_least, _gap, gain_of_frames, limited_by
 
 SHAPE, K = (12, 16), 4
 
@@ -84,6 +84,22 @@ def test_no_eigenvalue_is_below_what_lanczos_tells_even_where_the_least_is_alone
         assert -1.1 < _below_least(lambda x, values=values: values * x, len(values)) <= -1.0
     # Lanczos ends at once where all eigenvalues are one.
     assert _below_least(lambda x: -x, DENSE + 1) == pytest.approx(-1.0, abs=1e-4)
+
+
+def test_few_eigenvalues_far_above_do_not_blur_the_least():
+    n = 20000
+    rng = np.random.default_rng(0)
+    values = np.sort(rng.uniform(-1.0, 60.0, n))
+    values[:3], values[-3:] = (-2.0, -1.9, -1.8), (9e3, 1.5e4, 2e4)
+    values = values.astype(np.float32)
+    steps = []
+
+    def apply(x):
+        steps.append(1)
+        return values * x
+
+    assert -2.3 < _below_least(apply, n) <= -2.0
+    assert len(steps) < STEPS
 
 
 def test_it_can_be_interrupted_and_is_a_bound_all_the_same():
