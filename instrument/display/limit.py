@@ -10,7 +10,16 @@ from typing import Any
 
 from instrument.display.hologram import prepare_target
 from instrument.files.images import Pixels
-from recon.holography import Display, HologramOptions, HologramRecord, HologramStop, Limit, hologram_limit
+from recon.holography import (
+    Display,
+    HologramOptions,
+    HologramRecord,
+    HologramStop,
+    Limit,
+    hologram_limit,
+    random_mask,
+)
+from recon.holography.display import no_mask
 from recon.holography.limit import BANDS
 from recon.holography.target import band_of
 
@@ -46,19 +55,41 @@ def limits_of_lifts(
             if callback is not None:
                 callback(lift, record)
 
-        found.append(hologram_limit(display, target, options, callback=show, cancel=cancel))
+        before = found[-1].columns if found else None
+        found.append(hologram_limit(display, target, options, initial=before, callback=show, cancel=cancel))
         if found[-1].stop_reason is HologramStop.CANCELLED:
             break
     return found
 
 
+def coarser_mask(display: Display) -> Display | None:
+    """Return a display with a random mask of pixels twice as wide (or without one), in its place.
+
+    None where there is no mask to make coarser, and near, where a mask's pixels set how wide the picture is.
+    """
+    side = display.factor // 2
+    if side == 0 or display.near:
+        return None
+    shape = (display.slm_shape[0] * side, display.slm_shape[1] * side)
+    make = random_mask if side > 1 else no_mask
+    mask = make(shape, design_wavelength_nm=display.mask.design_wavelength_nm)
+    return replace(display, mask=mask, displacement=None)
+
+
 def limit_lines(found: Sequence[Limit], display: Display, options: HologramOptions) -> list[str]:
-    """Return what could be reached, which frequencies fall short and why, and what would help, in lines."""
+    """Return what could be reached, which frequencies fall short and why, and what lifts are worth."""
     here = found[0]
-    lines = [
-        f"limit: no number of frames shows this picture better than {_decibels(here.bound_db)} through this "
-        f"mask (a bound; {here.reached_db:.2f} dB is reached by what need not be frames of phases)"
-    ]
+    behind = "through this mask" if display.factor > 1 else "with these phases"
+    if here.bound_db < _NO_LIMIT_DB:
+        lines = [
+            f"limit: no number of frames shows this picture better than {here.bound_db:.2f} dB {behind} "
+            f"(a bound; {here.reached_db:.2f} dB is reached by what need not be frames of phases)"
+        ]
+    else:
+        lines = [
+            f"limit: none is in sight {behind}; {here.reached_db:.2f} dB is reached by what need not be "
+            "frames of phases"
+        ]
     cutoff = band_of(display).cutoff
     least, coarse = display.factor / cutoff, "set by the mask within an SLM pixel, not by the SLM"
     if display.near:  # a period is farther than a mask pixel's first order goes aside
@@ -75,12 +106,15 @@ def limit_lines(found: Sequence[Limit], display: Display, options: HologramOptio
             f"{reached:.0%} reached{why}"
         )
     for lift, better in zip(lifts_of(options)[1:], found[1:], strict=False):
-        best = _decibels(better.bound_db)
-        lines.append(f"  black at {lift:g} of white (--lift {lift:g}): at most {best} of it")
+        lines.append(f"  black at {lift:g} of white (--lift {lift:g}): {at_most(better)}")
     return lines
 
 
-def _decibels(bound_db: float) -> str:
-    if bound_db < _NO_LIMIT_DB:
-        return f"{bound_db:.2f} dB"
-    return f"{_NO_LIMIT_DB:.0f} dB (no limit in sight)"
+def at_most(limit: Limit) -> str:
+    """Return a bound in words."""
+    return f"at most {limit.bound_db:.2f} dB" if limit.bound_db < _NO_LIMIT_DB else "no limit in sight"
+
+
+def frames_line(gain_db: float) -> str:
+    """Return what frames are worth, of :func:`gain_of_frames`; nothing where that is not known."""
+    return f"  more frames (--frames): up to about {gain_db:.1f} dB above one" if gain_db > 0 else ""

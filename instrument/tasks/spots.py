@@ -8,15 +8,30 @@ from pathlib import Path
 from typing import Annotated
 
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import bench_display, load_alignment, slm_size
+from instrument.display.hologram import bench_display, load_alignment, prepare_target, slm_size
 from instrument.display.hologram_files import HologramFiles
-from instrument.display.limit import lifts_of, limit_lines, limits_of_lifts
+from instrument.display.limit import (
+    at_most,
+    coarser_mask,
+    frames_line,
+    lifts_of,
+    limit_lines,
+    limits_of_lifts,
+)
 from instrument.display.spots import SpotFiles, spots_of
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image
 from instrument.tasks.task import BenchFile, Desk, Done, Only, bench_of, saying_what_is_left, task
 from recon.base.declare import option
-from recon.holography import Display, HologramOptions, HologramRecord, HologramStop, compute_spots
+from recon.holography import (
+    Display,
+    HologramOptions,
+    HologramRecord,
+    HologramStop,
+    compute_spots,
+    hologram_limit,
+)
+from recon.holography.limit import gain_of_frames
 
 _OF_PICTURES = ("picture",)
 
@@ -135,9 +150,18 @@ def tell_limit(desk: Desk, picture: Pixels, display: Display, options: HologramO
             advance(float(before + record.iteration), note=f"{black}{record.psnr_db:.2f} dB")
 
         found = limits_of_lifts(picture, display, options, z_mm=z_mm, callback=show, cancel=cancel)
-    if found[-1].stop_reason is HologramStop.CANCELLED:
+        lines = limit_lines(found, display, options)
+        if not cancel.is_set():
+            target = prepare_target(picture, display, options, z_mm=z_mm)
+            lines.append(frames_line(gain_of_frames(display, [target], options)))
+        coarser = coarser_mask(display)
+        if coarser is not None and not cancel.is_set():
+            target = prepare_target(picture, coarser, options, z_mm=z_mm)
+            better = at_most(hologram_limit(coarser, target, options, cancel=cancel))
+            lines.append(f"  half of the field, along each axis (--expansion {coarser.expansion}): {better}")
+    if cancel.is_set():
         desk.warn("Interrupted: this is a bound all the same, less sharp than it could be.")
-    for line in limit_lines(found, display, options):
+    for line in filter(None, lines):
         desk.say(line)
     return Done()
 

@@ -42,6 +42,11 @@ Array = npt.NDArray[Any]
 
 COLUMNS = 6
 """Of V: more do not lower the loss by a hundredth of a decibel at 16x."""
+SETTLED = 1e-3
+"""Part of the loss by which it falls in an iteration, below which what is left to gain costs more than it
+sharpens the bound: 0.03 dB at 16x."""
+FAR_DB = 40.0
+"""Where the relaxation is that good nothing limits a picture that an eye sees: no bound is looked for."""
 BANDS = (0.0, 0.05, 0.15, 0.4, 1.0)
 """Edges, in parts of the eye's cut-off, of the bands that are told apart."""
 DENSE, STEPS, DOUBT = 400, 400, 1e-6
@@ -57,6 +62,7 @@ class Limit:
     ----------
     bound_db : float
         Of the seen image's PSNR (the target's white as peak, the target's light): no frames are better.
+        Infinite where none is in sight: the relaxation itself reaches :data:`FAR_DB`, or says too little.
     reached_db : float
         Of the relaxation's own solution; the bound is as sharp as the two are close.
     wanted, reached : ndarray, float64, (n_bands,)
@@ -64,6 +70,9 @@ class Limit:
         mean, and the part of it that is reached, 1 for all.
     stop_reason : HologramStop
     seconds : float
+        Of the search.
+    columns : ndarray, complex64, (n_columns, height, width)
+        The relaxation's solution: where the search for a like target may start.
     """
 
     bound_db: float
@@ -72,6 +81,7 @@ class Limit:
     reached: npt.NDArray[np.float64]
     stop_reason: HologramStop
     seconds: float
+    columns: npt.NDArray[np.complex64]
 
 
 def hologram_limit(
@@ -79,6 +89,7 @@ def hologram_limit(
     target: Target,
     options: HologramOptions | None = None,
     *,
+    initial: Array | None = None,
     callback: Callable[[HologramRecord, Array], object] | None = None,
     cancel: threading.Event | None = None,
 ) -> Limit:
@@ -89,9 +100,12 @@ def hologram_limit(
     display : Display
     target : Target
     options : HologramOptions
-        Its iterations, time, tolerance and seed. The loss is "frequency": what an eye resolves counts.
+        Its iterations, time, tolerance (:data:`SETTLED` where none is given) and seed. The loss is
+        "frequency": what an eye resolves counts.
+    initial : ndarray, optional
+        ``columns`` of a like target's limit.
     callback, cancel
-        As :func:`recon.holography.compute_hologram`.
+        As :func:`recon.holography.compute_hologram`; what ends early is a bound that is less sharp.
 
     Raises InputError for another loss or a complex SLM, and for a display of which something was learned.
     """
@@ -105,15 +119,20 @@ def hologram_limit(
         raise InputError("The limit is known for a phase SLM and the loss 'frequency'.")
     model = HologramModel(display, [target], options, frames=COLUMNS)
     variable = _Rows(model)
-    rng = np.random.default_rng(options.seed)
-    start = rng.normal(size=(2, COLUMNS, *display.slm_shape)).astype(np.float32)
-    search = _Lbfgs(variable, variable.pack(start[0] + 1j * start[1]))
-    history, reason = _Watch(options, callback, cancel).run(search, options.iterations, None)
+    if initial is None:
+        start = np.random.default_rng(options.seed).normal(size=(2, COLUMNS, *display.slm_shape))
+        initial = start[0] + 1j * start[1]
+    search = _Lbfgs(variable, variable.pack(initial))
+    if options.tolerance is None:
+        options = replace(options, tolerance=SETTLED)
+    history, reason = _Watch(options, callback, cancel).run(search, options.iterations, FAR_DB)
     slm = variable.field(search.x)
     found = model.evaluate(slm)
-    gap = _gap(model, slm, found.gradient)
     peak = model.peaks[0] ** 2 * model.counted
-    least = max(2 * found.loss - gap, 0.0) ** 2 / (2 * found.loss)
+    least = 0.0
+    if reason is not HologramStop.QUALITY:
+        gap = _gap(model, slm, found.gradient, cancel)
+        least = max(2 * found.loss - gap, 0.0) ** 2 / (2 * found.loss)
     wanted, reached = _bands(model, slm)
     return Limit(
         -10 * np.log10(least / peak) if least > 0 else float("inf"),
@@ -122,6 +141,7 @@ def hologram_limit(
         reached,
         reason,
         history[-1].seconds,
+        slm,
     )
 
 
@@ -248,7 +268,7 @@ def _bands(model: HologramModel, slm: Array) -> tuple[Array, Array]:
     return contrasts, parts
 
 
-def _gap(model: HologramModel, slm: Array, gradient: Array) -> float:
+def _gap(model: HologramModel, slm: Array, gradient: Array, cancel: threading.Event | None = None) -> float:
     """Return how far the loss may be above the relaxation's least."""
     display = model.display
     alpha, dc = display.dc.modulated, display.dc.amplitude
@@ -268,16 +288,16 @@ def _gap(model: HologramModel, slm: Array, gradient: Array) -> float:
         out[n] = np.conj(dc) * back.sum() - rest * x[n] if dc else 0
         return out
 
-    return float((n + 1) * max(0.0, -_below_least(apply, n + 1)))
+    return float((n + 1) * max(0.0, -_below_least(apply, n + 1, cancel)))
 
 
-def _below_least(apply: Callable[[Array], Array], n: int) -> float:
-    """Return what no eigenvalue of a Hermitian map of C^n is below.
+def _below_least(apply: Callable[[Array], Array], n: int, cancel: threading.Event | None = None) -> float:
+    """Return what no eigenvalue of a Hermitian map of C^n is below; less sharp where it is cancelled.
 
     Certain up to :data:`DENSE` dimensions. Beyond, Lanczos' from a random start ``b``. With the least
-    eigenvalue ``l`` and its vector ``v``, ``|p(A) b|^2 >= |p(l)|^2 |<b, v>|^2`` for every polynomial; of all of
-    degree below ``k`` the one of least norm, 1 at ``l``, has ``|p(A) b|^2 = 1 / K(l)``, ``K`` the sum of the
-    squares of the polynomials that Lanczos' recurrence makes (Christoffel's function of what ``b`` sees). So
+    eigenvalue ``l`` and its vector ``v``, ``|p(A) b|^2 >= |p(l)|^2 |<b, v>|^2`` for every polynomial ``p``.
+    Of all of degree below ``k`` and 1 at ``l``, the least ``|p(A) b|^2`` is ``1 / K(l)``, ``K`` the sum
+    of the squared polynomials that Lanczos' recurrence makes (Christoffel's function of what ``b`` sees). So
     ``|<b, v>|^2 <= 1 / K(l)``, and in C^n that is as small with a probability below ``n / K(l)``: where this
     is :data:`DOUBT`, no eigenvalue is below. A bulk of eigenvalues near the least one does not blur it, and a
     few far above cost a few steps.
@@ -303,7 +323,8 @@ def _below_least(apply: Callable[[Array], Array], n: int) -> float:
             ritz = eigvalsh_tridiagonal(diagonal, off)
             rounding = (1e-5 if ended else _ROUNDED) * float(np.abs(ritz).max())
             below = float(ritz[0]) if ended else _unlikely(diagonal, off, ritz, np.log(n / DOUBT))
-            if ended or step == STEPS or ritz[0] - below < _SHARP * abs(below):
+            hurried = step == STEPS or (cancel is not None and cancel.is_set())
+            if ended or hurried or ritz[0] - below < _SHARP * abs(below):
                 return below - rounding
         off.append(beta)
         before, v = v, w / np.float32(beta)

@@ -411,6 +411,10 @@ def _in_turns(variable: Phase, search: _Lbfgs, watch: _Watch) -> Hologram:
     return Hologram(slm.astype(np.complex64), history, reason, history[-1].seconds)
 
 
+TOLERANCE = 1e-5
+"""Where none is asked for."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Watch:
     """Steps a search until what was asked for is reached or spent."""
@@ -429,6 +433,7 @@ class _Watch:
         """Step on; ``before`` is the history so far, whose iterations count."""
         history = [*before] or [HologramRecord(0, 0.0, *search.point)]
         seconds, calm = history[-1].seconds, 0
+        tolerance = TOLERANCE if self.options.tolerance is None else self.options.tolerance
         while True:
             last = history[-1]
             if (reason := self._ended(last, seconds, iterations, psnr_db)) is not None:
@@ -438,7 +443,7 @@ class _Watch:
             seconds += time.perf_counter() - began
             if found is None:
                 return tuple(history), HologramStop.CONVERGED
-            calm = calm + 1 if last.loss - found.loss < self.options.tolerance * last.loss else 0
+            calm = calm + 1 if last.loss - found.loss < tolerance * last.loss else 0
             history.append(HologramRecord(last.iteration + 1, seconds, found.loss, found.psnr_db))
             if self.callback is not None:
                 self.callback(history[-1], search.slm)

@@ -212,10 +212,11 @@ class HologramOptions:
         group=_STOP,
         applies=_OF_PICTURES,
     )
-    tolerance: float = option(
-        1e-5,
+    tolerance: float | None = option(
+        None,
         help="Stop when the loss fell by less than this fraction in each of five iterations in a row. "
         "0: never.",
+        default_words="1e-05; of a limit 0.001",
         least=0,
         metavar="X",
         group=_STOP,

@@ -15,7 +15,7 @@ from calibration_routines.display.hologram_photograph import display_of_pattern,
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
 from instrument.display.hologram import Alignment, bench_display, field_picture, prepare_target
-from instrument.display.limit import limit_lines
+from instrument.display.limit import coarser_mask, limit_lines
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image, write_image
 from instrument.files.sample_images import SAMPLES, load_sample
@@ -246,9 +246,11 @@ def test_spots_without_a_mask_come_from_an_array_or_a_list(capsys):
 def test_the_limit_is_said_before_anything_is_computed(capsys):
     assert main(["hologram", "picture.png", "--limit", "--iterations", "10", "--lift", "0.2"]) == 0
     said = capsys.readouterr().out
-    assert "no number of frames shows this picture better than" in said
+    assert "limit: none is in sight through this mask" in said
     assert "black at 0.3 of white" in said
     assert "black at 0.1 of white" not in said
+    assert "more frames (--frames): up to about" in said
+    assert "half of the field, along each axis (--expansion 1): " in said
     assert not Path("slm.png").exists()
     assert main(["hologram", "picture.png", "--limit", "--color"]) == 2
     lifted = HologramOptions(lift=0.2, envelope="correct")
@@ -258,11 +260,15 @@ def test_the_limit_is_said_before_anything_is_computed(capsys):
 def test_the_limit_says_why_coarse_contrast_is_not_reached_behind_a_lens_and_near():
     mask = no_mask((96, 96), design_wavelength_nm=532.0)
     lens = Display((96, 96), mask, slm_pitch_um=16.0, wavelength_nm=532.0)
-    found = Limit(20.0, 19.0, np.full(4, 0.5), np.array([0.3, 0.3, 0.9, 0.3]), HologramStop.CONVERGED, 1.0)
+    reached, columns = np.array([0.3, 0.3, 0.9, 0.3]), np.ones((1, 96, 96), np.complex64)
+    found = Limit(20.0, 19.0, np.full(4, 0.5), reached, HologramStop.CONVERGED, 1.0, columns)
     near = limit_lines([found], replace(lens, distance_mm=4.0), HologramOptions())
     assert "light does not go so far aside" in near[1]
     assert "more contrast than so many SLM pixels can make" in near[4]
     assert "within an SLM pixel" in limit_lines([found], lens, HologramOptions())[1]
+    far = replace(found, bound_db=np.inf, reached_db=45.1)
+    assert "none is in sight with these phases; 45.10 dB" in limit_lines([far], lens, HologramOptions())[0]
+    assert coarser_mask(replace(lens, distance_mm=4.0)) is None
 
 
 @pytest.mark.usefixtures("here")

@@ -23,7 +23,16 @@ from recon.holography import (
     random_mask,
 )
 from recon.holography.learned import Learned
-from recon.holography.limit import COLUMNS, DENSE, STEPS, _below_least, _gap, gain_of_frames, limited_by
+from recon.holography.limit import (
+    COLUMNS,
+    DENSE,
+    FAR_DB,
+    STEPS,
+    _below_least,
+    _gap,
+    gain_of_frames,
+    limited_by,
+)
 
 SHAPE, K = (12, 16), 4
 
@@ -117,6 +126,21 @@ def test_it_can_be_interrupted_and_is_a_bound_all_the_same():
 def hologram(*psnr_db: float, reason: HologramStop = HologramStop.ITERATIONS) -> Hologram:
     history = tuple(HologramRecord(n, 0.0, 1.0, value) for n, value in enumerate(psnr_db))
     return Hologram(np.ones((1, *SHAPE), np.complex64), history, reason, 0.0)
+
+
+def test_a_search_goes_on_from_a_like_target_and_ends_where_nothing_limits():
+    display = Display(SHAPE, random_mask((SHAPE[0] * K, SHAPE[1] * K), seed=2))
+    first = hologram_limit(display, Target(picture(), white=1.0))
+    steps = []
+    again = hologram_limit(
+        display, Target(picture(), white=1.0), initial=first.columns, callback=lambda *_: steps.append(1)
+    )
+    assert len(steps) <= 6
+    assert again.bound_db == pytest.approx(first.bound_db, abs=0.1)
+    easy = hologram_limit(display, Target(np.full((48, 64), 0.5) + 0.01 * picture(), white=1.0))
+    assert easy.bound_db == np.inf
+    assert easy.reached_db >= FAR_DB
+    assert easy.stop_reason is HologramStop.QUALITY
 
 
 @pytest.mark.parametrize(
