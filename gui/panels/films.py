@@ -42,6 +42,7 @@ _FASTEST_MS = 20
 _REST_MS = 250
 """After a region was dragged, before its curve is read."""
 _FILTERS = "Films and curves (*.mp4 *.gif *.ome.zarr *.csv)"
+_NO_REGION = "Regions, dragged over the picture, get a curve each"
 _EMPTY = "Open a recording of this bench, or a video that was reconstructed from one."
 
 
@@ -160,6 +161,7 @@ class FilmsPanel(Panel):
             self.slider.setPageStep(max(len(film) // 20, 1))
             self.slider.setValue(0)
         self.plot.setLabel("bottom", "time (s)" if film.period_s else "frame")
+        self.plot.setXRange(film.times_s[0], film.times_s[-1], padding=0.01)
         self._set_usable()
         self._place = 0
         self._turn()
@@ -255,7 +257,9 @@ class FilmsPanel(Panel):
     def _draw_curves(self) -> None:
         for item in self.plot.listDataItems():
             self.plot.removeItem(item)
-        if self.film is None or not self.courses.size:
+        none = self.film is None or not self.courses.size
+        self.plot.setTitle(_NO_REGION if none else None, color=colours().dim, size="9pt")
+        if self.film is None or none:
             return
         changes = self.quantity.currentIndex() == 1
         self.plot.setLabel("left", "dF/F" if changes else "mean")

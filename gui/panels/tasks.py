@@ -114,7 +114,7 @@ class TasksPanel(Panel):
         self.list.setAccessibleName("Files that were written")
         self.list.setToolTip("What was written; a click shows a picture, a double click opens a file")
         self.list.itemClicked.connect(lambda item: self._show(item.data(Qt.ItemDataRole.UserRole)))
-        self.list.itemActivated.connect(lambda item: self._open(item.data(Qt.ItemDataRole.UserRole)))
+        self.list.itemActivated.connect(lambda item: self._open_result(item.data(Qt.ItemDataRole.UserRole)))
         self.folder_button = button("Open folder", "Show it in the file manager", self._open_folder)
         self.use_button = button(
             "Go on with it…", "Take the result to the panel that works with it", self._use
@@ -373,6 +373,13 @@ class TasksPanel(Panel):
         if self._running == "spots" and path.suffix == ".png" and "slm" in self.session.kinds:
             return "slm"
         return "reconstructions" if path in self._calibrations else ""
+
+    def _open_result(self, path: Path) -> None:
+        """Open a file in the panel that works with it, else as the desktop does."""
+        if panel := self._panel_for(path):
+            self.session.handed_on.emit(panel, path)
+        else:
+            self._open(path)
 
     def _open(self, path: Path) -> None:
         QDesktopServices.openUrl(QUrl.fromLocalFile(str(path)))

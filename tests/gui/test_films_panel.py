@@ -62,10 +62,13 @@ def test_a_film_is_played_followed_and_written(
     qtbot.waitUntil(lambda: panel.slider.value() < 20, timeout=WAIT_MS)  # round at the end
     panel.play_button.click()
     assert not panel._timer.isActive()
+    assert panel.plot.getViewBox().viewRange()[0] == pytest.approx([0, 1.45], abs=0.05)
+    assert panel.plot.getPlotItem().titleLabel.text.startswith("Regions, dragged")
     panel.region_button.click()
     panel.measure._dragged(QPointF(10, 8), QPointF(15, 11))
     qtbot.waitUntil(lambda: panel.courses.size == 29, timeout=WAIT_MS)
     assert panel.courses[0, [0, 14, 19]] == pytest.approx([1.5, 2.5, 1.5])
+    assert panel.plot.getPlotItem().titleLabel.isVisible() is False
     panel.quantity.setCurrentIndex(1)
     (item,) = panel.plot.listDataItems()
     assert item.getData()[1].max() == pytest.approx(1 / 1.5)

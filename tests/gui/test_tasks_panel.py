@@ -109,6 +109,8 @@ def test_a_hologram_of_spots_is_previewed_and_goes_on_to_the_slm(qtbot: QtBot, p
     panel.session.handed_on.connect(lambda *what: handed.extend(what))
     qtbot.mouseClick(panel.use_button, Qt.MouseButton.LeftButton)
     assert handed == ["slm", pattern]
+    panel.list.itemActivated.emit(panel.list.item(0))
+    assert handed == ["slm", pattern] * 2
 
 
 def test_two_calibrations_are_compared_with_table_and_python_beside_the_form(
