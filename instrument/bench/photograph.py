@@ -39,6 +39,8 @@ class Snapshot:
     """Of the last frame, but for what is combined of all: see :meth:`FrameMetadata.of_mean`."""
     average: int
     """Number of frames averaged."""
+    frame_means: tuple[float, ...] = ()
+    """Of a mean: the mean count of each frame; empty where that is not known."""
 
     @classmethod
     def of(cls, frames: Sequence[Frame]) -> Snapshot:
@@ -48,18 +50,31 @@ class Snapshot:
         total = np.zeros((), np.float64)
         for frame in frames:
             total = np.add(total, frame.image)
-        return cls._mean(total, [frame.metadata for frame in frames])
+        means = [_mean_count(frame) for frame in frames]
+        return cls._mean(total, [frame.metadata for frame in frames], means)
 
     @classmethod
-    def _mean(cls, total: npt.NDArray[np.float64], metadata: Sequence[FrameMetadata]) -> Snapshot:
+    def _mean(
+        cls, total: npt.NDArray[np.float64], metadata: Sequence[FrameMetadata], means: Sequence[float]
+    ) -> Snapshot:
         mean = np.asarray(total / len(metadata), np.float32)
         mean.flags.writeable = False
-        return cls(mean, FrameMetadata.of_mean(metadata), len(metadata))
+        return cls(mean, FrameMetadata.of_mean(metadata), len(metadata), tuple(means))
+
+    @property
+    def unsteadiness(self) -> float:
+        """Standard deviation of the frames' mean counts, relative, dark level included; 0 where unknown."""
+        means = np.array(self.frame_means)
+        return float(means.std(ddof=1) / means.mean()) if len(means) > 1 and means.mean() > 0 else 0.0
 
     @property
     def full_scale(self) -> int:
         """The largest count that the camera can report at its present bit depth."""
         return (1 << self.metadata.significant_bits) - 1
+
+
+def _mean_count(frame: Frame) -> float:
+    return float(frame.image.mean(dtype=np.float64))
 
 
 def photograph(
@@ -79,18 +94,20 @@ def photograph(
         raise BenchError(f"A photograph is the mean of 1 or more frames, not {average}.")
     total = np.zeros((), np.float64)
     metadata: list[FrameMetadata] = []
+    means: list[float] = []
     for taken in range(1, average + 1):
         frame = camera.snap()
         metadata.append(frame.metadata)
         if average > 1:
             total = np.add(total, frame.image)
+            means.append(_mean_count(frame))
         if on_frame is not None:
             on_frame(frame)
         if on_progress is not None:
             on_progress(taken, average)
     if average == 1:
         return Snapshot(frame.image, frame.metadata, average)
-    return Snapshot._mean(total, metadata)
+    return Snapshot._mean(total, metadata, means)
 
 
 class LightState(enum.StrEnum):
@@ -196,6 +213,7 @@ def snapshot_facts(bench: Bench, taken: Snapshot, light: LightState) -> dict[str
         "camera": str(bench.camera.identity),
         "light": light.value,
         "average": taken.average,
+        **({"frame_means": taken.frame_means} if taken.frame_means else {}),
         "full_scale": taken.full_scale,
         "noise": plain(noise),
         "pixel_pitch_um": bench.camera.pixel_pitch_um * taken.metadata.binning,
@@ -211,8 +229,9 @@ def read_snapshot(path: Path | str) -> Snapshot:
     image = read_image(path)
     try:
         metadata, average = value_of(FrameMetadata, image.metadata), int(image.metadata["average"])
+        means = tuple(float(mean) for mean in image.metadata.get("frame_means", ()))
     except (LookupError, TypeError, ValueError) as error:
         raise FileError(path, f"tells not how it was photographed: {error}.") from None
     pixels = image.pixels
     pixels.flags.writeable = False
-    return Snapshot(pixels, metadata, average)
+    return Snapshot(pixels, metadata, average, means)

@@ -42,6 +42,7 @@ snap_app, record_app = App(), App()
 
 DIM = 0.1
 """Of full scale: a lit photograph whose brightest pixel stays below it wastes most of the sensor's range."""
+_UNSTEADY = 0.02  # scatter of frames' mean counts that is said
 _LIGHT, _CAMERA, _FILES = "Light", "Camera", "Files"
 
 
@@ -215,6 +216,12 @@ def _report(target: Path, taken: Snapshot, light: LightState) -> None:
         f"Counts {float(taken.image.min()):g} to {float(taken.image.max()):g}, "
         f"mean {float(np.mean(taken.image, dtype=np.float64)):.1f}, of {taken.full_scale}."
     )
+    if taken.unsteadiness > _UNSTEADY:
+        typer.echo(
+            f"Note: the frames' mean counts scatter by {taken.unsteadiness:.1%}: the light flickers, or "
+            "other light comes and goes.",
+            err=True,
+        )
     if light is not LightState.DARK and taken.image.max() < DIM * taken.full_scale:
         typer.echo(
             f"Note: the brightest pixel is below {DIM:.0%} of full scale; lengthen --exposure-ms.",

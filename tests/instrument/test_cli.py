@@ -231,6 +231,16 @@ def test_snap_keeps_counts_and_metadata(here: Path, capsys: pytest.CaptureFixtur
     assert json.loads((here / "mean.json").read_text())["led_pattern"].startswith("point source")
 
 
+@pytest.mark.parametrize("flicker", [0.0, 0.2])
+def test_a_mean_of_frames_whose_light_flickers_says_so(
+    here: Path, capsys: pytest.CaptureFixture[str], flicker: float
+) -> None:
+    (here / "bench.toml").write_text(TINY + f"flicker = {flicker}\n")
+    assert main(["snap", "--out", "mean.npy", "--average", "4", "--exposure-ms", "20", "--source"]) == 0
+    assert ("the frames' mean counts scatter by" in capsys.readouterr().err) == (flicker > 0)
+    assert len(json.loads((here / "mean.json").read_text())["frame_means"]) == 4
+
+
 TINY = """
 [camera]
 driver = "simulated"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from statistics import fmean, stdev
 from types import SimpleNamespace
 
 import pytest
@@ -192,6 +193,10 @@ def test_snap_averages_and_completes_the_metadata() -> None:
     assert single.image[0, 0] == 101
     assert mean.image.dtype == "float32"
     assert mean.image[0, 0] == pytest.approx(103.0)
+    assert len(mean.frame_means) == 3
+    assert sum(mean.frame_means) / 3 == pytest.approx(mean.image.mean())
+    assert mean.unsteadiness == pytest.approx(stdev(mean.frame_means) / fmean(mean.frame_means))
+    assert single.unsteadiness == 0
     assert mean.metadata.dropped_before == 3
     assert mean.metadata.stage_position == {"x_um": 0.0, "z_um": 0.0}
     assert mean.metadata.led_pattern == "off"

@@ -162,6 +162,10 @@ def test_every_field_of_today_comes_back(tmp_path: Path, bench: Bench) -> None:
     back = read_snapshot(tmp_path / "photo.tif").metadata
     for declared in fields(FrameMetadata):
         assert getattr(back, declared.name) == getattr(taken.metadata, declared.name), declared.name
+    mean = bench.snap(3)
+    write_snapshot(bench, tmp_path / "mean.tif", mean, LightState.DARK)
+    assert read_snapshot(tmp_path / "mean.tif").frame_means == mean.frame_means
+    assert len(mean.frame_means) == 3
 
 
 def test_an_image_from_elsewhere_is_no_photograph_of_ours(tmp_path: Path) -> None:
