@@ -329,3 +329,126 @@ def test_the_penalties_are_balanced_within_bounds_and_for_a_dark_object_too():
     assert solver._balanced_penalties().tolist() == [[2.0, 10.0], [2.0 * 0.03, 3.0]]
     solver._mu[...] = [[1.0, 0.0], [1.0, 1e-4]]
     assert solver._balanced_penalties().tolist() == [[2.0, 0.0], [2.0 * 0.03, 1e-2]]
+
+
+def quadratic(solver, camera, channel):
+    """Return the data term's system on a channel's object, ``A^H A + T``, as a function."""
+    mu_u, mu_w = solver._mu[:, channel]
+
+    def applied(y):
+        psi = sum(2 * y - np.roll(y, 1, axis) - np.roll(y, -1, axis) for axis in (0, 1))
+        stack = np.zeros(camera.domain_shape)
+        stack[channel] = y
+        return camera.adjoint(camera.forward(stack))[channel] + mu_u * psi + mu_w * y
+
+    return applied
+
+
+@pytest.mark.parametrize("shared_psf", [False, True])
+@pytest.mark.parametrize("prior", [PRIORS["tv"], PRIORS["l1"]])
+def test_with_many_data_steps_an_object_solves_its_quadratic_problem(prior, shared_psf):
+    camera, data = problem(2, shared_psf=shared_psf)
+    solver = SensorAdmm(camera, data, prior, data_steps=40)
+    for _ in range(2):
+        right = solver._y.copy()
+        misfits = [solver._solve(channel, 40) for channel in (0, 1)]
+        y = solver._y.copy()
+        for channel in (0, 1):
+            expected = camera.adjoint(data)[channel] + right[channel]
+            np.testing.assert_allclose(quadratic(solver, camera, channel)(y[channel]), expected, atol=1e-8)
+        residual = data - camera.forward(y)
+        np.testing.assert_allclose(solver._e, residual, atol=1e-8)
+        assert misfits == pytest.approx(list(np.sum(residual**2, axis=(1, 2))), rel=1e-6)
+        solver._splits.sweep(1.5)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3])
+def test_data_steps_are_those_of_preconditioned_conjugate_gradients(steps):
+    camera, data = problem()
+    solver = SensorAdmm(camera, data, PRIORS["tv"])
+    solver.step()
+    mu_u, mu_w = solver._mu[:, 0]
+    laplacian = sum(
+        (4 * np.sin(np.pi * np.arange(n) / n) ** 2).reshape(shape)
+        for n, shape in zip(camera.grid_shape, ((-1, 1), (1, -1)), strict=True)
+    )
+
+    def inverted(y):  # T^-1 y
+        return np.fft.ifft2(np.fft.fft2(y) / (mu_u * laplacian + mu_w)).real
+
+    def bent(e):
+        return e + camera.forward(inverted(camera.adjoint(e[None])[0])[None])[0]
+
+    right, e = solver._y[0].copy(), solver._e[0].copy()
+    r = data[0] - camera.forward(inverted(right)[None])[0] - bent(e)
+    precondition = solver._preconditioners[0].apply
+    z = precondition(r, np.empty_like(r)).copy()
+    p, rho = z, float(np.vdot(r, z))
+    for _ in range(steps):
+        length = rho / float(np.vdot(p, bent(p)))
+        e = e + length * p
+        r = r - length * bent(p)
+        z = precondition(r, np.empty_like(r)).copy()
+        rho, before = float(np.vdot(r, z)), rho
+        p = z + rho / before * p
+    misfit = solver._solve(0, steps)
+    np.testing.assert_allclose(solver._e[0], e, atol=1e-9)
+    np.testing.assert_allclose(solver._y[0], inverted(right + camera.adjoint(e[None])[0]), atol=1e-9)
+    assert misfit == pytest.approx(float(np.vdot(e, e)))
+
+
+def test_the_first_iteration_takes_four_data_steps_and_others_as_many_as_asked(monkeypatch):
+    taken = []
+    monkeypatch.setattr(SensorAdmm, "_solve", lambda _self, _channel, steps: float(bool(taken.append(steps))))
+    for asked in (1, 6):
+        solver = SensorAdmm(*problem(), PRIORS["l1"], data_steps=asked)
+        solver.advance()
+        solver.advance()
+    assert taken == [4, 1, 6, 6]
+
+
+@pytest.mark.parametrize(
+    ("prior", "strength"),
+    [(PRIORS["tv"], 0.05), (PRIORS["l1"], 0.05), (TotalVariation(0.05) + L1(0.02), 0.05), (Zero(), None)],
+)
+def test_first_penalties_follow_the_objects_mean(prior, strength):
+    camera, data = problem(2)
+    data[1] *= 3
+    solver = SensorAdmm(camera, data, prior)
+    sums = camera._psfs.sum(axis=(2, 3))[0]
+    for channel in (0, 1):
+        mean = np.linalg.norm(data[channel]) / (np.sqrt(data[channel].size) * sums[channel])
+        power = np.abs(np.fft.rfft2(camera._psfs[0, channel], camera.grid_shape)) ** 2
+        penalty = power.mean() if strength is None else strength / (0.3 * mean)
+        mu_u, mu_w = solver._first_penalties()[:, channel]
+        assert mu_w == pytest.approx(0.05 * penalty, rel=1e-6)
+        assert mu_u == (pytest.approx(penalty, rel=1e-6) if "Total" in str(prior) else 0)
+    dark = SensorAdmm(camera, 0 * data, prior)._first_penalties()
+    np.testing.assert_allclose(dark[1], [
+        0.05 * np.mean(np.abs(np.fft.rfft2(psf, camera.grid_shape)) ** 2) for psf in camera._psfs[0]
+    ], rtol=1e-6)  # fmt: skip
+
+
+def test_pixels_penalties_are_set_by_the_data_terms_gradient_at_three_iterations(monkeypatch):
+    operator, data = problem(2, erased=True)
+    solver = SensorAdmm(operator, data, PRIORS["tv"])
+    for _ in range(12):
+        solver.advance()
+    monkeypatch.setattr(solver._splits, "balanced_penalties", lambda: solver._mu.copy())
+    w = solver.solution
+    gradient = operator.adjoint(operator.forward(w) - solver._weight * solver._data)
+    for channel in (0, 1):
+        multiplier = solver._mu[1, channel] * np.linalg.norm(solver._splits.t_w[channel] - w[channel])
+        slope = np.linalg.norm(gradient[channel])
+        expected = np.sqrt(multiplier * slope) / np.linalg.norm(w[channel])
+        expected = np.clip(expected, solver._mu[1, channel] / 100, solver._mu[1, channel] * 100)
+        expected = max(expected, 0.03 * solver._mu[0, channel])
+        assert solver._balanced_penalties()[1, channel] == pytest.approx(expected, rel=1e-9)
+    solver.iteration = 6  # no turn of the gradient's
+    unchanged = np.maximum(solver._mu[1], 0.03 * solver._mu[0])
+    np.testing.assert_allclose(solver._balanced_penalties(), [solver._mu[0], unchanged])
+    monkeypatch.setattr(solver._splits, "balanced_penalties", lambda: 1e4 * solver._mu)
+    np.testing.assert_allclose(solver._balanced_penalties(), np.array([[10.0], [100.0]]) * solver._mu)
+    monkeypatch.setattr(solver._splits, "balanced_penalties", lambda: 1e-4 * solver._mu)
+    least = [solver._mu[0] / 10, np.maximum(solver._mu[1] / 100, 0.003 * solver._mu[0])]
+    np.testing.assert_allclose(solver._balanced_penalties(), least)
