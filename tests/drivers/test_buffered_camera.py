@@ -181,7 +181,7 @@ def test_damaged_frames_count_as_lost_and_are_told_when_nothing_comes() -> None:
     assert queue.incomplete_frames == 2
     with pytest.raises(DeviceTimeoutError) as silence:
         queue.next_frame(2.0)
-    assert "2 frames came damaged" in str(silence.value)
+    assert " 2 frames came damaged" in str(silence.value)
     assert "pulses" not in str(silence.value)
     queue.stop_sequence()
     queue.set_trigger_mode("hardware")

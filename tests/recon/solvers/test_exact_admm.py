@@ -1,0 +1,201 @@
+"""Single iterations of the volume ADMMs, held to what the text says they do, by plain operators."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon.camera.convolution import Convolution
+from recon.camera.varying_psfs import FieldOfPsfs, local_convolution
+from recon.priors import L1, NonNegativity, TotalVariation
+from recon.solvers.operator_admm import LEAST_PIXELS, OperatorAdmm
+from recon.solvers.prior_splits import balancing
+from recon.solvers.splitting import SensorData, Tuning, is_due, residual_norm
+from recon.solvers.volume_admm import FIRST_PENALTY, VolumeAdmm, is_lateral_periodic
+
+SENSOR = (7, 8)
+RNG = np.random.default_rng(5)
+CAMERA = Convolution(RNG.random((3, 1, 5, 4)) ** 3, SENSOR, dtype=np.float64)
+VALID = RNG.random(SENSOR) > 0.2
+DATA = CAMERA.forward((RNG.random(CAMERA.domain_shape) > 0.97).astype(np.float64))
+DATA += 0.01 * RNG.standard_normal(DATA.shape)
+DEPTHS = ((0.5, 1.0, 1.0), (0.4, 0.9, 1.1), (0.3, 0.8, 1.2))
+FIELDS = [FieldOfPsfs(RNG.random((4, 1, 5, 4)) ** 3, [(-3, -3), (-3, 3), (3, -3), (3, 3)]) for _ in range(3)]
+FIELD = local_convolution(FIELDS, SENSOR, dtype=np.float64)
+CENTRAL = Convolution(np.stack([field.psfs[0] for field in FIELDS]), SENSOR, dtype=np.float64)
+
+
+def volume_tv(isotropic: bool = False, weights: Any = DEPTHS) -> TotalVariation:
+    return TotalVariation.of_volume(0.03, weights, isotropic=isotropic)
+
+
+def field_tv(isotropic: bool = False) -> TotalVariation:
+    return TotalVariation(0.03, axis_weights=(0.5, 1, 1.1), wrap=(False,) * 3, isotropic=isotropic)
+
+
+def solver_of(kind: str, prior: Any, **tuning: Any) -> VolumeAdmm | OperatorAdmm:
+    data, how = SensorData(DATA, VALID), Tuning(**tuning)
+    made: Any = (
+        VolumeAdmm(CAMERA, data, prior, tuning=how)
+        if kind == "volume"
+        else OperatorAdmm(FIELD, CENTRAL, data, prior, tuning=how)
+    )
+    made.system.follow = lambda progress: None  # as exact as it goes, from the first on
+    made.system.tolerance, made.system.max_steps = 1e-13, 200
+    return made
+
+
+def iterate(solver: VolumeAdmm | OperatorAdmm) -> np.ndarray:
+    """Return a solver's object, and leave its spectrum, which the transform may spoil, as it was."""
+    if isinstance(solver, OperatorAdmm):
+        return solver._iterate().copy()
+    kept = solver.X.copy()
+    x = solver._iterate()
+    solver.X = kept
+    return x
+
+
+def shrink(s: np.ndarray, threshold: float, isotropic: bool) -> np.ndarray:
+    if isotropic:
+        size = np.sqrt(np.sum(s**2, axis=0))
+        return s * np.maximum(1 - threshold / np.maximum(size, 1e-300), 0)
+    return np.sign(s) * np.maximum(np.abs(s) - threshold, 0)
+
+
+ANOTHER = TotalVariation(0.02, axis_weights=(1.0, 1.0), tolerance=1e-13, max_inner=5000)
+PRIORS = {
+    "TV": lambda tv: tv(),
+    "isotropic TV, bounds": lambda tv: tv(True) + NonNegativity(),
+    "TV, l1, bounds": lambda tv: tv() + L1(0.01) + NonNegativity(),
+    "another prior": lambda tv: tv() + NonNegativity() + ANOTHER,
+    "l1": lambda _: L1(0.02),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["volume", "field"])
+@pytest.mark.parametrize("name", PRIORS)
+def test_an_iteration_is_what_the_text_says(name: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recon.solvers.operator_admm.FIRST_STEPS", 200)
+    monkeypatch.setattr("recon.solvers.operator_admm.STEPS", 200)
+    prior = PRIORS[name](volume_tv if kind == "volume" else field_tv)
+    solver = solver_of(kind, prior, kappa=0.7, balance=False)
+    camera: Any = CAMERA if kind == "volume" else FIELD
+    tv = next((term for term in prior.terms() if isinstance(term, TotalVariation)), None)
+    kappa = 0.7 if tv or kind == "volume" else 1.0
+    relaxation = 1.8 if kind == "volume" else 1.7
+    psi = None if tv is None else tv.differences(np.zeros(camera.domain_shape))
+    data = DATA * VALID
+    assert solver.penalty == pytest.approx(
+        FIRST_PENALTY * (CAMERA if kind == "volume" else CENTRAL).power()[0].mean()
+    )
+    for n, change in enumerate((1.0, 1.0, 2.5, 0.4)):
+        used = solver._used_penalty
+        solver.penalty = mu = solver.penalty * change  # as if it had been balanced
+        x, S = iterate(solver), solver.S.reshape(-1, *camera.domain_shape).copy()
+        before = [(split.split.copy(), split.state.copy(), split.mu) for split in solver.splits]
+        record = solver.advance()
+        relax = relaxation if n else 1.0
+        r = np.zeros(camera.domain_shape)
+        primal = dual = size = multiplier = worth = 0.0
+        if psi is not None and tv is not None:
+            d, u = psi.forward(x), shrink(S, tv.weight / used, tv.isotropic)
+            state = u + used / mu * (S - u) + relax * (d - u)
+            np.testing.assert_allclose(solver.S.reshape(state.shape), state, atol=1e-9)
+            now = shrink(state, tv.weight / mu, tv.isotropic)
+            r += psi.adjoint(2 * now - state)
+            primal, dual, size, multiplier = (squared(v) for v in (d - now, now - u, d, state - now))
+            worth = tv.value(x)
+        for split, (variable, old, own) in zip(solver.splits, before, strict=True):
+            state = variable + own / (mu * kappa) * (old - variable) + relax * (x - variable)
+            np.testing.assert_allclose(split.state, state, atol=1e-9)
+            now = split.split
+            np.testing.assert_allclose(now, split.prior.prox(state, 1 / (mu * kappa)), atol=1e-6)
+            r += kappa * (2 * now - state)
+            primal, dual = primal + kappa * squared(x - now), dual + kappa * squared(now - variable)
+            size, multiplier = size + kappa * squared(x), multiplier + kappa * squared(state - now)
+            worth += split.prior.value(now)
+        after = iterate(solver)
+        bent = kappa * len(solver.splits) * after
+        bent += 0 if psi is None else psi.adjoint(psi.forward(after))
+        residual = data - VALID * camera.forward(after)
+        np.testing.assert_allclose(mu * (bent - r), camera.adjoint(residual), atol=1e-8)
+        np.testing.assert_allclose(solver.e, residual[0], atol=1e-8)
+        assert record.data_residual == pytest.approx(np.linalg.norm(residual))
+        if n:
+            assert record.primal_residual == pytest.approx((primal / size) ** 0.5, rel=1e-6)
+            assert record.dual_residual == pytest.approx((dual / multiplier) ** 0.5, rel=1e-6)
+        if kind == "volume":
+            misfit = 0.5 * squared(data - VALID * camera.forward(x))
+            assert record.objective == pytest.approx(misfit + worth, rel=1e-6)
+        first = solver.splits[1 if solver.separable.is_zero and len(solver.splits) > 1 else 0].split
+        np.testing.assert_array_equal(solver.solution, first)
+        if n and kind == "volume":
+            moved = sum(squared(s.split - old[0]) for s, old in zip(solver.splits, before, strict=True))
+            assert record.change == pytest.approx((moved / (len(before) * squared(x))) ** 0.5)
+        elif n:
+            place = 1 if solver.separable.is_zero and len(before) > 1 else 0
+            assert record.change == pytest.approx((squared(first - before[place][0]) / squared(first)) ** 0.5)
+
+
+def squared(v: np.ndarray) -> float:
+    return float(np.sum(v**2))
+
+
+@pytest.mark.parametrize(("residuals", "factor"), [(4.0, 2.0), (0.25, 0.5), (100.0, 5.0), (1e-3, 0.2)])
+def test_a_volumes_penalty_follows_the_ratio_of_residuals_within_bounds(
+    residuals: float, factor: float
+) -> None:
+    solver = solver_of("volume", volume_tv())
+    before = solver.penalty
+    solver._rebalance(residuals, np.zeros(9))
+    assert solver.penalty == pytest.approx(factor * before)
+
+
+def test_a_fields_penalties_follow_each_its_own_residuals() -> None:
+    solver = solver_of("field", field_tv() + NonNegativity(), kappa=0.6)
+    assert isinstance(solver, OperatorAdmm)
+    before = solver.penalty
+    sums = np.array([7.0, 4.0, 1.0, 1.0, 4.0, 1.0, 16.0, 1.0, 1.0])
+    solver._rebalance(9.0, sums)
+    assert solver.penalty == pytest.approx(before * balancing(4, 1, 1, 4))
+    assert solver.penalty * float(solver.kappa) == pytest.approx(0.6 * before * balancing(1, 16, 1, 1))
+    least = LEAST_PIXELS * CENTRAL.power()[0].mean() / 3
+    solver._rebalance(9.0, np.array([7.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1e9, 1.0, 1.0]))
+    solver._rebalance(9.0, np.array([7.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1e9, 1.0, 1.0]))
+    assert solver.penalty * float(solver.kappa) == pytest.approx(max(least, 0.006 * before * 0.5))
+    x = RNG.standard_normal(FIELD.domain_shape)
+    psi = field_tv().differences(x)
+    bent = psi.adjoint(psi.forward(x)) + float(solver.kappa) * x
+    np.testing.assert_allclose(solver._invert(bent), x, atol=1e-9)
+    alone = solver_of("field", L1(0.1))
+    before = alone.penalty
+    alone._rebalance(4.0, np.zeros(9))
+    assert alone.penalty == pytest.approx(2 * before)
+
+
+def test_penalties_are_balanced_ever_more_seldom() -> None:
+    due = [n for n in range(200) if is_due(n)]
+    assert due == [2, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192]
+
+
+def test_what_is_no_number_is_an_infinite_residual() -> None:
+    assert residual_norm(np.array([3.0, 4.0])) == 5.0
+    assert residual_norm(np.array([3.0, np.nan])) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("weights", "wrap", "lateral"),
+    [
+        ((1.0, 1.0), None, True),
+        ((1.0, 1.0), (True, True), True),
+        ((1.0, 1.0), (False, True), False),
+        ((1.0, 1.0, 1.0), (False, True, True), True),
+        ((1.0, 1.0, 1.0), None, False),
+        ((1.0,), None, False),
+        (DEPTHS, (False, True, True), True),
+    ],
+)
+def test_which_differences_a_volumes_sweeps_have(weights: Any, wrap: Any, lateral: bool) -> None:
+    assert is_lateral_periodic(TotalVariation(1.0, axis_weights=weights, wrap=wrap)) == lateral
