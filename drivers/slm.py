@@ -25,9 +25,12 @@ class Slm(PlaysSequences[npt.NDArray[np.uint8]]):
     ----------
     mirrors : bool
         Whether a level is how much light a pixel sends, 255 all of it; else it is a phase.
+    is_screen : bool
+        Whether it gives light of its own, as a monitor does.
     """
 
     mirrors: bool = False
+    is_screen: bool = False
 
     @property
     @abstractmethod

@@ -46,6 +46,7 @@ class SimulatedScreen(SimulatedPanel):
     """
 
     model = "screen"
+    is_screen = True
     Options = ScreenOptions
     options: ScreenOptions
     world: SimulatedWorld

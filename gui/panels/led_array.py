@@ -49,6 +49,7 @@ class LedPanel(DevicePanel):
             self.plot.hideAxis(axis)
         self.plot.setMinimumHeight(110)
         self.plot.setToolTip("A click toggles an LED")
+        self.plot.setAccessibleName("LEDs where they are; one is toggled by its number, too")
         self.spots: Any = pg.ScatterPlotItem(pxMode=False, pen=None)
         self.spots.sigClicked.connect(self._clicked)
         self.plot.addItem(self.spots)

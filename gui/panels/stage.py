@@ -164,6 +164,8 @@ class StagePanel(DevicePanel):
                 button(text, "Jog by one step", partial(self._jog_clicked, letter, sign))
                 for text, sign in (("−", -1), ("+", 1))
             )
+            minus.setAccessibleName(f"{letter}: one step back")
+            plus.setAccessibleName(f"{letter}: one step forward")
             minus.setFixedWidth(34)
             plus.setFixedWidth(34)
             limit = label(f"{lower.removesuffix(upper.split()[-1]).rstrip()} … {upper}", "dim")

@@ -13,7 +13,9 @@ import numpy.typing as npt
 from PySide6.QtGui import QImage, QPixmap
 from PySide6.QtWidgets import QWidget
 
+from calibration_routines.optics.beads import BeadCalibration
 from calibration_routines.optics.photograph import Photograph
+from calibration_routines.optics.screen_solve import ScreenCalibration
 from calibration_routines.plan_procedures import PlanProcedure
 from calibration_routines.procedure import Outcome, Outlook, Routine, routines
 from calibration_routines.psf.sweep import SweepCalibration
@@ -166,6 +168,11 @@ class SweepsPanel(ProcedurePanel):
         if isinstance(outcome.result, SweepCalibration):
             self.psfs.show_all(outcome.result.quality)
             self._show_psf(0)  # rather than the last frame, which is dark
+        elif isinstance(outcome.result, BeadCalibration | ScreenCalibration):
+            psfs = outcome.result.calibration.psfs  # (n_psfs, n_channels, height, width)
+            self._show_image(psfs[len(psfs) // 2].mean(axis=0))
+            which = f"PSF {len(psfs) // 2 + 1} of {len(psfs)}" if len(psfs) > 1 else "The PSF"
+            self.frame_words.setText(f"{which}, as it was solved for")
         if isinstance(outcome.result, Photograph):
             self._show_image(outcome.result.measurement)
             self.frame_words.setText("The photograph, dark frames taken off")

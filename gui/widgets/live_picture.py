@@ -258,6 +258,7 @@ class LivePicture(QWidget):
         self.cross_button = button(
             "✛", "Cross-hair: a click moves it, and arrow keys in the picture", checkable=True
         )
+        self.cross_button.setAccessibleName("Cross-hair")
         self.profile_button = button(
             "Profile", "Counts along a line: drag its ends, or arrow keys (Alt: one end)", checkable=True
         )

@@ -48,6 +48,7 @@ def plot_widget(
     """
     plot = _Plot(enableMenu=False)
     plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+    plot.setAccessibleName(" over ".join(filter(None, (y_label, x_label))) or "Plot")
     plot.restyle()
     # Room for letters below the line, and for the half of a number that stands at an axis' end.
     plot.getPlotItem().layout.setContentsMargins(0, 6, 16, 4)
@@ -123,6 +124,7 @@ class LevelsBar(QWidget):
         self.map.currentTextChanged.connect(lambda _: self.changed.emit())
         self.plot: Any = pg.PlotWidget(background=colours().panel, enableMenu=False)
         self.plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)  # levels are typed in their fields
+        self.plot.setAccessibleName("Histogram of the picture")
         self.plot.setFixedHeight(44)
         self.plot.setMinimumWidth(50)
         self.plot.hideAxis("left")

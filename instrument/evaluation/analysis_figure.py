@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 _QUIET = "#52667a"
 _COLUMNS = 3
 _WIDTH_IN, _HEAD_IN, _ROW_IN, _FOOT_IN, _NOTE_IN = 15.5, 1.35, 3.35, 0.3, 0.185
+_GAP_IN, _FACT_IN, _LINE_IN = 0.09, 0.28, 0.2
+"""In the column of figures: above a name, with the name, of a line."""
 _COLORS = ("#00798c", "#d1495b", "#edae49", "#30638e", "#6a4c93")
 
 
@@ -45,7 +47,8 @@ def draw_analysis(analysis: Analysis, title: str, subtitle: str = "", *, simulat
     columns = _note_columns(analysis.notes)
     note_rows = max(map(len, columns))
     notes_in = _NOTE_IN * note_rows + (0.35 if note_rows else 0.0)
-    height_in = _HEAD_IN + _ROW_IN * rows + notes_in + _FOOT_IN
+    body_in = max(_ROW_IN * rows, _facts_in(analysis))  # neither panels nor words run into the notes
+    height_in = _HEAD_IN + body_in + notes_in + _FOOT_IN
     figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=110, facecolor="white")
     top, bottom = 1 - _HEAD_IN / height_in, (_FOOT_IN + notes_in + 0.35) / height_in
     sides: dict[str, Any] = {"left": 0.05, "right": 0.715, "top": top, "bottom": bottom}
@@ -352,16 +355,26 @@ def _voxels(axes: Axes, a: Analysis) -> None:
         axes.set_aspect("equal", adjustable="datalim")
 
 
-def _facts(figure: Figure, a: Analysis, x: float, top: float, height_in: float) -> None:
-    """Write the figures in words down the right-hand column."""
+def _facts_in(a: Analysis) -> float:
+    """Return how high the column of figures is, inches."""
+    lines = [_lines(value) for _, value in facts(a)]
+    return sum(_FACT_IN * bool(name) for name, _ in facts(a)) + _LINE_IN * sum(map(len, lines))
+
+
+def _lines(value: str) -> list[str]:
     import textwrap
 
+    return textwrap.wrap(value, 46)
+
+
+def _facts(figure: Figure, a: Analysis, x: float, top: float, height_in: float) -> None:
+    """Write the figures in words down the right-hand column."""
     y = top
     for name, value in facts(a):
         if name:
-            y -= 0.09 / height_in
+            y -= _GAP_IN / height_in
             figure.text(x, y, name.strip(), fontsize=9.5, color=_QUIET, va="top")
-            y -= 0.19 / height_in
-        for line in textwrap.wrap(value, 46):
+            y -= (_FACT_IN - _GAP_IN) / height_in
+        for line in _lines(value):
             figure.text(x, y, line, fontsize=10.5, color=INK, va="top")
-            y -= 0.2 / height_in
+            y -= _LINE_IN / height_in

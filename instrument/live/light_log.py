@@ -19,6 +19,9 @@ _LAG_NS = 30_000_000
 def light_words(bench: Bench) -> str:
     """Return what is lit now, as far as the program knows, in a few words."""
     light, pattern = light_of(bench), led_pattern(bench)
+    slm = bench.slm
+    if slm is not None and slm.is_screen and light is LightState.DARK and slm.displayed.any():
+        return "screen"
     if light is LightState.DARK and not bench.knows_scene:
         return "not known" if pattern is None else "LEDs dark, scene not known"
     if light is not LightState.AS_IS:

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from drivers.frame import FrameMetadata
@@ -40,7 +41,7 @@ def test_what_the_operator_lights_is_not_known_before_he_was_asked() -> None:
 
     def words() -> str:
         bench: Any = SimpleNamespace(
-            led_array=None, scene_lit=lights.scene_lit, knows_scene=lights.knows_scene
+            led_array=None, slm=None, scene_lit=lights.scene_lit, knows_scene=lights.knows_scene
         )
         return light_words(bench)
 
@@ -49,3 +50,13 @@ def test_what_the_operator_lights_is_not_known_before_he_was_asked() -> None:
     assert words() == "nothing lit"
     lights.switch_scene(lit=True)
     assert words() == "scene"
+
+
+def test_a_screen_that_shows_something_is_light() -> None:
+    slm = SimpleNamespace(is_screen=True, displayed=np.zeros((2, 3), np.uint8))
+    bench: Any = SimpleNamespace(led_array=None, slm=slm, scene_lit=False, knows_scene=True)
+    assert light_words(bench) == "nothing lit"
+    slm.displayed[1, 1] = 1
+    assert light_words(bench) == "screen"
+    slm.is_screen = False  # a phase gives no light
+    assert light_words(bench) == "nothing lit"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from instrument.evaluation.analysis_figure import facts
+from instrument.evaluation.analysis_figure import draw_analysis, facts
 from recon.analysis import analyse, middle
 from recon.analysis.correlation import half_light_deg
 from recon.analysis.middle import Middle
@@ -144,3 +144,15 @@ def test_an_axis_along_which_nothing_is_told_apart_is_named_and_makes_voxels_coa
 def test_half_of_the_light_is_left_where_half_of_an_even_pattern_is_on_the_sensor() -> None:
     found = half_light_deg(np.ones((40, 60)), (100, 60), 0.001, lambda y, _x: np.ones(len(y)))
     np.testing.assert_allclose(np.tan(np.deg2rad(found)), (0.05, 0.03), atol=0.0015)
+
+
+def test_nothing_on_the_page_of_an_analysis_runs_into_its_notes() -> None:
+    found = Reached((2.2, 2.0), (40e3, 60e3), (TriedPair(2.0, 0, True),), "admm-sensor, tv", 1.0)
+    analysis = analyse(_calibration((48, 56)), reach=lambda *_args, **_named: found)
+    many = replace(analysis, notes=(*analysis.notes, *("A note that takes a line of its own. " * 4,) * 12))
+    for one in (analysis, many):
+        page = draw_analysis(one, "A page", simulated=True)
+        height_in = page.get_size_inches()[1]
+        notes = max(text.get_position()[1] for text in page.texts if text.get_text().startswith("•"))
+        column = [text.get_position()[1] for text in page.texts if text.get_position()[0] == 0.745]
+        assert min(column) - 0.15 / height_in > notes
