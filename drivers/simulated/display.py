@@ -49,7 +49,9 @@ class DisplayOptions(CommonOptions):
     )
     mask_seed: int = Field(0, ge=0, description="Of the random binary mask.")
     masked: bool = Field(
-        True, description="Whether there is a mask; without one mask_pitch_um is the SLM's pitch."
+        True,
+        description="Whether there is a mask; without one mask_pitch_um is the SLM's pitch, and where the "
+        "mask is (shift_um, z_um, roll_mrad, pitch_mrad, yaw_mrad, the stage) changes nothing.",
     )
     mask_pitch_um: float = Field(4.0, gt=0, description="Pitch of the mask's pixels.")
     wavelength_nm: float = Field(660.0, gt=0, description="Of the laser; the mask is made for it.")
@@ -156,8 +158,10 @@ class DisplayWorld(Surroundings):
 
     # What there is to see ---
     def pose(self) -> MaskPose:
-        """Return where the mask truly is."""
+        """Return where the mask truly is; no place is wrong where there is none."""
         stage, options = self._stage(), self.options
+        if not options.masked:
+            return MaskPose()
         return MaskPose(
             options.shift_um[0] + stage.get("x_um", 0.0),
             options.shift_um[1] + stage.get("y_um", 0.0),

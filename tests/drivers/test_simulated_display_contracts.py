@@ -59,3 +59,17 @@ def test_the_laser_is_the_scene_and_the_mask_rides_on_the_stage() -> None:
         moved = bench.snap().image.astype(float)
         assert abs(moved - lit).mean() > 0.2 * lit.mean()
         assert "SIMULATED" in bench.label
+
+
+def test_a_mask_that_is_not_there_has_no_place() -> None:
+    seen = []
+    for masked, moved in ((True, {}), (True, {"x_um": 40.0}), (False, {}), (False, {"x_um": 40.0})):
+        world = DisplayWorld(DisplayOptions(time_scale=0.0, masked=masked, mask_pitch_um=8.0))
+        world.scene_lit = True
+        DisplaySlm(SlmOptions(shape=(32, 40)), world).open()
+        world.mount_mask(lambda moved=moved: moved)
+        light = world.photons_per_s((1.0, 1.0, 1.0))
+        assert light is not None
+        seen.append(light)
+    assert abs(seen[0] - seen[1]).mean() > 0.1 * seen[0].mean()
+    assert (seen[2] == seen[3]).all()

@@ -20,15 +20,12 @@ WITHOUT_MASK = {
     "expansion": "1",
     "mask_pitch_um": "8.0",
     "masked": "false",
-    "shift_um": "[0.0, 0.0]",
-    "z_um": "0.0",
-    "roll_mrad": "0.0",
-    "pitch_mrad": "0.0",
-    "yaw_mrad": "0.0",
     "magnification": "0.0",
     "relay_distortion_um": "0.0",
     "flatness_rad": "0.6",
 }
+IN_PLACE = {"shift_um": "[0.0, 0.0]"} | dict.fromkeys(("z_um", "roll_mrad", "pitch_mrad", "yaw_mrad"), "0.0")
+"""Of a mask, where there is one."""
 
 
 def write_bench(**changes: str) -> None:
@@ -44,7 +41,7 @@ def test_a_picture_by_mirrors_is_photographed_as_it_was_computed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    masked = {"expansion": "4", "mask_pitch_um": "4.0", "masked": "true", "flatness_rad": "0.0"}
+    masked = {"expansion": "4", "mask_pitch_um": "4.0", "masked": "true", "flatness_rad": "0.0"} | IN_PLACE
     write_bench(**masked)
     write_image("picture.png", np.add.outer(np.arange(80), np.arange(90)).astype(np.uint8))
     shown = ["--capture", "seen.png", "--target", "picture.png"]
