@@ -90,6 +90,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "drivers/common/stream_reader.py",
             "drivers/common/buffered_camera.py",
             "recon/streams/video.py",
+            "recon/streams/detail.py",
             "recon/streams/fit.py",
             "recon/streams/live.py",
             "recon/streams/live_picture.py",
@@ -100,6 +101,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
         (
             "tests/drivers/test_stream.py",
+            "tests/drivers/test_buffered_camera.py",
             "tests/drivers/test_answers.py",
             "tests/drivers/test_aravis.py",
             "tests/drivers/test_basler.py",
@@ -151,6 +153,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "recon/solvers/cosine_preconditioner.py",
             "recon/solvers/douglas_rachford.py",
             "recon/solvers/fista.py",
+            "recon/solvers/moving.py",
             "recon/solvers/operator_admm.py",
             "recon/solvers/prior_splits.py",
             "recon/solvers/sensor_admm.py",
