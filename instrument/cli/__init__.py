@@ -81,6 +81,7 @@ COMMANDS: Mapping[str, Command] = {
     "show": Command(ACQUISITION, "say what is in a run; or show a hologram on the SLM", "show"),
     "verify": _task(ACQUISITION, "verify"),
     "export": _task(ACQUISITION, "export"),
+    "import": _task(ACQUISITION, "import"),
     "reconstruct": Command(
         RECONSTRUCTION, "reconstruct the scene from a PSF and a photograph", "reconstruct"
     ),

@@ -29,6 +29,7 @@ from instrument.files.ome_tiff import (
     depths_in_words,
     depths_um,
     facts_of,
+    film_facts,
     is_ome_name,
     photograph_fields,
     resolution,
@@ -210,7 +211,8 @@ def image_metadata(path: Path) -> dict[str, Any]:
                     said = {"pixel_format": "Bayer" + "".join(_COLOURS[c] for c in pattern[:2])}
                 said |= _depths(tiff)
                 if tiff.is_ome:
-                    return said | facts_of(page.description)
+                    return said | film_facts(page.description) | facts_of(page.description)
+                said |= _times(tiff)
                 text = (tiff.imagej_metadata or {}).get("Info") or page.description
         else:
             text = reading.read_bytes(side_car(path)).decode()
@@ -229,6 +231,14 @@ def _depths(tiff: tifffile.TiffFile) -> dict[str, Any]:
         unit, step = MICROMETRES.get(str(stack.get("unit", "?"))), stack.get("spacing")
         told = [unit * float(step) * z for z in range(int(stack.get("slices", 0)))] if unit and step else []
     return {"depths_um": told} if told else {}
+
+
+def _times(tiff: tifffile.TiffFile) -> dict[str, float]:
+    """Return the time from frame to frame of ImageJ's stacks."""
+    stack = tiff.imagej_metadata or {}
+    period_s, fps = float(stack.get("finterval", 0)), float(stack.get("fps", 0))
+    period_s = period_s or (1 / fps if fps > 0 else 0.0)
+    return {"frame_period_s": period_s} if stack.get("frames", 0) > 1 and period_s > 0 else {}
 
 
 # Folders -----------------------------------------------------------------------------------------
@@ -269,9 +279,12 @@ def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> Im
     else:
         raise FileError(path, f"holds an array of shape {array.shape}; a stack of images is expected.")
     pixels, converted = _standard_dtype(path, array)
-    depths = image_metadata(path).get("depths_um", []) if path.is_file() else []
-    told = {"depths_um": depths} if len(depths) == len(pixels) > 1 else {}
-    words = (depths_in_words(depths),) if told else ()
+    told = image_metadata(path) if path.is_file() else {}
+    depths = told.pop("depths_um", [])
+    words: tuple[str, ...] = ()
+    if len(depths) == len(pixels) > 1:
+        told["depths_um"] = depths
+        words = (depths_in_words(depths),)
     return ImageFile(path, pixels, (*notes, *more, *converted, *words), told)
 
 

@@ -113,6 +113,33 @@ def depths_um(description: str) -> list[float]:
     return [] if unit is None or step is None else [unit * float(step) * z for z in range(n_z)]
 
 
+_SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "min": 60.0}
+
+
+def film_facts(description: str) -> dict[str, float]:
+    """Return what an OME-TIFF says of its frames, by the names of a photograph's facts.
+
+    ``frame_period_s`` from one to the next, ``pixel_pitch_um`` along x, ``exposure_ms`` of the first. Raises
+    ValueError when it is no XML.
+    """
+    pixels = next(iter(_parts(description, "Pixels")), None)
+    if pixels is None:
+        return {}
+    plane = next(iter(_parts(pixels, "Plane")), None)
+    fields = (
+        ("frame_period_s", pixels, "TimeIncrement", _SECONDS, 1.0),
+        ("pixel_pitch_um", pixels, "PhysicalSizeX", MICROMETRES, 1.0),
+        ("exposure_ms", plane, "ExposureTime", _SECONDS, 1e3),
+    )
+    found = {}
+    for name, where, field, units, scale in fields:
+        text = None if where is None else where.get(field)
+        unit = None if where is None else units.get(where.get(f"{field}Unit", ""))
+        if text is not None and unit is not None:
+            found[name] = scale * unit * float(text)
+    return found
+
+
 def depths_in_words(depths: Sequence[float] | npt.NDArray[np.float64]) -> str:
     """Say at which depths a file's planes are; micrometres."""
     steps = np.diff(depths)

@@ -239,8 +239,9 @@ def _recording(path: Path) -> Run:
         raise FileError(
             path,
             f"is {found}: --video takes the folder of a recording.",
-            "'diffuserbench record' makes one, 'diffuserbench list' shows them; a single photograph is "
-            "reconstructed by --image without --video.",
+            "'diffuserbench record' makes one, 'diffuserbench import' one of another program's film, "
+            "'diffuserbench list' shows them; a single photograph is reconstructed by --image without "
+            "--video.",
         )
     run = Run.open(path)
     require_video(run)

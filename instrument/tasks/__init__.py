@@ -46,6 +46,9 @@ TASKS: Mapping[str, TaskEntry] = {
         "write a run's frames as TIFF, HDF5, NumPy, PNG, MP4",
         "runs:export",
     ),
+    "import": TaskEntry(
+        RUNS, "Import a film", "make a recording of another program's film", "runs:import_film"
+    ),
     "video": TaskEntry(
         VIDEOS, "Reconstruct a recording", "every frame of a recording, to a video", "video:video"
     ),

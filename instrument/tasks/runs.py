@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from instrument.files.errors import BenchError, FileError
+from instrument.files.images import read_stack
 from instrument.files.volumes import is_zarr_name, uneven_steps
 from instrument.reconstruction.film import Film, Window, open_video, slowed, write_film
 from instrument.runs.export import export as export_run
+from instrument.runs.imported import FilmFacts
+from instrument.runs.imported import import_film as write_recording
 from instrument.runs.inspection import verify as verify_run
 from instrument.runs.run import Run
 from instrument.tasks.task import Desk, Done, Given, task
@@ -43,6 +46,65 @@ def verify(desk: Desk, options: VerifyOptions) -> Done:
         verdict = "sound" if found.is_sound else "DAMAGED"
         desk.say(f"{path}: {verdict}, {run.condition}, {found.frames} of {run.n_frames} frames read back.")
     return Done(good=sound)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions:
+    """A film that another program recorded, and what its file may not tell."""
+
+    film: Path = option(
+        help="TIFF stack (OME, ImageJ), OME-Zarr, HDF5, MATLAB, .npy, or a folder of images in their order.",
+        metavar="FILM",
+        positional=True,
+    )
+    frames_per_s: float | None = option(
+        None,
+        help="Frames a second.",
+        default_words="what the file tells (OME, ImageJ)",
+        above=0,
+        flags=("--fps",),
+    )
+    pixel_um: float | None = option(
+        None,
+        help="Edge of the camera's pixels, as its frames are binned.",
+        default_words="what the file tells (OME)",
+        unit="um",
+        above=0,
+    )
+    exposure_ms: float | None = option(
+        None,
+        help="Exposure time.",
+        default_words="what the file tells (OME), else the time from frame to frame",
+        unit="ms",
+        above=0,
+    )
+    label: str = option("recording", help="Becomes part of the folder's name.")
+    out: Path = option(Path("runs"), help="Folder that the run's folder is made in.", metavar="FOLDER")
+
+
+@task(
+    "diffuserbench import film.ome.tif",
+    "diffuserbench import frames/ --fps 50 --pixel-um 6.5 --label fish",
+)
+def import_film(desk: Desk, options: ImportOptions) -> Done:
+    """Make a recording of a film that another program made: reconstruct it, play it, find what is active.
+
+    The film is copied; its file stays as it is. Pixels stay as they are, raw mosaics too (reconstruct
+    --bayer). Compressed films (MP4, AVI) are not taken: their pixels are not in proportion to the light.
+    """
+    film = read_stack(options.film)
+    for note in film.notes:
+        desk.fact("Film", note)
+    facts = FilmFacts(
+        frames_per_s=options.frames_per_s, pixel_um=options.pixel_um, exposure_ms=options.exposure_ms
+    )
+    known = facts.of(film)
+    with desk.step("Frames") as advance:
+        run = write_recording(film, options.out, options.label, facts, advance)
+    if known.exposure_ms is None:
+        desk.warn("Warning: nothing tells the exposure time; the time from frame to frame is noted as such.")
+    desk.say(f"{run.n_frames} frames, {known.frames_per_s:.4g} a second, pixels of {known.pixel_um:.4g} um.")
+    return Done((run.path,))
 
 
 def _slice(text: str) -> slice:

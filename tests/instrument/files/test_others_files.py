@@ -155,7 +155,7 @@ def test_depths_that_a_stack_tells_are_said_and_kept(tmp_path: Path) -> None:
     )
     assert read_stack(path).metadata == {"depths_um": pytest.approx([0, 0.005, 0.01, 0.015, 0.02])}
     tifffile.imwrite(path, STACK, ome=True, metadata={"axes": "TYX", "TimeIncrement": 1.0})
-    assert (read_stack(path).metadata, read_stack(path).notes) == ({}, ())
+    assert (read_stack(path).metadata, read_stack(path).notes) == ({"frame_period_s": 1.0}, ())
 
 
 def test_a_photograph_called_ome_tif_is_one(tmp_path: Path) -> None:
