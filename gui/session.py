@@ -132,6 +132,11 @@ class BenchSession(QObject):
         """Whether a device can be used."""
         return self.state(kind).condition == "open"
 
+    @property
+    def is_ready(self) -> bool:
+        """Whether opening every device was tried, and the camera is open."""
+        return self._watch.isActive() and "camera" in self.kinds and self.is_open("camera")
+
     # Opening -------------------------------------------------------------------------------------
     def open(self) -> Job:
         """Open every device, each whatever happens to the others, then start the live view."""

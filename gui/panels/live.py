@@ -58,6 +58,8 @@ class LivePanel(Panel):
         super().__init__(session, parent)
         self.photograph: Path | None = None
         """The last one that was taken here."""
+        self._began = False
+        """Whether the scene was lit, or need not be, to begin with."""
 
     @classmethod
     def prepare(cls) -> None:
@@ -179,6 +181,9 @@ class LivePanel(Panel):
         self.session.lights.note()
         if not self.isVisible():
             return
+        if not self._began and self.session.is_ready:
+            self._began = True
+            self._light_the_scene()
         if self._shown_at and time.monotonic() - self._shown_at[-1] < _LEAST_GAP_S:
             return
         frame, shown = self.session.live.newest(), self.picture.frame
@@ -190,7 +195,6 @@ class LivePanel(Panel):
         if shown is None:
             self.picture.frame = frame
             self.count()
-            self._light_the_scene()
         self.picture.show_frame(frame)
         self.picture.view.set_caption(self._caption(frame))
         self.picture.view.caution_against("")
@@ -339,7 +343,10 @@ class LivePanel(Panel):
             self.picture.region_button.setChecked(False)
 
     def _light_the_scene(self) -> None:
-        """Begin with something to see, where the simulated world can light it by itself."""
+        """Begin with something to see, where the simulated world can light it by itself.
+
+        Before the first frame: a dark one of megapixels takes a second that nobody wants to wait for.
+        """
         if self.session.config.scene.control != "simulated" or self.light is not LightState.DARK:
             return
         if "led_array" in self.session.kinds:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +18,10 @@ from pytestqt.qtbot import QtBot
 from drivers.device import OwnSetting
 from drivers.errors import LimitError
 from gui.main_window import MainWindow
+from gui.panel import whole
 from gui.panels.live import LivePanel
 from gui.panels.runs import RunsPanel
+from gui.session import BenchSession
 from gui.widgets.device_settings import DeviceSettings
 from gui.widgets.image_view import ImageView
 from instrument.bench.photograph import LightState
@@ -44,6 +47,24 @@ def _type(qtbot: QtBot, field: object, text: str) -> None:
     field.selectAll()  # type: ignore[attr-defined]
     qtbot.keyClicks(field, text)
     qtbot.keyClick(field, Qt.Key.Key_Return)
+
+
+def test_the_scene_is_lit_before_the_first_frame(
+    qtbot: QtBot, make_session: Callable[[], BenchSession], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = make_session()
+    monkeypatch.setattr(session.live, "newest", lambda: None)  # a sensor of megapixels
+    panel = whole(LivePanel(session))
+    qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
+    panel.show()
+    with qtbot.waitSignal(session.opened, timeout=WAIT_MS):
+        session.open()
+    qtbot.waitUntil(lambda: session.bench.scene_lit, timeout=WAIT_MS)
+    session.stop_live()
+    session.switch_light(LightState.DARK)
+    qtbot.waitUntil(lambda: not session.bench.scene_lit, timeout=WAIT_MS)
+    qtbot.wait(100)
+    assert not session.bench.scene_lit, "to begin with, and never again by itself"
 
 
 def test_it_opens_running_with_the_scene_lit(qtbot: QtBot, live: LivePanel) -> None:
