@@ -103,9 +103,9 @@ class HologramCamera:
         wanted, peak = wanted_picture(target, display)
         seen, wanted = within(target.window, seen), within(target.window, wanted)
         scaled = seen * (wanted.mean() / seen.mean())
-        return Capture(
-            scaled / peak, wanted / peak, compare(scaled, wanted, peak), float((total >= ceiling).mean())
-        )
+        weights = self.computed.field_weights() if target.window is None else None
+        scores = compare(scaled, wanted, peak, weights)
+        return Capture(scaled / peak, wanted / peak, scores, float((total >= ceiling).mean()))
 
     def refine(
         self,
@@ -117,7 +117,8 @@ class HologramCamera:
         """Photograph, let the model aim as far beyond as the picture falls short, compute again, photograph.
 
         The model is wrong, but it knows well which change of the pattern changes the picture how. So it is
-        asked for what it showed last plus what the photograph lacked. The best pattern by photograph is kept:
+        asked for what it showed last plus what the photograph lacked. The best pattern by photograph (in the
+        fovea, where there is one) is kept:
         the result is the given one where nothing helps (its photograph decides, with the camera's noise
         averaged).
 
@@ -132,7 +133,7 @@ class HologramCamera:
         """
         best_slm = now = np.asarray(slm, np.complex64)
         first = self.capture(list(now), target, average=options.average)
-        best, measured, history = first, first, [first.scores.psnr_db]
+        best, measured, history = first, first, [first.scores.asked_psnr_db]
         plain = HologramModel(self.display, [target], self.computed)
         for number in range(1, options.refine + 1):
             shown = plain.seen(now) / plain.peaks[0]
@@ -142,10 +143,10 @@ class HologramCamera:
             model = HologramModel(self.display, [replace(target, image=aim, white=1.0)], self.computed)
             now = compute_hologram(model, initial=now, iterations=_ITERATIONS, tolerance=0).slm
             measured = self.capture(list(now), target, average=options.average)
-            history.append(measured.scores.psnr_db)
+            history.append(measured.scores.asked_psnr_db)
             if progress is not None:
-                progress(number, measured.scores.psnr_db)
-            if measured.scores.psnr_db > best.scores.psnr_db:
+                progress(number, history[-1])
+            if measured.scores.asked_psnr_db > best.scores.asked_psnr_db:
                 best, best_slm = measured, now
         return Refinement(best_slm, first, best, tuple(history))
 
@@ -208,10 +209,18 @@ def _require_lens(distance_mm: float | None) -> None:
 
 
 def options_of_pattern(facts: Mapping[str, Any]) -> HologramOptions:
-    """Return how a pattern was computed, by the facts beside it: fit, tone, envelope, mirrors' light."""
-    names = ("fit", "srgb", "lift", "envelope", *(("mirrors", "light") if is_of_mirrors(facts) else ()))
+    """Return how a pattern was computed, by the facts beside it: fit, tone, envelope, fovea, mirrors' light.
+
+    Weights from a file are not kept with a pattern: the whole field counts then.
+    """
     said = facts.get("options", {})
-    return HologramOptions(**{name: said[name] for name in names if name in said})
+    names = ("fit", "srgb", "lift", "envelope", *(("mirrors", "light") if is_of_mirrors(facts) else ()))
+    if said.get("loss") == "spatial" and facts.get("own_weights") is False:
+        names = (*names, "loss", "centre", "radius", "periphery")
+    given: dict[str, Any] = {name: said[name] for name in names if name in said}
+    if "centre" in given:
+        given["centre"] = tuple(given["centre"])
+    return HologramOptions(**given)
 
 
 def target_of_pattern(picture: Pixels, display: Display, facts: Mapping[str, Any]) -> Target:

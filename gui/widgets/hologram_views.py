@@ -22,9 +22,9 @@ from gui.widgets.building import choice, fill, narrow, offer, split
 from gui.widgets.image_view import ImageView, StretchedImage
 from gui.widgets.plots import curve_pen, plot_widget
 from gui.widgets.result_views import FactsView, ViewGrid
-from instrument.display.hologram_files import drawn_pattern
+from instrument.display.hologram_files import drawn_pattern, score_words
 from instrument.files.errors import percent
-from recon.holography import HologramRecord, Scores, foveal_weights, painted_weights
+from recon.holography import HologramRecord, foveal_weights, painted_weights
 
 WeightsMode = Literal["uniform", "fovea", "painted"]
 Stroke = tuple[float, float, float, float]
@@ -350,7 +350,7 @@ class HologramViews(QWidget):
                 "Computed without an alignment of the mask: a mask out of place shows nothing of it."
             )
         facts = [
-            ("Photographed", _scores(photographed.capture.scores)),
+            ("Photographed", score_words(photographed.capture.scores)),
             ("Camera", f"registered to {photographed.camera_residual_px:.2f} px"),
             ("Picture", picture),
             *_facts(self.computed),
@@ -377,7 +377,7 @@ def _facts(computed: Computed) -> list[tuple[str, str]]:
     last = result.hologram.history[-1]
     depths = [order.z_mm, *(z_mm for _, z_mm in order.further)]
     facts = [
-        (f"Seen (computed){f' at {z_mm:g} mm' if len(depths) > 1 else ''}", _scores(scores))
+        (f"Seen (computed){f' at {z_mm:g} mm' if len(depths) > 1 else ''}", score_words(scores))
         for z_mm, scores in zip(depths, result.scores, strict=True)
     ]
     stopped = f"after {last.iteration} iterations, {result.hologram.seconds:.1f} s"
@@ -390,10 +390,3 @@ def _facts(computed: Computed) -> list[tuple[str, str]]:
         ("Expansion", f"{display.expansion}x on {columns} x {rows} pixels, {display.wavelength_nm:g} nm"),
         *(("Pattern", str(path)) for path in computed.patterns),
     ]
-
-
-def _scores(scores: Scores) -> str:
-    return (
-        f"{scores.psnr_db:.2f} dB, SSIM {scores.ssim:.3f}; middle quarter {scores.crop_psnr_db:.2f} dB, "
-        f"SSIM {scores.crop_ssim:.3f}"
-    )

@@ -23,7 +23,7 @@ from instrument.display.hologram import (
     read_weights,
     slm_size,
 )
-from instrument.display.hologram_files import HologramFiles, light_words
+from instrument.display.hologram_files import HologramFiles, light_words, score_words
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image, read_stack
 from instrument.tasks.spots import HologramInputs, make_spots, say_distance, tell_limit
@@ -185,10 +185,7 @@ def _print(label: str, result: HologramResult, options: HologramOptions) -> None
     )
     for plane, score in enumerate(result.scores):
         name = f"  plane {plane + 1}: " if len(result.scores) > 1 else "  seen: "
-        typer.echo(
-            f"{name}{score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}; "
-            f"middle quarter {score.crop_psnr_db:.2f} dB, SSIM {score.crop_ssim:.3f}"
-        )
+        typer.echo(f"{name}{score_words(score)}")
     typer.echo(
         f"  (computed on the alias-free grid, envelope {options.envelope}, {options.frames} frame(s), "
         "through the eye's low-pass)"

@@ -261,6 +261,7 @@ def _capture(
         write_capture,
         write_refined,
     )
+    from instrument.display.hologram_files import score_words
     from instrument.files.images import read_image
 
     assert options.capture is not None
@@ -285,14 +286,10 @@ def _capture(
         typer.echo("Background estimated (--as-is): the darkest 10 x 10 pixels.", err=True)
     if found.refined is not None:
         path = write_refined(pattern, found.refined, facts, io.binning)
-        first, best = found.refined.psnr_db[0], found.capture.scores.psnr_db
+        first, best = found.refined.psnr_db[0], found.capture.scores.asked_psnr_db
         typer.echo(f"camera in the loop: {first:.2f} dB -> {best:.2f} dB; {path}")
     write_capture(options.capture, found)
-    score = found.capture.scores
-    typer.echo(
-        f"photographed: {score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}; "
-        f"middle quarter {score.crop_psnr_db:.2f} dB"
-    )
+    typer.echo(f"photographed: {score_words(found.capture.scores)}")
     _warn_of_saturation(found.capture.saturated_fraction)
     typer.echo(f"Wrote {options.capture}")
 

@@ -97,6 +97,7 @@ class HologramResult:
                 "phase_levels": options.phase_levels or "continuous",
             },
             "options": record(options),
+            "own_weights": options.weights is not None,
             "iterations": last.iteration,
             "seconds": round(self.hologram.seconds, 3),
             "stopped": str(self.hologram.stop_reason),
@@ -128,7 +129,8 @@ def compute_and_judge(
     seen = tuple(within(part, model.seen(hologram.slm, p)) / model.peaks[p] for p in planes)
     whole = [model.intensity(hologram.slm, p) for p in planes]
     raw = tuple(within(part, whole[p]) / model.peaks[p] for p in planes)
-    scores = tuple(compare(s, w, 1.0) for s, w in zip(seen, wanted, strict=True))
+    weights = model.options.field_weights() if part is None else None
+    scores = tuple(compare(s, w, 1.0, weights) for s, w in zip(seen, wanted, strict=True))
     efficiency = model.efficiency(hologram.slm)
     if targets[0].window is not None:
         efficiency *= float(within(targets[0].window, whole[0]).sum() / whole[0].sum())

@@ -18,7 +18,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
 from instrument.files.images import side_car, write_image
 from instrument.files.slm_image import field_levels, write_slm_image
-from recon.holography import Display, HologramOptions
+from recon.holography import Display, HologramOptions, Scores
 from recon.holography.judge import DISSERTATION, GRIDS, METHODS, Cell, average
 from recon.holography.losses import loss_of
 
@@ -89,7 +89,7 @@ class HologramFiles:
             ("expansion", f"{display.expansion}x, {display.slm_shape[1]} x {display.slm_shape[0]} pixels"),
             ("loss, method", f"{loss_of(self.options.loss).name}, {self.options.method}"),
             ("judged", f"alias-free grid, envelope {self.options.envelope}, {self.options.frames} frame(s)"),
-            ("crop", f"{result.scores[0].crop_psnr_db:.1f} dB in the middle quarter"),
+            _part_words(result.scores[0]),
             ("light", light_words(result, self.options)),
             ("stopped", str(result.hologram.stop_reason)),
             ("iterations", f"{result.hologram.history[-1].iteration}"),
@@ -138,6 +138,21 @@ class HologramFiles:
     def preview(self, number: int, channel: int) -> Path:
         """Return the preview's file."""
         return self.out.with_name(f"{self._stem(number, channel)}-preview.png")
+
+
+def score_words(scores: Scores) -> str:
+    """Say how good a picture is: over the field, in its middle quarter, in the fovea where there is one."""
+    fovea = "" if scores.fovea_psnr_db is None else f"fovea {scores.fovea_psnr_db:.2f} dB; "
+    return (
+        f"{scores.psnr_db:.2f} dB, SSIM {scores.ssim:.3f}; {fovea}"
+        f"middle quarter {scores.crop_psnr_db:.2f} dB, SSIM {scores.crop_ssim:.3f}"
+    )
+
+
+def _part_words(scores: Scores) -> tuple[str, str]:
+    if scores.fovea_psnr_db is not None:
+        return "fovea", f"{scores.fovea_psnr_db:.1f} dB where the field counts fully"
+    return "crop", f"{scores.crop_psnr_db:.1f} dB in the middle quarter"
 
 
 def light_words(result: HologramResult, options: HologramOptions) -> str:

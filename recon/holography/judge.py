@@ -7,7 +7,7 @@ a grid of at least twice the aperture (which holds its whole bandwidth), the unt
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from recon.holography.display import Display, random_mask
 from recon.holography.model import HologramModel
 from recon.holography.optimise import compute_hologram
 from recon.holography.options import HologramOptions
-from recon.holography.target import Grid, Target, foveal_weights
+from recon.holography.target import Grid, Target, foveal_weights, weights_on
 
 Array = npt.NDArray[Any]
 
@@ -28,13 +28,20 @@ Array = npt.NDArray[Any]
 class Scores:
     """How close the seen image is to the target, both low-passed (Eq. 7.18) and of equal mean.
 
-    Peak is the target's white. The crop is the middle quarter of the field (Table 7.1, "partial FoV").
+    Peak is the target's white. The crop is the middle quarter of the field (Table 7.1, "partial FoV"); the
+    fovea what counts fully with a loss that weighs the field, None with others.
     """
 
     psnr_db: float
     ssim: float
     crop_psnr_db: float
     crop_ssim: float
+    fovea_psnr_db: float | None = None
+
+    @property
+    def asked_psnr_db(self) -> float:
+        """What a hologram was asked for: in the fovea where there is one, else over the field."""
+        return self.psnr_db if self.fovea_psnr_db is None else self.fovea_psnr_db
 
 
 def intensity(slm: Array, display: Display, *, z_mm: float = 0.0, padding: int = 2) -> Array:
@@ -94,18 +101,29 @@ def judge(slm: Array, display: Display, target: Target, *, padding: int = 2) -> 
     return compare(seen[part], wanted[part], peak)
 
 
-def compare(seen: Array, wanted: Array, peak: float) -> Scores:
-    """Score an image against the wanted one after scaling it to the same mean."""
+def compare(seen: Array, wanted: Array, peak: float, weights: Array | None = None) -> Scores:
+    """Score an image against the wanted one after scaling it to the same mean.
+
+    ``weights``: over the same field, its centre in the middle; where they are greatest is the fovea.
+    """
     scaled = seen * (wanted.mean() / seen.mean())
     y, x = (slice(n // 4, n - n // 4) for n in wanted.shape)
     crop = scaled[y, x], wanted[y, x]
+    fovea = None
+    if weights is not None:
+        counted = np.fft.fftshift(weights_on(weights, wanted.shape)) >= _FULLY
+        fovea = psnr(scaled[counted][None], wanted[counted][None], data_range=peak)
     return Scores(
         psnr(scaled, wanted, data_range=peak),
         ssim(scaled, wanted, data_range=peak),
         psnr(*crop, data_range=peak),
         ssim(*crop, data_range=peak),
+        fovea,
     )
 
+
+_FULLY = 0.99
+"""Of the greatest weight."""
 
 Image = npt.NDArray[Any]
 
@@ -212,4 +230,5 @@ def average(cells: Sequence[Cell], expansion: int, grid: Grid, method: str, *, o
         for cell in cells
         if (cell.expansion, cell.grid, cell.method) == (expansion, grid, method)
     ]
-    return Scores(*(float(np.mean([getattr(s, f.name) for s in chosen])) for f in fields(Scores)))
+    names = ("psnr_db", "ssim", "crop_psnr_db", "crop_ssim")
+    return Scores(*(float(np.mean([getattr(s, name) for s in chosen])) for name in names))

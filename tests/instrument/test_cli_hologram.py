@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration_routines.display.hologram_photograph import display_of_pattern, photograph_hologram
+from calibration_routines.display.hologram_photograph import (
+    display_of_pattern,
+    options_of_pattern,
+    photograph_hologram,
+)
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
 from instrument.display.hologram import Alignment, bench_display, field_picture, prepare_target
@@ -269,6 +274,31 @@ def test_the_limit_says_why_coarse_contrast_is_not_reached_behind_a_lens_and_nea
     far = replace(found, bound_db=np.inf, reached_db=45.1)
     assert "none is in sight with these phases; 45.10 dB" in limit_lines([far], lens, HologramOptions())[0]
     assert coarser_mask(replace(lens, distance_mm=4.0)) is None
+
+
+@pytest.mark.usefixtures("here")
+def test_a_fovea_has_its_own_figure_where_it_is(capsys):
+    asked = ["--loss", "spatial", "--centre", "0.3,0.7", "--radius", "0.15", "--iterations", "40"]
+    assert main(["hologram", "picture.png", "-q", "16", *asked]) == 0
+    said = re.search(r"seen: ([\d.]+) dB.*fovea ([\d.]+) dB", capsys.readouterr().out)
+    assert said is not None
+    whole_db, fovea_db = (float(value) for value in said.groups())
+    assert fovea_db > whole_db + 5
+    facts = json.loads(Path("slm.json").read_text())
+    assert facts["metrics"][0]["fovea_psnr_db"] == pytest.approx(fovea_db, abs=0.01)
+    kept = options_of_pattern(facts)
+    assert (kept.loss, kept.centre, kept.radius) == ("spatial", (0.3, 0.7), 0.15)
+    assert options_of_pattern({**facts, "own_weights": True}).loss == "frequency"
+    y, x = np.mgrid[0.5:64, 0.5:64] / 64
+    wanted = np.full((64, 64), 0.5)
+    seen = wanted + 0.1 * (np.hypot(y - 0.3, x - 0.7) > 0.2)
+    seen *= wanted.mean() / seen.mean()
+    scores = compare(seen, wanted, 1.0, kept.field_weights())
+    inside = np.hypot(y - 0.3, x - 0.7) < 0.14
+    expected = 10 * np.log10(1 / np.mean((seen - wanted)[inside] ** 2))
+    assert scores.fovea_psnr_db == pytest.approx(expected, abs=0.01)
+    assert scores.asked_psnr_db == scores.fovea_psnr_db
+    assert compare(seen, wanted, 1.0).fovea_psnr_db is None
 
 
 @pytest.mark.usefixtures("here")
