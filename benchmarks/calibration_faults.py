@@ -139,6 +139,9 @@ FAULTS = {
         1500,
         "source.*large|pinhole",
     ),
+    "pinhole unsaid": Fault(
+        lambda s: {"world": f"source_diameter_um = {s}"}, 400, "source of|source is too large|pinhole"
+    ),
 }
 
 

@@ -20,6 +20,7 @@ from calibration_routines.psf.psf_quality import (
 )
 from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.stage_fit import Drift, StageFit, judge_drift, judge_points
+from calibration_routines.psf.structure import Structure, fit_structure
 from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import DARK, FEATURE_PX, PSF, REFERENCE
 from calibration_routines.scatter import STEADY, TOLERATED, Scatter, Steadied, pooled, steadied
@@ -125,6 +126,8 @@ class SweepAnalysis:
     """What is wrong with light, place or dark frames, whatever the point."""
     mount: MountFit | None = None
     """Where the source stands by the central PSFs; None where they do not tell."""
+    structure: Structure | None = None
+    """How wide the central PSFs' finest structure is; None where they do not tell."""
 
 
 def analyse_sweep(
@@ -155,6 +158,7 @@ def analyse_sweep(
     scatters: list[Scatter] = []
     ambient: list[float] = []
     off_axis: list[bool] = []
+    structure: dict[float, float] = {}
     removed_in_all: Float | None = None
     reference_ms = 0.0
     for plane in planes:
@@ -169,6 +173,8 @@ def analyse_sweep(
         cleaned, stray = remove_low_frequencies(light, dct_order)
         quality.append(measure_point(plane, light - stray, steady, dark, binning))
         psfs.append(cleaned * scale)
+        if not plane.off_axis and len(steady.frames) > 1:
+            structure.setdefault(plane.source_um[2], _structure_px(steady, binning))
         removed = channels_first(replace_hot(dark.at(reference_ms), dark.hot))
         background = block_mean(removed, binning) + stray * scale
         removed_in_all = background if removed_in_all is None else removed_in_all + background
@@ -199,6 +205,7 @@ def analyse_sweep(
             *(() if mount is None else mount.findings),
         ),
         mount=mount,
+        structure=fit_structure(list(structure), list(structure.values()), binned(geometry, binning)),
     )
 
 
@@ -291,6 +298,22 @@ def noise_of_mean(frames: Counts | Float) -> float:
     return 1.4826 / 2**0.5 * float(np.median(np.abs(step - np.median(step))))
 
 
+def _structure_px(steady: Steadied, binning: int) -> float:
+    """Return the width of the finest structure of a point's pattern, by two frames about its middle."""
+    frames = [channels_first(steady.frames[k]).mean(axis=0) for k in (0, -1)]
+    row, column = ndimage.center_of_mass(np.maximum(frames[0], 0))
+    size = _STRUCTURE_PX * binning
+    top, left = (
+        int(np.clip(at - size / 2, 0, max(n - size, 0)))
+        for at, n in zip((row, column), frames[0].shape, strict=True)
+    )
+    first, last = (
+        block_mean(np.ascontiguousarray(one[top : top + size, left : left + size]), binning) for one in frames
+    )
+    return feature_size_px(first, last)
+
+
+_STRUCTURE_PX = 768  # of the binned pattern's middle: that many tell its structure
 _LOCAL_MEAN_PX = 16.0  # structure coarser than this does not count
 _REACH_PX = 24
 

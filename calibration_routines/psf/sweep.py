@@ -34,6 +34,7 @@ from calibration_routines.psf.mount_fit import MountFit
 from calibration_routines.psf.psf_quality import PsfQuality, place_of
 from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.stage_fit import Drift, StageFit
+from calibration_routines.psf.structure import Structure
 from calibration_routines.psf.sweep_options import AskedSweep, PointSweep
 from calibration_routines.psf.sweep_plan import (
     PSF,
@@ -95,6 +96,10 @@ class SweepCalibration:
     """Of the source's image from the nearest depth; 0 where its size is not known."""
     mount: MountFit | None = None
     """Where the source stands by light, place and growth, with d and pitch; None where too little tells."""
+    structure: Structure | None = None
+    """Of the central PSFs; None where too little tells."""
+    source_size_um: float | None = None
+    """As configured."""
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -321,6 +326,7 @@ class _TakenSweep:
                 "scatter": plain(analysis.scatter) | {"findings": list(analysis.findings)},
                 "late_hot_pixels": self.dark.late_hot,
                 "mount": None if analysis.mount is None else plain(analysis.mount),
+                "structure": None if analysis.structure is None else plain(analysis.structure),
                 "good": not doubted,
             },
             provenance=self._provenance(exposures, analysis.reference_exposure_ms),
@@ -339,6 +345,8 @@ class _TakenSweep:
             self.dark.late_hot,
             source_width_px(record.source_size_um, calibration.geometry, sweep.depths_um[0]),
             analysis.mount,
+            analysis.structure,
+            record.source_size_um,
         )
 
     def _provenance(self, exposures: SweepExposures, reference_ms: float) -> dict[str, Any]:

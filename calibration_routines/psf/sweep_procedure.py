@@ -149,6 +149,10 @@ def quality_lines(done: SweepCalibration) -> list[str]:
             f"Source: the pinhole's image is {done.source_width_px:.1f} pixels wide from the nearest depth "
             "([source] size_um): the PSFs are blurred by that."
         )
+    if done.structure is not None and (
+        words := done.structure.line(done.source_size_um, done.source_width_px)
+    ):
+        lines.append(words)
     if done.scatter.averages and not done.scatter.findings():
         lines.append(_frames_line(done.scatter))
     central = [q for q in done.quality if q.similarity is None]

@@ -4,18 +4,37 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calibration_routines.procedure import routines
 from calibration_routines.psf.mount_fit import MountFit, fit_mount, off_middle, with_pitch
 from calibration_routines.psf.psf_quality import PsfQuality
 from calibration_routines.psf.stage_fit import StageFit
+from calibration_routines.psf.structure import fit_structure
 from calibration_routines.psf.sweep_plan import size_findings
+from instrument.bench.bench import open_bench
+from instrument.bench.config_file import parse_config
 from recon.camera.refocus import paraxial_scale
 from recon.camera.registration import moved, rescaled
 from recon.types import Geometry
 
+BENCH = """
+[camera]
+driver = "simulated"
+[stage]
+driver = "simulated"
+[led_array]
+driver = "simulated"
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+time_scale = 0
+source_diameter_um = {diameter_um}
+"""
 GEOMETRY = Geometry(pixel_pitch_um=13.0, diffuser_distance_mm=8.9, aperture_mm=(1.5, 2.0))
 DEPTHS = 1 / np.linspace(1 / 60e3, 1 / 150e3, 7)
 RNG = np.random.default_rng(1)
@@ -157,6 +176,34 @@ def test_a_pinhole_wider_than_the_resolution_is_said() -> None:
     (words,) = size_findings(1500.0, GEOMETRY, 60e3)
     assert "17.1 pixels" in words
     assert size_findings(150.0, GEOMETRY, 60e3) == size_findings(None, GEOMETRY, 60e3) == ()
+
+
+def test_a_pinhole_of_unknown_size_is_told_by_structure_that_widens_as_its_image() -> None:
+    image_px = 300.0 * 8.9e3 / DEPTHS / 13.0  # of 300 um
+    widths = np.hypot(2.3, image_px) * (1 + 0.01 * RNG.normal(size=len(DEPTHS)))
+    found = fit_structure(DEPTHS, widths, GEOMETRY)
+    assert found is not None
+    assert found.source_um == pytest.approx(300, rel=0.1)
+    assert found.widened_px == pytest.approx(image_px[0], abs=3 * found.error_px)
+    assert "whose size is not configured" in found.line(None, 0.0)
+    assert "not 30 as configured" in found.line(30.0, 0.3)
+    assert found.line(300.0, float(image_px[0])) == ""
+    for near, far in ((2.34, 2.28), (4.04, 3.92), (7.5, 7.2)):  # of smooth diffusers under small sources
+        plain = fit_structure(DEPTHS, np.linspace(near, far, len(DEPTHS)), GEOMETRY)
+        assert plain is not None
+        assert plain.line(None, 0.0) == ""
+    assert fit_structure(DEPTHS[:2], widths[:2], GEOMETRY) is None
+    assert fit_structure(DEPTHS, widths, replace(GEOMETRY, pixel_pitch_um=None)) is None
+
+
+@pytest.mark.parametrize("diameter_um", [30, 400])
+def test_a_sweep_tells_a_large_source_that_nobody_configured(tmp_path: Path, diameter_um: int) -> None:
+    text = BENCH.format(diameter_um=diameter_um)
+    with open_bench(parse_config(text, None)) as bench:
+        asked = {"z_min_um": 60e3, "z_max_um": 150e3, "planes": 4, "average": 2}
+        done = routines["axial"].asked(asked).carry_out(bench, tmp_path)
+    said = [line for line in done.verdict if "the pattern's finest structure widens" in line]
+    assert bool(said) == (diameter_um == 400)
 
 
 def test_a_rail_that_leans_or_a_diffuser_beside_the_middle_is_said() -> None:

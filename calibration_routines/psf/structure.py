@@ -1,0 +1,89 @@
+"""How large the source is, told by a sweep over depths: its image on the sensor is ``size d / z`` wide.
+
+Under a small source the finest structure of a smooth diffuser's pattern is as wide at every depth, within
+some percent. Under a large one it widens towards the diffuser; so it does where a diffuser is out of focus
+there, which the sweep cannot tell from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon.types import Geometry
+
+_LEAST_DEPTHS = 3
+_LEAST_RANGE = 1.2  # of depths, farthest over nearest
+_SEEN_PX = 1.0  # widening at the nearest depth that is said
+_SURE = 3.0  # standard deviations
+_LEAST_ERROR = 0.03  # of a structure's width: what the diffuser itself leaves (2 to 4 % over 60 to 200 mm)
+_EXPLAINED = 1.5  # of the configured source's image
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """Widths of the pattern's finest structure, pixels of the PSFs."""
+
+    near_px: float
+    far_px: float
+    """At the nearest and at the farthest depth."""
+    widened_px: float
+    """By what goes with ``1 / z``, at the nearest depth: about the width of the source's image there."""
+    error_px: float
+    """Standard deviation of that."""
+    source_um: float
+    """A source whose image is so wide; one that is much wider than the structure is larger, by up to 1.8."""
+
+    def line(self, size_um: float | None, configured_px: float) -> str:
+        """Return what is to be said of it; nothing where the configured size explains it.
+
+        Parameters
+        ----------
+        size_um, configured_px : float
+            The source's size as configured, None where it is not, and its image's width at the nearest depth.
+        """
+        if self.widened_px <= max(_SEEN_PX, _SURE * self.error_px, _EXPLAINED * configured_px):
+            return ""
+        whose = "whose size is not configured" if size_um is None else f"not {size_um:g} as configured"
+        return (
+            f"Source: towards the diffuser the pattern's finest structure widens from {self.far_px:.1f} to "
+            f"{self.near_px:.1f} pixels, as under a source of {self.source_um:.0f} um or more, {whose}: the "
+            "PSFs are blurred by that, or the diffuser is out of focus there. Measure the pinhole, and set "
+            "[source] size_um."
+        )
+
+
+def fit_structure(
+    depths_um: Sequence[float], widths_px: Sequence[float], geometry: Geometry
+) -> Structure | None:
+    """Fit how the finest structure's width goes with depth; None where too little tells.
+
+    Parameters
+    ----------
+    depths_um, widths_px : sequence of float
+        Of the central PSFs.
+    geometry : Geometry
+        Of the PSFs' pixels.
+    """
+    z, widths = np.array(depths_um, np.float64), np.array(widths_px, np.float64)
+    d_mm, pitch_um = geometry.diffuser_distance_mm, geometry.pixel_pitch_um
+    if len(z) < _LEAST_DEPTHS or z.max() < _LEAST_RANGE * z.min() or d_mm is None or pitch_um is None:
+        return None
+    # Widths of what is folded with one another add as squares.
+    design = np.stack([np.ones_like(z), (z.min() / z) ** 2], axis=1)
+    solution, *_ = np.linalg.lstsq(design, widths**2, rcond=None)
+    rest = widths**2 - design @ solution
+    spread = max(float(np.sqrt((rest**2).sum() / (len(z) - 2))), 2 * _LEAST_ERROR * float(widths.mean()) ** 2)
+    of_square = spread * float(np.sqrt(np.linalg.inv(design.T @ design)[1, 1]))
+    widened = float(np.sqrt(max(float(solution[1]), 0.0)))
+    error = of_square / (2 * widened) if widened > 0 else float(np.sqrt(of_square))
+    near, far = int(np.argmin(z)), int(np.argmax(z))
+    return Structure(
+        float(widths[near]),
+        float(widths[far]),
+        widened,
+        error,
+        widened * pitch_um * float(z.min()) / (1e3 * d_mm),
+    )
