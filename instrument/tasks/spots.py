@@ -170,11 +170,12 @@ def say_distance(desk: Desk, displays: Sequence[Display], options: HologramOptio
     """Say how wide a picture without a lens is, and how it is computed."""
     if options.distance_mm is None:
         return
-    how = ", as the mask is (near: by its angular spectrum)" if displays[0].near else ""
+    behind = "mask" if displays[0].factor > 1 else "SLM"
+    how = f", as the {behind} is (near: by its angular spectrum)" if displays[0].near else ""
     width_mm = min(display.picture_mm for display in displays)
     desk.warn(
         f"Without a lens: the picture's field is {width_mm:.4g} mm wide{how}, {options.distance_mm:g} mm "
-        "behind the mask."
+        f"behind the {behind}."
     )
 
 
