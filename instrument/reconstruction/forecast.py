@@ -292,14 +292,15 @@ def _stretch(first: Sequence[IterationRecord], copy: Sequence[IterationRecord]) 
     """Return how many times as many iterations it takes to come as far as a copy, by the first of them."""
     reached = np.array([record.unrest for record in first])
     course = np.array([record.unrest for record in copy])
-    if not ((reached > 0).all() and (course > 0).all()):
-        return 1.0
     number, differs = np.arange(1, len(first) + 1), []
+    place = np.flatnonzero(course > 0)  # the first iteration of varying PSFs and volumes changes nothing
+    if place.size == 0:
+        return 1.0
     stretches = np.geomspace(1 / STRETCHED, STRETCHED, 120)
     for stretch in stretches:
         at = number / stretch
-        told = (number > _UNCOUNTED) & (at >= _UNCOUNTED - 1) & (at <= len(copy))
-        told_by = np.interp(at[told], np.arange(1, len(copy) + 1), np.log(course))
+        told = (number > _UNCOUNTED) & (at >= _UNCOUNTED - 1) & (at <= len(copy)) & (reached > 0)
+        told_by = np.interp(at[told], place + 1, np.log(course[place]))
         many = np.count_nonzero(told) >= _UNCOUNTED
         differs.append(np.mean((np.log(reached[told]) - told_by) ** 2) if many else np.inf)
     return float(stretches[int(np.argmin(differs))]) if np.isfinite(differs).any() else 1.0

@@ -91,6 +91,10 @@ def test_a_copy_that_settles_twice_as_fast_is_stretched() -> None:
     copy = _records([1 / n for n in range(1, 100)])
     assert _stretch(_records([2 / n for n in range(1, TRIED + 1)]), copy) == pytest.approx(2, rel=0.02)
     assert _stretch(copy[:TRIED], copy) == pytest.approx(1, rel=0.02)
+    from_nothing = [0.0, *(2 / n for n in range(2, TRIED + 1))]  # as volumes and varying PSFs begin
+    begun = _records([0.0, *(1 / n for n in range(2, 201))])
+    assert _stretch(_records(from_nothing), begun) == pytest.approx(2, rel=0.02)
+    assert _stretch(_records([0.0] * TRIED), begun) == 1
     assert _stretch(_records([0.0] * TRIED), copy) == 1, "nothing can be told of an empty picture"
 
 
