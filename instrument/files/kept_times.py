@@ -1,6 +1,6 @@
 """How long steps took on this machine: what tells of no progress is expected to take as long as last time.
 
-Steps of a simulated bench that compute light say something the first time, too: by a machine with two cores.
+Steps of a simulated bench that compute light say something the first time, too: by how quick transforms are.
 """
 
 from __future__ import annotations
@@ -19,14 +19,19 @@ MOST = 300
 WORTH_S = 0.5
 """Shorter ones need not be foretold."""
 _LARGEST = 1e9  # thirty years; frames, too
-_FIRST_S_PER_MEGAPIXEL = {
-    "Looking for hot pixels": 0.3,
-    "Finding the scene's exposure": 1.3,
-    "finding the scene's exposure": 1.3,
-    "finding exposures": 1.2,
-    "photographing bead slides": 1.6,
+_TRANSFORMS_PER_MEGAPIXEL = {
+    "Looking for hot pixels": 10.0,
+    "Finding the scene's exposure": 120.0,
+    "finding the scene's exposure": 120.0,
+    "finding exposures": 48.0,
+    "photographing bead slides": 120.0,
 }
-"""Steps that compute light on a simulated bench, on two cores of 2026 with little else to do."""
+"""Steps that compute light on a simulated bench: their time of the processor, in that of a picture of
+1024 x 1024 which is transformed and back."""
+_FEW, _TRIED_S = 50.0, 0.05
+"""Transforms that are not worth a try, and seconds of the processor that it takes."""
+_ALONE = 1.2
+"""Times as long as if all of it were shared among the threads."""
 _of = ""
 _simulated_megapixels = 0.0
 _window = False
@@ -67,8 +72,36 @@ def expected(what: str) -> Expected | None:
     try:
         return Expected(sane(recall(_key(what))), "last time")
     except (LookupError, TypeError, ValueError):
-        first_s = _FIRST_S_PER_MEGAPIXEL.get(what, 0.0) * _simulated_megapixels
-        return Expected(first_s, "on another machine") if first_s > WORTH_S else None
+        transforms = _TRANSFORMS_PER_MEGAPIXEL.get(what, 0.0) * _simulated_megapixels
+        if transforms < _FEW or not seen():
+            return None
+        return Expected(transforms * transform_s() * _waiting(), "a first guess")
+
+
+def transform_s() -> float:
+    """Try how much of the processor's time it takes here to transform a picture of 1024 x 1024 and back."""
+    import numpy as np
+    from scipy import fft
+
+    picture = np.zeros((1024, 1024), np.float32)
+    fft.irfft2(fft.rfft2(picture))  # tables are made
+    began_s, count = time.process_time(), 0
+    while time.process_time() - began_s < _TRIED_S:
+        fft.irfft2(fft.rfft2(picture))
+        count += 1
+    return (time.process_time() - began_s) / count
+
+
+def _waiting() -> float:
+    """Return how many times as long by the clock, as busy as the machine was during the last minute."""
+    from recon.base.threads import get_threads
+
+    threads, cores = get_threads(), len(os.sched_getaffinity(0))
+    try:
+        load = os.getloadavg()[0]
+    except OSError:
+        load = 0.0
+    return _ALONE / min(threads, cores) * max((load + threads) / cores, 1.0)
 
 
 @contextmanager

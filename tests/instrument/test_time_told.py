@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 import sys
 import time
@@ -52,11 +53,13 @@ def test_a_step_is_expected_to_take_as_long_as_last_time(
         assert kept_times.expected("reading") is None
 
 
-def test_the_first_time_a_simulated_scene_is_exposed_goes_by_other_machines(
+def test_the_first_time_a_simulated_scene_is_exposed_goes_by_how_quick_this_machine_is_now(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     step = "Finding the scene's exposure"
-    monkeypatch.setattr(kept_times, "WORTH_S", 0.5)
+    quick, slow = 0.01, 0.05
+    monkeypatch.setattr(kept_times, "transform_s", lambda: quick)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
     kept_times.about("real bench")
     assert kept_times.expected(step) is None
     kept_times.about("small", simulated_megapixels=0.08)
@@ -64,8 +67,16 @@ def test_the_first_time_a_simulated_scene_is_exposed_goes_by_other_machines(
     kept_times.about("large", simulated_megapixels=5.5)
     told = kept_times.expected(step)
     assert told is not None
-    assert 2 < told.seconds < 20
+    assert 1 < told.seconds < 20
     assert told.by != "last time"
+    monkeypatch.setattr(kept_times, "transform_s", lambda: slow)
+    busy = kept_times.expected(step)
+    assert busy is not None
+    assert busy.seconds == pytest.approx(slow / quick * told.seconds)
+    monkeypatch.setattr(os, "getloadavg", lambda: (100.0, 0.0, 0.0))
+    waiting = kept_times.expected(step)
+    assert waiting is not None
+    assert waiting.seconds > 2 * busy.seconds
     kept_times.remember("large: " + step, 4.0)
     assert kept_times.expected(step) == (4.0, "last time")
 
@@ -130,3 +141,8 @@ def test_times_are_whole_in_a_narrow_terminal_and_the_note_gives_way(
     line = cast(io.StringIO, page.file).getvalue().rstrip("\n")
     assert "\n" not in line
     assert re.search(r"picture .+ 57/100 0:00:00 left about \S+ s +iter.*…", line), line
+
+
+def test_a_transform_is_tried_in_little_time() -> None:
+    began_s = time.process_time()
+    assert 0 < kept_times.transform_s() <= time.process_time() - began_s
