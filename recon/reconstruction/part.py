@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from operator import add
 from typing import Any
 
@@ -175,17 +175,14 @@ class Part:
             raise NoMemoryError(f"This picture needs {self.plan}. Bin the images, or allow more.")
 
     def _convolution(self, psfs: Array) -> Convolution:
-        camera = Convolution(
-            psfs,
-            self.problem.sensor_shape,
-            dtype=self.dtype,
-            allocate=lambda shape, dtype: self.storage.zeros(shape, dtype, lasting=True),
-        )
         self.plan = volume_plan(self.problem)
         if not self.plan.fits:
             scratch = memory.scratch_for(self.plan, self.problem.options.scratch)
             self.storage = memory.Storage(scratch, self.plan.room)
-        return camera
+        lasting = partial(
+            self.storage.zeros, lasting=True
+        )  # not this part's, which would never be free again
+        return Convolution(psfs, self.problem.sensor_shape, dtype=self.dtype, allocate=lasting)
 
     def _varying(self, fields: list[FieldOfPsfs]) -> SpatiallyVarying | VaryingOnDevice:
         problem, shape = self.problem, self.problem.sensor_shape

@@ -15,6 +15,7 @@ and of the pixels are each balanced by their own residuals, as those of pictures
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -86,7 +87,8 @@ class OperatorAdmm(ExactAdmm):
         room: Room | None = None,
         shown: tuple[slice, slice] = (slice(None), slice(None)),
     ) -> None:
-        super().__init__(central, data, tuning, room, 1.7, self._bend)
+        own = weakref.WeakMethod(self._bend)  # else its memory was free only when Python looks for circles
+        super().__init__(central, data, tuning, room, 1.7, lambda e: own()(e))  # type: ignore[misc]
         self.camera, self.shown = camera, shown
         dtype = camera.dtype
         tv, self.separable, others = split_prior(prior, _is_not_periodic)
