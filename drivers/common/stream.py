@@ -262,7 +262,11 @@ class FrameStream:
         newest_only : bool
             Skip to the newest frame each time (live views); otherwise every frame that the callback is fast
             enough for.
+
+        Raises DeviceError when the stream does not run: nothing would ever be handed out.
         """
+        if not self._running:
+            raise self.error or StoppedError(self.camera.name, "does not stream.", "Start the stream first.")
         subscription = Subscription(self, callback, newest_only)
         self._subscriptions.append(subscription)
         return subscription

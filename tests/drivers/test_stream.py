@@ -564,3 +564,18 @@ def test_a_subscription_gets_every_frame_or_skips_to_the_newest(newest_only: boo
         while stream.acquired < 30 or subscription.status.waiting:
             time.sleep(0.001)
     assert seen == ([seen[0], 29] if newest_only else list(range(seen[0], 30)))
+
+
+def test_who_subscribes_to_a_stream_that_does_not_run_is_told() -> None:
+    stream = FrameStream(finite(3), 4)
+    with pytest.raises(StoppedError, match="Start the stream first"):
+        stream.subscribe(lambda _: None)
+    with stream:
+        stream.subscribe(lambda _: None)
+    camera = FreeRunningCamera()
+    camera.fail_at = 0
+    with FrameStream(camera, 4) as failed:
+        while failed.is_running:
+            time.sleep(0.001)
+        with pytest.raises(DeviceError, match="unplugged"):
+            failed.subscribe(lambda _: None)
