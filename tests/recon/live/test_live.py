@@ -12,6 +12,7 @@ import pytest
 
 from recon import Calibration, InputError, NoiseModel, reconstruct
 from recon.base.metrics import psnr
+from recon.streams.detail import Detail
 from recon.streams.fit import CalibrationWatch
 from recon.streams.live import LiveReconstructor
 from recon.streams.live_picture import DARK, NOISE_ONLY, UNLIT, UNLIT_SO_FAR, Level, LivePicture
@@ -657,6 +658,7 @@ def test_iterations_are_those_that_fit_into_the_budget() -> None:
     refined = reconstructor.refine()
     assert refined is not None
     assert (refined.iterations, refined.total_iterations) == (11, 11), "what one takes was not known"
+    assert (first.shown, refined.shown) == ("", "")
     assert refined.work_ms == pytest.approx(115)
     assert refined.volume is None
     total, frames = 11, iter(range(1, 99))
@@ -773,3 +775,50 @@ def test_what_was_settled_on_noise_is_made_anew_once(monkeypatch: pytest.MonkeyP
         assert len(made) == (n >= 2)
     reconstructor._settled = True
     assert reconstructor.refine() is None
+
+
+@pytest.mark.parametrize("plane", [None, 2])
+def test_a_picture_says_which_depths_it_is_of(plane: int | None) -> None:
+    psfs = np.stack([np.roll(spots_psf((32, 32), 9), 3 * k, 1) for k in range(4)])[:, None]
+    z_um = np.c_[np.zeros((4, 2)), [1000.0, 2000.0, 3000.0, 4000.0]]
+    reconstructor = LiveReconstructor(Calibration(psfs, z_um), noise=1.0, coarsest=1, plane=plane)
+    reconstructor._shape = (32, 32)
+    volume = np.random.default_rng(0).random((4, 32, 32)).astype(np.float32)
+    solver = SimpleNamespace(iterations=7)
+
+    def picture(planes: tuple[int, ...], volume: np.ndarray, done: int | None, **known: Any) -> LivePicture:
+        level: Any = SimpleNamespace(
+            **{"detail": Detail(2, planes), "binning": 2, "method": "admm", "solver": solver} | known
+        )
+        return reconstructor._picture(level, volume, done, Spent(0.0, 0.0))
+
+    every = (0, 1, 2, 3)
+    iterated = picture(every, volume, 3)
+    assert (iterated.method, iterated.iterations, iterated.total_iterations) == ("admm", 3, 7)
+    assert iterated.volume is volume
+    assert iterated.planes == every
+    if plane is None:
+        np.testing.assert_array_equal(iterated.image, volume.max(axis=0))
+        assert iterated.shown == "brightest of 4 depths"
+    else:
+        np.testing.assert_array_equal(iterated.image, volume[2])
+        assert iterated.shown == "depth 2 of 4 depths"
+    two = picture((2, 3), volume[:2], 3)
+    assert two.planes == (2, 3)
+    np.testing.assert_array_equal(two.image, volume[:2].max(axis=0) if plane is None else volume[0])
+    assert "2 of 4 depths (3, 4 mm)" in two.shown
+    for planes, middle in ((every, 2), ((0, 1, 3), 1)):
+        filtered = picture(planes, volume[:1], 0)
+        assert (filtered.method, filtered.iterations, filtered.total_iterations) == ("wiener", 0, 0)
+        assert filtered.volume is None
+        assert filtered.planes == (middle if plane is None else 2,)
+        assert filtered.shown == f"depth {middle if plane is None else 2} of 4 depths"
+        np.testing.assert_array_equal(filtered.image, volume[0])
+    assert picture(every, volume, 1, solver=None).total_iterations == 0
+    reconstructor._dark, reconstructor._settled = True, True
+    black = picture(every, volume[:1], None)
+    assert (black.method, black.iterations, black.doubt, black.settled) == ("", 0, DARK, True)
+    assert picture(every, volume, 2).doubt == NOISE_ONLY
+    reconstructor._dark, reconstructor._fit._doubt = False, "It is another's"
+    assert picture(every, volume[:1], None).doubt == UNLIT
+    assert picture(every, volume, 2).doubt == "It is another's"
