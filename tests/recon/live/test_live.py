@@ -169,7 +169,11 @@ def test_quality_gives_way_not_time() -> None:
         fed += 1
     assert fed == 3
     reconstructor._coming.wait()
+    assert reconstructor._level is not None
+    finer = reconstructor._level.solver
     coarse = reconstructor.feed(photograph(0, 0))
+    assert finer is not None
+    assert finer.solvers == [None], "its memory is given up"
     assert (coarse.binning, coarse.method) == (2, "admm-sensor")
     assert coarse.image.shape == (32, 48)
     assert "binned 2 x 2" in coarse.quality
@@ -822,3 +826,26 @@ def test_a_picture_says_which_depths_it_is_of(plane: int | None) -> None:
     reconstructor._dark, reconstructor._fit._doubt = False, "It is another's"
     assert picture(every, volume[:1], None).doubt == UNLIT
     assert picture(every, volume, 2).doubt == "It is another's"
+
+
+@pytest.mark.parametrize(("binning", "planes"), [(1, (0, 1, 2, 3)), (1, (0, 2)), (2, (1, 3))])
+def test_a_level_has_its_pixels_and_depths_and_is_judged_by_all_depths(
+    binning: int, planes: tuple[int, ...]
+) -> None:
+    psfs = np.stack([np.roll(spots_psf((32, 32), 9), 3 * k, 1) for k in range(4)])[:, None]
+    z_um = np.c_[np.zeros((4, 2)), [1000.0, 2000.0, 3000.0, 4000.0]]
+    reconstructor = LiveReconstructor(Calibration(psfs, z_um), noise=1.0, coarsest=2)
+    frame = reconstructor._measured(np.random.default_rng(0).poisson(900 * psfs[1, 0]).astype(np.float32))
+    level = reconstructor._level_of(Detail(binning, planes), frame)
+    side = 32 // binning
+    for problem, n_planes in ((level.problem, len(planes)), (level.whole, 4)):
+        assert (problem.n_planes, problem.sensor_shape) == (n_planes, (side, side))
+        assert problem.depths.central.shape[2:] == (side, side)
+    assert level.problem is level.whole or len(planes) < 4
+    kept = level.problem.depths.z_um
+    np.testing.assert_array_equal(kept, 1000.0 * (1 + np.array(planes)))
+    shown = planes[len(planes) // 2]
+    assert level.preview.problem.n_planes == 1
+    own = level.whole.depths.central[shown, 0]
+    seen = level.preview.problem.depths.central[0, 0]
+    np.testing.assert_allclose(seen / seen.sum(), own / own.sum(), atol=1e-6)
