@@ -370,6 +370,8 @@ class TasksPanel(Panel):
             return "charts"
         if path.name.endswith(".ome.zarr") and TASKS[self._running].group == VIDEOS:
             return "films"
+        if self._running == "import":
+            return "films"
         if self._running == "spots" and path.suffix == ".png" and "slm" in self.session.kinds:
             return "slm"
         return "reconstructions" if path in self._calibrations else ""

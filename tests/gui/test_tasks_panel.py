@@ -113,6 +113,20 @@ def test_a_hologram_of_spots_is_previewed_and_goes_on_to_the_slm(qtbot: QtBot, p
     assert handed == ["slm", pattern] * 2
 
 
+def test_a_film_that_is_imported_goes_on_to_films(qtbot: QtBot, panel: TasksPanel, tmp_path: Path) -> None:
+    np.save(tmp_path / "film.npy", np.ones((3, 8, 9), np.uint16))
+    told = {"frames_per_s": 10.0, "pixel_um": 5.0}
+    shown(qtbot, panel, "import", film=tmp_path / "film.npy", out=tmp_path / "mine", **told)
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        panel.start()
+    (made,) = (tmp_path / "mine").iterdir()
+    assert panel.files == (made,), panel.words.toPlainText()
+    handed: list[object] = []
+    panel.session.handed_on.connect(lambda *what: handed.extend(what))
+    qtbot.mouseClick(panel.use_button, Qt.MouseButton.LeftButton)
+    assert handed == ["films", made]
+
+
 def test_two_calibrations_are_compared_with_table_and_python_beside_the_form(
     qtbot: QtBot, panel: TasksPanel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
