@@ -20,6 +20,7 @@ _SEEN_PX = 1.0  # widening at the nearest depth that is said
 _SURE = 3.0  # standard deviations
 _LEAST_ERROR = 0.03  # of a structure's width: what the diffuser itself leaves (2 to 4 % over 60 to 200 mm)
 _EXPLAINED = 1.5  # of the configured source's image
+_WIDE_PX = 4.0  # structure of one depth that a source may be the reason of: twice what two pixels resolve
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,8 @@ class Structure:
     """Standard deviation of that."""
     source_um: float
     """A source whose image is so wide; one that is much wider than the structure is larger, by up to 1.8."""
+    depths: int
+    """How many told; one tells only what the source's image is at most."""
 
     def line(self, size_um: float | None, configured_px: float) -> str:
         """Return what is to be said of it; nothing where the configured size explains it.
@@ -44,6 +47,14 @@ class Structure:
         size_um, configured_px : float
             The source's size as configured, None where it is not, and its image's width at the nearest depth.
         """
+        if self.depths == 1:
+            if size_um is not None or self.near_px <= _WIDE_PX:
+                return ""
+            return (
+                f"Source: the pattern's finest structure is {self.near_px:.1f} pixels wide. The image of a "
+                f"source of {self.source_um:.0f} um would be, too: one depth does not tell it from the "
+                "diffuser's own. Measure the pinhole, and set [source] size_um."
+            )
         if self.widened_px <= max(_SEEN_PX, _SURE * self.error_px, _EXPLAINED * configured_px):
             return ""
         whose = "whose size is not configured" if size_um is None else f"not {size_um:g} as configured"
@@ -69,7 +80,13 @@ def fit_structure(
     """
     z, widths = np.array(depths_um, np.float64), np.array(widths_px, np.float64)
     d_mm, pitch_um = geometry.diffuser_distance_mm, geometry.pixel_pitch_um
-    if len(z) < _LEAST_DEPTHS or z.max() < _LEAST_RANGE * z.min() or d_mm is None or pitch_um is None:
+    if d_mm is None or pitch_um is None or not len(z):
+        return None
+    um_per_px = pitch_um * float(z.min()) / (1e3 * d_mm)
+    if len(z) == 1:
+        width = float(widths[0])
+        return Structure(width, width, width, 0.0, width * um_per_px, 1)
+    if len(z) < _LEAST_DEPTHS or z.max() < _LEAST_RANGE * z.min():
         return None
     # Widths of what is folded with one another add as squares.
     design = np.stack([np.ones_like(z), (z.min() / z) ** 2], axis=1)
@@ -85,5 +102,6 @@ def fit_structure(
         float(widths[far]),
         widened,
         error,
-        widened * pitch_um * float(z.min()) / (1e3 * d_mm),
+        widened * um_per_px,
+        len(z),
     )

@@ -193,6 +193,10 @@ def test_a_pinhole_of_unknown_size_is_told_by_structure_that_widens_as_its_image
         assert plain is not None
         assert plain.line(None, 0.0) == ""
     assert fit_structure(DEPTHS[:2], widths[:2], GEOMETRY) is None
+    for width, size_um, said in ((4.9, None, True), (4.9, 30.0, False), (2.3, None, False)):
+        one = fit_structure(DEPTHS[:1], [width], GEOMETRY)
+        assert one is not None
+        assert ("one depth does not tell" in one.line(size_um, 0.0)) == said
     assert fit_structure(DEPTHS, widths, replace(GEOMETRY, pixel_pitch_um=None)) is None
 
 
