@@ -177,8 +177,16 @@ def _hdf5(run: Run, path: Path, indices: list[int], images: Iterator[Image]) -> 
         data.attrs["axes"] = "t,y,x,c" if array.is_colour else "t,y,x"
         for place, image in enumerate(images):
             data[place] = image
+        noted = [run.metadata(i) for i in indices]
+        for name in ("pixel_format", "significant_bits", "black_level", "gain"):  # one for all, as a rule
+            data.attrs[name] = _told([getattr(one, name) for one in noted])
         file.create_dataset("frame_number", data=np.array(indices))
-        file.create_dataset("exposure_ms", data=[run.metadata(i).exposure_ms for i in indices])
+        file.create_dataset("exposure_ms", data=[one.exposure_ms for one in noted])
+        began_ns = noted[0].host_time_ns
+        file.create_dataset("time_s", data=[(one.host_time_ns - began_ns) / 1e9 for one in noted])
+        for axis in noted[0].stage_position:
+            if all(axis in one.stage_position for one in noted):
+                file.create_dataset(f"stage/{axis}", data=[one.stage_position[axis] for one in noted])
         lines = [json.dumps(run.records[i].to_json(), ensure_ascii=False) for i in indices]
         file.create_dataset("metadata", data=lines, dtype=h5py.string_dtype())
         file.attrs["run"] = run.path.name

@@ -142,6 +142,14 @@ def test_hdf5(run: Run, tmp_path: Path) -> None:
         assert list(file["frame_number"]) == STORED
         assert json.loads(file["metadata"][3])["index"] == 4
         assert file.attrs["simulated"]
+        facts = run.metadata(STORED[0])
+        told = file["frames"].attrs
+        assert (told["significant_bits"], told["black_level"]) == (facts.significant_bits, facts.black_level)
+        assert (told["pixel_format"], told["gain"]) == (facts.pixel_format, facts.gain)
+        times = [(run.metadata(i).host_time_ns - facts.host_time_ns) / 1e9 for i in STORED]
+        assert list(file["time_s"]) == times
+        for axis, place in facts.stage_position.items():
+            assert file["stage"][axis][0] == place
 
 
 def test_png(run: Run, tmp_path: Path) -> None:
