@@ -17,7 +17,7 @@ from instrument.reconstruction.stored_result import find_results
 
 _DARK = 0.05
 """Below this share of full scale a picture's brightest pixels are lost in the noise of most cameras."""
-_SATURATED = 1e-3
+SATURATED = 1e-3
 """Share of saturated pixels from which a photograph is spoilt."""
 EXPOSE = "expose"
 """What the live view is asked to do: to find an exposure for what is lit."""
@@ -122,7 +122,7 @@ def light_of(frame: Frame | None) -> str:
     if frame is None:
         return "unknown"
     metadata = frame.metadata
-    if metadata.saturated_fraction > _SATURATED:
+    if metadata.saturated_fraction > SATURATED:
         return "saturated"
     brightest = int(frame.image[::_STRIDE, ::_STRIDE].max())
     return "dark" if brightest < _DARK * ((1 << metadata.significant_bits) - 1) else "good"

@@ -18,6 +18,7 @@ from drivers.frame import FrameMetadata
 from gui.background import LiveFollower, NewestOnly
 from gui.forms.options_form import FOLDED, OptionsForm
 from gui.jobs import Job, JobContext
+from gui.journey import SATURATED
 from gui.panel import Panel, on_bench
 from gui.session import BenchSession
 from gui.widgets.building import Hint, button, choice, every, fill, in_row, label, offer, scrolled
@@ -27,7 +28,7 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import OrientationButton, follow_orientation
 from instrument.bench.kept import KeptWithBench
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
-from instrument.files.errors import BenchError, count, duration
+from instrument.files.errors import BenchError, count, duration, percent
 from instrument.live.light_log import NOTHING_LIT
 from instrument.live.live import LiveResult
 from instrument.reconstruction.job import find_calibration
@@ -336,11 +337,19 @@ class LiveReconstructionPanel(Panel):
             self.view.caution_against(". ".join(filter(None, (f"Old picture: {why}", doubt))), old=True)
 
     def _doubt(self, result: LiveResult) -> str:
-        """Return what is doubtful about a picture: by its pixels, and by what lit its frame."""
-        lit = self.session.lights.during(result.metadata)
-        if lit == NOTHING_LIT and not result.picture.doubt:
+        """Return what is doubtful about a picture: by its pixels, and by what its frame was."""
+        of_pixels, of_frame = result.picture.doubt, self._frame_doubt(result.metadata)
+        if of_pixels and self.session.lights.during(result.metadata) == NOTHING_LIT:
+            return of_pixels  # which says it
+        return ". ".join(filter(None, (of_frame, of_pixels)))
+
+    def _frame_doubt(self, frame: FrameMetadata) -> str:
+        """Return what is doubtful about a frame: its light, its exposure."""
+        if self.session.lights.during(frame) == NOTHING_LIT:
             return "Its frame was taken with nothing lit"
-        return result.picture.doubt
+        if frame.saturated_fraction > SATURATED:
+            return f"{percent(frame.saturated_fraction)} of its frame's pixels are saturated: expose shorter"
+        return ""
 
     def _caption(self, frame: FrameMetadata) -> str:
         """Say of which frame a picture is, and with which calibration it was made."""
@@ -440,9 +449,7 @@ class LiveReconstructionPanel(Panel):
         shown = self._shown
         if shown is not None and shown.metadata.frame_id == frame.frame_id:
             return self._doubt(shown)
-        return (
-            "Its frame was taken with nothing lit" if self.session.lights.during(frame) == NOTHING_LIT else ""
-        )
+        return self._frame_doubt(frame)
 
     def _refining_ended(self) -> None:
         self._refining = None

@@ -77,6 +77,16 @@ def test_it_follows_a_stream_that_was_interrupted(
     qtbot.waitUntil(lambda: panel._shown is not shown, timeout=WAIT_MS)
 
 
+def test_a_picture_of_a_saturated_frame_says_so(
+    qtbot: QtBot, window: MainWindow, panel: LiveReconstructionPanel
+) -> None:
+    qtbot.waitUntil(lambda: panel._shown is not None, timeout=WAIT_MS)
+    window.session.bench.camera.set_exposure_ms(300.0)
+    qtbot.waitUntil(lambda: "of its frame's pixels are saturated" in panel.view.caution, timeout=WAIT_MS)
+    window.session.bench.camera.set_exposure_ms(10.0)
+    qtbot.waitUntil(lambda: "saturated" not in panel.view.caution, timeout=WAIT_MS)
+
+
 def test_a_picture_of_noise_is_called_so_by_its_own_frame_and_an_old_one_old(
     qtbot: QtBot, window: MainWindow, panel: LiveReconstructionPanel
 ) -> None:
