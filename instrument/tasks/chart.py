@@ -19,6 +19,7 @@ from recon.reconstruction.options import ReconstructionOptions
 if TYPE_CHECKING:
     from instrument.evaluation.chart import ChartData
     from instrument.reconstruction.job import Job
+    from recon.evaluation.chart_hologram import HologramProblem
     from recon.evaluation.scored import Point
     from recon.evaluation.trial import Named, Subject
 
@@ -173,7 +174,31 @@ def hologram(desk: Desk, subject: HologramChart, bench: BenchFile, files: ChartF
     from instrument.evaluation.chart_problems import problem_of_pictures
 
     about = subject.targets, subject.z_mm, subject.expansion, subject.frames, subject.slm
-    return _charted(desk, *problem_of_pictures(bench_of(desk, bench), *about), files)
+    problem, facts = problem_of_pictures(bench_of(desk, bench), *about)
+    done = _charted(desk, problem, facts, files)
+    _tell_limits(desk, problem)
+    return done
+
+
+_QUICK = 2_000_000
+"""Pixels of a mask up to which a limit takes less than half a minute."""
+
+
+def _tell_limits(desk: Desk, problem: HologramProblem) -> None:
+    """Say what no number of frames of a phase SLM exceeds, of each expansion that is quickly told."""
+    from instrument.display.limit import at_most
+    from recon.holography import hologram_limit
+
+    alone = [(d, t[0]) for d, t in zip(problem.displays, problem.targets, strict=True) if len(t) == 1]
+    with desk.interruptible() as cancel:
+        for display, target in alone:
+            if cancel.is_set():
+                return
+            if display.mask.levels.size > _QUICK:
+                told = "diffuserbench hologram --limit tells"
+            else:
+                told = at_most(hologram_limit(display, target, cancel=cancel))
+            desk.say(f"Any number of phase frames, {display.expansion}x: {told}")
 
 
 _SIMULATED = "simulated microscope"

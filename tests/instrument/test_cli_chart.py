@@ -199,7 +199,8 @@ def test_holograms_are_charted(monkeypatch, tmp_path):
     arguments = ("hologram", "leaves", "--slm", "16x24", "-q", 4, "-q", 9, "--frames", 1, "--frames", 2)
     result = run(*arguments, "--out", tmp_path)
     assert result.exit_code == 0, result.output
-    for told in ("Pareto front 4x", "Pareto front 9x", "SIMULATED", "no second frame"):
+    limits = [f"Any number of phase frames, {q}x: no limit in sight" for q in (4, 9)]
+    for told in ("Pareto front 4x", "Pareto front 9x", "SIMULATED", "no second frame", *limits):
         assert told in result.output
     record = json.loads((tmp_path / "chart.json").read_text())
     assert record["kind"] == "hologram"
