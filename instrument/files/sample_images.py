@@ -73,7 +73,7 @@ def _head() -> Image:
     return np.asarray(pixels / float(pixels.max()), np.float64)
 
 
-def _leaves(seed: int, contrast: float) -> Image:
+def dead_leaves(seed: int, contrast: float) -> Image:
     """Dead leaves: overlapping discs of all sizes, whose statistics are like a photograph's."""
     n = 512
     rng = np.random.default_rng(seed)
@@ -104,8 +104,8 @@ SAMPLES: Mapping[str, Sample] = {
     "portrait": Sample("Matplotlib's sample data, grace_hopper.jpg (public domain)", _portrait),
     "relief": Sample("Matplotlib's sample data, jacksboro_fault_dem.npz, shaded", _relief),
     "head": Sample("Matplotlib's sample data, s1045.ima.gz (MRI slice)", _head),
-    "leaves": Sample("drawn here: dead-leaves model, full contrast", lambda: _leaves(1, 1.0)),
-    "soft leaves": Sample("drawn here: dead-leaves model, 70 % contrast", lambda: _leaves(2, 0.7)),
+    "leaves": Sample("drawn here: dead-leaves model, full contrast", lambda: dead_leaves(1, 1.0)),
+    "soft leaves": Sample("drawn here: dead-leaves model, 70 % contrast", lambda: dead_leaves(2, 0.7)),
     "clouds": Sample("drawn here: 1/f noise", _clouds),
 }
 
