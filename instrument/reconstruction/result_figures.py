@@ -14,6 +14,7 @@ from instrument.files.figures import Convergence, Panel, Summary, save_figure, s
 from instrument.files.seen import as_seen, srgb
 from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.job import Job
+from recon.base.blocks import block_sum
 from recon.reconstruction.result import Reconstruction
 
 if TYPE_CHECKING:
@@ -86,8 +87,13 @@ def volume_seen(volume: Grey) -> npt.NDArray[np.uint8]:
     return np.asarray(np.round(255 * srgb(coloured)), np.uint8)
 
 
-_SLICES = 4
+_SLICES = 3
 _WHITE_PERCENTILE = 99.8
+
+
+def lightest(volume: Grey) -> list[int]:
+    """Return the planes that hold most of a volume's light (n_z, height, width), in their order."""
+    return sorted(np.argsort(-volume.sum(axis=(1, 2)), kind="stable")[:_SLICES].tolist())
 
 
 def volume_figure(result: Reconstruction, *, simulated: bool = False) -> Figure:
@@ -109,14 +115,14 @@ def volume_figure(result: Reconstruction, *, simulated: bool = False) -> Figure:
     axes[0, 2].set(title="brightest over y", xlabel="x (pixels)", ylabel="depth plane")
     axes[0, 3].imshow(side.T, cmap="magma", aspect="auto", vmin=0, vmax=_white(side), interpolation="nearest")
     axes[0, 3].set(title="brightest over x", xlabel="depth plane", ylabel="y (pixels)")
-    planes = np.unique(np.linspace(0, len(volume) - 1, _SLICES + 1).round().astype(int)[1:])
-    strip = np.concatenate([volume[z] for z in planes[: _SLICES - 1]], axis=1)
+    planes = lightest(volume)
+    strip = np.concatenate([volume[z] for z in planes], axis=1)
     grid = axes[1, 0].get_gridspec()
     for axis in axes[1, :3]:
         axis.remove()
     slices = figure.add_subplot(grid[1, :3])
     slices.imshow(srgb(strip / white), cmap="gray", vmin=0, vmax=1)
-    slices.set(title="planes " + ", ".join(_depth(result, z) for z in planes[: _SLICES - 1]))
+    slices.set(title="planes " + ", ".join(_depth(result, z) for z in planes))
     slices.axis("off")
     for channel, history in enumerate(result.histories):
         iterations = [r.iteration for r in history]
@@ -158,7 +164,7 @@ def _summary(result: Reconstruction, job: Job, rotate_deg: int) -> Summary:
     height, width = image.shape[:2]
     panels = (
         Panel("PSF", _shown(psf[..., 0] if psf.shape[-1] == 1 else psf), gamma=0.5, caption="square root"),
-        Panel("Photograph", _on_screen(job.measurement), caption="dark level subtracted", white=1.0),
+        Panel("Photograph", _on_screen(photographed(job)), caption="dark level subtracted", white=1.0),
         Panel("Reconstruction", _on_screen(image), caption=f"{height} x {width}", white=1.0),
     )
     facts = [("method", result.solver), ("prior", result.prior)]
@@ -173,6 +179,18 @@ def _used_psf(result: Reconstruction, job: Job) -> int:
     """Return which of the calibration's PSFs the reconstruction took."""
     z_um = result.provenance.get("psf_z_um")
     return 0 if z_um is None else int(np.argmin(np.abs(job.calibration.source_positions_um[:, 2] - z_um)))
+
+
+def photographed(job: Job) -> npt.NDArray[np.float32]:
+    """Return the photograph to be shown: a colour mosaic's pixels count for their own colour, a cell each."""
+    image, valid = job.measurement, job.valid
+    mosaic = None if job.reduction is None else job.reduction.mosaic
+    if mosaic is None or valid is None or valid.all() or min(image.shape[:2]) < 2:
+        return image
+    measured = block_sum(np.moveaxis(valid, -1, 0), 2)
+    light = block_sum(np.moveaxis(np.where(valid, image, 0), -1, 0), 2)
+    cells = np.asarray(light / np.maximum(measured, 1), np.float32)
+    return np.moveaxis(cells, 0, -1)
 
 
 def _on_screen(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
