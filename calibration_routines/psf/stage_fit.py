@@ -52,6 +52,8 @@ MAX_GROWTH = 5e-4
 """Change of the pattern's size between two visits that is called a motion along the axis."""
 MAX_PLACE_DRIFT_PX = 0.5
 """Shift of the reference's pattern that is called a drift, pixels."""
+CREEP_PX = 0.2
+"""Shift from the first visit that is said: places are off by it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +137,7 @@ def judge_drift(
                 f"{abs(larger):.2%} {size}: the source came {way}. z lost steps, or something slipped along "
                 "the axis: look at the coupling, and take the sweep again."
             )
+    findings += _crept(compared, scatter, said=any("pattern moved" in words for words in findings))
     return Drift(
         tuple(before_point),
         tuple(change.brightness for change in compared),
@@ -144,6 +147,18 @@ def judge_drift(
         scatter.brightness_error,
         tuple(change.ambient for change in compared),
         tuple(grown),
+    )
+
+
+def _crept(compared: Sequence[Change], scatter: Scatter, *, said: bool) -> tuple[str, ...]:
+    """Return what small steps from visit to visit add up to, unless one of them was said."""
+    far = max(change.shift_px for change in compared)
+    if said or not np.isfinite(far) or far <= MAX_PLACE_DRIFT_PX + _SURE * scatter.place_error_px:
+        return ()
+    return (
+        f"from visit to visit the reference's pattern moved on, {far:.1f} pixels off its first place in "
+        f"all (up to {MAX_PLACE_DRIFT_PX:g} expected): the source, the camera or the table creeps. Let it "
+        "settle, clamp what slackens, and sweep again.",
     )
 
 

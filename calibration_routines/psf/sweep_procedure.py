@@ -10,6 +10,7 @@ from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.psf.mount_fit import off_middle
 from calibration_routines.psf.psf_quality import place_of
 from calibration_routines.psf.sampling import reachable_depths_um, standing_depth_um
+from calibration_routines.psf.stage_fit import CREEP_PX, Drift
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep, finish_sweep, watch_sweep
 from calibration_routines.psf.sweep_options import AskedSweep, AxialSweep, LateralSweep, VolumeSweep
 from calibration_routines.psf.sweep_plan import (
@@ -142,7 +143,7 @@ def quality_lines(done: SweepCalibration) -> list[str]:
         lines.append(
             f"Source: {len(done.drift.brightness)} visits to the reference; brightness within "
             f"{max(abs(b - 1) for b in done.drift.brightness):.1%} ({taken}), place within "
-            f"{max(done.drift.shift_px):.2f} pixels."
+            f"{max(done.drift.shift_px):.2f} pixels{_crept(done.drift)}."
         )
     if FEATURE_PX >= done.source_width_px > _SEEN_WIDTH_PX:
         lines.append(
@@ -164,6 +165,11 @@ def quality_lines(done: SweepCalibration) -> list[str]:
             "neighbours' median, like the others): let the camera warm up."
         )
     return lines
+
+
+def _crept(drift: Drift) -> str:
+    """Return the words for a pattern that moved by more than places should."""
+    return ": it moved, and places are off by that" if max(drift.shift_px) > CREEP_PX else ""
 
 
 def _frames_line(scatter: Scatter) -> str:

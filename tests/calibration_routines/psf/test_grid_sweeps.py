@@ -302,6 +302,10 @@ def test_drift_is_read_from_the_reference() -> None:
     ]
     assert "15.0% dimmer" in drift.findings[0]
     assert "moved from 0.0 to 1.3 pixels" in drift.findings[1]
+    steps = [shift(pattern, (0.0, 0.3 * k), order=3) for k in range(4)]
+    creeping = judge_drift(steps, [0, 5, 10, 15], 15, [0.0, 20.0, 40.0, 60.0])
+    assert ["0.9 pixels off its first place in all" in words for words in creeping.findings] == [True]
+    assert judge_drift(steps[:2], [0, 5], 5, [0.0, 20.0]).findings == ()
     set_clock = replace(drift, seconds=(0.0, 60.0, 50.0))
     assert not set_clock.is_correctable
     assert set_clock.brightness_at(30.0) == 1.0
