@@ -18,7 +18,7 @@ from drivers.errors import DeviceError
 from drivers.frame import Frame
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
-from instrument.live.live import LiveView, live_view
+from instrument.live.live import LiveResult, LiveView, live_view
 from recon import Calibration, InputError
 from recon.streams.live import LiveReconstructor
 from recon.streams.live_picture import LivePicture
@@ -175,6 +175,9 @@ def test_closing_waits_for_the_picture_in_progress() -> None:
 def test_the_status_is_of_the_last_pictures() -> None:
     view = LiveView(FrameStream(FreeRunningCamera(), 3), Slow(0.0))
     assert np.isnan(view.status.pictures_per_s)
+    view._done.extend([(5.0, 1.0), (5.25, 2.0)])
+    assert view.status.pictures_per_s == 4.0
+    view._done.clear()
     view._done.extend((7 + 0.5 * n, float(n)) for n in range(101))
     status = view.status
     assert (status.pictures_per_s, status.latency_median_ms, status.latency_p99_ms) == (2.0, 50.0, 99.0)
@@ -277,3 +280,23 @@ def test_a_refinement_gives_way_to_a_frame_that_waits_and_to_the_end() -> None:
     reader.status.waiting = 0
     view.end()
     assert view._is_wanted_elsewhere()
+
+
+def test_the_end_of_the_camera_ends_the_pictures_and_is_told_to_who_waits() -> None:
+    camera = FreeRunningCamera(0.002)
+    camera.n_frames = 1
+    slow = Slow(0.0)
+    view = LiveView(FrameStream(camera, 3), slow)
+    waited: list[Any] = []
+
+    def waits(than: LiveResult) -> None:
+        waited.append(view.wait_newer(than, 60.0))
+
+    for result in view:
+        if result.refined and result.picture.total_iterations == slow.settled_after:
+            waiting = threading.Thread(target=waits, args=(result,), daemon=True)
+            waiting.start()
+            camera.stop_sequence()
+            waiting.join(20)
+    assert waited == [None]
+    assert not view.is_running
