@@ -145,10 +145,10 @@ def test_time_is_that_of_iterations_alone_and_a_keeper_sees_each_and_the_end(now
 
 
 def test_what_was_kept_counts_for_the_rules(now_s: list[float]) -> None:
-    before = tuple(IterationRecord(n, 10.0 * n, change=0.05) for n in (1, 2))
+    before = tuple(IterationRecord(n, 10.0 * n, change=c) for n, c in ((1, 1.0), (2, 0.05), (3, 0.05)))
     out = Told(now_s, [0.05, 0.05]).run(StoppingRules(tolerance=0.1), keeper=Kept(before))
     assert out.stop_reason is StopReason.CONVERGED
-    assert [(r.iteration, r.seconds) for r in out.history] == [(1, 10.0), (2, 20.0), (3, 21.0)]
+    assert [(r.iteration, r.seconds) for r in out.history] == [(1, 10.0), (2, 20.0), (3, 30.0), (4, 31.0)]
     calm = tuple(IterationRecord(n, 10.0 * n, change=0.05) for n in (1, 2, 3))
     solver = Told(now_s)
     assert len(solver.run(StoppingRules(tolerance=0.1), keeper=Kept(calm)).history) == 3
