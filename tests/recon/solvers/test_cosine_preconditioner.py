@@ -13,11 +13,11 @@ SEPARABLE, DIFFERENCES = 0.7, 0.3
 
 
 def seen(
-    sensor: tuple[int, int], psf: tuple[int, int] = (4, 5)
+    sensor: tuple[int, int], psf: tuple[int, int] = (4, 5), grid: tuple[int, int] | None = None
 ) -> tuple[Convolution, np.ndarray, np.ndarray]:
     """Return a camera, its power, and ``C F^-1 q F C^T`` as a matrix over the sensor's pixels."""
     rng = np.random.default_rng(3)
-    camera = Convolution(rng.random((1, *psf)) ** 3, sensor, dtype=np.float64)
+    camera = Convolution(rng.random((1, *psf)) ** 3, sensor, grid_shape=grid, dtype=np.float64)
     power = camera.power()[0]
     rows, columns = (laplacian_eigenvalues(n) for n in camera.grid_shape)
     q = power / (SEPARABLE + DIFFERENCES * (rows[:, None] + columns[None, : power.shape[1]]))
@@ -42,8 +42,11 @@ def applied(preconditioner: CosinePreconditioner, sensor: tuple[int, int]) -> np
 
 @pytest.mark.parametrize("sensor", [(6, 9), (1, 8), (11, 7)])
 @pytest.mark.parametrize("weight", [1.0, 0.4])
-def test_where_all_modes_are_exact_it_is_the_inverse(sensor: tuple[int, int], weight: float) -> None:
-    camera, power, matrix = seen(sensor)
+@pytest.mark.parametrize("grid", [None, (15, 15)])
+def test_where_all_modes_are_exact_it_is_the_inverse(
+    sensor: tuple[int, int], weight: float, grid: tuple[int, int] | None
+) -> None:
+    camera, power, matrix = seen(sensor, grid=grid)
     preconditioner = made(camera, power)
     weights = np.ones(sensor)
     weights[:2, :3] = weight
