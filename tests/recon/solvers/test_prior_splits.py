@@ -85,7 +85,8 @@ def test_penalties_are_guessed_until_residuals_are_known_and_balanced_from_then_
         ((1.0, 1.0, 1.0, 0.0), 1.0),
         ((1.0, np.inf, 1.0, 1.0), 1.0),
         ((np.nan, 1.0, 1.0, 1.0), 1.0),
-        ((SETTLED**2, 16 * SETTLED**2, 1.0, 16.0), 1.0),
+        ((SETTLED**2, 4 * SETTLED**2, 1.0, 16.0), 1.0),
+        ((SETTLED**2 / 4, 16 * SETTLED**2, 1.0, 16.0), 1.0),
         ((1.01 * SETTLED**2, 1.01 * SETTLED**2, 1.0, 16.0), 2.0),
         ((SETTLED**2, 16.16 * SETTLED**2, 1.0, 16.0), 1.01**-0.25),
     ],
@@ -246,8 +247,9 @@ def test_penalties_are_balanced_each_by_its_own_residuals() -> None:
     u, w = (49 / 64 * (100 / 100)) ** 0.25, (4 / 9 * (25 / 100)) ** 0.25
     np.testing.assert_allclose(splits.balanced_penalties(), [[2 * u, 3 * u], [5 * w, 7 * w]])
     np.testing.assert_array_equal(splits.mu, [[2.0, 3.0], [5.0, 7.0]])
-    calm = W | {"PRIMAL_W": 100 * SETTLED**2, "CHANGE_W": 25 * SETTLED**2}
-    np.testing.assert_array_equal(told(L1(0.2), **calm).balanced_penalties()[1], [1.0, 1.0])
+    for primal, change in ((100, 5), (10, 25)):
+        calm = W | {"PRIMAL_W": primal * SETTLED**2, "CHANGE_W": change * SETTLED**2}
+        np.testing.assert_array_equal(told(L1(0.2), **calm).balanced_penalties()[1], [1.0, 1.0])
     one = W | {"PRIMAL_W": 101 * SETTLED**2, "CHANGE_W": 25 * SETTLED**2}
     np.testing.assert_allclose(told(L1(0.2), **one).balanced_penalties()[1], 1.01**0.25)
     other = W | {"PRIMAL_W": 100 * SETTLED**2, "CHANGE_W": 25.25 * SETTLED**2}
