@@ -293,3 +293,15 @@ def test_the_solution_is_the_other_priors_where_nothing_is_asked_of_pixels() -> 
     without.y[...] = right
     without.sweep(0.0)
     np.testing.assert_allclose(bounded.y - without.y, bounded.others[0].pull(), atol=1e-12)
+
+
+def test_channels_one_after_the_other_are_all_at_once() -> None:
+    whole, _ = swept(TV + L1(0.2) + NonNegativity())
+    single = PriorSplits(TV + L1(0.2) + NonNegativity(), random(0).copy())
+    single.set_penalties(np.array([[0.7, 0.7], [1.3, 1.3]]))
+    single.y[...] = random(1)
+    for channel in (1, 0):
+        single.sweep(1.6, channel)
+    for name in ("y", "tx", "ty", "t_w"):
+        np.testing.assert_array_equal(getattr(single, name), getattr(whole, name))
+    np.testing.assert_allclose(single.channel_sums(), whole.channel_sums(), rtol=1e-12)
