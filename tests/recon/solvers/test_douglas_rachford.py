@@ -24,8 +24,7 @@ SENSOR = (7, 8)
 RNG = np.random.default_rng(5)
 CAMERA = Convolution(RNG.random((3, 1, 5, 4)) ** 3, SENSOR, dtype=np.float64)
 VALID = RNG.random(SENSOR) > 0.2
-DATA = CAMERA.forward((RNG.random(CAMERA.domain_shape) > 0.97).astype(np.float64))
-DATA += 0.01 * RNG.standard_normal(DATA.shape)
+DATA = RNG.random((1, *SENSOR)) ** 4
 SPARSE = L1(0.05) + NonNegativity()
 TV = TotalVariation.of_volume(0.03)
 

@@ -19,8 +19,7 @@ SENSOR = (7, 8)
 RNG = np.random.default_rng(5)
 CAMERA = Convolution(RNG.random((3, 1, 5, 4)) ** 3, SENSOR, dtype=np.float64)
 VALID = RNG.random(SENSOR) > 0.2
-DATA = CAMERA.forward((RNG.random(CAMERA.domain_shape) > 0.97).astype(np.float64))
-DATA += 0.01 * RNG.standard_normal(DATA.shape)
+DATA = RNG.random((1, *SENSOR)) ** 4
 DEPTHS = ((0.5, 1.0, 1.0), (0.4, 0.9, 1.1), (0.3, 0.8, 1.2))
 FIELDS = [FieldOfPsfs(RNG.random((4, 1, 5, 4)) ** 3, [(-3, -3), (-3, 3), (3, -3), (3, 3)]) for _ in range(3)]
 FIELD = local_convolution(FIELDS, SENSOR, dtype=np.float64)
