@@ -1,7 +1,8 @@
 """What napari shows of this program's files: a reader of its own, which napari finds by ``napari.yaml``.
 
 Runs, calibrations, volumes and videos are OME-Zarr, of which nothing is read that is not looked at; results
-are TIFF with a record beside. What is not this program's is left to other readers.
+are TIFF with a record beside, exported volumes and photographs TIFF that says it is ours. What is not this
+program's is left to other readers.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from typing import Any
 
 from instrument.files.calibration_file import is_calibration, load_calibration
 from instrument.files.errors import FileError
+from instrument.files.images import image_metadata
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
 from instrument.files.tiff_pages import open_tiff
-from instrument.files.volumes import is_zarr_name, stem_of
+from instrument.files.volumes import is_zarr_name, stem_of, tiff_facts
 from instrument.runs.run_files import FRAMES, is_run
 
 Layer = tuple[Any, dict[str, Any], str]
@@ -48,7 +50,8 @@ def _kind(path: Path) -> Callable[[Path], list[Layer]] | None:
         return _run
     if is_zarr_name(path):
         return _array if "diffuserbench" in _attributes(path) else None
-    return _result if path.suffix.lower() in (".tif", ".tiff") and _record(path) else None
+    is_tiff = path.suffix.lower() in (".tif", ".tiff")
+    return _result if is_tiff and (_record(path) or _annotated(path)) else None
 
 
 def _attributes(path: Path) -> Mapping[str, Any]:
@@ -69,6 +72,18 @@ def _record(path: Path) -> Mapping[str, Any]:
         return {}
     ours = isinstance(found, dict) and str(found.get("program", "")).startswith("diffuserbench")
     return found if ours else {}
+
+
+def _annotated(path: Path) -> Mapping[str, Any]:
+    """Return what this program says in a TIFF, a photograph's or a volume's; nothing of any other."""
+    try:
+        with open_tiff(path) as file:
+            if facts := tiff_facts(file):
+                return facts
+        facts = image_metadata(path)
+        return facts if {"bench", "pixel_format", "pixel_pitch_um"} <= facts.keys() else {}
+    except Exception:  # noqa: BLE001 - whatever is wrong with it, another reader may say
+        return {}
 
 
 def _run(path: Path) -> list[Layer]:
@@ -113,8 +128,9 @@ def _array(path: Path, name: str = "") -> list[Layer]:
 
 
 def _result(path: Path) -> list[Layer]:
-    """Return a reconstruction on its grid."""
-    record = _record(path)
+    """Return a reconstruction on its grid, or a photograph."""
+    facts = _annotated(path)
+    record = _record(path) or {**facts, "grid": {"object_pitch_um": facts.get("pixel_pitch_um"), **facts}}
     with open_tiff(path) as file:
         series = file.series[0]
         data, axes = series.asarray(), [{"s": "c"}.get(a, a) for a in series.axes.lower()]
@@ -127,7 +143,10 @@ def _result(path: Path) -> list[Layer]:
     if isinstance(depths, list) and len(depths) > 1:
         middle = len(depths) // 2
         step["z"] = abs(depths[middle] - depths[middle - 1])
-    return [_image(data, axes, step, {}, path.stem, record)]
+    origin = {}
+    if "z" in step and pitch and (centre := grid.get("centre")) and depths[0] < depths[-1]:
+        origin = {"z": depths[0], "y": -centre[0] * pitch, "x": -centre[1] * pitch}
+    return [_image(data, axes, step, origin, path.stem, record)]
 
 
 def _image(

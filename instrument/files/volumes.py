@@ -16,11 +16,13 @@ import numpy.typing as npt
 
 from instrument.files.atomic import whole_file, whole_folder
 from instrument.files.errors import FileError
-from instrument.files.ome_tiff import resolution
+from instrument.files.ome_tiff import annotation, facts_of, resolution
 from instrument.files.reading import folder_bytes, require_file, require_plausible, stored_bytes
 from instrument.files.tiff_pages import open_tiff
 
 if TYPE_CHECKING:
+    import tifffile
+
     from recon.camera.grid import Grid
 
 EVEN = 0.01
@@ -147,7 +149,7 @@ def write_volume_tiff(
     """Write a volume as OME-TIFF, ``ZYX`` or ``ZCYX``, whole or not at all, with one plane in memory.
 
     ``planes`` are (height, width) or (height, width, n_channels), ``shape`` is that of all with n_z in front.
-    The voxel size is that of the middle plane, where it is known.
+    The voxel size is that of the middle plane, where it is known; what :func:`grid_facts` says is annotated.
 
     Raises FileError or OSError when it cannot be written.
     """
@@ -168,6 +170,7 @@ def write_volume_tiff(
         }
         metadata["Plane"] = {f"Position{axis}": list(map(float, where)) for axis, where in places.items()}
         metadata["Plane"] |= {f"Position{axis}Unit": ["µm"] * n_pages for axis in places}
+    metadata["MapAnnotation"] = annotation({"words": _of_voxels(grid), **grid_facts(grid)})
     stored = (shape[0], shape[3], *shape[1:3]) if colour else shape
     big = 4 * int(np.prod(shape)) > _BIG_TIFF_BYTES
     with whole_file(path) as temporary, tifffile.TiffWriter(temporary, ome=True, bigtiff=big) as tiff:
@@ -431,10 +434,12 @@ def open_volume(path: Path | str) -> VolumeSource:
     raise FileError(path, "is no volume: an OME-Zarr folder, a TIFF or a .npy file is expected.")
 
 
-def volume_in_memory(voxels: npt.NDArray[Any], path: Path) -> VolumeSource:
+def volume_in_memory(
+    voxels: npt.NDArray[Any], path: Path, facts: Mapping[str, Any] | None = None
+) -> VolumeSource:
     """Return a source of an array, (n_z, height, width) or (n_z, height, width, n_channels).
 
-    ``path`` is what messages call it. The array may be a memory map.
+    ``path`` is what messages call it, ``facts`` as :class:`VolumeSource`. The array may be a memory map.
 
     Raises FileError when it has another number of axes, or no voxel.
     """
@@ -446,7 +451,7 @@ def volume_in_memory(voxels: npt.NDArray[Any], path: Path) -> VolumeSource:
         )
     view = voxels[..., None] if voxels.ndim == 3 else voxels
     shape = (view.shape[0], view.shape[1], view.shape[2])
-    return VolumeSource(path, [lambda z, y, x: view[z, y, x]], [shape], view.shape[3])
+    return VolumeSource(path, [lambda z, y, x: view[z, y, x]], [shape], view.shape[3], facts=facts)
 
 
 _SPARSE_BYTES = 1 << 33
@@ -498,6 +503,14 @@ def _open_npy(path: Path) -> VolumeSource:
         raise FileError(path, f"is no plain .npy array: {error}.") from error
 
 
+def tiff_facts(tiff: tifffile.TiffFile) -> dict[str, Any]:
+    """Return what this program annotated in an OME-TIFF; empty where it did not."""
+    try:
+        return {} if tiff.ome_metadata is None else facts_of(tiff.ome_metadata)
+    except ValueError:
+        return {}
+
+
 def _open_tiff(path: Path) -> VolumeSource:
     """Map the file where it lies in one piece, else read it page by page."""
     import tifffile
@@ -516,6 +529,7 @@ def _open_tiff(path: Path) -> VolumeSource:
         if tiff is not None:
             tiff.close()
         raise FileError(path, f"is no TIFF, or a damaged one: {error!r:.200}.") from error
+    facts = tiff_facts(tiff)
     axes = series.axes.replace("S", "C")
     if len(axes) == 3 and axes.endswith("YX"):
         axes = "ZYX"  # a stack of pages from elsewhere: whatever its axis is called, it is the depth
@@ -531,7 +545,7 @@ def _open_tiff(path: Path) -> VolumeSource:
             mapped = tifffile.memmap(path, mode="r")
         except Exception as error:
             raise FileError(path, f"is damaged: {error!r:.200}.") from error
-        return volume_in_memory(np.moveaxis(mapped, 1, -1) if axes == "ZCYX" else mapped, path)
+        return volume_in_memory(np.moveaxis(mapped, 1, -1) if axes == "ZCYX" else mapped, path, facts)
     per_plane = shape.get("C", 1) if axes == "ZCYX" else 1
 
     def read(z: Any, y: Any, x: Any) -> npt.NDArray[Any]:
@@ -544,4 +558,4 @@ def _open_tiff(path: Path) -> VolumeSource:
         return planes[0] if isinstance(z, int) else np.stack(planes)
 
     size = (shape["Z"], shape["Y"], shape["X"])
-    return VolumeSource(path, [read], [size], shape.get("C", 1), tiff.close)
+    return VolumeSource(path, [read], [size], shape.get("C", 1), tiff.close, facts)

@@ -12,7 +12,8 @@ import instrument
 from instrument.files.atomic import write_json
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import FileError
-from instrument.files.volumes import write_volume_zarr
+from instrument.files.images import write_image
+from instrument.files.volumes import write_volume_tiff, write_volume_zarr
 from instrument.napari_reader import get_reader, read
 from instrument.reconstruction.video_files import VideoPictures, create_output
 from recon.camera.grid import Grid
@@ -37,6 +38,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tifffile.imwrite(made / "picture.tif", pixels[0, 0])
     write_json(made / "picture.json", {"program": "diffuserbench 1", "grid": {"object_pitch_um": 7.5}})
     tifffile.imwrite(made / "other.tif", pixels[0, 0])
+    tifffile.imwrite(made / "other.ome.tif", pixels[:, 0], ome=True, metadata={"axes": "ZYX"})
+    write_volume_tiff(made / "exported.tif", iter(pixels[:3, 0]), (3, 8, 9), GRID)
+    write_image(made / "photo.ome.tif", pixels[0, 0], {"pixel_pitch_um": 6.5})
     return made
 
 
@@ -45,6 +49,8 @@ SHOWN = {
     "volume.ome.zarr": [(3, 8, 9), (20.0, 5.0, 5.0), ("um", "um", "um")],
     "film.ome.zarr": [(4, 8, 9), (0.5, 1.0, 1.0), ("s", "pixel", "pixel")],
     "picture.tif": [(8, 9), (7.5, 7.5), ("um", "um")],
+    "exported.tif": [(3, 8, 9), (20.0, 5.0, 5.0), ("um", "um", "um")],
+    "photo.ome.tif": [(8, 9), (6.5, 6.5), ("um", "um")],
 }
 
 
@@ -57,6 +63,8 @@ def test_each_is_shown_with_its_scale(folder: Path, name: str) -> None:
     assert layer["scale"] == pytest.approx(scale)
     assert tuple(layer["units"]) == units
     assert "diffuserbench" in layer["metadata"]
+    if name == "exported.tif":
+        assert layer["translate"] == read(str(folder / "volume.ome.zarr"))[0][1]["translate"]
 
 
 def test_a_run_without_frames_is_refused_in_words(tmp_path: Path) -> None:
@@ -65,7 +73,7 @@ def test_a_run_without_frames_is_refused_in_words(tmp_path: Path) -> None:
 
 
 def test_what_is_not_the_program_s_is_left_to_others(folder: Path) -> None:
-    for other in ("other.tif", "nothing", "picture.json", "run/frames.ome.zarr/0"):
+    for other in ("other.tif", "other.ome.tif", "nothing", "picture.json", "run/frames.ome.zarr/0"):
         assert get_reader(str(folder / other)) is None
     assert get_reader([str(folder / "run"), str(folder / "film.ome.zarr")]) is None
 

@@ -7,7 +7,7 @@ import pytest
 import zarr
 from ome_zarr_models.v05 import Image
 
-from instrument.files.volumes import write_volume_tiff, write_volume_zarr
+from instrument.files.volumes import grid_facts, open_volume, write_volume_tiff, write_volume_zarr
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.result_file import Outputs, write_reconstruction
 from recon import Calibration, Options, Problem, solve
@@ -50,6 +50,12 @@ def test_an_ome_tiff_says_where_its_planes_lie(tmp_path, volume):
         (z, c, Z_UM[z]) for z in range(3) for c in range(3)
     ]
     assert (pixels.planes[0].position_x, pixels.planes[0].position_y) == (-2000.0, -3000.0)
+    for planes in (volume, colour):  # and the program itself knows the grid again
+        write_volume_tiff(tmp_path / "again.tif", iter(planes), planes.shape, GRID)
+        source = open_volume(tmp_path / "again.tif")
+        assert source.facts == {"words": source.facts["words"], **grid_facts(GRID)}
+        assert source.facts["words"].startswith("Perspective grid")
+        source.close()
 
 
 def test_colour_goes_first_and_unknown_sizes_have_no_unit(tmp_path, volume):
