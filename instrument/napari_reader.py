@@ -11,13 +11,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from instrument.files.calibration_file import is_calibration, load_calibration
 from instrument.files.errors import FileError
 from instrument.files.images import image_metadata
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
 from instrument.files.tiff_pages import open_tiff
-from instrument.files.volumes import is_zarr_name, stem_of, tiff_facts
+from instrument.files.volumes import is_zarr_name, middle_step_um, stem_of, tiff_facts
 from instrument.runs.run_files import FRAMES, is_run
 
 Layer = tuple[Any, dict[str, Any], str]
@@ -139,13 +141,12 @@ def _result(path: Path) -> list[Layer]:
     if isinstance(widths := grid.get("pitch_um"), list) and widths:  # a volume's: its middle plane's
         pitch = widths[len(widths) // 2]
     depths = grid.get("z_um")
-    step = {"y": pitch, "x": pitch}
+    step, origin = {"y": pitch, "x": pitch}, {}
     if isinstance(depths, list) and len(depths) > 1:
-        middle = len(depths) // 2
-        step["z"] = abs(depths[middle] - depths[middle - 1])
-    origin = {}
-    if "z" in step and pitch and (centre := grid.get("centre")) and depths[0] < depths[-1]:
-        origin = {"z": depths[0], "y": -centre[0] * pitch, "x": -centre[1] * pitch}
+        step["z"] = middle_step_um(np.array(depths))
+        centre = grid.get("centre")
+        if pitch and centre and depths[0] < depths[-1]:
+            origin = {"z": depths[0], "y": -centre[0] * pitch, "x": -centre[1] * pitch}
     return [_image(data, axes, step, origin, path.stem, record)]
 
 
