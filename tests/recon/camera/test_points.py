@@ -11,6 +11,7 @@ from recon.camera.points import (
     PointImages,
     Points,
     _fitted,
+    _refined,
     cleaned,
     overlooked,
     points_on_grid,
@@ -147,3 +148,42 @@ def test_blobs_on_a_grid_are_points_at_their_centroids_the_brightest_first() -> 
     assert len(kept) == MOST
     assert kept.light.tolist() == sorted(many[many > 0], reverse=True)[:MOST]
     assert points_on_grid(np.zeros((9, 9)), (4, 4)).places.shape == (0, 2)
+
+
+def test_a_point_moves_half_a_pixel_at_once_at_most() -> None:
+    wide = np.exp(-((np.mgrid[:21, :21] - 10) ** 2).sum(axis=0) / 12)[None]
+    seen = camera(wide)
+    image = seen.image(points((2.0, 0.0, 1.0)))
+    place, light = _refined(seen, image - seen.image(points((0, 0, 0.9))), np.zeros(2), 0.9)
+    assert place[0] == pytest.approx(0.5)
+    assert abs(place[1]) < 0.01
+    assert light > 0.85
+    left = seen.image(points((0.2, 0.0, 1.0))) - seen.image(points((0, 0, 1.0)))
+    near, _ = _refined(seen, left, np.zeros(2), 1.0)
+    assert near[0] == pytest.approx(0.2, abs=0.02)
+
+
+def test_a_move_that_gains_nothing_is_halved_twice_and_given_up() -> None:
+    rng = np.random.default_rng(0)
+    tried: list[np.ndarray] = []
+    here = rng.standard_normal((3, 4, 5)).astype(np.float32)
+    where = slice(0, 4), slice(0, 5)
+
+    class Nowhere:
+        def patch(self, place: np.ndarray, *, slopes: bool = False) -> tuple[np.ndarray, tuple[slice, slice]]:
+            if slopes:
+                return here, where
+            tried.append(place - start)
+            return np.zeros((1, 4, 5), np.float32), where
+
+    start, data = np.array([3.0, -2.0]), rng.standard_normal((4, 5)).astype(np.float32)
+    data += np.float32(3) * here[0]
+    left = data - np.float32(0.5) * here[0]
+    place, light = _refined(Nowhere(), left, start, 0.5)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(place, start)
+    best = _fitted(here[0], data)[0]
+    assert light == pytest.approx(best, rel=1e-5)
+    np.testing.assert_allclose(left, data - np.float32(best) * here[0], atol=1e-5)
+    assert len(tried) == 3
+    np.testing.assert_allclose(tried[1:], [tried[0] / 2, tried[0] / 4])
+    assert np.abs(tried[0]).max() <= 0.5 + 1e-12
