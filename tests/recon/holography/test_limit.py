@@ -183,7 +183,22 @@ def test_contrast_is_told_neither_of_a_good_hologram_nor_of_one_still_searching(
     assert [line.partition(":")[0] for line in words] == told
 
 
-def test_planes_of_a_volume_have_no_estimate_of_what_frames_gain():
-    display = Display(SHAPE, random_mask(SHAPE, seed=1))
-    planes = [Target(picture()), Target(picture(), 5.0)]
-    assert np.isnan(gain_of_frames(display, planes, HologramOptions()))
+def test_what_frames_gain_planes_is_told_from_a_part_with_the_planes_farther_apart(monkeypatch):
+    display = Display((48, 64), random_mask((96, 128), seed=1), slm_pitch_um=8.0, focal_mm=35.0)
+    planes = [Target(picture()), Target(picture()[::-1, ::-1].copy(), 8.0)]
+    whole = gain_of_frames(display, planes, HologramOptions())
+    seen = []
+
+    def watched(display, targets, *rest, **more):
+        seen.append((display.slm_shape, [target.z_mm for target in targets]))
+        return HologramModel(display, targets, *rest, **more)
+
+    monkeypatch.setattr("recon.holography.limit.HologramModel", watched)
+    monkeypatch.setattr("recon.holography.limit.SMALL_DEEP", 48 * 64 // 4)
+    part = gain_of_frames(display, planes, HologramOptions())
+    assert seen[0] == ((24, 32), [0.0, 32.0])
+    assert 0 < part == pytest.approx(whole, abs=3.0)
+    assert np.isnan(gain_of_frames(replace(display, distance_mm=500.0), planes, HologramOptions()))
+    monkeypatch.setattr("recon.holography.limit.MOST_DEEP", 10)
+    far = [planes[0], replace(planes[1], z_mm=200.0)]
+    assert np.isnan(gain_of_frames(display, far, HologramOptions()))
