@@ -105,8 +105,10 @@ def _(o: Operator) -> None:
 @step("it is turned")
 def _(o: Operator) -> None:
     panel = o.panel("reconstructions")
+    upright = panel.picture.orientation
+    assert upright.quarters == 2, "a simulated bench's"
     panel.picture.turn.menu().actions()[0].trigger()
-    o.wait(lambda: panel.picture.orientation.quarters == 1)
+    o.wait(lambda: panel.picture.orientation == upright.turned(1))
 
 
 @step("it is exported as a picture")

@@ -37,6 +37,7 @@ def test_export_writes_values_and_views(qtbot: QtBot, panel: ReconstructionsPane
     panel.open(tmp_path / "p.tif")
     qtbot.waitUntil(lambda: panel.result is not None, timeout=WAIT_MS)
     turns = {action.text(): action for action in panel.picture.turn.menu().actions()}
+    turns["As on the sensor"].trigger()
     turns["Turn left"].trigger()
     turns["Mirror left and right"].trigger()
     export("out.npy")

@@ -138,7 +138,7 @@ def test_another_scene_does_not_mix_with_a_chart(tmp_path):
         (("--size", 40, "--hologram", "leaves"), "Did you mean root hologram ...?"),
         (("--calibrations", "-c", "a", "-c", "b"), "Did you mean root calibrations ...?"),
         (("-c", "a", "--image", "i"), "Did you mean root photograph ...?"),
-        (("scene", "bead"), "not known"),
+        (("scene", "bead"), "Did you mean 'beads'?"),
         (("photograph", "--image", "x.tif"), "either --psf FILE or --calibration FOLDER"),
         (("photograph", "--psf", "p"), "--image FILE"),
         (("photograph", "--psf", "p", "--image", "i", "--volume", "v"), "do not apply: --psf"),
