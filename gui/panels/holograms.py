@@ -31,7 +31,7 @@ from gui.widgets.building import Hint, button, fill, in_column, in_row, scrolled
 from gui.widgets.dialogues import choose_path
 from gui.widgets.hologram_views import WEIGHTS_SHAPE, HologramViews, WeightsMode
 from instrument.bench.config_file import TEMPLATES
-from instrument.display.hologram import depth_limit_mm, expansion_side, field_picture
+from instrument.display.hologram import crop_words, depth_limit_mm, expansion_side, field_picture
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from recon.base.declare import expression, option, options_of
@@ -347,24 +347,27 @@ class HologramsPanel(Panel):
             return  # refused at its field
         self._suggest_out()
 
-        def read() -> tuple[object, npt.NDArray[Any]] | str | None:
+        def read() -> tuple[object, npt.NDArray[Any], str] | str | None:
             try:
                 wanted = (path, path.stat().st_mtime_ns, fit, srgb)
                 if wanted == self._target_shown:
                     return None
-                return wanted, field_picture(read_image(path).pixels, fit=fit, srgb=srgb)
+                pixels = read_image(path).pixels
+                return wanted, field_picture(pixels, fit=fit, srgb=srgb), crop_words(pixels, fit)
             except (BenchError, InputError, OSError) as error:
                 return str(error)
 
         self._reader.ask(read, self._target_read)
 
-    def _target_read(self, read: tuple[object, npt.NDArray[Any]] | str | None) -> None:
+    def _target_read(self, read: tuple[object, npt.NDArray[Any], str] | str | None) -> None:
         if isinstance(read, str):
             self._target_shown = None
             self.form.refuse("picture", read)
             self.refused(None, read)
         elif read is not None:
-            self._target_shown, target = read
+            self._target_shown, target, cropped = read
+            if cropped:
+                self.session.log("info", cropped)
             self.target.show_target(target)
             self.shown.setCurrentWidget(self.views)
 

@@ -239,15 +239,19 @@ def field_picture(
     return _to_white(image.mean(axis=2) if image.ndim == 3 else image)
 
 
-def crop_words(pixels: npt.NDArray[Any], fit: Fit) -> str:
-    """Say what of a picture is not shown; empty where all of it is."""
+def crop_words(
+    pixels: npt.NDArray[Any],
+    fit: Fit,
+    otherwise: str = "--fit contain shows all of it, --fit stretch stretches it",
+) -> str:
+    """Say what of a picture is not shown, and what shows it; empty where all of it is shown."""
     height, width = pixels.shape[:2]
     if fit != "cover" or height == width:
         return ""
     side = min(height, width)
     return (
         f"The field is square: the middle {side} x {side} of the picture's {height} x {width} pixels are "
-        "shown (--fit contain shows all of it, --fit stretch stretches it)."
+        f"shown ({otherwise})."
     )
 
 

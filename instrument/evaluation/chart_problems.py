@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import bench_display, prepare_target, slm_size
+from instrument.display.hologram import bench_display, crop_words, prepare_target, slm_size
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.files.sample_images import SAMPLES
@@ -23,6 +23,7 @@ from recon.evaluation.chart_reconstruction import ChartProblem
 from recon.evaluation.own_calibrations import OwnCalibration, OwnCalibrationsProblem
 from recon.evaluation.scene import make_scene
 
+_SQUARE = "a square one is shown whole"
 EXPANSIONS = (4, 16)
 """Charted beside the bench's own."""
 
@@ -155,6 +156,7 @@ def problem_of_pictures(
         "z_mm": depths,
         "bench": config.label,
         "expansions": factors,
+        "cropped": next(filter(None, (crop_words(pixels, "cover", _SQUARE) for pixels in read)), None),
         "simulated": True,
     }
     return HologramProblem(displays, targets, tuple(sorted(set(frames)))), about

@@ -175,6 +175,8 @@ def hologram(desk: Desk, subject: HologramChart, bench: BenchFile, files: ChartF
 
     about = subject.targets, subject.z_mm, subject.expansion, subject.frames, subject.slm
     problem, facts = problem_of_pictures(bench_of(desk, bench), *about)
+    if facts["cropped"]:
+        desk.warn(facts["cropped"])
     done = _charted(desk, problem, facts, files)
     _tell_limits(desk, problem)
     return done

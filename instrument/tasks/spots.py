@@ -8,7 +8,13 @@ from pathlib import Path
 from typing import Annotated
 
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import bench_display, load_alignment, prepare_target, slm_size
+from instrument.display.hologram import (
+    bench_display,
+    crop_words,
+    load_alignment,
+    prepare_target,
+    slm_size,
+)
 from instrument.display.hologram_files import HologramFiles
 from instrument.display.limit import (
     at_most,
@@ -123,7 +129,10 @@ def limit(
     display = options.display_of(bench_display(config, slm_size(config), expansion=options.expansion))
     if inputs.alignment is not None:
         display = load_alignment(inputs.alignment).of(display)
-    return tell_limit(desk, read_image(picture.target).pixels, display, options, inputs.depths(1)[0])
+    pixels = read_image(picture.target).pixels
+    if said := crop_words(pixels, options.fit):
+        desk.warn(said)
+    return tell_limit(desk, pixels, display, options, inputs.depths(1)[0])
 
 
 @task(subject="spots", needed=("spots",))

@@ -336,6 +336,9 @@ def test_the_target_is_shown_as_it_fills_the_field(
     panel.form.widgets["fit"].setCurrentText("stretch")
     qtbot.waitUntil(lambda: panel.target.image.shape == picture.shape, timeout=WAIT_MS)
     np.testing.assert_allclose(panel.target.image, picture)
+    with qtbot.waitSignal(panel.session.logged, timeout=WAIT_MS) as said:
+        panel.form.widgets["fit"].setCurrentText("cover")
+    assert "the middle 80 x 80 of the picture's 80 x 120 pixels are shown" in said.args[1]
 
 
 @pytest.mark.parametrize("how", ["the panel's Stop", "STOP"])

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from instrument.bench.config_file import parse_config, template
 from instrument.cli import COMMANDS
+from instrument.evaluation.chart_problems import problem_of_pictures
+from instrument.files.images import write_image
 from instrument.reconstruction.job import Job
 from instrument.tasks import chart as module
 from recon import Calibration, NoiseModel
@@ -213,6 +216,15 @@ def test_holograms_are_charted(monkeypatch, tmp_path):
     )
     assert (tmp_path / "chart.png").stat().st_size > 5000
     assert "middle_psnr_db" in (tmp_path / "chart.html").read_text()
+
+
+def test_what_a_chart_of_holograms_leaves_out_of_a_picture_is_told(tmp_path):
+    write_image(tmp_path / "wide.png", np.add.outer(np.arange(40), np.arange(60)).astype(np.uint8))
+    config = parse_config(template("display"), None)
+    asked = {"z_mm": (), "expansions": (1,), "frames": (1,), "slm": (16, 24)}
+    _, about = problem_of_pictures(config, [str(tmp_path / "wide.png")], *asked.values())
+    assert "the middle 40 x 40 of the picture's 40 x 60 pixels are shown" in about["cropped"]
+    assert problem_of_pictures(config, ["leaves"], *asked.values())[1]["cropped"] is None
 
 
 def test_a_setting_ends_when_the_program_was_killed(monkeypatch):
