@@ -98,6 +98,7 @@ def test_isotropic_and_anisotropic_values():
     assert TotalVariation(3.0).value(x) == pytest.approx(12)
     assert TotalVariation(3.0, isotropic=True).value(x) == pytest.approx(3 * (2 + np.sqrt(2)))
     assert HaarTotalVariation(3.0).value(x) == pytest.approx(12)
+    assert HaarTotalVariation(3.0).value(x * 0 + 1) == 0
 
 
 def test_total_variation_with_nothing_to_do():
@@ -228,5 +229,10 @@ def test_the_prox_ends_at_every_fifth_step_once_its_gap_is_small_enough(isotropi
     for tolerance in (1e-3, 1e-5, 1e-7):
         accepted = found(tolerance=tolerance, max_inner=5000)
         assert (objective(accepted) - best) / size <= tolerance
-    loose = found(tolerance=30 * off[1], max_inner=5000)
-    assert any(np.allclose(loose, step, atol=1e-12) for step in steps[:2])
+    every_fifth = [beck_teboulle(plain, x, 0.8, n, np.zeros((2, *x.shape)))[0] for n in range(5, 61, 5)]
+    ended = set()
+    for tolerance in np.geomspace(1e-1, 1e-3, 9):
+        accepted = found(tolerance=tolerance, max_inner=5000)
+        ended |= {n for n, step in enumerate(every_fifth) if np.allclose(accepted, step, atol=1e-12)}
+        assert any(np.allclose(accepted, step, atol=1e-12) for step in every_fifth)
+    assert len(ended) > 1
