@@ -26,6 +26,7 @@ from instrument.files.image_folders import images_in, in_order, order_in_words
 from instrument.files.named_arrays import is_zarr, read_zarr
 from instrument.files.ome_tiff import (
     MICROMETRES,
+    MOST_PLANES,
     depths_in_words,
     depths_um,
     facts_of,
@@ -229,7 +230,8 @@ def _depths(tiff: tifffile.TiffFile) -> dict[str, Any]:
     else:
         stack = tiff.imagej_metadata or {}
         unit, step = MICROMETRES.get(str(stack.get("unit", "?"))), stack.get("spacing")
-        told = [unit * float(step) * z for z in range(int(stack.get("slices", 0)))] if unit and step else []
+        count = min(int(stack.get("slices", 0)), MOST_PLANES)
+        told = [unit * float(step) * z for z in range(count)] if unit and step else []
     return {"depths_um": told} if told else {}
 
 

@@ -19,6 +19,8 @@ from instrument.files import reading
 SUFFIXES = (".ome.tif", ".ome.tiff")
 """Names that ask for OME-TIFF."""
 NAMESPACE = "diffuserbench"
+MOST_PLANES = 100_000
+"""A damaged file may say any number."""
 MICROMETRES = {
     "": 1.0, "nm": 1e-3, "um": 1.0, "µm": 1.0, "μm": 1.0, "\\u00B5m": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6,
     "micron": 1.0, "microns": 1.0, "micrometer": 1.0, "nanometer": 1e-3, "millimeter": 1e3,
@@ -100,7 +102,7 @@ def depths_um(description: str) -> list[float]:
     """
     pixels = next(iter(_parts(description, "Pixels")), None)
     n_z = 0 if pixels is None else int(pixels.get("SizeZ", "1"))
-    if pixels is None or not 1 < n_z <= reading.MOST_TEXT_BYTES:
+    if pixels is None or not 1 < n_z <= MOST_PLANES:
         return []
     places: dict[int, float] = {}
     for plane in _parts(pixels, "Plane"):

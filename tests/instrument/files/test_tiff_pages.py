@@ -13,6 +13,7 @@ import tifffile
 
 from instrument.files.errors import FileError
 from instrument.files.images import image_metadata, read_image, read_stack
+from instrument.files.ome_tiff import depths_um
 from instrument.files.tiff_pages import open_tiff
 from instrument.files.volumes import open_volume
 
@@ -49,3 +50,11 @@ def test_pages_that_end_are_read(tmp_path: Path, byteorder: str, *, bigtiff: boo
     tifffile.imwrite(path, PAGES, metadata=None, **kind)
     with open_tiff(path) as file:
         np.testing.assert_array_equal(file.asarray(), PAGES)
+
+
+def test_planes_that_a_damaged_description_promises_are_not_counted() -> None:
+    described = '<OME><Pixels SizeZ="{}" PhysicalSizeZ="2"/></OME>'
+    assert depths_um(described.format(3)) == [0.0, 2.0, 4.0]
+    assert depths_um(described.format(10**14)) == []
+    with pytest.raises(ValueError, match="no XML"):
+        depths_um("{}")
