@@ -10,8 +10,10 @@ exactly.
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from recon.base import fft
+from recon.base.namespace import Namespace, to_host
 from recon.camera.base import Array
 
 EXACT_MODES = 18
@@ -20,51 +22,72 @@ EXACT_MODES = 18
 BANDWIDTH = 4
 """Frequencies up to this multiple of the highest exact mode's are summed for their matrix."""
 
+NEARLY = 0.01
+"""Change of the share that a background takes from which on a preconditioner follows."""
+
 
 class CosinePreconditioner:
-    """Approximate inverse of ``I + C F^-1 q F C^T`` for one channel, symmetric and positive.
+    """Approximate inverse of ``I + W C F^-1 s q F C^T W`` for one channel, symmetric and positive.
 
-    Here ``q = power / (separable + differences |Psi|^2)`` and ``C`` crops to the sensor. In the sensor's
-    cosine basis the inverse is taken as ``1 / (1 + q)``, diagonal (Chan's optimal diagonal, from the
-    autocorrelation times the overlap of the sensor with itself shifted) but for the block of the lowest
-    modes, which is exact.
+    ``C`` crops to the sensor, ``W`` lets the lowest of its cosine modes count less, as a smooth background
+    that is estimated as well does, and ``s`` is a number. In the sensor's cosine basis the inverse is taken
+    as ``1 / (1 + s q)``, diagonal (Chan's optimal diagonal, from the autocorrelation times the overlap of the
+    sensor with itself shifted) but for the block of the lowest modes, which is exact.
 
     Parameters
     ----------
-    power : ndarray, (grid_height, grid_width // 2 + 1)
-        ``|H|^2`` of the camera's transfer function.
     grid_shape, sensor_shape : (int, int)
+    dtype : dtype
+    xp : module
+        Whose arrays: ``numpy`` or ``cupy``.
     """
 
-    def __init__(self, power: Array, grid_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> None:
-        dtype = power.dtype
-        self._modes = np.empty(sensor_shape, dtype)
-        self._symbol = _cosine_symbol(power, grid_shape, sensor_shape)
-        rows, columns = (laplacian_eigenvalues(2 * n)[:n] for n in sensor_shape)
-        self._laplacian = (rows[:, None] + columns[None]).astype(dtype)
-        self._low = _LowModes(power, grid_shape, sensor_shape)
+    def __init__(
+        self,
+        grid_shape: tuple[int, int],
+        sensor_shape: tuple[int, int],
+        dtype: npt.DTypeLike,
+        xp: Namespace = np,
+    ) -> None:
+        self._xp, self._shapes = xp, (grid_shape, sensor_shape)
+        self._modes: Array = xp.empty(sensor_shape, dtype)
+        self._low = _LowModes(grid_shape, sensor_shape)
         self._weights = np.ones(self._low.counts)
-        self._gain = np.ones(sensor_shape, dtype)
-        self._low_gain = np.eye(self._low.size, dtype=dtype)
+        self._symbol: Array = xp.zeros((1, 1), dtype)
+        self._near: Array = np.zeros((self._low.size, self._low.size))
+        self._scale: float | None = None
 
     def weigh(self, shape: tuple[int, int], weight: float) -> None:
-        """Have so many of the lowest modes count less from the next penalties on: ``I + W C q C^T W``."""
+        """Have so many of the lowest modes count less from the next scale or penalties on."""
         self._weights[: shape[0], : shape[1]] = weight
+        self._scale = None
 
-    def set_penalties(self, differences: float, separable: float) -> None:
-        """Adapt to ``T = separable + differences |Psi|^2``."""
+    def set_curvature(self, q: Array) -> None:
+        """Give ``q``, real, on the half spectrum; it is not kept."""
+        q = to_host(q)
+        self._symbol = self._xp.asarray(_cosine_symbol(q, *self._shapes))
+        self._near = self._low.block(self._low.near(q))
+        self._scale = None
+
+    def set_scale(self, scale: float) -> None:
+        """Set ``s``."""
+        if scale == self._scale:
+            return
+        self._scale = scale
+        gain = self._symbol * self._symbol.dtype.type(scale)
+        gain += 1
+        self._gain = 1 / gain
+        self._set_low(scale * self._near)
+
+    def _set_low(self, block: Array) -> None:
+        """Invert ``1 +`` the lowest modes' block."""
         from scipy.linalg import lapack
 
-        dtype = self._gain.dtype
-        np.multiply(self._laplacian, dtype.type(differences), out=self._gain)
-        self._gain += dtype.type(separable)
-        # 1 / (1 + symbol / T)
-        np.divide(self._gain, self._gain + self._symbol, out=self._gain)
         weights = self._weights.ravel()
-        block = self._low.block(differences, separable) * weights * weights[:, None]
-        factor, _ = lapack.dpotrf(np.eye(len(block)) + block, lower=1)
+        factor, _ = lapack.dpotrf(np.eye(len(block)) + block * weights * weights[:, None], lower=1)
         inverse, _ = lapack.dpotri(factor, lower=1)  # its lower half, in 0.4 of a general inverse's time
-        self._low_gain = (np.tril(inverse) + np.tril(inverse, -1).T).astype(dtype)
+        whole = (np.tril(inverse) + np.tril(inverse, -1).T).astype(self._modes.dtype)
+        self._low_gain = self._xp.asarray(whole)
 
     def apply(self, r: Array, out: Array) -> Array:
         """Write the preconditioned residual into ``out``."""
@@ -76,20 +99,50 @@ class CosinePreconditioner:
         return fft.idct(modes, out)
 
 
+class PicturePreconditioner(CosinePreconditioner):
+    """The same for ``q = power / T`` with ``T = separable + differences |Psi|^2``, whose penalties change.
+
+    The diagonal is that of the power over T's own: a change of penalties costs no transform.
+
+    Parameters
+    ----------
+    power : ndarray, (grid_height, grid_width // 2 + 1)
+        ``|H|^2`` of the camera's transfer function.
+    grid_shape, sensor_shape : (int, int)
+    """
+
+    def __init__(self, power: Array, grid_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> None:
+        super().__init__(grid_shape, sensor_shape, power.dtype)
+        self._symbol = _cosine_symbol(power, grid_shape, sensor_shape)
+        rows, columns = (laplacian_eigenvalues(2 * n)[:n] for n in sensor_shape)
+        self._laplacian = (rows[:, None] + columns[None]).astype(power.dtype)
+        self._power = self._low.near(power)
+        self._gain = np.ones(sensor_shape, power.dtype)
+
+    def set_penalties(self, differences: float, separable: float) -> None:
+        """Adapt to ``T``."""
+        dtype = self._gain.dtype
+        np.multiply(self._laplacian, dtype.type(differences), out=self._gain)
+        self._gain += dtype.type(separable)
+        # 1 / (1 + symbol / T)
+        np.divide(self._gain, self._gain + self._symbol, out=self._gain)
+        self._set_low(self._low.block(self._power / (separable + differences * self._low.laplacian)))
+
+
 def laplacian_eigenvalues(n: int) -> Array:
     """Eigenvalues of the wrapped second difference over ``n`` pixels: ``4 sin^2(pi k / n)``."""
     eigenvalues: Array = 4 * np.sin(np.pi * np.arange(n) / n) ** 2
     return eigenvalues
 
 
-def _cosine_symbol(power: Array, grid_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> Array:
-    """Diagonal of ``Phi C F^-1 power F C^T Phi^T`` up to the coupling of mirrored modes."""
+def _cosine_symbol(q: Array, grid_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> Array:
+    """Diagonal of ``Phi C F^-1 q F C^T Phi^T`` up to the coupling of mirrored modes."""
     (grid_height, grid_width), (height, width) = grid_shape, sensor_shape
-    autocorrelation = fft.irfft(power.astype(fft.complex_dtype(power.dtype)), grid_width)
-    overlap = np.zeros((2 * height, 2 * width), power.dtype)
+    autocorrelation = fft.irfft(q.astype(fft.complex_dtype(q.dtype)), grid_width)
+    overlap = np.zeros((2 * height, 2 * width), q.dtype)
     rows, row_share = _lags(height, grid_height)
     columns, column_share = _lags(width, grid_width)
-    shares = np.outer(row_share, column_share).astype(power.dtype)
+    shares = np.outer(row_share, column_share).astype(q.dtype)
     overlap[np.ix_(rows, columns)] = (
         shares * autocorrelation[np.ix_(rows % grid_height, columns % grid_width)]
     )
@@ -108,28 +161,30 @@ def _lags(n: int, grid: int) -> tuple[Array, Array]:
 class _LowModes:
     """The matrix of ``C q C^T`` between the lowest cosine modes, summed over the frequencies near them."""
 
-    def __init__(self, power: Array, grid_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> None:
+    def __init__(self, grid_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> None:
         self.counts = (min(EXACT_MODES, sensor_shape[0]), min(EXACT_MODES, sensor_shape[1]))
         self.size = self.counts[0] * self.counts[1]
-        pairs, frequencies = zip(
+        self._pairs, (fy, fx) = zip(
             *(_mode_pairs(*args) for args in zip(self.counts, sensor_shape, grid_shape, strict=True)),
             strict=True,
         )
-        self._pairs = pairs
         # The half spectrum holds q(-f) for f in its other half: q is even.
-        fy, fx = frequencies
         sign = np.where(fx < 0, -1, 1)
-        self._power = power[(sign[None] * fy[:, None]) % grid_shape[0], np.abs(fx)[None]].astype(np.float64)
-        self._laplacian = (
+        self._at = (sign[None] * fy[:, None]) % grid_shape[0], np.abs(fx)[None]
+        self.laplacian = (
             laplacian_eigenvalues(grid_shape[0])[fy][:, None] + laplacian_eigenvalues(grid_shape[1])[fx][None]
         )
         self._scale = 1.0 / (grid_shape[0] * grid_shape[1])
 
-    def block(self, differences: float, separable: float) -> Array:
-        """Return the matrix, (n_modes, n_modes), float64."""
-        q = self._power / (separable + differences * self._laplacian)
+    def near(self, q: Array) -> Array:
+        """Return the values of a half spectrum at these frequencies."""
+        values: Array = q[self._at].astype(np.float64)
+        return values
+
+    def block(self, near: Array) -> Array:
+        """Return the matrix of ``q`` near, (n_modes, n_modes), float64."""
         (ky, kx), (rows, columns) = self.counts, self._pairs
-        block = (rows @ q @ columns.T).real * self._scale
+        block = (rows @ near @ columns.T).real * self._scale
         symmetric: Array = block.reshape(ky, ky, kx, kx).transpose(0, 2, 1, 3).reshape(self.size, self.size)
         return 0.5 * (symmetric + symmetric.T)
 

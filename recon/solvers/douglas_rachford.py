@@ -173,7 +173,12 @@ class DouglasRachford(VolumeSplitting):
     def _allocate(self) -> None:
         """Make what an iteration works with."""
         require_memory(self.xp, _VOLUMES * self.operator.dtype.itemsize * int(self.z.size))
-        self._power = self.xp.asarray(self.operator.power()[0])
+        self._set_power(self.xp.asarray(self.operator.power()[0]))
+
+    def _set_power(self, power: Array) -> None:
+        """Give ``sum_z |H_z|^2`` of the planes that take part."""
+        self._power = power
+        self.system.set_curvature(power)
 
     def _sweep(self) -> tuple[Array, Array]:
         """Update z; return the transform of what the sensor sees of it, and the sums of :meth:`step`."""
@@ -223,7 +228,7 @@ class DouglasRachford(VolumeSplitting):
 
     def _solve_data_term(self, forward_z: Array) -> None:
         """Solve for e from ``A z``, masked."""
-        self.system.set_curvature(self._power * self._power.dtype.type(self._used_gamma))
+        self.system.set_scale(self._used_gamma)
         self.system.solve(self.data - forward_z, self.e)
 
     def set_data(self, data: SensorData) -> None:
@@ -293,7 +298,7 @@ class SparseDouglasRachford(DouglasRachford):
         self._planes = np.flatnonzero(self.watch.active)
         self._groups = PlaneGroups(len(self._planes))
         whole = self.watch.active.all()
-        self._power = self.operator.power(None if whole else (int(z) for z in self._planes))[0]
+        self._set_power(self.operator.power(None if whole else (int(z) for z in self._planes))[0])
 
     def _leave_out(self) -> None:
         """Leave out what has been empty for long."""

@@ -144,7 +144,7 @@ class OperatorAdmm(ExactAdmm):
         """Make what T depends on follow kappa."""
         self._pixels = float(self.kappa) * len(self.splits)  # what the splits of x itself add to T
         self._eigenvalues = None if self._weights is None else self._laplacian(self._weights)
-        self._q = self._power / self._lateral_eigenvalues(self._weights)
+        self.system.set_curvature(self._power / self._lateral_eigenvalues(self._weights))
 
     def _laplacian(self, weights: Array) -> Array:
         """Eigenvalues of T under cosine transforms."""

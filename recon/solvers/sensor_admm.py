@@ -39,7 +39,7 @@ from recon.camera.factors import BackgroundRemoval, Erasures
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import IterationRecord
-from recon.solvers.cosine_preconditioner import CosinePreconditioner, laplacian_eigenvalues
+from recon.solvers.cosine_preconditioner import NEARLY, PicturePreconditioner, laplacian_eigenvalues
 from recon.solvers.prior_splits import PictureSplitting
 
 BALANCING = (3, 6, 12, 24, 48, 96, 192)
@@ -66,9 +66,6 @@ IMPUTATION = 1.5
 
 LEAST_SHARE = 0.05
 """Share of valid pixels from which a local mean is worth taking."""
-
-NEARLY = 0.01
-"""Change of the share that a background takes from which on the preconditioner follows."""
 
 FIRST_DATA_STEPS = 4
 """Conjugate gradient steps of the first iteration, whose start is nowhere near."""
@@ -143,7 +140,7 @@ class SensorAdmm(PictureSplitting):
         self._row_sums = np.zeros(grid[0])
         power = camera.power()
         self._preconditioners = [
-            CosinePreconditioner(power[c % len(power)], grid, camera.sensor_shape) for c in range(len(start))
+            PicturePreconditioner(power[c % len(power)], grid, camera.sensor_shape) for c in range(len(start))
         ]
         # What the first guess of the penalties needs to know of each channel's |H|^2.
         self._mean_power = power.mean(axis=(1, 2), dtype=np.float64)

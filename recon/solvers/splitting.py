@@ -19,6 +19,7 @@ from recon.camera.base import Array
 from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
 from recon.solvers.base import Solver
+from recon.solvers.cosine_preconditioner import NEARLY, CosinePreconditioner
 from recon.solvers.memory import Storage
 from recon.solvers.moving import move_spectra
 
@@ -35,8 +36,11 @@ class SensorSystem:
     frequency: a two-dimensional problem however many planes there are. Erasures are part of ``C`` and cost
     nothing.
 
-    The preconditioner ``C F^-1 1 / (1 + q / 2) F C^T`` is the inverse for a sensor that covers half the grid.
-    Smooth light of which a restrained background leaves little hardly bends: it is its own.
+    Conjugate gradients are preconditioned in the sensor's cosine modes, of which a smooth background takes
+    the lowest (:class:`~recon.solvers.cosine_preconditioner.CosinePreconditioner`). A camera that is no
+    convolution does not have the power at its lowest frequencies that the central one has, which that inverse
+    takes for exact: there ``C F^-1 1 / (1 + q / 2) F C^T`` serves, the inverse for a sensor that covers half
+    the grid, and smooth light of which a restrained background leaves little is its own.
 
     Parameters
     ----------
@@ -77,14 +81,19 @@ class SensorSystem:
         self.max_steps = MOST_STEPS
         self._operator_bend = bend
         self.dtype = np.dtype(dtype)
+        self._adapted_to: float | None = None
+        self._cosine: CosinePreconditioner | None = None
+        if bend is None:
+            shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
+            self._cosine = CosinePreconditioner(grid_shape, shape, self.dtype, xp)
         self.set_background(measured.background)
         self._mask = None if valid is None or valid.all() else xp.asarray(valid.astype(self.dtype))
         # The grid's rows that hold the sensor; no others are ever transformed to or from real space.
         rows = (1, window[0].stop - window[0].start, grid_shape[1])
         self._cast, self._seen = xp.zeros(rows, self.dtype), xp.empty(rows, self.dtype)
         self._spectrum = xp.empty(fft.spectrum_shape(grid_shape), fft.complex_dtype(self.dtype))
-        self._q = xp.zeros(fft.spectrum_shape(grid_shape), self.dtype)
-        self._preconditioner = xp.ones_like(self._q)
+        self._q: Array = xp.zeros(fft.spectrum_shape(grid_shape), self.dtype)
+        self._scale = 0.0
         self.steps = 0
 
     def set_background(self, background: BackgroundRemoval | None) -> None:
@@ -92,11 +101,22 @@ class SensorSystem:
         xp = self.xp
         self._basis = None if background is None else [xp.asarray(part) for part in background.basis(0)]
         self._taken = 1.0 if background is None else background.taken
+        if background is None or self._cosine is None:
+            return
+        if self._adapted_to is None or abs(self._taken - self._adapted_to) > NEARLY:
+            rows, columns, _ = background.basis(0)
+            self._cosine.weigh((len(rows), len(columns)), 1 - self._taken)
+            self._adapted_to = self._taken
 
     def set_curvature(self, q: Array) -> None:
-        """Give ``q``, real, on the half spectrum."""
-        self._q[...] = q
-        self.xp.divide(1.0, 1.0 + 0.5 * q, out=self._preconditioner)
+        """Give ``q`` but for a factor, real, on the half spectrum; it is kept as it is."""
+        self._q = q
+        if self._cosine is not None:
+            self._cosine.set_curvature(q)
+
+    def set_scale(self, scale: float) -> None:
+        """Give the factor of ``q``: a penalty's reciprocal, or a step."""
+        self._scale = scale
 
     def follow(self, progress: float) -> None:
         """Set the tolerance by how far the solver around it has still to go (a relative residual).
@@ -151,11 +171,32 @@ class SensorSystem:
 
     def _bend(self, e: Array) -> Array:
         """``C q C^T e``."""
-        return (
-            self._filtered(e, self._q)
-            if self._operator_bend is None
-            else self.masked(self._operator_bend(self.weighed(e)))
-        )
+        if self._operator_bend is not None:
+            return self.masked(self._operator_bend(self.weighed(e)))
+        bent = self._filtered(e, self._q)
+        bent *= bent.dtype.type(self._scale)
+        return bent
+
+    def _adapt(self) -> None:
+        """Have the preconditioner follow ``q`` and its factor."""
+        if self._cosine is not None:
+            self._cosine.set_scale(self._scale)
+        else:
+            self._inverse = 1 / (1 + self._q * self._q.dtype.type(0.5 * self._scale))
+
+    def _preconditioned(self, residual: Array) -> Array:
+        """Return a residual times an approximate inverse, on the valid pixels."""
+        if self._cosine is None:
+            z = self._filtered(residual, self._inverse)
+            if self._taken < 1:
+                z += self._smooth(residual)
+        else:
+            z = self._cosine.apply(residual, self.xp.empty_like(residual))
+        if self._taken == 1:
+            return self.masked(z)
+        if self._mask is not None:  # light that no pixel measures would have to be taken back
+            z *= self._mask
+        return z
 
     def solve(self, right: Array, e: Array) -> None:
         """Improve ``e`` in place until the residual is down to the tolerance."""
@@ -164,16 +205,13 @@ class SensorSystem:
         if not np.isfinite(target):
             e[...] = np.nan
             return
+        self._adapt()
         residual = right - e - self._bend(e)
         direction = xp.zeros_like(e)
         rho = 1.0
         self.steps = 0
         while float(xp.linalg.norm(residual)) > target and self.steps < self.max_steps:
-            z = self._filtered(residual, self._preconditioner)
-            if self._taken < 1:
-                smooth = self._smooth(residual)
-                # On valid pixels only, as all else: light that no pixel measures would have to be taken back.
-                z += smooth if self._mask is None else smooth * self._mask
+            z = self._preconditioned(residual)
             rho, rho_before = float(xp.vdot(residual, z)), rho
             if not rho > 0:  # what is left is less than the arithmetic can tell
                 break

@@ -51,7 +51,6 @@ class LeanTotalVariation(VolumeAdmm):
         self.g = zeros((nz, *fft.spectrum_shape((ny, nx))), fft.complex_dtype(dtype))
         self._dy2, dx2 = (laplacian_eigenvalues(n).astype(dtype) for n in (ny, nx))
         self._dx2 = dx2[: nx // 2 + 1].copy()
-        self._q = np.empty(self.g.shape[1:], dtype)
         self._prepare_transfer()
         self.X = zeros(self.g.shape, self.g.dtype)
         self.S = zeros((nz, ny, 4, nx), dtype)
@@ -68,6 +67,7 @@ class LeanTotalVariation(VolumeAdmm):
     def _prepare_transfer(self) -> None:
         k = self._kernels
         nz, ny, nxh = self.g.shape
+        q = np.empty((ny, nxh), self.operator.dtype)
         for z in range(nz):
             self.operator.transfer_plane(z, out=self.g[z])
 
@@ -75,16 +75,17 @@ class LeanTotalVariation(VolumeAdmm):
             ratio = self._ratios()
             row = np.empty((nz, nxh), self.g.dtype)
             k.solve_transfer_rows(
-                self.g, self.axis_weights, self._dy2, self._dx2, self.kappa, self._q, y0, y1, ratio, row
+                self.g, self.axis_weights, self._dy2, self._dx2, self.kappa, q, y0, y1, ratio, row
             )
 
         in_blocks(job, ny)
+        self.system.set_curvature(q)
 
     def _ratios(self) -> Array:
         """Return a worker's scratch for tiles of equal width: one of a last column costs as many pages."""
         nz, _, columns = self.g.shape
         tiles = max(round(columns / _TILE), 1)
-        return np.zeros((nz + 1, -(-columns // tiles)), self._q.dtype)
+        return np.zeros((nz + 1, -(-columns // tiles)), self.operator.dtype)
 
     @property
     def solution(self) -> Array:

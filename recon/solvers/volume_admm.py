@@ -69,7 +69,6 @@ class ExactAdmm(VolumeSplitting):
     splits: tuple[ProxSplit, ...]
     separable: Separable
     kappa: np.floating[Any]
-    _q: Array
 
     def _begin(self, tv: TotalVariation | None, seen: Array | None, power: Array) -> None:
         """Set out from an object of which the sensor sees so much; ``power``: the data term's curvature."""
@@ -118,7 +117,7 @@ class ExactAdmm(VolumeSplitting):
         """Do one iteration. ``objective`` is that of the iterate before, negative parts aside."""
         seen, sums = self._sweep()
         self._used_penalty = self.penalty
-        self.system.set_curvature(self._q / self.operator.dtype.type(self.penalty))
+        self.system.set_scale(1 / self.penalty)
         self.system.solve(self.data - seen, self.e)
         self._update()
         record = self._record(sums)
@@ -302,7 +301,7 @@ class VolumeAdmm(ExactAdmm):
         self._factorise()
         H = self._transfer
         self.g = self._solve_depths(xp.conj(H))
-        self._q = (H * self.g).real.sum(axis=0)
+        self.system.set_curvature((H * self.g).real.sum(axis=0))
         self.S = xp.zeros((3, *domain[1:]), operator.dtype)
         self.X = fft.rfft(zeros[0])
 

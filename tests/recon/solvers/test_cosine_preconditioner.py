@@ -7,7 +7,12 @@ import pytest
 from scipy.fft import dctn, idctn
 
 from recon.camera.convolution import Convolution
-from recon.solvers.cosine_preconditioner import EXACT_MODES, CosinePreconditioner, laplacian_eigenvalues
+from recon.solvers.cosine_preconditioner import (
+    EXACT_MODES,
+    CosinePreconditioner,
+    PicturePreconditioner,
+    laplacian_eigenvalues,
+)
 
 SEPARABLE, DIFFERENCES = 0.7, 0.3
 
@@ -27,8 +32,27 @@ def seen(
     return camera, power, spread[apart[0], apart[1]]
 
 
-def made(camera: Convolution, power: np.ndarray) -> CosinePreconditioner:
-    return CosinePreconditioner(power, camera.grid_shape, camera.sensor_shape)
+KINDS = ("penalties", "curvature")
+
+
+def made(kind: str, camera: Convolution, weight: float = 1.0) -> CosinePreconditioner:
+    """Return it for a picture's penalties, or for any curvature that comes with a factor; told of both."""
+    power, grid = camera.power()[0], camera.grid_shape
+    if kind == "penalties":
+        picture = PicturePreconditioner(power, grid, camera.sensor_shape)
+        picture.weigh((2, 3), weight)
+        picture.set_penalties(DIFFERENCES, SEPARABLE)
+        return picture
+    rows, columns = (laplacian_eigenvalues(n) for n in grid)
+    general = CosinePreconditioner(grid, camera.sensor_shape, np.float64)
+    general.set_curvature(np.ones_like(power))
+    general.set_scale(5.0)
+    general.set_curvature(4 * power / (SEPARABLE + DIFFERENCES * (rows[:, None] + columns[: power.shape[1]])))
+    general.set_scale(0.3)
+    general.set_scale(0.25)
+    general.weigh((2, 3), weight)
+    general.set_scale(0.25)
+    return general
 
 
 def applied(preconditioner: CosinePreconditioner, sensor: tuple[int, int]) -> np.ndarray:
@@ -43,15 +67,14 @@ def applied(preconditioner: CosinePreconditioner, sensor: tuple[int, int]) -> np
 @pytest.mark.parametrize("sensor", [(6, 9), (1, 8), (11, 7)])
 @pytest.mark.parametrize("weight", [1.0, 0.4])
 @pytest.mark.parametrize("grid", [None, (15, 15)])
+@pytest.mark.parametrize("kind", KINDS)
 def test_where_all_modes_are_exact_it_is_the_inverse(
-    sensor: tuple[int, int], weight: float, grid: tuple[int, int] | None
+    sensor: tuple[int, int], weight: float, grid: tuple[int, int] | None, kind: str
 ) -> None:
-    camera, power, matrix = seen(sensor, grid=grid)
-    preconditioner = made(camera, power)
+    camera, _, matrix = seen(sensor, grid=grid)
+    preconditioner = made(kind, camera, weight)
     weights = np.ones(sensor)
     weights[:2, :3] = weight
-    preconditioner.weigh((2, 3), weight)
-    preconditioner.set_penalties(DIFFERENCES, SEPARABLE)
     n = matrix.shape[0]
     basis = dctn(np.eye(n).reshape(n, *sensor), axes=(1, 2), norm="ortho").reshape(n, n)
     lessen = basis @ np.diag(weights.ravel()) @ basis.T
@@ -60,14 +83,18 @@ def test_where_all_modes_are_exact_it_is_the_inverse(
 
 
 @pytest.mark.parametrize("psf", [(4, 5), (20, 25), (27, 31)])
+@pytest.mark.parametrize("kind", KINDS)
 def test_beyond_the_lowest_modes_it_is_chans_diagonal_and_among_them_the_inverse(
-    psf: tuple[int, int],
+    psf: tuple[int, int], kind: str
 ) -> None:
     sensor = (EXACT_MODES + 2, EXACT_MODES + 7)
     camera, power, matrix = seen(sensor, psf)
-    preconditioner = made(camera, power)
-    preconditioner.set_penalties(DIFFERENCES, SEPARABLE)
-    # The autocorrelation times the overlap of the sensor with itself shifted, seen by each mode's cosine.
+    preconditioner = made(kind, camera)
+    # The autocorrelation times the overlap of the sensor with itself shifted, seen by each mode's cosine: of
+    # the whole curvature, or for a picture of the power alone, over the restraint of each mode.
+    if kind == "curvature":
+        rows, columns = (laplacian_eigenvalues(n) for n in camera.grid_shape)
+        power = power / (SEPARABLE + DIFFERENCES * (rows[:, None] + columns[: power.shape[1]]))
     spread = np.fft.irfft2(power, camera.grid_shape)
     cosines, curvatures = [], []
     for n, grid in zip(sensor, camera.grid_shape, strict=True):
@@ -79,7 +106,7 @@ def test_beyond_the_lowest_modes_it_is_chans_diagonal_and_among_them_the_inverse
     (y, by_row), (x, by_column) = cosines
     symbol = by_row @ spread[np.ix_(y % camera.grid_shape[0], x % camera.grid_shape[1])] @ by_column.T
     restraint = SEPARABLE + DIFFERENCES * (curvatures[0][:, None] + curvatures[1])
-    gain = restraint / (restraint + symbol)
+    gain = 1 / (1 + symbol) if kind == "curvature" else restraint / (restraint + symbol)
     found = np.array([
         dctn(preconditioner.apply(idctn(mode, norm="ortho"), np.empty(sensor)), norm="ortho")[at]
         for at in np.ndindex(sensor) if max(at) >= EXACT_MODES

@@ -15,7 +15,7 @@ from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval, Erasures
 from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation, Zero
 from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules, StopReason, cosine_preconditioner
-from recon.solvers.cosine_preconditioner import CosinePreconditioner
+from recon.solvers.cosine_preconditioner import PicturePreconditioner
 from recon.solvers.prior_splits import PriorSplits
 from recon.solvers.sensor_admm import fill_smoothly
 
@@ -230,7 +230,7 @@ def system_matrix(camera, mu):
 
 
 def preconditioner_matrix(camera, mu):
-    preconditioner = CosinePreconditioner(camera.power()[0], camera.grid_shape, camera.sensor_shape)
+    preconditioner = PicturePreconditioner(camera.power()[0], camera.grid_shape, camera.sensor_shape)
     preconditioner.set_penalties(*mu)
     units = np.eye(np.prod(camera.sensor_shape)).reshape(-1, *camera.sensor_shape)
     return np.stack([preconditioner.apply(u, np.empty_like(u)).ravel() for u in units], axis=1)
@@ -314,7 +314,7 @@ def test_data_that_are_no_numbers_end_the_run_and_a_direction_that_leads_nowhere
     solver = SensorAdmm(operator, data, NonNegativity())
     for preconditioned in (np.zeros_like, np.negative):  # as rounding may have it where nothing is left
         monkeypatch.setattr(
-            CosinePreconditioner, "apply", lambda _, r, out, f=preconditioned: np.copyto(out, f(r)) or out
+            PicturePreconditioner, "apply", lambda _, r, out, f=preconditioned: np.copyto(out, f(r)) or out
         )
         solver.step()
         assert not solver._e.any()
