@@ -198,3 +198,23 @@ def test_what_is_no_number_is_an_infinite_residual() -> None:
 )
 def test_which_differences_a_volumes_sweeps_have(weights: Any, wrap: Any, lateral: bool) -> None:
     assert is_lateral_periodic(TotalVariation(1.0, axis_weights=weights, wrap=wrap)) == lateral
+
+
+@pytest.mark.parametrize("kind", ["volume", "field"])
+def test_a_start_is_seen_and_what_is_solved_obeys_the_bounds_or_the_first_other_prior(kind: str) -> None:
+    camera: Any = CAMERA if kind == "volume" else FIELD
+    start = np.random.default_rng(8).random(camera.domain_shape)
+    data, tv = SensorData(DATA, VALID), volume_tv() if kind == "volume" else field_tv()
+
+    def made(prior: Any) -> VolumeAdmm | OperatorAdmm:
+        if kind == "volume":
+            return VolumeAdmm(CAMERA, data, prior, initial=start)
+        return OperatorAdmm(FIELD, CENTRAL, data, prior, initial=start)
+
+    free = made(tv + ANOTHER)
+    np.testing.assert_allclose(free.e, (VALID * (DATA - camera.forward(start)))[0], atol=1e-9)
+    np.testing.assert_allclose(iterate(free), start, atol=1e-9)
+    np.testing.assert_array_equal(free._solved, free.splits[1].split)
+    bounded = made(tv + ANOTHER + NonNegativity())
+    np.testing.assert_array_equal(bounded._solved, bounded.splits[0].split)
+    np.testing.assert_array_equal(made(tv)._solved, start)
