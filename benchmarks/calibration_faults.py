@@ -101,7 +101,7 @@ FAULTS = {
     "flicker": Fault(_world("flicker = {0}"), 0.2, "flicker", display=True),
     "drift": Fault(_world("drift_per_min = -{0}"), 0.3, "dimmer|taken out|drift", display=True),
     "vibration": Fault(_world("vibration_px = {0}"), 0.5, "shake", display=True),
-    "creep": Fault(_world("creep_px_per_min = {0}"), 4.0, "moved|creeps", display=True),
+    "creep": Fault(_world("creep_px_per_min = {0}"), 4.0, "moved|moves|creeps", display=True),
     "ambient": Fault(
         _world("ambient_e_per_s = {0}\nambient_period_s = 120"), 4e4, "other light", display=True
     ),

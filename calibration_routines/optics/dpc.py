@@ -31,7 +31,7 @@ from calibration_routines.psf.analysis import DarkModel, ambient_findings, dark_
 from calibration_routines.psf.exposure import expose_light
 from calibration_routines.psf.stage_fit import MAX_PLACE_DRIFT_PX
 from calibration_routines.psf.sweep_plan import DARK
-from calibration_routines.scatter import Scatter, compare, pooled
+from calibration_routines.scatter import Scatter, compare, pooled, scatter_of
 from drivers.led_array import LedArray
 from instrument.bench.bench import Bench
 from instrument.files.atomic import named_by_worth, whole_file
@@ -44,6 +44,7 @@ from instrument.runs.acquire import abilities_of
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from recon.analysis.dpc import SIDES, DpcOptics, deflections_deg, phase_from_halves, slopes_deg
+from recon.base.blocks import block_mean
 from recon.base.declare import RARE, option
 
 if TYPE_CHECKING:
@@ -58,6 +59,8 @@ BANDS = ("red", "green", "blue")
 HEIGHT_FILE = "height_um.npy"
 AGAIN = "again"
 """Label of the first half's frames once more, after the others."""
+_COARSE = 4  # pixels along a block's side
+_SHAKEN_PX = 1.0  # smooth pictures that shake by less change by less than 1 %
 _TARGET = 0.6  # of full scale: halves differ in brightness where the sample deflects
 _COLOURS = ("#00798c", "#d1495b")
 _EDGE_QUANTILE = 0.999  # the largest deflection, less the outliers that noise makes
@@ -186,11 +189,11 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     optics, index = record.optics, record.setup.index
     dark = dark_model(run)
     halves, scatter = _halves(run, dark)
-    first = halves[SIDES[0]]
+    first, shaken = halves[SIDES[0]], scatter.motion_px > _SHAKEN_PX
     findings = (  # each half is brought to its own mean: flicker is none
-        *replace(scatter, flicker=0.0).findings("half"),
+        *replace(scatter, flicker=0.0, motion_px=shaken * scatter.motion_px).findings("half"),
         *ambient_findings(dark.brightening_per_ms * record.exposure_ms / max(float(first.mean()), 1e-9)),
-        *(_moved(run, dark, first) if scatter.averages else ()),  # else noise hides the pictures
+        *(_moved(run, dark, first) if scatter.averages == len(SIDES) else _unlike(record.setup.average)),
     )
     phase = phase_from_halves(halves, optics)
     height = (phase * (1e-3 * optics.wavelength_nm / (2 * np.pi * (index - 1)))).astype(np.float32)
@@ -270,10 +273,30 @@ def _halves(run: Run, dark: DarkModel) -> tuple[dict[str, Image], Scatter]:
     for side in SIDES:
         if np.any((run.images(side) >= full_scale(run)).any(axis=0) & ~dark.hot):
             raise CalibrationError(f"The half {side!r} saturates; lower the light. The run is in {run.path}.")
-        steady = light_of(run, [step.index for step in run.steps(side)], dark)
-        halves[side] = steady.mean
-        scatters.append(steady.scatter)
+        halves[side], scatter = _steady(run, side, dark)
+        scatters.append(scatter)
     return halves, pooled(scatters)
+
+
+def _steady(run: Run, label: str, dark: DarkModel) -> tuple[Image, Scatter]:
+    """Return a half's mean, and how its frames scatter.
+
+    Halves are so smooth that noise hides where single pixels lie: blocks of them tell.
+    """
+    steady = light_of(run, [step.index for step in run.steps(label)], dark)
+    scatter, _ = scatter_of(block_mean(steady.frames, _COARSE))
+    return steady.mean, replace(scatter, motion_px=_COARSE * scatter.motion_px)
+
+
+def _unlike(frames: int) -> tuple[str, ...]:
+    """Return what is to be said of halves whose frames are not found again in one another."""
+    if frames < 2:
+        return ()
+    return (
+        "frames of one half are not found again in one another: the picture moves or shakes by pixels, or "
+        "the light is too little for the sample's contrast. Clamp sample, objective and camera; give more "
+        "light.",
+    )
 
 
 def _moved(run: Run, dark: DarkModel, first: Image) -> tuple[str, ...]:
@@ -281,11 +304,12 @@ def _moved(run: Run, dark: DarkModel, first: Image) -> tuple[str, ...]:
     steps = run.steps(AGAIN)
     if not steps:
         return ()
-    change = compare(light_of(run, [step.index for step in steps], dark).mean, first)
-    if change.shift_px <= MAX_PLACE_DRIFT_PX:
+    change = compare(*(block_mean(half, _COARSE) for half in (_steady(run, AGAIN, dark)[0], first)))
+    away_px = _COARSE * change.shift_px
+    if away_px <= MAX_PLACE_DRIFT_PX:
         return ()
-    where = f"lies {change.shift_px:.1f} pixels from where it was"
-    seen = where if np.isfinite(change.shift_px) else "is another picture"
+    where = f"lies {away_px:.1f} pixels from where it was"
+    seen = where if np.isfinite(away_px) else "is another picture"
     return (
         f"the {SIDES[0]} half, taken again after the others, {seen} (up to {MAX_PLACE_DRIFT_PX:g} expected): "
         "sample, objective or camera moved, and halves differ by that. Clamp them, and take it again.",

@@ -78,7 +78,9 @@ def disturbed(light: Image, faults: FaultOptions, frame: tuple[int, int], at_s: 
     if rows or columns:
         place = np.array([[1, 0, columns], [0, 1, rows]])
         size = seen.shape[1], seen.shape[0]
-        seen = np.maximum(cv2.warpAffine(seen, place, size, flags=cv2.INTER_LANCZOS4), 0).astype(np.float32)
+        beyond = cv2.BORDER_REFLECT_101  # a picture goes on beyond the sensor: no dark rim comes in
+        there = cv2.warpAffine(seen, place, size, flags=cv2.INTER_LANCZOS4, borderMode=beyond)
+        seen = np.maximum(there, 0).astype(np.float32)
     phase = 2 * np.pi * at_s / faults.ambient_period_s
     return seen + np.float32(faults.ambient_e_per_s * binning**2 * (1 - np.cos(phase)) / 2)
 

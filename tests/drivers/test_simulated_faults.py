@@ -46,6 +46,8 @@ def test_what_changes_with_time_does_so_by_the_worlds_clock() -> None:
     assert drifting.sum() == pytest.approx(1.2 * PATTERN.sum())
     crept = disturbed(PATTERN, FaultOptions(creep_px_per_min=4.0), (0, 0), 30.0, 2)
     assert np.allclose(crept, np.roll(PATTERN, (1, 1), axis=(0, 1)), atol=1e-3)
+    even = disturbed(np.ones((20, 30), np.float32), FaultOptions(creep_px_per_min=6.0), (0, 0), 60.0, 1)
+    assert np.allclose(even, 1, atol=1e-5)  # no dark rim comes in
     ambient = FaultOptions(ambient_e_per_s=8.0, ambient_period_s=10.0)
     assert disturbed(PATTERN, ambient, (0, 0), 5.0, 2)[0, 0] == pytest.approx(32.0)
     assert disturbed(PATTERN, ambient, (0, 0), 10.0, 2)[0, 0] == pytest.approx(0.0, abs=1e-4)

@@ -99,6 +99,18 @@ def test_what_moves_meanwhile_is_told_by_the_first_half_taken_again(tmp_path: Pa
     assert json.loads(done.files[0].read_text())["scatter"]["frames"] == 2
 
 
+def test_smooth_pictures_that_shake_make_the_surface_doubtful(tmp_path: Path) -> None:
+    """Noise hid where single pixels lie: surfaces that were off by 8 % passed."""
+    world = "[simulated_led_microscope]"
+    with small_bench(SMALL.replace(world, f"{world}\nvibration_px = 5.0")) as bench:
+        done = DpcProcedure(replace(SETUP, average=2, dark_frames=2)).carry_out(bench, tmp_path)
+    assert any(
+        "the picture shakes by" in words or "found again in one another" in words for words in done.verdict
+    )
+    assert not done.good
+    assert done.files[0].name == "doubtful_dpc.json"
+
+
 def weak_phase(shape: tuple[int, int], amplitude: float) -> npt.NDArray[np.float64]:
     rng = np.random.default_rng(4)
     ky, kx = np.fft.fftfreq(shape[0])[:, None], np.fft.fftfreq(shape[1])
