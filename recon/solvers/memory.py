@@ -30,6 +30,8 @@ def in_words(n_bytes: float) -> str:
 
 VOLUMES = {"tv": 6, "l1": 2}
 """Volumes that each solver keeps: X, g and four states; z and the transfer functions."""
+LOW_MODES = 5.5 * 2**20
+"""Bytes of the matrices of a preconditioner's lowest modes, of pictures and volumes of any size."""
 KEPT_FREE = 0.1
 """Share of the available memory that is left to everybody else."""
 
@@ -110,9 +112,9 @@ def plan(
     groups, result = min(GROUPS, n_z), result_values * itemsize
     if kind == "tv":  # the sweep's scratch, or, when that is over, a copy of the solution and the result
         scratch = (4 + 5 * min(get_threads(), n_z) + 0.6 * groups) * plane
-        beside = max(scratch, result + real + 2 * plane)
-    else:
-        beside = result + (9 + 0.5 * groups) * plane
+        beside = max(scratch, result + real + 2 * plane) + LOW_MODES
+    else:  # the lowest modes take the most before the first iteration, and half of it is kept
+        beside = max(result + (9 + 0.5 * groups) * plane + 0.5 * LOW_MODES, 6 * plane + LOW_MODES)
     work = psf_values * itemsize + groups * plane + int(beside)
     # TV: the spectra X (twice read and written) and g (twice read), four states read and written. l1: z read
     # and written, the transfer functions read.
@@ -138,14 +140,12 @@ def varying_bytes(kind: str, n_z: int, plane: int, camera: int, scattered: int) 
 
 _PICTURE = (13.0, 2.3, 12.8)
 """Grids a channel, grids beside them, and sensors a channel that a picture's splitting takes at its peak."""
-_SMALL = 5.5 * 2**20
-"""What it takes beside them: the matrices of the preconditioner's lowest modes."""
 
 
 def picture_bytes(channels: int, grid: int, sensor: int) -> int:
     """Return what a picture through one PSF takes, its first look included; bytes a grid and a sensor."""
     per_channel, beside, per_sensor = _PICTURE
-    return int((per_channel * channels + beside) * grid + per_sensor * channels * sensor + _SMALL)
+    return int((per_channel * channels + beside) * grid + per_sensor * channels * sensor + LOW_MODES)
 
 
 def available_bytes() -> int:

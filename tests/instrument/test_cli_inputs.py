@@ -27,7 +27,19 @@ from recon.base.declare import Option
 
 ROOT = Path(__file__).resolve().parents[2]
 READ = {
-    *("again", "alignment", "bench", "calibration", "case", "dark", "file", "files", "folder", "folders"),
+    *(
+        "again",
+        "alignment",
+        "bench",
+        "calibration",
+        "case",
+        "dark",
+        "file",
+        "files",
+        "film",
+        "folder",
+        "folders",
+    ),
     *(
         "image",
         "new",
@@ -187,7 +199,7 @@ _WHOLE = {"whole_file", "whole_folder", "draft_folder"}
 _GIVEN_A_DRAFT = """
 activity: write_activity_figure|atomic: clear_left|atomic: draft_folder|atomic: whole_file
 calibration_file: _write|calibration_file: _write_ome_zarr|export: _npy|export: _tiff|images: _write_png
-images: _write_tiff|volumes: _open_zarr|result: figure_png"""
+images: _write_ome_tiff|images: _write_tiff|volumes: _open_zarr|result: figure_png"""
 _IN_A_FOLDER_OF_ITS_OWN = """
 checkpointing: CheckpointFolder.remove|demo_display: run_display_demo|frame_array: FrameArray._write_draft
 frame_array: FrameArray.create|frame_array: FrameArray.remove_half_written|frame_array: FrameArray.write
