@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from calibration_routines.psf.psf_quality import MAX_CLIPPED, PsfQuality
 from calibration_routines.psf.stage_fit import StageFit
@@ -143,6 +142,8 @@ def fit_mount(
         return np.asarray(logs - p[0] + 2 * np.log(np.maximum(z + scale * p[1], 0.05 * z)))
 
     start = np.array([float(np.mean(logs + 2 * np.log(z))), 0.0])
+    from scipy.optimize import least_squares  # late: commands that calibrate otherwise start sooner
+
     fitted = least_squares(off, start, loss="soft_l1", f_scale=0.01)
     rest = off(fitted.x)
     spread = max(float(np.sqrt((rest**2).sum() / (len(z) - 2))), brightness_error, _LEAST_ERROR)
@@ -251,7 +252,7 @@ def _distance(
     left = (
         float(np.sqrt(((np.array(rest) - slope * step) ** 2).sum() / (pairs - 1) / np.mean(slope**2))) / d_um
     )
-    left *= max(1.0, float(student.ppf(_ONE_SIDED, pairs - 1)) / _SURE_OF_D / np.sqrt(pairs))
+    left *= max(1.0, float(stdtrit(pairs - 1, _ONE_SIDED)) / _SURE_OF_D / np.sqrt(pairs))
     error = float(np.sqrt(left**2 + _LAW**2 + unsure**2))
     ratio = found / d_um / bent
     return (ratio, error * ratio) if error < _TELLS else None

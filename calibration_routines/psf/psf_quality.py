@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import dctn, idctn
-from scipy.stats import theilslopes
 
 from recon.base.blocks import block_mean
 
@@ -285,6 +284,8 @@ def _support(coarse: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
 
 def _centroid_steps(planes: Sequence[PsfQuality], judged: Sequence[PsfQuality]) -> list[float]:
     """Return the distance of each judged centroid from a robust straight line through the planes', in 1/z."""
+    from scipy.stats import theilslopes  # late: commands that calibrate otherwise start sooner
+
     inverse_z = np.array([1.0 / plane.z_um for plane in planes])
     centroids = np.array([plane.centroid_px for plane in planes])
     at = np.array([1.0 / plane.z_um for plane in judged])

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
 
 from calibration_routines.psf.psf_quality import (
     MAX_STEP_PX,
@@ -321,6 +320,8 @@ def fit_stage(
     solution, *_ = np.linalg.lstsq(-places_um, shifts_px, rcond=None)
     start[:4] = solution.T.ravel()
     scale = float(np.abs(places_um).max())
+    from scipy.optimize import least_squares  # late: commands that calibrate otherwise start sooner
+
     fitted = least_squares(
         missed, start, loss="soft_l1", f_scale=_OUTLIER_PX, x_scale=[1 / scale] * 4 + [1.0] * (len(start) - 4)
     )
