@@ -104,13 +104,15 @@ class ImageFile:
 def read_image(path: Path | str | ImageFile, *, holes: bool = False) -> ImageFile:
     """Read one image; one that was read already is returned. With ``holes`` it may have NaN pixels.
 
-    Raises FileError when the file is missing, a folder, empty, unreadable, no image, several images, or holds
-    values that are no finite numbers.
+    A folder with one image in it, as a photograph's run is, stands for that image.
+
+    Raises FileError when the file is missing, another folder, empty, unreadable, no image, several images, or
+    holds values that are no finite numbers.
     """
     if isinstance(path, ImageFile):
         _refuse_non_finite(path.path, path.pixels, holes=holes)
         return path
-    path, array, notes = _decoded(Path(path))
+    path, array, notes = _decoded(_only_image(Path(path)))
     array, more = _one_image(path, array)
     pixels, converted = _standard_dtype(path, array, holes=holes)
     return ImageFile(path, pixels, (*notes, *more, *converted), image_metadata(path))
@@ -136,7 +138,7 @@ def read(path: Path | str) -> ImageFile:
         raise BenchError(
             f"A file or folder is read by its name, not {type(path).__name__}; arrays are taken as they are."
         )
-    if Path(path).is_dir() and not is_zarr(Path(path)):
+    if Path(path).is_dir() and not is_zarr(Path(path)) and len(images_in(Path(path))) != 1:
         return read_stack(path)
     try:
         return read_image(path, holes=True)
@@ -252,9 +254,7 @@ def _read_folder(folder: Path, leave_out: Path | None) -> ImageFile:
     if leave_out is not None:
         paths = [p for p in paths if p.resolve() != leave_out.resolve()]
     if not paths:
-        inside = [path for path in sorted(folder.iterdir()) if path.is_dir() and images_in(path)]
-        remedy = f"Folders in it that do: {', '.join(map(str, inside[:4]))}." if inside else ""
-        raise FileError(folder, f"holds no images ({READABLE}).", remedy)
+        raise FileError(folder, f"holds no images ({READABLE}).", _folders_that_do(folder))
     if len(paths) == 1:  # Micro-Manager's folders may hold one file of all planes
         return read_stack(paths[0])
     paths, depths = in_order(folder, paths)
@@ -268,6 +268,26 @@ def _read_folder(folder: Path, leave_out: Path | None) -> ImageFile:
     stack: Pixels = np.stack(images)  # type: ignore[assignment]
     metadata = {"files": [path.name for path in paths], "depths_um": list(depths)}
     return ImageFile(folder, stack, (order_in_words(paths, depths), *first.notes), metadata)
+
+
+def _only_image(path: Path) -> Path:
+    if not path.is_dir() or is_zarr(path):
+        return path
+    inside = images_in(path)
+    if len(inside) == 1:
+        return inside[0]
+    more = ", ..." if len(inside) > 4 else ""
+    named = f"Images in it: {', '.join(one.name for one in inside[:4])}{more}."
+    what = "is a folder; a file is expected" + ("" if inside else ", and it holds no images")
+    raise FileError(path, f"{what}.", named if inside else _folders_that_do(path))
+
+
+def _folders_that_do(folder: Path) -> str:
+    try:
+        inside = [path for path in sorted(folder.iterdir()) if path.is_dir() and images_in(path)]
+    except OSError:  # of others
+        return ""
+    return f"Folders in it that do: {', '.join(map(str, inside[:4]))}." if inside else ""
 
 
 def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> ImageFile:

@@ -13,7 +13,7 @@ import pytest
 import tifffile
 
 from instrument.files.errors import FileError
-from instrument.files.images import read_image, read_stack, write_image
+from instrument.files.images import read, read_image, read_stack, write_image
 
 RNG = np.random.default_rng(7)
 
@@ -136,6 +136,21 @@ def test_metadata_travels_with_the_image(tmp_path: Path) -> None:
     with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
         assert json.loads(tiff.pages[0].description) == metadata
     assert json.loads((tmp_path / "b.json").read_text()) == metadata
+
+
+def test_a_folder_of_one_image_stands_for_it(tmp_path: Path) -> None:
+    run = tmp_path / "runs" / "today_photograph"
+    (run / "frames.ome.zarr").mkdir(parents=True)
+    (run / "state.json").write_text("{}")
+    with pytest.raises(FileError, match=r"a file is expected, and it holds no images\.$"):
+        read_image(run)
+    write_image(run / "photograph.tif", np.eye(5, dtype=np.uint16))
+    assert read_image(run).path == read(run).path == run / "photograph.tif"
+    with pytest.raises(FileError, match=r"Folders in it that do: .*today_photograph"):
+        read_image(tmp_path / "runs")
+    write_image(run / "b.tif", np.eye(5, dtype=np.uint16))
+    with pytest.raises(FileError, match=r"a file is expected\. Images in it: b.tif, photograph.tif\."):
+        read_image(run)
 
 
 def make_bad_files(folder: Path) -> None:
