@@ -2,14 +2,15 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 
-.PHONY: help demo charts docs test mutants lint format types clean
+.PHONY: help demo charts docs test tests mutants lint format types clean
 
 help: ## what one can make
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
-$(STAMP): pyproject.toml
+$(PACKAGES): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 	  echo "diffuserbench needs Python 3.11 or newer; '$(PYTHON)' is $$($(PYTHON) --version 2>&1 || echo missing)."; \
 	  echo "Install it (Debian: sudo apt install python3 python3-venv) or name one: make demo PYTHON=python3.12"; exit 1; }
@@ -17,6 +18,9 @@ $(STAMP): pyproject.toml
 	  echo "Could not make a virtual environment in '$(VENV)'. On Debian: sudo apt install python3-venv"; exit 1; }
 	@echo "Installing diffuserbench and what it needs into $(VENV) (once; a minute or more) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+	@touch $(PACKAGES)
+
+$(STAMP): $(PACKAGES)
 	@echo "Compiling what is compiled once, and trying it (half a minute) ..."
 	@$(BIN)/diffuserbench test || echo "Installed, but not all of it works as it should: see above."
 	@touch $(STAMP)
@@ -31,21 +35,23 @@ docs: $(STAMP) ## the site of all documentation, with search, gallery and refere
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[docs]"
 	$(BIN)/python -m sphinx -q -b html docs build/docs
 
-test: $(STAMP) lint types ## every check and every test
+test: lint types tests ## every check and every test
+
+tests: $(STAMP) ## the tests alone
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 mutants: $(STAMP) ## change the program a little again and again, and see whether a test notices (half an hour)
 	$(BIN)/python -m tests.mutants
 
-lint: $(STAMP) ## style, imports between the rooms
+lint: $(PACKAGES) ## style, imports between the rooms
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
-types: $(STAMP) ## strict type check
+types: $(PACKAGES) ## strict type check
 	$(BIN)/mypy
 
-format: $(STAMP) ## rewrite the source in house style
+format: $(PACKAGES) ## rewrite the source in house style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
