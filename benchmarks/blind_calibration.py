@@ -23,7 +23,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from drivers.simulated.options import WorldOptions
-from drivers.simulated.world import LUMINANCE, SimulatedWorld, sample_picture
+from drivers.simulated.scenes import LUMINANCE, sample_picture
+from drivers.simulated.world import SimulatedWorld
 from recon import reconstruct
 from recon.base.threads import set_threads
 from recon.blind import BlindSettings, calibrate_from_beads

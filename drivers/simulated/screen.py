@@ -8,8 +8,9 @@ import numpy.typing as npt
 from pydantic import Field
 
 from drivers.device import DriverOptions, SharedPart
+from drivers.simulated.scenes import SHEET_SHARE
 from drivers.simulated.slm import PanelOptions, SimulatedPanel
-from drivers.simulated.world import SHEET_SHARE, SimulatedWorld
+from drivers.simulated.world import SimulatedWorld
 from recon.optics.scene import Layer, Scene, picture
 
 _FINER = 2  # cells of the rendered picture along a pixel: a turned pixel keeps its place within a tenth

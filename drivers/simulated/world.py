@@ -1,4 +1,4 @@
-"""The simulated world: what all simulated devices of one bench share, coupled by physics, and its scenes."""
+"""The simulated world: what all simulated devices of one bench share, coupled by physics."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from drivers.device import DriverOptions
+from drivers.simulated import kept_light
 from drivers.simulated.living import POWER, LivingLight
 from drivers.simulated.options import PRESETS, Preset, WorldOptions
 from drivers.simulated.scene_light import SceneLight
-from drivers.simulated.surroundings import Surroundings
+from drivers.simulated.scenes import make_scene, make_slide, place_of
+from drivers.simulated.surroundings import CommonOptions, Surroundings
 from recon.optics.animal import Animal, draw_animal
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.fall_off import (
@@ -27,78 +28,9 @@ from recon.optics.fall_off import (
 )
 from recon.optics.grid import PixelGrid, mixed_spectrum
 from recon.optics.render import RenderSettings, product, render
-from recon.optics.scene import Scene, TruthGrid, bar_target, bead_volume, picture, tilted_target, true_scene
+from recon.optics.scene import Scene, TruthGrid, true_scene
 from recon.optics.wave import WavePropagator
 from recon.types import Geometry
-
-FIELD_SHARE = 0.5
-SHEET_SHARE = 2.0
-"""Of what the sensor sees: a sheet reaches beyond it on all sides."""
-
-SHEET_PIXELS = 128
-"""A side: fine enough for the light of single LEDs."""
-
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
-
-
-def make_scene(options: WorldOptions, preset: Preset, distance_um: float) -> Scene | None:
-    """Build the scene that the options name; sizes left out follow from what the sensor sees."""
-    if options.scene == "none":
-        return None
-    z_um, height_um = _place(options, preset, distance_um)
-    if options.scene in ("picture", "color_picture"):
-        portrait = sample_picture()
-        if options.scene == "picture":
-            portrait = portrait @ LUMINANCE
-        return picture(portrait, z_um, height_um * portrait.shape[1] / portrait.shape[0])
-    if options.scene == "sheet":
-        if options.scene_height_mm is None:
-            height_um *= SHEET_SHARE / FIELD_SHARE
-        return picture(np.ones((SHEET_PIXELS, SHEET_PIXELS)), z_um, height_um, name="sheet")
-    if options.scene == "bars":
-        return picture(bar_target(), z_um, height_um, name="bar target")
-    if options.scene == "tilted_bars":
-        return tilted_target(bar_target(), z_um, height_um, options.scene_tilt_deg)
-    depth_um = 0.5 * z_um if options.scene_depth_mm is None else 1e3 * options.scene_depth_mm
-    near, far = z_um - depth_um / 2, z_um + depth_um / 2
-    extent_um = (height_um * near / z_um, height_um * near / z_um)
-    return bead_volume(
-        options.beads, extent_um, (near, far), diameter_um=options.bead_diameter_um, seed=options.seed
-    )
-
-
-def make_slide(options: WorldOptions, preset: Preset, distance_um: float, number: int) -> Scene:
-    """Build a flat slide of beads where the scene is; each ``number`` has its beads at other places."""
-    z_um, height_um = _place(options, preset, distance_um)
-    return bead_volume(
-        options.beads,
-        (height_um, height_um),
-        (z_um, z_um),
-        diameter_um=options.bead_diameter_um,
-        seed=options.seed + 1000 * (number + 1),
-    )
-
-
-def _place(options: WorldOptions, preset: Preset, distance_um: float) -> tuple[float, float]:
-    """Return a scene's distance from the diffuser and its height: half of what the sensor sees there."""
-    z_um = 1e3 * (options.scene_distance_mm or preset.source_distance_mm)
-    if options.scene_height_mm is not None:
-        return z_um, 1e3 * options.scene_height_mm
-    return z_um, FIELD_SHARE * preset.sensor.shape[0] * preset.sensor.pitch_um * z_um / distance_um
-
-
-def sample_picture() -> npt.NDArray[np.float32]:
-    """Load the photograph that ships with matplotlib, ``(600, 512, 3)`` float32 linear brightness, 0 to 1."""
-    from matplotlib import cbook  # a third of a second, for one scene
-
-    path = cbook.get_sample_data("grace_hopper.jpg", asfileobj=False)
-    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if bgr is None:
-        raise ValueError(f"matplotlib's sample picture {path} cannot be read")
-    srgb = bgr[:, :, ::-1].astype(np.float32) / 255
-    low = srgb <= 0.04045
-    return np.where(low, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
 
 Position = tuple[float, float, float]
 Rgb = tuple[float, float, float]
@@ -149,7 +81,7 @@ class SimulatedWorld(Surroundings):
         self.animal: Animal | None = None
         """What lives, where the scene does."""
         if options.scene == "animal":
-            self.animal = draw_animal(*_place(options, preset, self.distance_um), options.seed)
+            self.animal = draw_animal(*place_of(options, preset, self.distance_um), options.seed)
         self._living: dict[tuple[Rgb, int], LivingLight] = {}
         self._born_s: float | None = None
         alive = self.animal
@@ -302,8 +234,11 @@ class SimulatedWorld(Surroundings):
             kept = any(key[:3] == ("scene", number, None) and key[-1] == binning for key in self._cache)
         if factor < 2 or kept or scene is None or self.animal is not None or not self.scene_lit:
             return None
-        seen = (0.0, sum(product(self._glow(self.options.scene_rgb), weights)), 0.0)
-        return self._render(scene, seen, factor * binning, COARSE), factor
+        seen = product(self._glow(self.options.scene_rgb), weights)
+        name = self._kept_by(scene, seen, binning)
+        if name and kept_light.is_kept(name):
+            return None
+        return self._render(scene, (0.0, sum(seen), 0.0), factor * binning, COARSE), factor
 
     def _picture(
         self, what: tuple[Any, ...], scene: Scene, leds: SceneLight | None, weights: Rgb, binning: int
@@ -311,7 +246,15 @@ class SimulatedWorld(Surroundings):
         """Return light of a scene that glows, or is lit by LEDs: at once where all is grey, else by bands."""
 
         def render_in(seen: Rgb) -> Image:
-            return self._render(scene if leds is None else leds.on(scene), seen, binning)
+            if leds is not None:
+                return self._render(leds.on(scene), seen, binning)
+            name = self._kept_by(scene, seen, binning) if what[0] == "scene" else None
+            light = kept_light.kept(name) if name else None
+            if light is None:
+                light = self._render(scene, seen, binning)
+                if name:
+                    kept_light.keep(name, light)
+            return light
 
         if scene.grey and (leds is None or leds.grey):
             return self._cached((*what, weights, binning), lambda: render_in(weights))
@@ -330,6 +273,15 @@ class SimulatedWorld(Surroundings):
             bead_photons=self.preset.bead_photons_per_s_sr,
             settings=settings or RenderSettings(spectral_samples=self.options.spectral_samples),
         )
+
+    def _kept_by(self, scene: Scene, weights: Rgb, binning: int) -> str | None:
+        """Return the name that a scene's light is kept on disk by; None where it is computed quickly."""
+        grid = self.sensor_grid(binning)
+        if grid.shape[0] * grid.shape[1] < kept_light.WORTH_PIXELS:
+            return None
+        # Noise and faults come after the light.
+        options = self.options.model_dump(exclude=set(CommonOptions.model_fields) - {"seed"})
+        return kept_light.name_of(scene, self.preset, options, weights, grid)
 
     def _alive(self, animal: Animal, seen: Rgb, binning: int) -> Image:
         with self._lock:
@@ -380,7 +332,7 @@ class SimulatedWorld(Surroundings):
     @property
     def slide_z_um(self) -> float:
         """How far from the diffuser slides of beads are put."""
-        return _place(self.options, self.preset, self.distance_um)[0]
+        return place_of(self.options, self.preset, self.distance_um)[0]
 
     def change_slide(self, number: int) -> None:
         """Put a slide of beads in front of the camera; each ``number`` has them at other places."""

@@ -14,6 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from drivers.common.cache import cache_folder
+
 MOST = 300
 """Steps that are remembered; beyond, the oldest are forgotten."""
 WORTH_S = 0.5
@@ -52,8 +54,7 @@ def about(what: str, *, simulated_megapixels: float = 0.0) -> None:
 
 def place() -> Path:
     """Return the file, in the user's cache; it may be removed at any time."""
-    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(cache).expanduser() / "diffuserbench" / "times.json"
+    return cache_folder() / "times.json"
 
 
 def seen() -> bool:
