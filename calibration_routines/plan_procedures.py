@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from calibration_routines.display.kept_frames import kept_by
+from calibration_routines.display.kept_frames import going_on, kept_by
 from calibration_routines.procedure import (
     Listener,
     Outcome,
@@ -107,10 +107,8 @@ def settled(
     if run.plan is None:
         words = f"a recording, {found.condition}; there is nothing to go on with."
         if command := kept_by(run):
-            words = (
-                f"{len(run.records)} frames of {command}: diffuserbench {command} --again {path} sees them "
-                "again, and takes what they lack."
-            )
+            frames = f"{len(run.records)} frames of {command}"
+            words = f"{frames}. To have them seen again, and what they lack taken: {going_on(run)}"
         elif done:
             words = f"a recording, {run.condition}, with {len(run.records)} of {run.n_frames} frames."
     else:

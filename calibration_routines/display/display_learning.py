@@ -103,7 +103,7 @@ class LearningProcedure(SeenAgain, Checked, Procedure):
         slm, out = require_slm(bench), writable(bench, folder, self.out, "display")
         place = load_alignment(self.alignment) if self.alignment is not None else None
         nominal = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
-        with KeptFrames(bench, folder, "calibrate display", self.again) as kept:
+        with KeptFrames(bench, folder, "calibrate display", self) as kept:
             io = DisplayBench(
                 bench,
                 bench.config.display.slm_binning,

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -29,6 +30,7 @@ from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_control import EndedEarlyError
 from instrument.runs.writer import FrameToStore, RunWriter
 from recon.base.declare import RARE, option
+from recon.base.option_text import command_line
 
 Array = npt.NDArray[Any]
 
@@ -47,6 +49,20 @@ class Taken(Protocol):
         """How it came about."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class SeenAgain:
+    """Options of a routine whose frames can be seen again."""
+
+    again: Path | None = option(
+        None,
+        metavar="RUN",
+        label="Frames of run",
+        help="A run of the same: its frames are seen again, and further ones taken where they end.",
+        default_words="new frames",
+        group=RARE,
+    )
+
+
 class KeptFrames:
     """Keeps the frames of one routine on its bench; a context, which ends their run.
 
@@ -58,14 +74,16 @@ class KeptFrames:
         Where the run's folder goes; None: the bench's data folder.
     command : str
         That carries the routine out, ``"calibrate slm"``.
-    again : Path, optional
-        A run of the same whose frames are seen again; new ones are added to it.
+    options : SeenAgain
+        Of the routine; in the run's log as they are typed. A run that they name is seen again, and new frames
+        are added to it.
 
-    Raises BenchError when ``again`` holds no frames of this routine; RunError when it is no run.
+    Raises BenchError when that run holds no frames of this routine; RunError when it is no run.
     """
 
-    def __init__(self, bench: Bench, folder: Path | None, command: str, again: Path | None = None) -> None:
+    def __init__(self, bench: Bench, folder: Path | None, command: str, options: SeenAgain) -> None:
         self._bench, self._folder, self._command = bench, folder, command
+        self._typed, again = command_line(command, replace(options, again=None)), options.again
         self._run = None if again is None else Run.open(again)
         self._questions: list[str] = []
         self._writer: RunWriter | None = None
@@ -84,8 +102,8 @@ class KeptFrames:
     ) -> None:
         if error is not None and self.path is not None:
             error.add_note(
-                f"{self._next} frames are kept: diffuserbench {self._command} --again {self.path}, other "
-                "options as they were, goes on with them."
+                f"{self._next} frames are kept. To go on with them: {self._typed} --again "
+                f"{shlex.quote(str(self.path))}"
             )
         if self._writer is not None:
             reason = FinishReason.COMPLETED
@@ -151,27 +169,13 @@ class KeptFrames:
                 folder = self._folder or self._bench.config.data_folder
                 label = self._command.split()[-1]
                 self._writer = RunWriter.create(folder, label=label, bench=record_of(self._bench))
-            self._writer.start(routine=self._command)
+            self._writer.start(routine=self._command, typed=self._typed)
         frames = []
         for frame, asked in zip(taken, questions, strict=False):
             self._writer.note(_ASKED, index=self._next, question=asked)
             frames.append(FrameToStore(self._next, frame.image, frame.metadata))
             self._next += 1
         self._writer.write(frames)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SeenAgain:
-    """Options of a routine whose frames can be seen again."""
-
-    again: Path | None = option(
-        None,
-        metavar="RUN",
-        label="Frames of run",
-        help="A run of the same: its frames are seen again, and further ones taken where they end.",
-        default_words="new frames",
-        group=RARE,
-    )
 
 
 def kept_words(bench: Bench, frames: int, again: Path | None) -> str:
@@ -193,6 +197,16 @@ def question(shown: Array | None, *settings: Any) -> str:
 def kept_by(run: Run) -> str:
     """Return the command whose routine kept a run's frames so; empty for every other run."""
     return next((str(event["routine"]) for event in run.events if "routine" in event), "")
+
+
+def going_on(run: Run) -> str:
+    """Return what is typed to go on with a run's kept frames, on its own bench; empty for every other run."""
+    if not (command := kept_by(run)):
+        return ""
+    typed = next(
+        (str(event["typed"]) for event in run.events if "typed" in event), f"diffuserbench {command}"
+    )
+    return f"{typed} --again {shlex.quote(str(run.path))} --bench {shlex.quote(str(run.path / 'bench.toml'))}"
 
 
 def _answered(run: Run) -> list[str]:

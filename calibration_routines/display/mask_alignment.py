@@ -352,7 +352,7 @@ class AlignmentProcedure(Procedure):
         out = writable(bench, folder, settings.out, "alignment")
         correction = load_slm_correction(settings.slm_calibration) if settings.slm_calibration else None
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
-        with KeptFrames(bench, folder, "align mask", settings.again) as kept:
+        with KeptFrames(bench, folder, "align mask", settings) as kept:
             io = DisplayBench(
                 bench,
                 bench.config.display.slm_binning,

@@ -253,7 +253,7 @@ class SlmProcedure(SeenAgain, Checked, Procedure):
         """Measure, and save what ``align mask`` and ``show`` take."""
         slm, out = require_slm(bench), writable(bench, folder, self.out, "slm calibration")
         place = load_alignment(self.alignment) if self.alignment is not None else None
-        with KeptFrames(bench, folder, "calibrate slm", self.again) as kept:
+        with KeptFrames(bench, folder, "calibrate slm", self) as kept:
             io = DisplayBench(
                 bench,
                 bench.config.display.slm_binning,

@@ -8,8 +8,9 @@ from typing import Any, Literal
 
 from instrument.files.atomic import output_folder
 from instrument.files.errors import BenchError, FileError
-from instrument.tasks.task import Desk, Done, command_line, saying_what_is_left, task
+from instrument.tasks.task import Desk, Done, saying_what_is_left, task
 from recon.base.declare import option
+from recon.base.option_text import command_line
 
 
 @dataclass(frozen=True, kw_only=True)

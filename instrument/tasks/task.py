@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import shlex
 import sys
 import typing
 from abc import ABC, abstractmethod
@@ -17,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 from instrument.files.atomic import protecting
 from instrument.files.errors import BenchError
 from recon.base.declare import Option, changed, option, options_of
-from recon.base.option_text import shown
 
 if TYPE_CHECKING:
     from instrument.bench.config import BenchConfig
@@ -179,20 +177,6 @@ def bench_of(desk: Desk, bench: BenchFile) -> BenchConfig:
             f"No {DEFAULT_NAME} in this folder: the built-in SIMULATED bench is used (diffuserbench new)."
         )
     return config
-
-
-def command_line(name: str, *objects: object) -> str:
-    """Return the words that carry out a task in the terminal."""
-    first, others = [], []
-    for o, value in (pair for one in objects for pair in changed(one)):
-        each = [shown(o, one) for one in value] if o.item is not None else [shown(o, value)]
-        if o.declaration.positional:
-            first += each
-        elif isinstance(value, bool):
-            others.append(o.flags[0].split("/")[-1] if not value else o.flag)
-        else:
-            others += [word for one in each for word in (o.flag, one)]
-    return shlex.join(["diffuserbench", name, *first, *others])
 
 
 Part = tuple[type, tuple[Option, ...]]

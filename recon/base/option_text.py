@@ -6,12 +6,13 @@ import dataclasses
 import enum
 import math
 import re
+import shlex
 import typing
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from recon.base.declare import Declaration, Option, expression, options_of
+from recon.base.declare import Declaration, Option, changed, expression, options_of
 from recon.errors import InputError
 
 
@@ -100,6 +101,20 @@ def shown(o: Option, value: Any) -> str:
     if isinstance(value, tuple | list):
         return ("," if "," in o.declaration.metavar else " ").join(shown(o, one) for one in value)
     return str(value)
+
+
+def command_line(name: str, *objects: object) -> str:
+    """Return the words that carry out a command in the terminal with these objects' options."""
+    first, others = [], []
+    for o, value in (pair for one in objects for pair in changed(one)):
+        each = [shown(o, one) for one in value] if o.item is not None else [shown(o, value)]
+        if o.declaration.positional:
+            first += each
+        elif isinstance(value, bool):
+            others.append(o.flags[0].split("/")[-1] if not value else o.flag)
+        else:
+            others += [word for one in each for word in (o.flag, one)]
+    return shlex.join(["diffuserbench", *name.split(), *first, *others])
 
 
 def default_shown(o: Option) -> str:

@@ -54,12 +54,13 @@ def test_a_table_that_ended_early_goes_on(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(EndedEarlyError) as ended:
         measured(tmp_path, "first.json")
     (path,) = (p for p in tmp_path.iterdir() if p.is_dir())
-    assert f"calibrate slm --again {path}" in ended.value.__notes__[0]
+    typed = f"diffuserbench calibrate slm --levels 9 --out {tmp_path / 'first.json'} --again {path}"
+    assert typed in ended.value.__notes__[0]
     run = Run.open(path)
     assert (run.condition, len(run.records)) == (RunCondition.ABORTED, ENDS_AT)
     with Bench(parse_config(TEXT, None)).open() as bench:
         words = ResumeProcedure(path).carry_out(bench, tmp_path).verdict
-    assert "calibrate slm --again" in " ".join(words)
+    assert f"{typed} --bench {path / 'bench.toml'}" in " ".join(words)
 
     began = run.metadata(1).host_time_ns
     gone_on = measured(tmp_path, "on.json", again=path)
@@ -86,7 +87,8 @@ def test_an_alignment_that_was_interrupted_says_where_the_stage_is_and_goes_on(t
     (path,) = (p for p in tmp_path.iterdir() if p.is_dir())
     notes = " ".join(ended.value.__notes__)
     assert "The stage stands at x_um 0, y_um 0" in notes
-    assert f"align mask --again {path}" in notes
+    assert "align mask --reach 8" in notes
+    assert f"--again {path}" in notes
     kept = len(Run.open(path).records)
     assert 0 < kept < 7
     began = Run.open(path).metadata(kept - 1).host_time_ns
