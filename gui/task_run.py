@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -15,6 +15,7 @@ from PySide6.QtCore import QObject, Signal
 from gui.jobs import Job, JobContext, JobRunner
 from gui.procedure_run import Situation
 from gui.widgets.building import every
+from instrument.files.orientation import AS_IT_IS, Kind, Orientation
 from instrument.tasks.task import Advance, Desk, Done
 
 _LOOK_MS = 100
@@ -46,8 +47,9 @@ class WindowDesk(Desk):
     is handed over in one step.
     """
 
-    def __init__(self, context: JobContext) -> None:
+    def __init__(self, context: JobContext, seen: Mapping[Kind, Orientation]) -> None:
         self._context = context
+        self._seen = seen
         self._told: deque[Told] = deque()
         self._situation = Situation()
         self._go_on = threading.Event()
@@ -88,6 +90,10 @@ class WindowDesk(Desk):
 
         yield advance
         self._wait()
+
+    def seen(self, kind: Kind) -> Orientation:
+        """Return how the window turned pictures of a kind when the task was started."""
+        return self._seen.get(kind, AS_IT_IS)
 
     @contextmanager
     def interruptible(self) -> Iterator[threading.Event]:
@@ -160,11 +166,13 @@ class TaskRun(QObject):
         """Whether a task goes on."""
         return self._job is not None
 
-    def start(self, title: str, do: Callable[[Desk], Done]) -> Job:
-        """Carry out a task, in a job."""
+    def start(
+        self, title: str, do: Callable[[Desk], Done], seen: Mapping[Kind, Orientation] | None = None
+    ) -> Job:
+        """Carry out a task, in a job; ``seen``: how pictures are turned now."""
 
         def work(context: JobContext) -> Done:
-            self._desk = desk = WindowDesk(context)
+            self._desk = desk = WindowDesk(context, seen or {})
             return do(desk)
 
         self._desk = None

@@ -170,7 +170,7 @@ class FilmsPanel(Panel):
     def _turn(self) -> None:
         """Turn the pictures as all of their kind are turned."""
         if self.film is not None:
-            self.view.orient(orientation_of(self.session, "frames" if self.film.is_recording else "results"))
+            self.view.orient(orientation_of(self.session, self.film.kind))
 
     def go_to(self, place: int) -> None:
         """Show a picture."""
@@ -282,12 +282,15 @@ class FilmsPanel(Panel):
         if film is None:
             return None
         levels, regions = self.levels.levels, [(r.rows, r.columns) for r in self.measure.regions]
+        orientation = orientation_of(self.session, film.kind)
 
         def write(context: JobContext) -> Path:
             def advance(done: int, total: int) -> None:
                 context.report(done / total)
 
-            return write_film(film, target, levels=levels, regions=regions, advance=advance)
+            return write_film(
+                film, target, levels=levels, regions=regions, orientation=orientation, advance=advance
+            )
 
         job = self.follow(self.jobs.compute(f"Exporting {target.name}", write))
         self.progress.show()

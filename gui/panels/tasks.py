@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from PySide6.QtCore import Qt, QUrl
 from PySide6.QtGui import QDesktopServices, QFontDatabase, QImage, QPixmap
@@ -33,10 +33,12 @@ from gui.widgets.building import (
     tabs,
     text_view,
 )
+from gui.widgets.orientation import orientation_of
 from gui.widgets.sweep_views import Picture
 from gui.widgets.tab_order import tab_in_order
 from gui.words import in_the_window
 from instrument.files.calibration_file import newest_calibration
+from instrument.files.orientation import Kind
 from instrument.tasks import CHARTS, TASKS, VIDEOS
 from instrument.tasks.task import WRITTEN, Desk, Done, Task
 from recon.base.declare import Imports, Option, expression
@@ -274,7 +276,8 @@ class TasksPanel(Panel):
         self.run_bar.set_running(True)
         self.stack.setEnabled(False)
         self.choice.setEnabled(False)
-        self.run.start(TASKS[self.name].title, do)
+        seen = {kind: orientation_of(self.session, kind) for kind in get_args(Kind)}
+        self.run.start(TASKS[self.name].title, do, seen)
 
     def _clear(self) -> None:
         self.words.setPlainText("")

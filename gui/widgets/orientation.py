@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
 
 from PySide6.QtWidgets import QMenu, QPushButton
 
 from gui.session import BenchSession
-from instrument.files.orientation import AS_IT_IS, Orientation
+from instrument.files.orientation import AS_IT_IS, Kind, Orientation
 
-Kind = Literal["frames", "results"]
 _KEPT = "orientation"
 
 

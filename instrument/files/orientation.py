@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+
+Kind = Literal["frames", "results"]
+"""Pictures of a camera, and reconstructed ones: all of a kind are turned alike."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from instrument.files.atomic import require_new, whole_file, write_text
 from instrument.files.errors import FileError
 from instrument.files.films import as_shown, write_mp4
+from instrument.files.orientation import AS_IT_IS, Kind, Orientation
 from instrument.files.volumes import grid_of, is_zarr_name
 from instrument.reconstruction.video_files import (
     DEFAULT_FPS,
@@ -74,6 +75,11 @@ class Film:
     def is_recording(self) -> bool:
         """Whether its pictures are frames of a camera, and nothing was reconstructed."""
         return self._run is not None
+
+    @property
+    def kind(self) -> Kind:
+        """What its pictures are turned like."""
+        return "frames" if self.is_recording else "results"
 
     @property
     def times_s(self) -> npt.NDArray[np.float64]:
@@ -156,6 +162,7 @@ def write_film(
     fps: float | None = None,
     levels: tuple[float, float] | None = None,
     regions: Sequence[Window] = (),
+    orientation: Orientation = AS_IT_IS,
     advance: Advance | None = None,
 ) -> Path:
     """Write a film in the format that the target's name asks for, whole or not at all; returns the target.
@@ -170,6 +177,8 @@ def write_film(
         Values shown black and white.
     regions : sequence of (slice, slice)
         Rows and columns, for ``.csv``; none: the whole picture.
+    orientation : Orientation
+        How pictures are turned and mirrored in what is shown, ``.mp4`` and ``.gif``; values stay as they are.
     advance : callable, optional
         ``advance(pictures done, pictures)`` after each; may raise to end the work.
 
@@ -187,7 +196,10 @@ def write_film(
         _write_zarr(film, target, advance)
         return target
     low, high = film.levels() if levels is None else levels
-    shown = (as_shown(picture, low, high) for picture in _pictures(film, advance))
+    shown = (
+        np.ascontiguousarray(orientation.apply(as_shown(picture, low, high)))
+        for picture in _pictures(film, advance)
+    )
     if name.endswith(".gif"):
         height, width = film.read(0).shape[:2]
         if (needed := len(film) * height * width) > _GIF_BYTES:

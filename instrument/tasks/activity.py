@@ -78,7 +78,8 @@ def activity(
         if warm is not None and warm < WARM_ITERATIONS:
             desk.warn(
                 f"Warning: this video has {warm} warm iterations a frame. With fewer than {WARM_ITERATIONS} "
-                f"some of what is active is missed: reconstruct it with --warm {WARM_ITERATIONS}."
+                f"some of what is active is missed: reconstruct the recording with {WARM_ITERATIONS} or more "
+                "('reconstruct --video --warm')."
             )
         free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
         with desk.step("looking for activity"):

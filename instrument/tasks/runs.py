@@ -227,7 +227,14 @@ def _export_film(desk: Desk, options: ExportOptions) -> Done:
         if rows.stop > height or columns.stop > width:
             raise BenchError(f"--region: the pictures have {height} x {width} pixels.")
     with desk.step("Pictures") as advance:
-        write_film(film, options.out, fps=options.frames_per_s, regions=options.regions, advance=advance)
+        write_film(
+            film,
+            options.out,
+            fps=options.frames_per_s,
+            regions=options.regions,
+            orientation=desk.seen(film.kind),
+            advance=advance,
+        )
     if words := slowed(options.out, options.frames_per_s or film.fps):
         desk.warn(f"Warning: {words}")
     return Done((options.out,))
@@ -251,7 +258,7 @@ def _export_result(desk: Desk, options: ExportOptions, given: Given) -> Done:
             result = result.metric(options.voxel_um)
             desk.fact("Voxels", result.voxels_in_words())
         with desk.step("Planes") as advance:
-            export_result(result, target, advance=advance)
+            export_result(result, target, orientation=desk.seen("results"), advance=advance)
         steps = "" if result.planes_um is None else uneven_steps(result.planes_um[0])
     finally:
         result.close()

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from instrument.files.atomic import protecting
 from instrument.files.errors import BenchError
+from instrument.files.orientation import AS_IT_IS, Kind, Orientation
 from recon.base.declare import Option, changed, option, options_of
 
 if TYPE_CHECKING:
@@ -55,6 +56,11 @@ class Desk(ABC):
     @abstractmethod
     def interruptible(self) -> AbstractContextManager[Event]:
         """Give an event that is set where somebody ends the work; what there is by then is to be kept."""
+
+    def seen(self, kind: Kind) -> Orientation:
+        """Return how pictures of a kind are turned where one looks at them: what is exported is turned so."""
+        del kind
+        return AS_IT_IS
 
     def fact(self, name: str, text: str) -> None:
         """Tell a result with its name."""

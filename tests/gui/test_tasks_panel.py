@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
@@ -17,6 +18,8 @@ from gui.panel import whole
 from gui.panels.tasks import TasksPanel
 from gui.session import BenchSession
 from instrument.files.calibration_file import save_calibration
+from instrument.files.images import write_image
+from instrument.reconstruction.video_files import VideoPictures, create_output
 from instrument.tasks import TASKS
 from instrument.tasks.task import Desk, Done
 from recon.types import Calibration, Geometry
@@ -65,6 +68,25 @@ def test_every_task_has_a_form_of_its_own_declarations(qtbot: QtBot, panel: Task
         ]
         assert panel.objects() is None if required else panel.objects() is not None
         assert panel.as_python().startswith("#") == bool(required)
+
+
+def test_what_is_exported_is_turned_as_it_is_seen(qtbot: QtBot, panel: TasksPanel, tmp_path: Path) -> None:
+    picture = np.arange(12, dtype=np.float32).reshape(3, 4)
+    write_image(tmp_path / "result.tif", picture)
+    create_output(tmp_path / "film.ome.zarr", 1, (32, 32), period_s=0.1, grid=None, attributes={})
+    bright = np.zeros((32, 32), np.float32)
+    bright[:4] = 1
+    VideoPictures(tmp_path / "film.ome.zarr", write=True).write(0, bright)
+    for what, target in (("result.tif", "copy.npy"), ("film.ome.zarr", "copy.gif")):
+        shown(qtbot, panel, "export", run=tmp_path / what)
+        panel._pages["export"].form.set_values({"out": tmp_path / target})
+        with qtbot.waitSignal(panel.run.succeeded, timeout=WAIT_MS):
+            panel.run_bar.start_button.click()
+        qtbot.waitUntil(lambda: not panel.run.is_running, timeout=WAIT_MS)
+    np.testing.assert_array_equal(np.load(tmp_path / "copy.npy"), picture[::-1, ::-1])
+    with Image.open(tmp_path / "copy.gif") as gif:
+        rows = np.asarray(gif.convert("L")).mean(axis=1)
+    assert rows[-4:].min() > rows[:-4].max()
 
 
 def test_what_was_found_comes_to_the_front_and_a_picture_when_there_is_one(

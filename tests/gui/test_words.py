@@ -28,6 +28,7 @@ _IN_WINDOW = ("recon", "instrument", "calibration_routines")
             "“Verify runs” in Files names every damaged frame.",
         ),
         ("Make one: diffuserbench align mask", "Make one: Alignment"),
+        ("with 6 ('reconstruct --video --warm').", "with 6 (“Reconstruct a recording” in Files)."),
         ("is no video of 'reconstruct --video'.", "is no video of “Reconstruct a recording” in Files."),
         ("install diffuserbench again", "install diffuserbench again"),
         ("3 settings: run the same command again to go on.", "3 settings: “Start” again to go on."),
