@@ -36,13 +36,14 @@ from instrument.reconstruction.video_work import BlockReport, CancelledError, cl
 from instrument.runs.run import Run
 from instrument.runs.run_files import is_run
 from recon.base.declare import inapplicable
+from recon.base.threads import linear_algebra_on_one_thread
 from recon.reconstruction.decoys import check_calibration
 from recon.reconstruction.measurement import Floats, Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, require_joint
 from recon.streams.stillness import has_light
-from recon.streams.video import BLOCK, COLD_ITERATIONS, LOOKED_AT, VideoSolver, stream_problem
+from recon.streams.video import BLOCK, COLD_ITERATIONS, LOOKED_AT, VideoSolver, stream_problem, weight_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,6 +96,7 @@ class PreparedVideo:
         return [number for number in range(len(self.job.blocks)) if number not in done]
 
 
+@linear_algebra_on_one_thread()
 def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVideo:
     """Read the recording's first frame and the PSF, settle everything, and make the job or find it begun.
 
@@ -132,6 +134,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         crop = Crop(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
         reduction = replace(reduction, crop=crop)
     usual = COLD_ITERATIONS if request.video.over_time is None else JOINT_ITERATIONS
+    times_noise = weight_of(problem)
     plan = VideoPlan(
         run=str(run.path.resolve()),
         frames=frames,
@@ -142,12 +145,12 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         over_time=request.video.over_time,
         rotate_deg=request.rotate_deg,
         picture_shape=(*problem.grid.shape[problem.n_planes == 1 :], *picture.measurement.shape[2:]),
-        settings=_settings(request, picture, problem, reduction),
+        settings=_settings(request, picture, problem, reduction, times_noise),
     )
     job, resumed = _job(request, plan, force)
     if job is None:
         _create(request, run, plan, problem)
-        job = VideoJob.create(request.out, plan, problem, reduction)
+        job = VideoJob.create(request.out, plan, problem, reduction, times_noise)
     saturated = sum(record.metadata.saturated_fraction > 0 for record in run.records.values())
     warnings = list(dict.fromkeys((*picture.warnings, *problem.warnings)))
     if saturated:
@@ -276,8 +279,12 @@ def _binned_shape(run: Run, index: int, factor: int) -> tuple[int, int]:
     return height // factor, width // factor
 
 
-def _settings(request: VideoRequest, picture: Job, problem: Problem, reduction: Reduction) -> dict[str, Any]:
+def _settings(
+    request: VideoRequest, picture: Job, problem: Problem, reduction: Reduction, times_noise: float | None
+) -> dict[str, Any]:
     """Return what the result depends on, JSON-compatible."""
+    with VideoSolver(problem, times_noise=times_noise) as solver:
+        weights = solver.weights
     provenance = {key: value for key, value in picture.provenance.items() if key != "image"}
     chosen: dict[str, Any] = plain(
         {
@@ -289,7 +296,7 @@ def _settings(request: VideoRequest, picture: Job, problem: Problem, reduction: 
             "model": problem.model,
             "model_reason": problem.reason,
             "background_estimated": problem.smooth,
-            "weight": max(VideoSolver(problem).weights),
+            "weight": max(weights),
             "noise_deviation": problem.noise,
             "optics_sha256": _digest(problem, reduction),
             "simulated": picture.simulated,

@@ -91,8 +91,18 @@ class VideoJob:
         return output.with_name(f".{stem_of(output)}.job")
 
     @classmethod
-    def create(cls, output: Path, plan: VideoPlan, problem: Problem, reduction: Reduction) -> VideoJob:
-        """Write a job beside its output; ``job.json``, which makes it one, comes last."""
+    def create(
+        cls,
+        output: Path,
+        plan: VideoPlan,
+        problem: Problem,
+        reduction: Reduction,
+        times_noise: float | None = None,
+    ) -> VideoJob:
+        """Write a job beside its output; ``job.json``, which makes it one, comes last.
+
+        ``times_noise``: the prior's weight as the first frame tells it, so that no worker looks again.
+        """
         folder = cls.folder_of(output)
         (folder / _DONE).mkdir(parents=True)
         arrays: dict[str, Any] = {
@@ -101,6 +111,7 @@ class VideoJob:
             "binning": np.array([reduction.first_binning, reduction.binning]),
             "crop": _crop_array(reduction.crop),
             "mosaic": np.array(reduction.mosaic or ""),
+            "times_noise": np.array(np.nan if times_noise is None else times_noise),
         }
         with whole_file(folder / _CAMERA) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
@@ -165,6 +176,12 @@ class VideoJob:
             extent = Extent((int(height), int(width)), reach, margin)  # jobs of before have no margin
         options = ReconstructionOptions(**asked)
         return stream_problem(measurement, calibration, options, choosing=False, extent=extent)
+
+    @property
+    def times_noise(self) -> float | None:
+        """The prior's weight in units of the noise; None where it is the table's or is yet to be found."""
+        weight = float(self._arrays.get("times_noise", np.nan))  # none in jobs of before
+        return None if np.isnan(weight) else weight
 
     @property
     def reduction(self) -> Reduction:

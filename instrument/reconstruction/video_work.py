@@ -29,7 +29,7 @@ from instrument.reconstruction.video_files import VideoPictures
 from instrument.reconstruction.video_job import VideoJob
 from instrument.runs.run import Run
 from instrument.runs.run_files import log_size
-from recon.base.threads import get_threads, set_threads
+from recon.base.threads import get_threads, linear_algebra_on_one_thread, set_threads
 from recon.reconstruction.measurement import Floats
 from recon.streams.joint import solve_together
 from recon.streams.stillness import has_light
@@ -64,6 +64,7 @@ class CancelledError(Exception):
     """The block was left unfinished because somebody wanted the end."""
 
 
+@linear_algebra_on_one_thread()
 def solve_block(
     job_folder: str,
     output: str,
@@ -143,7 +144,10 @@ def _solver_for(job: VideoJob) -> tuple[VideoJob, VideoSolver]:
     kept = _kept.value = None  # its memory is needed
     plan = job.plan
     solver = VideoSolver(
-        job.problem, cold_iterations=plan.cold_iterations, warm_iterations=plan.warm_iterations
+        job.problem,
+        cold_iterations=plan.cold_iterations,
+        warm_iterations=plan.warm_iterations,
+        times_noise=job.times_noise,
     )
     _kept.value = job, solver
     return job, solver

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from recon.analysis.resolution import lateral_resolution
 from recon.base.blocks import block_mean
 from recon.base.checks import SATURATED_LIGHT, saturated_light, saturated_share
+from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.camera_model import CAMERAS, ModelName
 from recon.camera.registration import likeness
 from recon.camera.transformed import Transformation, transformed
@@ -81,6 +82,7 @@ VARIED = 0.35
 more than any other pattern: then all of them are tried, or, where one was chosen, nobody is accused."""
 
 
+@linear_algebra_on_one_thread()
 def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> CalibrationCheck | None:
     """Let a problem's calibration compete with its decoys on the channel that has most signal.
 

@@ -16,6 +16,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.camera_model import Extent, choose_model
 from recon.errors import InputError
 from recon.reconstruction.first_look import look_at
@@ -176,6 +177,8 @@ class VideoSolver:
         Of the first frame after :meth:`begin`, and of each after it.
     parts : list of Part, optional
         The problem's, where they are there already.
+    times_noise : float, optional
+        The prior's weight, of :func:`weight_of`, where that is known already.
 
     Attributes
     ----------
@@ -183,6 +186,7 @@ class VideoSolver:
         Since the last frame that began from zero.
     """
 
+    @linear_algebra_on_one_thread()
     def __init__(
         self,
         problem: Problem,
@@ -190,6 +194,7 @@ class VideoSolver:
         cold_iterations: int = COLD_ITERATIONS,
         warm_iterations: int = WARM_ITERATIONS,
         parts: list[Part] | None = None,
+        times_noise: float | None = None,
     ) -> None:
         if min(cold_iterations, warm_iterations) < 1:
             raise InputError(
@@ -199,9 +204,9 @@ class VideoSolver:
         self._offered = require_steps(problem)
         self._first = self.problem = problem
         self.parts = parts or [Part(problem, channels) for channels in parts_of(problem)]
-        look = look_at(problem)
+        times_noise = weight_of(problem) if times_noise is None else times_noise
         for part in self.parts:
-            part.weigh(problem.options.tau, None if look is None else look.weight(problem.prior_name))
+            part.weigh(problem.options.tau, times_noise)
         self.solvers: list[Any] = [None for _ in self.parts]
         self.iterations = self._calm = 0
         self._cold = True
@@ -247,6 +252,7 @@ class VideoSolver:
                 break
         return self.picture()
 
+    @linear_algebra_on_one_thread()
     def take(self, frame: Floats) -> None:
         """Take a frame as of :meth:`next`, to be iterated by :meth:`advance`."""
         self.problem = self._first.with_data(frame)
@@ -322,6 +328,12 @@ class VideoSolver:
         if isinstance(solver, Solver):
             solver.compile()
         return solver
+
+
+def weight_of(problem: Problem) -> float | None:
+    """Return the prior's weight in units of the noise, by a first look at a problem; None for the table's."""
+    look = look_at(problem)
+    return None if look is None else look.weight(problem.prior_name)
 
 
 def require_steps(problem: Problem) -> OfferedSolver:

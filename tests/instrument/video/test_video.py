@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import zarr
 from ome_zarr_models.v05 import Image
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
@@ -44,6 +45,8 @@ from recon.base.metrics import psnr
 from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.problem import Problem
+from recon.solvers.sensor_admm import SensorAdmm
 from recon.streams.stillness import has_light
 from recon.streams.video import VideoSolver
 from tests.mocks.recordings import write_recording
@@ -318,6 +321,33 @@ def test_blocks_solved_together_hold_no_other_solver(
 
 
 @pytest.mark.slow
+def test_workers_take_the_weight_that_the_first_frame_told(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared = prepare_video(request(recording, tmp_path))
+
+    def anew(_: Problem) -> None:
+        raise AssertionError("a worker looked again")
+
+    blas = []
+    move = SensorAdmm.set_data
+
+    def set_data(solver: SensorAdmm, data: np.ndarray) -> None:
+        blas.append(max(found["num_threads"] for found in threadpool_info() if found["user_api"] == "blas"))
+        move(solver, data)
+
+    with monkeypatch.context() as patched, threadpool_limits(2):
+        patched.setattr("recon.streams.video.look_at", anew)
+        patched.setattr(SensorAdmm, "set_data", set_data)
+        block_module.solve_block(str(prepared.job.folder), str(prepared.request.out), 0)
+    assert set(blas) == {1}  # its threads would wait for one another by spinning
+    told = prepared.job.plan.settings["weight"]
+    with VideoSolver(prepared.job.problem) as again:
+        assert told == pytest.approx(max(again.weights), rel=1e-12)
+    with VideoSolver(prepared.job.problem, times_noise=prepared.job.times_noise) as again:
+        assert told == pytest.approx(max(again.weights), rel=1e-12)
+
+
 def test_a_cluster_here_takes_work_from_its_owner_only() -> None:
     pytest.importorskip("cryptography", reason="a cluster's keys need cryptography")
     distributed = pytest.importorskip("distributed")
