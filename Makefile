@@ -38,7 +38,7 @@ docs: $(STAMP) ## the site of all documentation, with search, gallery and refere
 test: lint types tests ## every check and every test
 
 tests: $(STAMP) ## the tests alone
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 2 --dist worksteal --durations=40
 
 mutants: $(STAMP) ## change the program a little again and again, and see whether a test notices (half an hour)
 	$(BIN)/python -m tests.mutants

@@ -116,6 +116,25 @@ def test_a_files_image_is_no_array_and_says_where_its_array_is(
             used()
 
 
+def test_how_files_are_read_is_said_by_arrays_and_numbers_as_well(
+    scene: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    for name, image in zip(("photo.tif", "psf.tif"), scene, strict=True):
+        db.write_image(tmp_path / name, image)
+    files = tmp_path / "photo.tif", tmp_path / "psf.tif"
+    dark = np.full((48, 48), OFFSET, np.uint16)
+    found = db.reconstruct(*files, dark=dark, crop=(0, 0, 40, 44), noise=(2, 0.5), iterations=2)
+    assert found.image.shape == (40, 44)
+    assert found.facts()["Dark"] == "the frame an array (mean 30.0 counts)"
+    for given, said in (
+        ({"dark": dark[1:]}, "an array: the dark frame is 47 x 48 .* but the image .*photo.tif is 48 x 48"),
+        ({"crop": (0, 0, 40)}, "crop: write TOP,LEFT,HEIGHT,WIDTH"),
+        ({"erasures": dark}, r"erasures must be .* not an array of shape \(48, 48\)\."),
+    ):
+        with pytest.raises((ValueError, db.BenchError), match=said):
+            db.reconstruct(*files, **given)
+
+
 def test_what_a_notebook_shows_is_short() -> None:
     made = make_scene("beads", size=32)
     operator = db.Convolution(made.calibration.psfs[:1, 0], (32, 32))

@@ -381,13 +381,16 @@ def _refuse_non_finite(path: Path, array: npt.NDArray[Any], *, holes: bool) -> N
     if holes and finite.any():
         finite |= np.isnan(array)
     if not finite.all():
-        where = tuple(int(i) for i in np.argwhere(~finite)[0])
-        raise FileError(
-            path,
-            f"holds {array.size - int(finite.sum())} values that are no finite numbers "
-            f"(the first, {array[where]}, at index {where}).",
-            "Replace them, e.g. by the mean of their neighbours.",
+        where, count = tuple(int(i) for i in np.argwhere(~finite)[0]), array.size - int(finite.sum())
+        them = (
+            "a value that is no finite number" if count == 1 else f"{count} values that are no finite numbers"
         )
+        first = (
+            f"{array[where]} at index {where}"
+            if count == 1
+            else f"the first, {array[where]}, at index {where}"
+        )
+        raise FileError(path, f"holds {them} ({first}).", "Replace it, e.g. by the mean of its neighbours.")
 
 
 _BIG_TIFF_BYTES = 3_900_000_000

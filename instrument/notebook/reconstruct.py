@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import fields
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +119,8 @@ def reconstruct(
     **overrides
         Single options by name: of the reconstruction (``prior="l1"``, ``iterations=50``, ``z_um=30e3``), and
         of how files are read (``dark``, ``crop``, ``binning``, ``erasures``, ``mosaic``, ``noise``), as
-        values or in the words of the terminal (``dark="dark.tif"``).
+        values or in the words of the terminal (``dark="dark.tif"``, ``crop=(20, 30, 400, 600)``); ``dark``
+        may be an image or array, too.
 
     Raises InputError, BenchError or FileError: what was found, what was expected, what to do.
     """
@@ -174,12 +176,20 @@ def _opened(given: Any, name: str) -> ImageFile:
 
 
 def _inputs(given: Mapping[str, Any]) -> InputOptions:
-    """Return options of files; words are read as the terminal reads them."""
+    """Return options of files; words are read as the terminal reads them, and numbers in a row as words."""
     parsers = {o.name: o.declaration.parse for o in options_of(InputOptions)}
-    read = {
-        name: parse(value) if isinstance(value, str) and (parse := parsers[name]) is not None else value
-        for name, value in given.items()
-    }
+    read: dict[str, Any] = {}
+    for name, value in given.items():
+        if isinstance(value, tuple | list) and all(isinstance(one, Real) for one in value):
+            value = ",".join(map(str, value))
+        elif name == "dark" and np.ndim(value):
+            opened = _opened(value, "dark frame")
+            value = opened if value is opened else ImageFile(Path("an array"), opened.pixels)
+        parse = parsers[name] if isinstance(value, str) else None
+        try:
+            read[name] = value if parse is None else parse(value)
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
     inputs = InputOptions(**read)
     require(inputs)
     return inputs

@@ -199,7 +199,7 @@ class Option:
         if any(_fits(kind, value) for kind in self.kinds):
             return None
         if not {int, float} & set(self.kinds):
-            return f"{name} must be {self.expected(typed=typed)}, not {value!r}."
+            return f"{name} must be {self.expected(typed=typed)}, not {_shown(value)}."
         said = self.declaration
         kind = Integral if self.is_whole else Real
         is_number = isinstance(value, kind) and not isinstance(value, bool)
@@ -208,7 +208,7 @@ class Option:
         # A NaN fails every comparison.
         if is_number and said.least <= value <= said.most and said.above < value < said.below:  # type: ignore[operator]
             return None
-        shown = f"{value / said.shown_factor:g}" if typed and is_number else repr(value)  # type: ignore[operator]
+        shown = f"{value / said.shown_factor:g}" if typed and is_number else _shown(value)  # type: ignore[operator]
         return f"{name} must be {self.expected(typed=typed)}, not {shown}."
 
     @property
@@ -243,6 +243,11 @@ class Option:
         if Path in self.kinds:
             words.append("the name of a file")
         return f"{', '.join(words)} or {number}" if words else number
+
+
+def _shown(value: object) -> str:
+    shape = getattr(value, "shape", ())
+    return f"an array of shape {shape}" if shape else repr(value)
 
 
 def _fits(kind: Any, value: object) -> bool:
