@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,13 +24,16 @@ if TYPE_CHECKING:
 
 def chart_page(data: ChartData) -> str:
     """Return a page: points to hover over, families to switch off, axes to choose; the front by name."""
-    known = [k for k in data.kind.scores if any(is_known(p, k.key) for p in data.points)]
+
+    def known(axes: Iterable[Any]) -> list[dict[str, Any]]:
+        return [asdict(axis) for axis in axes if any(is_known(p, axis.key) for p in data.points)]
+
     payload = json.dumps(
         {
             "points": [p.to_json() for p in data.points],
             "colours": colours_of(data),
-            "costs": [asdict(axis) for axis in data.kind.costs],
-            "scores": [asdict(axis) for axis in known],
+            "costs": known(data.kind.costs),
+            "scores": known(data.kind.scores),
             "groups": list(dict.fromkeys(p.group for p in data.points)),
         }
     ).replace("</", "<\\/")  # "</" inside a script would end it
@@ -44,7 +47,8 @@ _PAGE = """<!doctype html>
 :root{color-scheme:light dark;--ink:#22303c;--ground:#fff;--line:#ddd}
 @media(prefers-color-scheme:dark){:root{--ink:#dfe6ec;--ground:#14191e;--line:#36404a}}
 body{font:14px system-ui,sans-serif;margin:1.5em;color:var(--ink);background:var(--ground)}
-h1{font-size:1.2em}label{margin-right:1em}svg text{fill:var(--ink)}svg .grid{stroke:var(--line)}
+h1{font-size:1.2em}label{margin-right:1em;white-space:nowrap}
+svg text{fill:var(--ink)}svg .grid{stroke:var(--line)}
 #tip{position:absolute;background:var(--ground);border:1px solid #8496a5;padding:.4em .6em;
 font-size:12px;white-space:pre;pointer-events:none;display:none}.front{stroke:var(--ink);stroke-width:1.5}
 polyline{fill:none}
@@ -115,7 +119,8 @@ function draw() {
   for (const ps of runs.values()) line(ps, {stroke: data.colours[ps[0].family], "stroke-opacity": 0.3});
   node("polyline", {class: "front", points: front.map((p, i) => (i ? px(p[x.key]) + "," +
     py(front[i - 1][y.key]) + " " : "") + px(p[x.key]) + "," + py(p[y.key])).join(" ")});
-  const words = p => p.setting + (p.iterations ? ", " + p.iterations + " iterations" : "");
+  const times = n => n ? `, ${n} iteration${n > 1 ? "s" : ""}` : "";
+  const words = p => p.setting + times(p.iterations);
   for (const p of front) {
     const item = document.createElement("li");
     item.textContent = words(p) + ": " + x.words + " " + short(p[x.key]) + ", " + y.words + " " +

@@ -145,9 +145,11 @@ def _verdict_of(case: Path) -> dict[str, Any]:
     """
     from instrument.reconstruction.stored_result import open_result
 
-    verdict: dict[str, Any] | None = open_result(case).record.get("verdict")
+    record = open_result(case).record
+    verdict: dict[str, Any] | None = record.get("verdict")
     if not verdict or not verdict.get("evidence"):
-        raise FileError(case, "was not judged, so that it has no place on a map.", "Reconstruct it anew.")
+        remedy = "Reconstruct it anew." if record else "Give a picture that reconstruct wrote."
+        raise FileError(case, "was not judged, so that it has no place on a map.", remedy)
     return verdict
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -390,7 +391,9 @@ MAPS: dict[str, StressMap] = {
 def map_named(name: str) -> StressMap:
     """Return a map by its name, with the methods that others' packages, or this program, have registered."""
     if name not in MAPS:
-        raise InputError(f"There is no map {name!r}. Maps: {', '.join(MAPS)}.")
+        near = difflib.get_close_matches(name, MAPS, 1)
+        meant = f" Did you mean {near[0]!r}?" if near else ""
+        raise InputError(f"There is no map {name!r}. Maps: {', '.join(MAPS)}.{meant}")
     stress = MAPS[name]
     first = stress.methods[0]
     if name not in _OF_SCENES or "," in first:

@@ -11,6 +11,7 @@ from matplotlib.text import Text
 
 from instrument.evaluation.chart import ChartData, colours_of
 from instrument.evaluation.chart_figure import MOST_LINES, chart_figure, chosen, draw_chart
+from instrument.evaluation.figures import chart_page
 from recon.evaluation.scored import KINDS, SECONDS, Point, pareto
 
 SCORE = KINDS["reconstruction"].scores[0]
@@ -70,6 +71,13 @@ def test_names_stand_apart_beside_the_panel_and_say_what_the_front_costs() -> No
     assert bold
     assert all(text.endswith(("ms", " s")) for text in bold)
     assert len(chart_figure(data).axes) == 2
+
+
+def test_a_page_offers_the_axes_that_were_measured() -> None:
+    bare = tuple(replace(p, peak_mib=np.nan) for p in _points(3))
+    pages = [chart_page(ChartData("reconstruction", {}, points, {}, ())) for points in (_points(3), bare)]
+    assert ["memory beyond" in page for page in pages] == [True, False]
+    assert all("time of the solver" in page for page in pages)
 
 
 def test_long_names_are_cut_by_no_edge_and_no_panel() -> None:
