@@ -54,7 +54,8 @@ class Facts:
     opening : bool
         Whether devices are still being opened.
     light : str
-        Of the newest frame: ``"unknown"`` (none yet), ``"dark"``, ``"saturated"`` or ``"good"``.
+        Of the newest frame: ``"unknown"`` (none yet), ``"held"`` (none comes), ``"dark"``, ``"saturated"`` or
+        ``"good"``.
     shown : bool
         Whether a pattern is on the SLM.
     made : Made
@@ -128,6 +129,11 @@ def light_of(frame: Frame | None) -> str:
     return "dark" if brightest < _DARK * ((1 << metadata.significant_bits) - 1) else "good"
 
 
+def _light_now(session: BenchSession) -> str:
+    newest = session.live.newest()
+    return "held" if newest is None and not session.live.is_running else light_of(newest)
+
+
 def facts_of(session: BenchSession, made: Made) -> Facts:
     """Return how a session stands now; reads no file and asks no device."""
     states = {kind: session.state(kind).condition for kind in session.kinds}
@@ -135,7 +141,7 @@ def facts_of(session: BenchSession, made: Made) -> Facts:
     return Facts(
         failed=tuple(kind for kind, state in states.items() if state == "failed"),
         opening="opening" in states.values() or (bool(states) and set(states.values()) == {"closed"}),
-        light=light_of(session.live.newest()),
+        light=_light_now(session),
         shown=slm is not None and session.is_open("slm") and bool(slm.displayed.any()),
         made=made,
     )
@@ -204,10 +210,11 @@ def _exposed(facts: Facts, *, later: bool) -> Step:
     """Return the step to a picture that can be used; ``later``: what came after it is done."""
     words = {
         "unknown": "The first frame is awaited.",
+        "held": "The live view is held: let it go on by “Live”.",
         "dark": "The picture is nearly black: light the scene, or expose longer.",
         "saturated": "The picture is saturated: expose shorter.",
     }.get(facts.light, "")
-    what = "" if facts.light == "unknown" else EXPOSE
+    what = "" if facts.light in ("unknown", "held") else EXPOSE
     answer = EXPOSING if what else "Look at it"
     return Step("Expose", later or facts.light == "good", words, answer, "live", what)
 

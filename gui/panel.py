@@ -57,6 +57,9 @@ class Panel(QWidget):
         self.copy_button.setFlat(True)
         self._tips: dict[QWidget, str] = {}
         """What was refused here, with the tool tip that it had."""
+        self._said_of: QWidget | None = None
+        """The field that the last line is about, where it is about one."""
+        self._heeded: set[Refusing] = set()
         self._fade = after_rest(self, _REFUSAL_MS, self.accepted)
         fill(self, (self.body, 1), in_row((self._note, 1), self.copy_button), margins=(8, 8, 8, 4), spacing=4)
 
@@ -117,7 +120,31 @@ class Panel(QWidget):
             mark(field, "refused", True)
             field.setToolTip(why)
         elided(self._note, why)
+        self._said_of = field
+        if isinstance(field, Refusing):
+            self._clear_with(field)
         self._fade.start()
+
+    def heed(self, field: Refusing) -> None:
+        """Have what a field refuses told in the panel's last line, until it is mended."""
+
+        def refused(why: str) -> None:
+            self.refused(None, why)
+            self._said_of = field
+
+        field.refused.connect(refused)
+        self._clear_with(field)
+
+    def _clear_with(self, field: Refusing) -> None:
+        """Clear the last line when a field that it is about is mended."""
+
+        def mended() -> None:
+            if self._said_of is field:
+                self.accepted()
+
+        if field not in self._heeded:
+            self._heeded.add(field)
+            field.mended.connect(mended)
 
     def accepted(self, field: QWidget | None = None) -> None:
         """Clear what ``refused`` showed: the line, the field, and all buttons, which hold nothing to mend."""

@@ -364,7 +364,8 @@ QTabBar::tab {{ background: palette(alternate-base); color: palette(placeholder-
 QTabBar::tab:selected {{ background: palette(base); color: palette(text);
   border-top: 2px solid palette(link); }}
 QTabBar::tab:hover {{ color: palette(text); }}
-QTabBar::tab:selected:focus {{ color: palette(link); border: 2px solid palette(link); }}
+QTabBar::tab:selected:focus {{ color: palette(link); border: 2px solid palette(link);
+  padding: 5px 11px 3px 11px; }}
 QDockWidget {{ color: palette(placeholder-text); }}
 QDockWidget::title {{ background: palette(alternate-base); padding: 4px 8px; }}
 QMainWindow::separator {{ background: palette(midlight); width: 3px; height: 3px; }}

@@ -80,7 +80,7 @@ class LedPanel(DevicePanel):
         self.index.returnPressed.connect(self._toggle_typed)
         for field in (self.na, self.index):
             field.setFixedWidth(80)
-            field.refused.connect(lambda why: self.refused(None, why))
+            self.heed(field)
         tip = "Light or darken the LED of this number"
         self.toggle_button = button("Toggle LED", tip, self._toggle_typed)
         self.pattern_buttons: dict[str, QPushButton] = {}

@@ -127,7 +127,7 @@ class LivePanel(Panel):
         )
         self.average = NumberEdit("frames", 1, minimum=1, integer=True, tip="Frames averaged in a photograph")
         self.average.setFixedWidth(90)
-        self.average.refused.connect(lambda why: self.refused(None, why))
+        self.heed(self.average)
         self.light_buttons = QButtonGroup(self)
         self.light_buttons.setExclusive(False)  # what is lit is shown as it is, not as it was clicked
         light = in_row(spacing=2)

@@ -120,7 +120,7 @@ class LiveReconstructionPanel(Panel):
         self.budget = NumberEdit("ms", _BUDGET_MS, minimum=5.0, maximum=5000.0, tip=tip)
         self.budget.setFixedWidth(80)
         self.budget.submitted.connect(self._set_budget)
-        self.budget.refused.connect(lambda why: self.refused(None, why))
+        self.heed(self.budget)
         declared = (*options_of(ReconstructionOptions), *options_of(LiveOptions))
         own = ("z_um", "budget_ms")
         asked = [o for o in declared if o.name not in own]

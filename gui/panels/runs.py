@@ -63,7 +63,7 @@ class RunsPanel(Panel):
         session = self.session
         left, top, below = QWidget(), QWidget(), QWidget()
         right = split(top, below, sizes=[480, 260], down=True)
-        fill(self.body, split(left, right, sizes=[560, 640], firm=True))
+        fill(self.body, split(left, right, sizes=[640, 560], firm=True))
         self._make_list()
         fill(left, self.where, (self.table, 1), (self.hint, 1), margins=(0, 0, 6, 0))
         yield

@@ -159,7 +159,7 @@ class StagePanel(DevicePanel):
             )
             target.setFixedWidth(120)
             target.submitted.connect(partial(self._move_to, axis.name))
-            target.refused.connect(lambda why: self.refused(None, why))
+            self.heed(target)
             minus, plus = (
                 button(text, "Jog by one step", partial(self._jog_clicked, letter, sign))
                 for text, sign in (("−", -1), ("+", 1))
@@ -180,7 +180,7 @@ class StagePanel(DevicePanel):
                 _words(unit), _STEPS.get(unit, 1.0), minimum=1e-6, tip="A jog; Shift × 10, Ctrl × 0.1"
             )
             step.setFixedWidth(110)
-            step.refused.connect(lambda why: self.refused(None, why))
+            self.heed(step)
             self.steps[unit] = step
             self._step_row.addWidget(label("Step"))
             self._step_row.addWidget(step)

@@ -261,7 +261,7 @@ class RecordBar(QWidget):
         self.button = button("● Record", tip, self.toggle)
         self.seconds = NumberEdit("s", 10.0, minimum=0.01, tip="How long to record, seconds")
         self.seconds.setFixedWidth(80)
-        self.seconds.refused.connect(lambda why: panel.refused(None, why))
+        panel.heed(self.seconds)
         self.label = QLineEdit("recording")
         self.label.setAccessibleName("Name of the recording")
         self.label.setToolTip("Becomes part of the run folder's name")
@@ -337,8 +337,10 @@ class RecordBar(QWidget):
         self.note.setText(" · ".join(words))
 
     def _done(self, run: Run) -> None:
-        self.note.setText(f"{len(run.records)} frames in {run.path.name}")
-        self._session.log("info", f"Recorded {len(run.records)} frames: {run.path}")
+        count = len(run.records)
+        frames = f"{count} frame{'' if count == 1 else 's'}"
+        self.note.setText(f"{frames} in {run.path.name}")
+        self._session.log("info", f"Recorded {frames}: {run.path}")
         self._session.run_finished.emit(run.path)
 
     def _ended_early(self, how: str) -> None:

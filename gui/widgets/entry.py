@@ -23,9 +23,12 @@ class Refusing(QLineEdit):
     -------
     refused : str
         Why it is.
+    mended
+        It is not any more.
     """
 
     refused = Signal(str)
+    mended = Signal()
 
     def _tip_now(self) -> str:
         """Return the tool tip of a field that is not refused."""
@@ -42,8 +45,11 @@ class Refusing(QLineEdit):
             self._mark("")
 
     def _mark(self, why: str) -> None:
+        was_refused = bool(self.property("refused"))
         mark(self, "refused", bool(why))
         self.setToolTip(why or self._tip_now())
+        if was_refused and not why:
+            self.mended.emit()
 
 
 class Entry(Refusing):

@@ -50,6 +50,9 @@ def test_the_way_of_a_camera_is_gone_step_by_step(tmp_path: Path) -> None:
     assert step(Facts(opening=True)) == "Connect"
     assert step(Facts(failed=("stage",))) == "Connect"
     assert step(Facts()) == step(Facts(light="dark")) == step(Facts(light="saturated")) == "Expose"
+    held = next_of(steps_of(config, Facts(light="held")))
+    assert held is not None
+    assert "“Live”" in held.words
     assert step(GOOD) == "Calibrate"
     paths = [tmp_path / name for name in ("calibration", "photo.tif", "result.json")]
     for number, path in enumerate(paths):
@@ -81,9 +84,18 @@ def test_what_lies_in_a_folder_is_found(tmp_path: Path) -> None:
     assert made.surface == tmp_path / "y_dpc/dpc.json"
 
 
-def test_the_strip_names_the_next_step_and_leads_there(qtbot: QtBot, window: MainWindow) -> None:
+def test_the_strip_names_the_next_step_and_leads_there(
+    qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
     strip = window.strip
     assert light_of(window.session.live.newest()) in ("good", "dark", "saturated")
+    monkeypatch.setattr("gui.widgets.step_strip.facts_of", lambda _session, _made: given[0])
+    given = [GOOD]
+    strip.look()
+    given = [Facts(light="held")]
+    strip.look()  # the picture was well exposed before it was held, and is so still
+    assert "▸&nbsp;Calibrate" in strip.marks.text()
+    monkeypatch.undo()
     strip.show_facts(GOOD)
     assert "▸&nbsp;Calibrate" in strip.marks.text()
     assert "✓&nbsp;Connect" in strip.marks.text()

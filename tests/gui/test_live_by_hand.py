@@ -97,6 +97,13 @@ def test_a_photograph_waits_for_the_exposure_that_is_still_being_typed(qtbot: Qt
     assert live.average.property("refused")
     assert not live.session.jobs.is_busy("camera")
     assert live.photograph is None
+    assert "0 frames is outside" in live._note.toolTip()
+    _type_only(qtbot, live.form.widgets["exposure_ms"], "8")  # another field is mended
+    qtbot.keyClick(live.form.widgets["exposure_ms"], Qt.Key.Key_Return)
+    assert live._note.text()
+    _type_only(qtbot, live.average, "1")
+    qtbot.keyClick(live.average, Qt.Key.Key_Return)
+    assert not live._note.text(), "errors go when their cause goes"
 
 
 def test_a_region_is_drawn_with_the_mouse(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:
