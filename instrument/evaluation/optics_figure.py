@@ -1,4 +1,4 @@
-"""The page of a comparison of optics: PSFs, photographs, pictures, beads in depth, error against photons."""
+"""The page of a comparison of optics: PSFs, photographs, beads in depth, pictures, error against photons."""
 
 from __future__ import annotations
 
@@ -7,87 +7,105 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from instrument.files.figures import mark_simulated, style
-from instrument.files.seen import srgb
-from instrument.reconstruction.result_figures import in_colour_of_depth
-from recon.evaluation.optics_compared import Comparison, Image
+from recon.evaluation.optics_compared import DEPTHS_UM, Comparison, Image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.gridspec import SubplotSpec
 
 BEADS = "Beads lie at calibrated depths only; light from between them is not tested."
 """What a page and a table of a comparison say below."""
 _COLOURS = ("#444444", "#1b7fbd", "#d9822b", "#2a9d4a")
+_LIGHTS = 5
+"""Lights whose pictures are shown."""
 _MARGIN = 32
 """Pixels at each edge of the sensor's grid that the scenes leave dark."""
 
 
 def optics_figure(compared: Comparison) -> Figure:
-    """Draw a row for every kind of optics, the scenes above them, and the error against photons below."""
+    """Draw a row for every kind of optics: its PSF, the beads plane by plane, the picture at each light.
+
+    The scenes stand above them (Figs. 6.2 and 6.3), errors below.
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 15.5), layout="constrained")
+    first = next(iter(compared.found.values()))
+    lights = _spread(sorted(first.pictures), _LIGHTS)
+    n_z, n = len(compared.beads), len(compared.found)
+    widths = [*[1] * (2 + n_z), 0.15, *[1] * (1 + len(lights))]
+    figure = Figure(figsize=(1.7 * sum(widths), 1.7 * (n + 1) + 4.4), layout="constrained")
     figure.suptitle("One scene through four kinds of optics, equal light\n")
-    rows = figure.add_gridspec(
-        len(compared.found) + 2, 1, height_ratios=[*[1] * (len(compared.found) + 1), 1.5]
-    )
-    few, many = (
-        min(next(iter(compared.found.values())).pictures),
-        max(next(iter(compared.found.values())).pictures),
-    )
-    titles = (
-        "PSF (square root)",
-        "photograph",
-        f"{few:.0e} photons",
-        f"{many:.0e} photons",
-        "beads, depth as colour",
-    )
-    first = _row(figure, rows[0])
-    for axes in first:
-        axes.axis("off")
-    _picture(first[3], compared.picture, "the picture")
-    _depths(first[4], compared.beads, "the beads")
-    for row, (name, found) in enumerate(compared.found.items(), 1):
-        cells = _row(figure, rows[row])
-        shown = (np.sqrt(np.maximum(found.psf, 0)), found.photograph)
-        for place, image, title in zip(cells[:2], shown, titles[:2], strict=True):
-            _show(place, image, title)
-        for place, photons, title in zip(cells[2:4], (few, many), titles[2:4], strict=True):
-            _picture(place, found.pictures[photons], f"{title}: {found.psnr_db[photons]:.1f} dB")
-        _depths(cells[4], found.volume, f"{titles[4]}: {found.volume_psnr_db:.1f} dB")
-        cells[0].axis("on")
-        cells[0].set(xticks=[], yticks=[], ylabel=name)
-    below = figure.add_subplot(rows[len(compared.found) + 1])
-    for (name, found), colour in zip(compared.found.items(), _COLOURS, strict=True):
-        lights = sorted(found.psnr_db)
-        values = [found.psnr_db[light] for light in lights]
-        below.semilogx(lights, values, "o-", color=colour, label=name)
-    style(below, "Picture against the scene", "photons on the sensor", "PSNR, dB")
-    below.legend(loc="lower right", frameon=False)
+    rows = figure.add_gridspec(n + 2, 1, height_ratios=[*[1] * (n + 1), 1.9])
+
+    def row(at: int) -> tuple[list[Axes], list[Axes]]:
+        cells = rows[at].subgridspec(1, len(widths), width_ratios=widths)
+        axes = [figure.add_subplot(cells[0, column]) for column in range(len(widths))]
+        for cell in axes:
+            cell.axis("off")
+        return axes[: 2 + n_z], axes[3 + n_z :]
+
+    depths = [f"{z / 1e3:.2g} mm" for z in DEPTHS_UM]
+    deep, flat = row(0)
+    deep[0].set_title("Beads in depth", loc="left", fontsize=11)
+    flat[0].set_title("A picture in focus", loc="left", fontsize=11)
+    for cell, plane, depth in zip(deep[2:], compared.beads, depths, strict=True):
+        _scene(cell, plane, f"the beads, {depth}", float(compared.beads.max()))
+    _scene(flat[-1], compared.picture, "the picture")
+    for at, (name, found) in enumerate(compared.found.items(), 1):
+        deep, flat = row(at)
+        _show(deep[0], np.sqrt(np.maximum(found.psfs[n_z // 2], 0)), "PSF (square root)")
+        deep[0].axis("on")
+        deep[0].set(xticks=[], yticks=[], ylabel=name)
+        _show(deep[1], found.bead_photograph, "photograph")
+        for cell, plane, depth in zip(deep[2:], found.volume, depths, strict=True):
+            _scene(cell, plane, depth, float(found.volume.max()))
+        _show(flat[0], found.photograph, "photograph")
+        for cell, photons in zip(flat[1:], lights, strict=True):
+            _scene(cell, found.pictures[photons], f"{photons:.3g} photons: {found.psnr_db[photons]:.1f} dB")
+    below = rows[n + 1].subgridspec(1, 2, width_ratios=[2 + n_z, 1.15 + len(lights)])
+    _beads(figure.add_subplot(below[0, 0]), compared)
+    _errors(figure.add_subplot(below[0, 1]), compared)
     figure.supxlabel(BEADS, fontsize=9)
     mark_simulated(figure, 0.985)
     return figure
 
 
-def _row(figure: Figure, place: SubplotSpec) -> list[Axes]:
-    cells = place.subgridspec(1, 5)
-    return [figure.add_subplot(cells[0, column]) for column in range(5)]
+def _spread(values: list[float], most: int) -> list[float]:
+    """Return the values, or as many as there is room for, first and last among them."""
+    if len(values) <= most:
+        return values
+    return [values[round(k * (len(values) - 1) / (most - 1))] for k in range(most)]
 
 
-def _show(axes: Axes, image: Image, title: str) -> None:
-    axes.imshow(image, cmap="gray", vmin=0, vmax=max(float(np.percentile(image, 99.8)), 1e-30))
+def _beads(axes: Axes, compared: Comparison) -> None:
+    names = list(compared.found)[::-1]
+    colours = dict(zip(compared.found, _COLOURS, strict=True))
+    values = [compared.found[name].volume_psnr_db for name in names]
+    bars = axes.barh(names, values, color=[colours[name] for name in names])
+    words = [
+        f" {compared.found[name].volume_psnr_db:.1f} dB, {compared.found[name].light_in_place:.0%} in place"
+        for name in names
+    ]
+    axes.bar_label(bars, words, fontsize=9)
+    axes.set_xlim(0, 1.4 * max(values))
+    style(axes, "Beads against the scene, and their light at its place in all three axes", "PSNR, dB", "")
+
+
+def _errors(axes: Axes, compared: Comparison) -> None:
+    for (name, found), colour in zip(compared.found.items(), _COLOURS, strict=True):
+        lights = sorted(found.psnr_db)
+        axes.semilogx(lights, [found.psnr_db[light] for light in lights], "o-", color=colour, label=name)
+    style(axes, "Picture against the scene", "photons on the sensor", "PSNR, dB")
+    axes.legend(loc="lower right", frameon=False)
+
+
+def _show(axes: Axes, image: Image, title: str, top: float = 0.0) -> None:
+    top = top or max(float(np.percentile(image, 99.8)), 1e-30)
+    axes.imshow(image, cmap="gray", vmin=0, vmax=top, interpolation="nearest")
     axes.set_title(title, fontsize=9)
     axes.axis("off")
 
 
-def _picture(axes: Axes, image: Image, title: str) -> None:
-    _show(axes, image[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN], title)
-
-
-def _depths(axes: Axes, volume: Image, title: str) -> None:
-    front = volume.max(axis=0)
-    coloured = in_colour_of_depth(front, volume.argmax(axis=0), len(volume), 0.5 * float(front.max()) or 1.0)
-    axes.imshow(srgb(coloured)[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN], interpolation="nearest")
-    axes.set_title(title, fontsize=9)
-    axes.axis("off")
+def _scene(axes: Axes, image: Image, title: str, brightest: float = 0.0) -> None:
+    """Show what is around the scene, beads of all planes at one brightness: white from half of the most."""
+    _show(axes, image[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN], title, 0.5 * brightest)

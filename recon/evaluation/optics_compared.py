@@ -2,14 +2,16 @@
 
 All four have one aperture at one distance from one sensor, and send as many photons onto it. Photographs are
 propagated as light, each cell of the scene at its own place; PSFs are those of a point on the axis of each
-depth, without noise. Everything is reconstructed alike: by l1, as sec. 6.2 does, with one PSF a depth. Beads
-are drawn at calibrated depths only; light from between them, which every real sample sends, is not tested.
+depth, without noise. The objective is corrected over its field, as such lenses are: it throws every point's
+light about the straight ray as the axis's. Everything is reconstructed alike: by l1, as sec. 6.2 does, with
+one PSF a depth, each picture with the best of three weights. Beads are drawn at calibrated depths only; light
+from between them, which every real sample sends, is not tested.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -18,17 +20,18 @@ from recon.base import metrics
 from recon.base.declare import option
 from recon.optics.diffuser import OPTICAL_EPOXY, Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.fall_off import no_fall_off
-from recon.optics.grid import GREEN, PixelGrid
-from recon.optics.render import render
+from recon.optics.grid import GREEN, PixelGrid, Spectrum
+from recon.optics.render import RenderSettings, render
 from recon.optics.scene import Scene, TruthGrid, bead_volume, picture
-from recon.optics.wave import WavePropagator
+from recon.optics.wave import Emission, Source, WavePropagator
 from recon.reconstruction.options import Options
 from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration, Geometry
 
 Image = npt.NDArray[np.float32]
 
-SHAPE, PITCH_UM = (112, 112), 20.0
+SHAPE, PITCH_UM = (111, 111), 20.0
+"""Odd: the axis meets the middle of a pixel. A spot on the corner of four is a square of four."""
 APERTURE_UM, LENSLET_UM = 500.0, 125.0
 DISTANCE_UM = 3800.0
 DEPTHS_UM = (1613.0, 2000.0, 2632.0)
@@ -38,8 +41,12 @@ _WEIGHTS = (0.0, 1.0, 0.0)
 _HEIGHTS_UM = 1.25
 
 OPTICS = ("objective", "smooth diffuser", "regular lenslets", "random lenslets")
-_RENDERED = {name: (80, 20) if name == "objective" else (6, 6) for name in OPTICS}
-"""What rendering picture and beads takes, in reconstructions: an objective's relief is the steepest."""
+_RENDERED = {name: (12, 6) if name == "objective" else (6, 6) for name in OPTICS}
+"""What rendering picture and beads takes, in lights' reconstructions."""
+_NODES = RenderSettings(node_tolerance=0.3, widest_spacing=0.05)
+"""Sharp spots are blurred between PSFs that are farther apart."""
+_OF_DEFAULT = (0.3, 1.0, 3.0)
+"""Weights that are tried: the default alone leaves nothing of a smooth diffuser's little light."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +59,8 @@ class OpticsOptions:
         default_words="30,000 to 10,000,000",
         above=0,
     )
-    volume_photons: float = option(3e5, help="Photons from the beads in depth.", above=0)
+    beads: int = option(60, help="Beads in depth: a few are found through any optics.", least=1)
+    volume_photons: float = option(1e5, help="Photons from the beads in depth.", above=0)
     iterations: int = option(100, help="Iterations of every reconstruction.", least=1)
     seed: int = option(0, help="Another one: other diffusers, beads and noise.", least=0)
 
@@ -63,8 +71,10 @@ class Compared:
 
     Attributes
     ----------
-    psf, photograph : ndarray, (height, width)
-        On the axis of the middle depth; of the picture at the middle one of the lights.
+    psfs : ndarray, (n_z, height, width)
+        Of a point on the axis at each depth.
+    photograph, bead_photograph : ndarray, (height, width)
+        Of the picture, at the middle one of the lights; of the beads.
     pictures : mapping of float to ndarray
         Reconstructed from each number of photons.
     psnr_db : mapping of float to float
@@ -72,17 +82,18 @@ class Compared:
     volume : ndarray, (n_z, height, width)
         The beads.
     volume_psnr_db : float
-    right_depth : float
-        Share of the light of the beads' own pixels that came back in the beads' own plane.
+    light_in_place : float
+        Share of the volume's light that is where beads are: in a bead's plane, a pixel from it at most.
     """
 
-    psf: Image
+    psfs: Image
     photograph: Image
+    bead_photograph: Image
     pictures: Mapping[float, Image]
     psnr_db: Mapping[float, float]
     volume: Image
     volume_psnr_db: float
-    right_depth: float
+    light_in_place: float
 
 
 @dataclass(frozen=True)
@@ -106,7 +117,11 @@ def compare_optics(
     flat = picture(_spokes(), DEPTHS_UM[1], width_um)
     spread = (24 * PITCH_UM * DEPTHS_UM[0] / DISTANCE_UM,) * 2
     beads = bead_volume(
-        24, spread, (DEPTHS_UM[0], DEPTHS_UM[-1]), diameter_um=8.0, seed=int(rng.integers(1_000_000))
+        options.beads,
+        spread,
+        (DEPTHS_UM[0], DEPTHS_UM[-1]),
+        diameter_um=8.0,
+        seed=int(rng.integers(1_000_000)),
     )
     beads = _onto_depths(beads)
     truth, planes = _truth(flat, None), np.stack([_truth(beads, k) for k in range(len(DEPTHS_UM))])
@@ -120,7 +135,8 @@ def compare_optics(
 
     found = {}
     for name in OPTICS:
-        light = WavePropagator(_diffuser(name, options.seed), DISTANCE_UM)
+        optics = _Corrected if name == "objective" else WavePropagator
+        light = optics(_diffuser(name, options.seed), DISTANCE_UM)
         grid = PixelGrid(SHAPE, PITCH_UM)
         psfs = [light.psf((0.0, 0.0, z), grid, GREEN.samples(1), emission="isotropic") for z in DEPTHS_UM]
         calibration = _calibration(np.stack(psfs))
@@ -129,23 +145,50 @@ def compare_optics(
         for scene, takes in zip((flat, beads), _RENDERED[name], strict=True):
             clean.append(_photographed(scene, grid, light))
             advance(takes)
-        pictures, shown = {}, {}
+        pictures, psnr_db, shown = {}, {}, {}
         for photons in options.photons:
             shown[photons] = _noisy(clean[0], photons, rng)
-            pictures[photons] = _solved(shown[photons], middle, options.iterations)[0]
+            best = _solved(shown[photons], middle, options.iterations, truth[None])
+            pictures[photons], psnr_db[photons] = best[0][0], best[1]
             advance(1)
-        volume = _solved(_noisy(clean[1], options.volume_photons, rng), calibration, options.iterations)
+        of_beads = _noisy(clean[1], options.volume_photons, rng)
+        volume, volume_psnr_db = _solved(of_beads, calibration, options.iterations, planes)
         advance(1)
         found[name] = Compared(
-            psfs[1],
+            np.stack(psfs),
             shown[sorted(shown)[len(shown) // 2]],
+            of_beads,
             pictures,
-            {n: metrics.psnr(image, truth, fit_scale=True) for n, image in pictures.items()},
+            psnr_db,
             volume,
-            metrics.psnr(volume, planes, fit_scale=True),
-            _in_right_plane(volume, planes),
+            volume_psnr_db,
+            _light_in_place(volume, planes),
         )
     return Comparison(found, truth, planes)
+
+
+class _Corrected(WavePropagator):
+    """A lens corrected over its field: off the axis it makes of a point what it makes of one on the axis."""
+
+    def psf(
+        self,
+        source_um: Source,
+        grid: PixelGrid,
+        spectrum: Spectrum,
+        *,
+        diameter_um: float = 0.0,
+        emission: Emission = "lambertian",
+        cell: bool = False,
+    ) -> Image:
+        """Return the light of a point on the axis, moved to where the straight ray ends."""
+        x, y, z = source_um
+        moved = (grid.center_um[0] + x * self.distance_um / z, grid.center_um[1] + y * self.distance_um / z)
+        # Rounding would make the same places many: they are kept by their grids.
+        center = (round(moved[0], 6) + 0.0, round(moved[1], 6) + 0.0)
+        about = replace(grid, center_um=center)
+        return super().psf(
+            (0.0, 0.0, z), about, spectrum, diameter_um=diameter_um, emission=emission, cell=cell
+        )
 
 
 def _diffuser(name: str, seed: int) -> Diffuser:
@@ -176,8 +219,6 @@ def _spokes(n: int = 72, spokes: int = 8) -> npt.NDArray[np.float64]:
 
 def _onto_depths(scene: Scene) -> Scene:
     """Put every bead at the nearest calibrated depth, where the camera sees it at the same place."""
-    from dataclasses import replace
-
     depths, beads = np.array(DEPTHS_UM), scene.beads[0]
     places = beads.positions_um.copy()
     nearest = depths[np.abs(1 / places[:, 2:] - 1 / depths).argmin(axis=1)]
@@ -193,7 +234,7 @@ def _truth(scene: Scene, plane: int | None) -> Image:
 
 
 def _photographed(scene: Scene, grid: PixelGrid, light: WavePropagator) -> Image:
-    return render(scene, _WEIGHTS, grid, light, no_fall_off, layer_photons=1, bead_photons=1)
+    return render(scene, _WEIGHTS, grid, light, no_fall_off, layer_photons=1, bead_photons=1, settings=_NODES)
 
 
 def _noisy(clean: Image, photons: float, rng: np.random.Generator) -> Image:
@@ -206,13 +247,22 @@ def _calibration(psfs: Image) -> Calibration:
     return Calibration(psfs[:, None], places, geometry=Geometry(PITCH_UM, DISTANCE_UM / 1e3))
 
 
-def _solved(counts: Image, calibration: Calibration, iterations: int) -> Image:
+def _solved(counts: Image, calibration: Calibration, iterations: int, truth: Image) -> tuple[Image, float]:
+    """Return what comes next to the truth by one of the weights, and its PSNR in dB."""
     wanted = Options(model="convolution", prior="l1", iterations=iterations, judged=False)
-    return reconstruct(counts, calibration, options=wanted).volume
+    default = reconstruct(counts, calibration, options=replace(wanted, iterations=1)).tau or 0.0
+    found = []
+    for times in _OF_DEFAULT:
+        volume = reconstruct(counts, calibration, options=replace(wanted, tau=times * default)).volume
+        found.append((volume, metrics.psnr(volume, truth, fit_scale=True)))
+    return max(found, key=lambda one: one[1])
 
 
-def _in_right_plane(volume: Image, truth: Image) -> float:
-    """Share of the light at pixels of beads that is in their own plane."""
+def _light_in_place(volume: Image, truth: Image) -> float:
+    """Share of the light that is a pixel at most from a bead, in its plane."""
     lit = truth > 0.1 * truth.max()
-    everywhere = volume * lit.any(axis=0)
-    return float(volume[lit].sum() / max(float(everywhere.sum()), 1e-30))
+    near = np.zeros_like(lit)
+    for row in (-1, 0, 1):
+        for column in (-1, 0, 1):
+            near |= np.roll(lit, (row, column), (1, 2))
+    return float(volume[near].sum() / max(float(volume.sum()), 1e-30))

@@ -19,7 +19,7 @@ def _read(text: str) -> np.ndarray:
 def test_the_comparison_of_optics_is_numbers() -> None:
     none = np.zeros((1, 1), np.float32)
     found = {
-        name: Compared(none, none, {}, {1e6: 20.5, 3e4: 13.25}, none[None], 21.0, 0.5)
+        name: Compared(none[None], none, none, {}, {1e6: 20.5, 3e4: 13.25}, none[None], 21.0, 0.5)
         for name in ("a b", "c")
     }
     table = _read(optics_csv(found))

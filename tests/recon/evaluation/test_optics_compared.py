@@ -21,10 +21,23 @@ def test_all_collect_the_same_light_and_the_objective_alone_is_sharp_at_one_dept
     assert min(peak["random lenslets"]) > 0.2 * peak["random lenslets"][1]
 
 
+def test_an_objective_is_as_sharp_off_its_axis():
+    grid = PixelGrid(oc.SHAPE, oc.PITCH_UM)
+    optics = oc._Corrected(oc._diffuser("objective", 0), oc.DISTANCE_UM)
+    z, pixels = oc.DEPTHS_UM[1], 15
+    x = pixels * oc.PITCH_UM * z / oc.DISTANCE_UM
+    axis, off = (optics.psf((at, 0.0, z), grid, GREEN.samples(1), emission="isotropic") for at in (0.0, x))
+    middle = oc.SHAPE[1] // 2
+    assert off.argmax() == axis.argmax() - pixels == middle * oc.SHAPE[1] + middle - pixels
+    np.testing.assert_allclose(off.max(), axis.max(), rtol=0.05)
+    assert axis.max() > 0.7 * axis.sum()  # one pixel: the axis meets its middle
+
+
 def test_beads_lie_on_the_planes_that_are_reconstructed():
     beads = oc._onto_depths(oc.bead_volume(9, (60.0, 60.0), (oc.DEPTHS_UM[0], oc.DEPTHS_UM[2])))
     assert set(beads.beads[0].positions_um[:, 2]) <= set(oc.DEPTHS_UM)
     planes = np.stack([oc._truth(beads, k) for k in range(3)])
     assert (planes > 0).any(axis=(1, 2)).all()
-    assert oc._in_right_plane(planes, planes) > 0.99
-    assert oc._in_right_plane(planes[::-1], planes) < 0.7
+    assert oc._light_in_place(planes, planes) > 0.99
+    assert oc._light_in_place(planes[::-1], planes) < 0.7
+    assert oc._light_in_place(planes + planes.max() / 10, planes) < 0.1  # haze is in nobody's place
