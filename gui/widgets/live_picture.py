@@ -188,6 +188,10 @@ LEVELS = {"full range": None, "0.1 – 99.9 %": (0.1, 99.9), "1 – 99 %": (1.0,
 """Percentiles of the counts shown darkest and brightest."""
 
 
+_STRIDE = 16
+"""Of the pixels that are looked at, along both sides: whether the light is another shows in a few."""
+_DIM = 0.002
+"""Of full scale: what noise and offsets may differ by."""
 _MOVED = 0.1
 """Of the span of the levels: from here on a frame is shown again by its own."""
 
@@ -299,8 +303,10 @@ class LivePicture(QWidget):
         fill(self, tools, (self.view, 1), self.profile_plot)
 
     def show_frame(self, frame: Frame) -> None:
-        """Show a frame with the levels in use."""
+        """Show a frame with the levels in use; in another light than the one before with its own."""
         self.frame, self.is_coarse = frame, False
+        if (before := self._measured) is not None and before is not frame and _other_light(before, frame):
+            self._measure(frame)
         top, left = frame.metadata.roi[:2]
         self.view.naming = (left, top, frame.metadata.binning)
         self.view.show_image(frame.image, *self.levels, frame.full_scale)
@@ -395,3 +401,10 @@ class LivePicture(QWidget):
         self.view.arrows_pan = not any(button.isChecked() for button in over)
         if not self.view.arrows_pan:
             self.view.setFocus()
+
+
+def _other_light(before: Frame, now: Frame) -> bool:
+    """Whether a frame is so much brighter or darker that levels and histogram of the other are not its."""
+    dark = now.metadata.black_level
+    means = [float(frame.image[::_STRIDE, ::_STRIDE].mean()) - dark for frame in (before, now)]
+    return abs(means[1] - means[0]) > 0.5 * max(min(means), 0.0) + _DIM * now.full_scale

@@ -420,6 +420,8 @@ def test_a_frame_that_is_much_brighter_is_not_left_with_the_levels_of_the_one_be
     for counts in (40, 3000):  # a slow camera: none comes between
         image = np.linspace(0, counts, like.size).reshape(like.shape).astype(like.dtype)
         picture.show_frame(replace(picture.frame, image=image))
+        assert picture.view._levels[:2] == picture.levels
+        assert picture.levels[1] > counts / 2, "not for a third of a second with another light's either"
         picture.measure()
         assert picture.view._levels[:2] == picture.levels
     assert picture.levels[1] > 2500
