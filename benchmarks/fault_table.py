@@ -5,7 +5,7 @@
 
 Each trial is a process of its own that carries out a command of the terminal on the simulated bench, or a
 live session of eight pictures from Python. The device call with the trial's number (counted at the driver,
-whoever makes it)
+whoever makes it; reading a property is a call)
 
 =========  =======================================================================================
 exception  raises an error that is no DeviceError, as a faulty driver's does
@@ -147,12 +147,19 @@ class Faulty:
         self._inside = threading.local()
 
     def install(self) -> None:
-        """Wrap the public methods of the simulated drivers, before a bench is made of them."""
+        """Wrap the public methods and properties of the simulated drivers, before a bench is made of them.
+
+        Those that a driver answers by itself stay as they are.
+        """
         for driver, interface in DRIVERS.items():
             for name in (name for name in dir(interface) if not name.startswith("_")):
-                method = getattr(driver, name)
-                if isinstance(method, FunctionType) and name not in ("check", "limits", "claims"):
-                    setattr(driver, name, self._wrapped(name, method))
+                member = getattr(driver, name)
+                if name in ("check", "claims", "name", "is_open"):
+                    continue
+                if isinstance(member, FunctionType):
+                    setattr(driver, name, self._wrapped(name, member))
+                elif isinstance(member, property) and member.fget is not None:
+                    setattr(driver, name, property(self._wrapped(name, member.fget)))
 
     def _wrapped(self, name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(method)
@@ -221,6 +228,7 @@ def soon() -> None:
         setattr(module, "STOP_ANSWER_S", SOON_S)  # noqa: B010 # its type is final
     setattr(stream, "CALL_MARGIN_S", SOON_S)  # noqa: B010
     checked.call_limit_s = lambda *_: SOON_S
+    Device.longest_call_s = SOON_S
     SimulatedCamera.longest_silence_s = SOON_S
 
 

@@ -192,7 +192,7 @@ class Device(ABC):
     @property
     @abstractmethod
     def name(self) -> str:
-        """The device as error messages name it, e.g. ``"stage (simulated)"``."""
+        """The device as error messages name it, e.g. ``"stage (simulated)"``; told without asking it."""
 
     @abstractmethod
     def open(self) -> None:
@@ -208,7 +208,7 @@ class Device(ABC):
     @property
     @abstractmethod
     def is_open(self) -> bool:
-        """Whether the device is connected."""
+        """Whether the device is connected, as far as the driver knows: told at once, without asking it."""
 
     @property
     @abstractmethod

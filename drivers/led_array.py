@@ -64,7 +64,7 @@ class LedArray(PlaysSequences[LedPattern]):
     @property
     @abstractmethod
     def pattern(self) -> LedPattern:
-        """The pattern shown now."""
+        """The pattern shown now: the last one that the device confirmed, told without asking it."""
 
     @abstractmethod
     def set_pattern(self, pattern: LedPattern) -> LedPattern:

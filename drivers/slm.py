@@ -57,7 +57,7 @@ class Slm(PlaysSequences[npt.NDArray[np.uint8]]):
     @property
     @abstractmethod
     def displayed(self) -> npt.NDArray[np.uint8]:
-        """The grey levels shown now, ``(height, width)`` uint8, read only."""
+        """The grey levels shown now, ``(height, width)`` uint8, read only; told without asking the device."""
 
     def _check(self, levels: npt.NDArray[np.uint8]) -> None:
         """Refuse what does not fit, for drivers."""

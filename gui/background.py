@@ -143,7 +143,7 @@ class LiveFollower:
             assert stream is not None
             self._stream = stream
             self.problem = ""
-            shape = stream.camera.frame_shape
+            shape = stream.frame_shape
             if shape != self._shape:
                 self.reconstructor.restart()
                 self._shape = shape

@@ -13,8 +13,9 @@ place of an axis      what its driver lets it settle within (3 times its resolut
 pattern, SLM image    none
 ====================  ==============================================================================
 
-A value that is no finite number is never a report. A call that sets, moves, opens or asks and does not come
-back is given up (``longest_call_s`` of the device), and its device is not used again before it does.
+A value that is no finite number is never a report. A call that sets, moves, opens or asks, or the reading of
+a property, that does not come back is given up (``longest_call_s`` of the device), and its device is not used
+again before it does.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import functools
 import inspect
 import logging
 import math
+import sys
 import threading
 import weakref
 from collections.abc import Callable, Mapping, Sequence
@@ -60,6 +62,13 @@ _ENDED_BY = {"snap": "stop_sequence", **dict.fromkeys(_MOVES, "stop")}
 _UNDONE_BY = {"open": "close", "set_pattern": "off", **_ENDED_BY}
 """What is done after a call that ended when it had been given up: it may have lit or moved something."""
 _INTERRUPTED_S = 2.0
+_AT_ONCE = {"name", "is_open", "pattern", "displayed"}
+"""Properties that no driver asks its device for: errors, what makes a bench safe and windows need them."""
+_READING = "reading "
+_OUTSIDE = {__name__, "drivers.common.stream"}
+"""Of the drivers' modules those that use devices as others do. What a driver's own code reads of itself, in
+threads of its own too, is not read in another thread, which may need a lock that the first one holds."""
+_here = threading.local()
 _hanging: weakref.WeakKeyDictionary[Device, list[threading.Thread]] = weakref.WeakKeyDictionary()
 """Not with the device: its attributes are its driver's."""
 _REMEDY = "Its readings cannot be trusted: check the device, its firmware and its driver."
@@ -88,12 +97,15 @@ def checked(driver: _D) -> _D:
 
 def _guarded_call(made: type, name: str) -> Callable[..., Any]:
     def call(self: Device, *args: Any, **named: Any) -> Any:
+        within_driver, _here.within_driver = _is_within_driver(), True
         try:
             return getattr(super(made, self), name)(*args, **named)
         except DeviceError:
             raise
         except Exception as error:
             raise _driver_failed(self, name, error) from error
+        finally:
+            _here.within_driver = within_driver
 
     def begins(self: Device, *args: Any, **named: Any) -> Any:
         require_ended(self)
@@ -103,7 +115,7 @@ def _guarded_call(made: type, name: str) -> Callable[..., Any]:
         return begins if name in _BEGIN else call
 
     def bounded(self: Device, *args: Any, **named: Any) -> Any:
-        if is_bounded():
+        if is_bounded() or _is_within_driver():
             return call(self, *args, **named)
         return _in_time(self, name, lambda: call(self, *args, **named))
 
@@ -166,15 +178,38 @@ def require_ended(device: Device) -> None:
 
 
 def _guarded_read(made: type, name: str) -> Callable[[Any], Any]:
+    own = made.__module__.partition(".")[0]
+
     def read(self: Device) -> Any:
+        within_driver, _here.within_driver = _is_within_driver(), True
         try:
             return getattr(super(made, self), name)
         except DeviceError:
             raise
         except Exception as error:
             raise _driver_failed(self, name, error) from error
+        finally:
+            _here.within_driver = within_driver
 
-    return read
+    if name in _AT_ONCE:
+        return read
+
+    def bounded(self: Device) -> Any:
+        asker = sys._getframe(1).f_globals.get("__name__", "")
+        asks_itself = asker.partition(".")[0] in ("drivers", own) and asker not in _OUTSIDE
+        if is_bounded() or asks_itself or _is_within_driver():
+            return read(self)
+        left = given_up(self)
+        if any(f": {_READING}" in thread.name for thread in tuple(left)):
+            require_ended(self)
+        return within(self.longest_call_s, self.name, _READING + name, lambda: read(self), left=left)
+
+    return bounded
+
+
+def _is_within_driver() -> bool:
+    """Return whether this thread is in a driver's call: it may hold locks that another would wait for."""
+    return getattr(_here, "within_driver", False)
 
 
 def _driver_failed(device: Device, name: str, error: Exception) -> DeviceError:

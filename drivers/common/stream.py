@@ -114,6 +114,8 @@ class FrameStream:
         self.acquired = 0
         self.dropped = 0
         self.error: DeviceError | None = None
+        self.frame_shape: tuple[int, ...] = ()
+        """Of its frames, once it was started."""
         self._running = False
         self._thread: threading.Thread | None = None
         self._subscriptions: list[Subscription] = []
@@ -128,7 +130,8 @@ class FrameStream:
         """
         if self._thread is not None:
             raise DeviceError(self.camera.name, "this stream has been started before.", "Make a new one.")
-        shape, dtype = self.camera.frame_shape, self.camera.frame_dtype
+        self.frame_shape = shape = self.camera.frame_shape
+        dtype = self.camera.frame_dtype
         # Two beyond the ring: one being filled, one for a reader that has just taken the oldest.
         self._pool = BufferPool(self.n_buffers + 2, shape, dtype)
         self._scratch: Pixels = np.empty(shape, dtype)
@@ -186,8 +189,13 @@ class FrameStream:
     def __enter__(self) -> Self:
         return self.start() if self._thread is None else self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(self, _type: object, error: BaseException | None, _traceback: object) -> None:
+        try:
+            self.close()
+        except Exception as failure:
+            if error is None or isinstance(error, StoppedError):
+                raise
+            error.add_note(str(failure))  # what came first tells more, and Ctrl-C is not taken for a failure
 
     # Getting frames ------------------------------------------------------------------------------
     def __iter__(self) -> Iterator[Frame]:

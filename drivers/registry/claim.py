@@ -53,12 +53,14 @@ class Claim:
             while not (busy := not lock(self._handle)) and not _is_at(self._handle, path):
                 os.close(self._handle)  # deleted since it was opened: a lock on it would hold nobody
                 self._handle = _open(path)
+            if not busy:
+                self._sign(path)
         except OSError as error:
             raise DeviceError(
                 device,
-                f"the locks of devices cannot be kept in {error.filename}: {error.strerror}.",
-                f"Make that folder one that all users may write to (chmod 1777), or name another in "
-                f"{PLACE_VARIABLE} for all of them.",
+                f"the locks of devices cannot be kept in {error.filename or path}: {error.strerror}.",
+                f"Make that folder one that all users may write to (chmod 1777) and that holds nothing else, "
+                f"or name another in {PLACE_VARIABLE} for all of them.",
             ) from error
         if busy:
             os.close(self._handle)
@@ -67,15 +69,23 @@ class Claim:
                 f"{resource} is in use by {_holder(path)}.",
                 "Close that program, or wait until it ends.",
             )
+
+    def _sign(self, path: Path) -> None:
+        """Write who holds it; what cannot be written is not held."""
         holder = {
             "program": " ".join([Path(sys.argv[0] or "python").name, *sys.argv[1:]])[:200],
             "pid": os.getpid(),
             "since": datetime.now(UTC).isoformat(timespec="seconds"),
             "host": socket.gethostname(),
-            "resource": resource,
+            "resource": self.resource,
         }
-        os.ftruncate(self._handle, 0)
-        os.pwrite(self._handle, json.dumps(holder).encode(), 0)
+        try:
+            os.ftruncate(self._handle, 0)
+            os.pwrite(self._handle, json.dumps(holder).encode(), 0)
+        except OSError as error:
+            self.release()
+            error.filename = str(path)
+            raise
 
     def release(self) -> None:
         """Give the device free; releasing twice does nothing."""
@@ -111,7 +121,7 @@ _TRIES, _BETWEEN_S = 10, 0.01
 def is_locked(path: Path) -> bool:
     """Return whether some process has a file or a folder locked; one that is not there, nobody has."""
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except FileNotFoundError:
         return False
     try:
@@ -155,13 +165,21 @@ def _is_for_all(folder: Path) -> bool:
         return False
 
 
+_AS_IT_IS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+"""Other users may have put there what they like: a link is not followed, a pipe not waited for."""
+
+
 def _open(path: Path) -> int:
     # Without O_CREAT first: Linux refuses O_CREAT on another user's file in a folder like this one.
-    with contextlib.suppress(FileNotFoundError):
-        return os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
-    handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
-    with contextlib.suppress(PermissionError):
-        os.fchmod(handle, 0o666)  # whatever the umask says: other users must be able to claim it too
+    try:
+        handle = os.open(path, os.O_RDWR | _AS_IT_IS)
+    except FileNotFoundError:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | _AS_IT_IS, 0o666)
+        with contextlib.suppress(PermissionError):
+            os.fchmod(handle, 0o666)  # whatever the umask says: other users must be able to claim it too
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise OSError(errno.EINVAL, "that is no file", str(path))
     return handle
 
 
@@ -173,29 +191,43 @@ def _is_at(handle: int, path: Path) -> bool:
 
 
 def _is_mine(path: Path) -> bool:
+    return _signed(path).get("pid") == os.getpid()
+
+
+def _signed(path: Path) -> dict[str, Any]:
+    """Return what a holder wrote of itself: nothing where that cannot be read, or is none of this."""
     try:
-        return bool(json.loads(path.read_text())["pid"] == os.getpid())
-    except (OSError, ValueError, KeyError):
-        return False
+        handle = os.open(path, os.O_RDONLY | _AS_IT_IS)
+        try:
+            found = json.loads(os.read(handle, _MOST_BYTES))
+        finally:
+            os.close(handle)
+        texts = ("program", "host", "since")
+        if isinstance(found["pid"], int) and all(str(found[key]).isprintable() for key in texts):
+            return dict(found)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        pass
+    return {}
+
+
+_MOST_BYTES = 4096
 
 
 def _holder(path: Path) -> str:
-    try:
-        holder: dict[str, Any] = json.loads(path.read_text())
-        words = f"{holder['program']!r}, process {holder['pid']}"
-        if holder["host"] != socket.gethostname():
-            return f"{words} on {holder['host']}, since {holder['since']}"
-        mine = " (this program)" if holder["pid"] == os.getpid() else ""
-        left = "" if _is_alive(holder["pid"]) else " (which has ended; a process that it started goes on)"
-        return f"{words}{mine}{left}, since {holder['since']}"
-    except (OSError, ValueError, KeyError):
+    if not (holder := _signed(path)):
         return "another program, which has just begun"
+    words = f"{holder['program']!r}, process {holder['pid']}"
+    if holder["host"] != socket.gethostname():
+        return f"{words} on {holder['host']}, since {holder['since']}"
+    mine = " (this program)" if holder["pid"] == os.getpid() else ""
+    left = "" if _is_alive(holder["pid"]) else " (which has ended; a process that it started goes on)"
+    return f"{words}{mine}{left}, since {holder['since']}"
 
 
 def _is_alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         pass  # another user's

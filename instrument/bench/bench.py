@@ -22,7 +22,7 @@ from drivers.registry.claim import Claim
 from drivers.slm import Slm
 from drivers.stage import Stage, approached
 from instrument.bench.camera_settings import apply_table
-from instrument.bench.config import BenchConfig, CameraTable, Kind, SlmTable, StageTable
+from instrument.bench.config import BenchConfig, CameraTable, DeviceConfig, Kind, SlmTable, StageTable
 from instrument.bench.config_file import load_config
 from instrument.bench.photograph import Progress, Snapshot, photograph
 from instrument.bench.safety import ClosingAtExit, SafeStep, StepsFailedError, safe_steps, try_all
@@ -54,10 +54,7 @@ class Bench:
             name: shared.part(shared.options) for name, shared in config.shared.items()
         }
         self.devices: Mapping[Kind, Device] = {
-            kind: checked(device.driver)(
-                device.options, self.shared[device.driver.Shared.table] if device.driver.Shared else None
-            )
-            for kind, device in config.devices.items()
+            kind: self._made(kind, device) for kind, device in config.devices.items()
         }
         switch = next((part for part in self.shared.values() if isinstance(part, SceneSwitch)), None)
         self._seated: dict[str, float] = {}
@@ -65,6 +62,17 @@ class Bench:
         self.newest_frame: Frame | None = None
         """The last frame of a photograph, whoever took it: what a window shows while a run goes on."""
         self._lights = Lights(config.source, config.scene, self.led_array, switch, ask)
+
+    def _made(self, kind: Kind, device: DeviceConfig) -> Device:
+        """Return a device of its driver, which touches no hardware yet, but may load a library that hangs."""
+        driver = device.driver
+        shared = self.shared[driver.Shared.table] if driver.Shared else None
+
+        def make() -> Device:
+            made: Device = checked(driver)(device.options, shared)
+            return made
+
+        return within(driver.longest_call_s, f"{kind} ({driver.__name__})", "making it", make)
 
     # Devices -----------------------------------------------------------------------------------
     @property
@@ -399,8 +407,9 @@ class Bench:
         try:
             self.close()
         except StepsFailedError as failure:
-            _log.error("%s", failure)
-            error.add_note(str(failure))
+            if str(failure) not in getattr(error, "__notes__", ()):  # how a run ended says the same
+                _log.error("%s", failure)
+                error.add_note(str(failure))
 
     def __enter__(self) -> Self:
         return self

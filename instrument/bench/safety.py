@@ -110,8 +110,14 @@ class StepsFailedError(BenchError):
 
     def __init__(self, failures: Iterable[tuple[str, BaseException]]) -> None:
         self.failures = tuple(failures)
-        listed = "".join(f"\n  {step}: {str(error) or type(error).__name__}" for step, error in self.failures)
+        listed = "".join(f"\n  {step}: {_without_its_name(step, error)}" for step, error in self.failures)
         super().__init__(f"The bench may not be safe. Check by eye what could not be done:{listed}")
+
+
+def _without_its_name(step: str, error: BaseException) -> str:
+    """Return what an error says, less the device's name that the step's words end in."""
+    name, _, said = str(error).partition(": ")
+    return said if said and step.endswith(name) else str(error) or type(error).__name__
 
 
 def safe_steps(

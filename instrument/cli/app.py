@@ -314,7 +314,7 @@ def report(error: BaseException) -> int:
 
 
 def _say(text: str, error: BaseException) -> None:
-    for line in (text, *getattr(error, "__notes__", ())):
+    for line in dict.fromkeys((text, *getattr(error, "__notes__", ()))):
         if line:
             sys.stderr.write(f"{line}\n")
 

@@ -41,7 +41,15 @@ from recon.types import Calibration
 from tests.instrument.conftest import mock_drivers
 from tests.instrument.runs.test_recorder import bench_with
 from tests.instrument.runs.test_resume import calls, open_mock_bench
-from tests.mocks.devices import MockCamera, MockLedArray, MockSlm, MockStage
+from tests.mocks.devices import (
+    MockCamera,
+    MockLedArray,
+    MockOptions,
+    MockSlm,
+    MockStage,
+    MockWorld,
+    MockWorldOptions,
+)
 from tests.mocks.free_running import FreeRunningCamera
 
 __all__ = ["mock_drivers"]
@@ -165,11 +173,12 @@ def test_a_device_that_takes_a_while_to_close_is_not_given_up(monkeypatch: pytes
 def test_a_camera_that_hangs_ends_a_recording_with_what_came_before(tmp_path: Path) -> None:
     camera = HangingCamera()
     bench = bench_with(camera)
-    with pytest.raises(DeviceError, match="hangs"):
+    with pytest.raises(DeviceError, match="hangs: its driver has not come back") as failure:
         record(bench, tmp_path, seconds=20)
+    assert any("hangs: handing out a frame" in note for note in failure.value.__notes__)
     run = Run.open(run_paths(tmp_path)[0])
     assert run.condition is RunCondition.FAILED
-    assert "hangs" in run.error
+    assert "has not come back" in run.error
     assert run.records
     assert light_is_off(bench)
     camera.let_go.set()
@@ -289,6 +298,55 @@ def test_a_device_that_hangs_when_set_or_moved_is_given_up_named_and_undone(
         assert [call for call in calls(bench) if call in ("stage.stop", "led_array.off")] == undone
         assert light_is_off(bench)
         assert device.settings() is not None
+
+
+@pytest.mark.usefixtures("mock_drivers", "soon")
+@pytest.mark.parametrize("kind", ["camera", "led_array"])
+def test_a_property_that_hangs_is_given_up_and_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Any
+) -> None:
+    let_go = threading.Event()
+    with open_mock_bench() as bench:
+        plain = HANGING[kind][0]
+        monkeypatch.setattr(Device, "longest_call_s", 0.25)
+        monkeypatch.setattr(plain, "identity", property(lambda _: let_go.wait(20)))
+        plan = Plan(label="p", parts=(Part(label="a", light=("source",)),))
+        with pytest.raises(DeviceTimeoutError, match=rf"^{kind} \(mock\): hangs: reading identity has not"):
+            acquire(bench, plan, tmp_path)
+        assert light_is_off(bench)
+        let_go.set()
+        for thread in given_up(bench.devices[kind]):
+            thread.join(5)
+
+
+def test_a_device_is_not_read_while_a_reading_hangs_and_reads_itself_in_its_own_thread() -> None:
+    lock = threading.Lock()
+
+    class Slow(MockSlm):
+        longest_call_s = 0.05
+
+        @property
+        def settle_ms(self) -> float:  # type: ignore[override]
+            with lock:
+                return 1.0
+
+        def tells(self) -> float:
+            return self.settle_ms
+
+    slm = checked(Slow)(MockOptions(), MockWorld(MockWorldOptions()))
+    assert slm.settle_ms == slm.tells()
+    user = {"__name__": "a_users", "slm": slm}
+    with lock:
+        with pytest.raises(DeviceTimeoutError, match="hangs: reading settle_ms has not ended"):
+            exec("slm.settle_ms", user)
+        with pytest.raises(DeviceTimeoutError, match="still hangs: reading settle_ms has not"):
+            exec("slm.settle_ms", user)
+        assert slm.name == "slm (mock)"
+        assert not slm.is_open
+    for thread in given_up(slm):
+        thread.join(5)
+    exec("told = slm.settle_ms", user)
+    assert user["told"] == slm.settle_ms
 
 
 def test_every_call_of_a_device_has_an_end_or_is_known_to_have_another() -> None:

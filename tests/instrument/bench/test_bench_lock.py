@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import secrets
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,7 +17,7 @@ import pytest
 from drivers.common.checked import given_up
 from drivers.device import Device, DriverOptions, port_claim
 from drivers.errors import DeviceError, DeviceTimeoutError
-from drivers.registry.claim import PLACE_VARIABLE, Claim, DeviceBusyError
+from drivers.registry.claim import PLACE_VARIABLE, Claim, DeviceBusyError, holder_of
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config, template
 from instrument.bench.safety import StepsFailedError
@@ -190,6 +192,46 @@ def test_a_folder_of_locks_that_cannot_serve_is_said(tmp_path: Path) -> None:
     (tmp_path / "locks").touch()
     with pytest.raises(DeviceError, match=r"cannot be kept in .*locks: not a folder.*chmod 1777"):
         Claim("port a", "stage")
+
+
+@pytest.mark.parametrize("puts", [os.mkfifo, os.mkdir, lambda path: path.symlink_to("/etc/passwd")])
+def test_what_another_user_puts_in_a_locks_place_is_said_and_not_waited_for(
+    tmp_path: Path, puts: Callable[[Path], object]
+) -> None:
+    Claim("port /dev/x", "stage").release()
+    (path,) = (tmp_path / "locks").iterdir()
+    path.unlink()
+    puts(path)
+    with pytest.raises(DeviceError, match=rf"cannot be kept in {path}: .*that holds nothing else"):
+        Claim("port /dev/x", "stage")
+    assert holder_of("port /dev/x") is None
+
+
+def test_a_holder_who_does_not_say_who_it_is_is_another_program(tmp_path: Path) -> None:
+    half = {"program": "x", "host": "h", "since": "now"}
+    with other_program("port /dev/x"):
+        (path,) = (tmp_path / "locks").iterdir()
+        for signed in (
+            "[1]",
+            "[" * 100_000,
+            half,
+            half | {"pid": "7"},
+            half | {"pid": 7, "host": "\x1b[31m"},
+        ):
+            path.write_text(signed if isinstance(signed, str) else json.dumps(signed))
+            with pytest.raises(DeviceBusyError, match="in use by another program, which has just begun"):
+                Claim("port /dev/x", "stage")
+
+
+def test_a_claim_that_cannot_be_signed_is_not_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "pwrite", full)
+        with pytest.raises(DeviceError, match=r"cannot be kept in .*\.lock: No space left"):
+            Claim("port /dev/x", "stage")
+    Claim("port /dev/x", "stage").release()
 
 
 def test_two_benches_of_one_program_exclude_each_other_too(tmp_path: Path) -> None:
