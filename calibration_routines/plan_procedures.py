@@ -21,6 +21,7 @@ from calibration_routines.procedure import (
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError
 from instrument.plan import Plan, check, estimate
+from instrument.plan.illumination import IlluminationOptions
 from instrument.runs.acquire import abilities_of, acquire, look, prepare_resume, settle
 from instrument.runs.inspection import Verification, run_paths, verify
 from instrument.runs.run import Run, RunCondition
@@ -45,6 +46,24 @@ class PlanProcedure(Procedure):
         home_if_needed(bench, listener, self.plan)
         listener.step(self.plan.label)
         return run_outcome(acquire(bench, self.plan, folder, on_progress=listener.frame, control=control))
+
+
+@dataclass(frozen=True, slots=True)
+class IlluminationProcedure(Procedure):
+    """Photograph the scene in the light of one group of LEDs after the other, and in the dark."""
+
+    asked: IlluminationOptions
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Hold its plan against the bench."""
+        return self._planned(bench).outlook(bench, folder)
+
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
+        """Take the frames."""
+        return self._planned(bench).perform(bench, folder, control, listener)
+
+    def _planned(self, bench: Bench) -> PlanProcedure:
+        return PlanProcedure(self.asked.plan(bench.led_array))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ _ELSEWHERE = {
     "record": "“Record” in the live view",
     "run": "a plan in Sweeps",
     "plan": "a plan in Sweeps",
+    "plan illumination": "“Patterned light” in Sweeps",
     "calibrate": "Sweeps",
     "align": "Alignment",
     "hologram": "Holograms",

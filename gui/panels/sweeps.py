@@ -16,7 +16,7 @@ from PySide6.QtWidgets import QWidget
 from calibration_routines.optics.beads import BeadCalibration
 from calibration_routines.optics.photograph import Photograph
 from calibration_routines.optics.screen_solve import ScreenCalibration
-from calibration_routines.plan_procedures import PlanProcedure
+from calibration_routines.plan_procedures import IlluminationProcedure, PlanProcedure
 from calibration_routines.procedure import Outcome, Outlook, Routine, routines
 from calibration_routines.psf.sweep import SweepCalibration
 from calibration_routines.psf.sweep_watch import PointTaken
@@ -33,6 +33,7 @@ from instrument.bench.photograph import Snapshot
 from instrument.files.errors import BenchError, FileError, SettingsError, count
 from instrument.live.frame_view import not_stretched
 from instrument.plan import Plan
+from instrument.plan.illumination import IlluminationOptions
 from instrument.plan.model import load_plan, plan_toml
 from recon.base.declare import option
 
@@ -72,6 +73,17 @@ PLAN = Routine(
 )
 
 
+ILLUMINATION = Routine(
+    name="illumination",
+    title="Patterned light",
+    help="Photograph the scene lit by one group of LEDs after the other. Once more with a plain white sheet "
+    "in its place; then “Reconstruct patterned light” in Files makes one picture of both runs",
+    options=IlluminationOptions,
+    procedure=IlluminationProcedure,
+    needs=("led_array",),
+)
+
+
 class SweepsPanel(ProcedurePanel):
     """Sweeps and plans."""
 
@@ -82,7 +94,7 @@ class SweepsPanel(ProcedurePanel):
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         own = [routine for routine in routines.values() if routine.command == "calibrate"]
-        super().__init__(session, [*own, PLAN], "Start", parent)
+        super().__init__(session, [*own, ILLUMINATION, PLAN], "Start", parent)
 
     def parts(self) -> Iterator[None]:
         """Make the widgets."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -18,20 +18,13 @@ from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.cli.progress import one_task
 from instrument.files.atomic import require_new, write_text
 from instrument.files.errors import BenchError, FileError, duration, size
-from instrument.plan import BenchAbilities, Light, Plan, check, estimate
-from instrument.plan.model import illumination_plan, load_plan, save_plan
-from instrument.plan.patterns import (
-    LED_PATTERNS,
-    group_lights,
-    groups_from_text,
-    led_shape,
-    pattern_help,
-    shape_from_text,
-)
+from instrument.plan import BenchAbilities, Plan, check, estimate
+from instrument.plan.illumination import IlluminationOptions
+from instrument.plan.model import load_plan, save_plan
+from instrument.plan.patterns import pattern_help
 from instrument.runs.acquire import abilities_of
 from instrument.runs.pace import Pace, pace_of
 from instrument.runs.rehearsal import rehearse
-from recon.base.declare import option
 
 Point = tuple[float, float]
 WIDTH, HEIGHT = 56, 14
@@ -76,30 +69,6 @@ def _scaled(value: float, low: float, high: float, last: int) -> int:
 
 
 app = App("Look at a plan before anything moves, or write one to start from.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class IlluminationOptions:
-    """Which LEDs light each frame, and how it is exposed."""
-
-    exposure_ms: float = option(help="Of every frame.", unit="ms", least=1e-3)
-    groups: list[list[int]] | None = option(
-        None, help="LEDs of each pattern: '0-3,8;4;5,6'.", metavar="LEDS", parse=groups_from_text
-    )
-    lattice: int | None = option(
-        None,
-        help="The array's LEDs in N x N groups by place; short for --pattern 'grid side=N'.",
-        metavar="N",
-        least=1,
-    )
-    pattern: str | None = option(
-        None,
-        help=f"A named pattern and all that belong to it: {', '.join(LED_PATTERNS)}. With options: "
-        "'half na=0.3'. diffuserbench plan patterns lists them.",
-        metavar="NAME",
-    )
-    level: int = option(255, help="Of every LED.", least=1, most=255)
-    average: int = option(1, help="Exposures averaged into a frame.", least=1)
 
 
 @app.command(
@@ -169,26 +138,17 @@ def illumination(
     Run it twice, with the scene and with a plain white sheet in its place; then
     diffuserbench reconstruct SCENE --patterned SHEET solves all frames together.
     """
-    groups, level = options.groups, options.level
-    if sum(given is not None for given in (groups, options.lattice, options.pattern)) != 1:
-        raise BenchError("Give the patterns either as --groups, --lattice N or --pattern NAME (one of them).")
     if out.suffix.lower() not in (".toml", ".json"):
         raise FileError(out, "a plan's name ends in .toml or .json.")
     require_new(out)
-    if groups is not None:
-        lights = group_lights(groups, level)
-    else:
-        shape = led_shape(*shape_from_text(options.pattern or f"grid side={options.lattice}"))
+    if options.needs_places:
         with open_and_say(bench) as opened:
-            if opened.led_array is None:
-                raise BenchError(
-                    "Patterns by place need the bench's LED array, and this bench has none. Give --groups."
-                )
-            rgb = None if level == 255 else (level, level, level)
-            lights = [Light.named(one, rgb) for one in shape.series(opened.led_array)]
-    plan = illumination_plan(lights, exposure_ms=options.exposure_ms, average=options.average)
+            plan = options.plan(opened.led_array)
+    else:
+        plan = options.plan(None)
     save_plan(plan, out)
-    typer.echo(f"Wrote {out}: {len(lights)} patterns. Look at it with: diffuserbench plan show {out}")
+    count = len(plan.parts[-1].light)
+    typer.echo(f"Wrote {out}: {count} patterns. Look at it with: diffuserbench plan show {out}")
 
 
 @app.command(epilog=examples("diffuserbench plan patterns"))

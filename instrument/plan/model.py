@@ -387,28 +387,3 @@ def _toml(value: Any) -> str:
         return "[" + ", ".join(map(_toml, value)) + "]"
     # Strings, numbers and booleans are written alike in both; a TOML basic string takes JSON's escapes.
     return json.dumps(value, ensure_ascii=False)
-
-
-# Active illumination ---
-DARK, PATTERN = "dark", "pattern"
-"""What the frames of such a plan are called."""
-
-
-def illumination_plan(lights: Sequence[Light], *, exposure_ms: float, average: int = 1) -> Plan:
-    """Return a plan that photographs the scene in each light in turn, and once in the dark.
-
-    The frames of its part ``"pattern"``, less the one of its part ``"dark"``, are what
-    :func:`recon.reconstruct` takes with patterns; :mod:`instrument.reconstruction.patterned` reads them.
-
-    Raises BenchError when there is no light.
-    """
-    if not lights:
-        raise BenchError("Active illumination needs patterns, each with one LED at least.")
-    exposures = (exposure_ms,)
-    return Plan(
-        label="active illumination",
-        parts=(
-            Part(label=DARK, light=(OFF,), exposures_ms=exposures, average=average),
-            Part(label=PATTERN, light=tuple(lights), exposures_ms=exposures, average=average),
-        ),
-    )

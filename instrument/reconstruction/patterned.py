@@ -16,7 +16,7 @@ import numpy.typing as npt
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile
-from instrument.plan.model import DARK, PATTERN
+from instrument.plan.illumination import DARK, PATTERN
 from instrument.reconstruction.job import Job, find_calibration, job_with
 from instrument.reconstruction.mosaic import pattern_of
 from instrument.reconstruction.options import InputOptions
@@ -52,7 +52,7 @@ class PatternedRequest:
     """What a picture is reconstructed from, and how."""
 
     run: Path
-    """Of a plan of :func:`instrument.plan.model.illumination_plan`, the scene in place."""
+    """Of a plan of :func:`instrument.plan.illumination.illumination_plan`, the scene in place."""
     sheet: Path
     """A run of the same plan, a plain white sheet in the scene's place; or patterns themselves as ``.npy``,
     (n_patterns, height, width) on the calibration's pixels."""

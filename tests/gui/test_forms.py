@@ -14,7 +14,7 @@ from calibration_routines.plan_procedures import PlanProcedure
 from calibration_routines.procedure import Outcome, Outlook, Procedure, Routine, Size, routines
 from calibration_routines.psf.sweep_options import AxialSweep
 from calibration_routines.psf.sweep_procedure import SweepProcedure
-from gui.panels.sweeps import PLAN
+from gui.panels.sweeps import ILLUMINATION, PLAN
 from gui.procedure_run import script
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import template
@@ -59,6 +59,7 @@ def test_settings_reach_the_request_in_its_units() -> None:
         (BEADS, {"rank": 0}, "rank"),
         (SCREEN, {"pictures": 1}, "pictures"),
         (PLAN, {"text": "label = "}, "text"),
+        (ILLUMINATION, {"exposure_ms": 5.0}, "groups"),
     ],
 )
 def test_a_mistake_names_its_field(form: Any, changed: dict[str, Any], field: str) -> None:
@@ -121,6 +122,7 @@ FAST = {"average": 1, "dark_frames": 1}
         (LATERAL, {"half_field_x_um": 0.0, "half_field_y_um": 0.0, "spacing_um": 1e3, **FAST}),
         (PHOTOGRAPH, FAST),
         (PLAN, {"text": POINT}),
+        (ILLUMINATION, {"exposure_ms": 5.0, "pattern": "half na=0.3"}),
         (SLM, {"levels": 8}),
     ],
     ids=lambda value: getattr(value, "name", ""),

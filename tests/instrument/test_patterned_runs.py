@@ -14,7 +14,8 @@ from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image
-from instrument.plan.model import illumination_plan, load_plan
+from instrument.plan.illumination import illumination_plan
+from instrument.plan.model import load_plan
 from instrument.plan.patterns import group_lights, groups_from_text
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned

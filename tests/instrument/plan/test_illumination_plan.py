@@ -6,7 +6,7 @@ import pytest
 
 from instrument.files.errors import BenchError
 from instrument.plan import Plan
-from instrument.plan.model import illumination_plan
+from instrument.plan.illumination import illumination_plan
 from instrument.plan.patterns import group_lights
 
 
