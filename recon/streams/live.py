@@ -14,6 +14,7 @@ import numpy.typing as npt
 from recon.base.blocks import block_mean
 from recon.base.checks import as_channels, require_finite
 from recon.base.declare import inapplicable, with_overrides
+from recon.camera.camera_model import members_of_depths
 from recon.errors import InputError
 from recon.reconstruction.measurement import Floats, Measurement
 from recon.reconstruction.options import ReconstructionOptions
@@ -103,6 +104,8 @@ class LiveReconstructor:
         if self._known.get("patterns") is not None:
             raise InputError("Live pictures are of one scene in one light: leave the patterns out.")
         self._given = calibration
+        places = calibration.source_positions_um if isinstance(calibration, Calibration) else None
+        self._one_of_many = places is not None and len(places) > len(members_of_depths(places))
         background = calibration.background if isinstance(calibration, Calibration) else None
         if background is not None and self._known.get("background") is None:
             self._known["background"] = np.moveaxis(background, 0, -1)
@@ -469,6 +472,7 @@ class LiveReconstructor:
             else f"brightest of {of}"
             if plane is None
             else f"depth {plane} of {of}",
+            camera=level.camera(filtered=filtered, varies=self._one_of_many),
             doubt=self._unlit() if done is None else NOISE_ONLY if self._dark else self._fit.doubt,
         )
 

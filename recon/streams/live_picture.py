@@ -42,6 +42,7 @@ UNLIT_SO_FAR = "Nothing was lit, as far as is known: whether there is light all 
 """Doubt of the black picture of such a frame until the calibration was held against it."""
 
 _LIVE = "Live pictures"
+_MODELS = {"convolution": "", "local": "local model", "lowrank": "low rank"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +115,8 @@ class LivePicture:
     """Depths of the calibration that were reconstructed, the nearest is 0: all, or fewer in short time."""
     shown: str = ""
     """Which of several depths ``image`` shows, in words."""
+    camera: str = ""
+    """What besides one PSF a depth on all pixels made it, in words: ``"local model, background"``."""
     doubt: str = ""
     """Why this is no picture of the scene, in words; empty where nothing speaks against it."""
 
@@ -131,7 +134,7 @@ class LivePicture:
         how = "Wiener filter" if self.method == "wiener" else steps
         scene = f"still, {self.frames} frames averaged" if self.frames > 1 else str(self.scene)
         settled = "settled" if self.settled else ""
-        worth = ", ".join(filter(None, (pixels, self.shown, how, scene, settled)))
+        worth = ", ".join(filter(None, (pixels, self.shown, self.camera, how, scene, settled)))
         return f"{self.doubt}: {worth}" if self.doubt else worth
 
 
@@ -174,6 +177,18 @@ class Level:
     def binning(self) -> int:
         """Pixels averaged along each axis."""
         return self.detail.binning
+
+    def camera(self, *, filtered: bool, varies: bool) -> str:
+        """Say which camera made a picture of the solver's, or of the filter's, where it is no plain one.
+
+        ``varies``: whether there are several PSFs of a depth.
+        """
+        problem = self.preview.problem if filtered else self.problem
+        model = _MODELS.get(problem.model, problem.model)
+        if varies and not model:
+            model = "one PSF for all of the field"
+        erased = f"{1 - problem.valid.mean():.1%} of the pixels left out" if not problem.valid.all() else ""
+        return ", ".join(filter(None, (model, "background" if problem.smooth else "", erased)))
 
     @cached_property
     def method(self) -> str:

@@ -43,6 +43,14 @@ CASES: dict[str, tuple[dict[str, Any], float]] = {
 }
 """Options, and how far from the single picture a stream may end: about twice what was measured.
 Landweber's iteration is slow: it is at rest, by its small steps, long before it is at the end."""
+SAID = {
+    "one PSF, erasures": ", one PSF for all of the field, 9.0% of the pixels left out, ",
+    "local": ", local model, ",
+    "low rank, l1, erasures": ", low rank, 9.0% of the pixels left out, ",
+    "smooth background, erasures": ", background, 9.0% of the pixels left out, ",
+    "own camera": ", vignetting, ",
+}
+"""What pictures say of the camera that made them."""
 
 
 @pytest.fixture(autouse=True)
@@ -89,6 +97,7 @@ def test_a_still_scene_becomes_what_its_mean_frame_becomes(name: str) -> None:
     alone = reconstruct(mean, scene.calibration, **options, iterations=400, tolerance=0).image
     picture = settled(LiveReconstructor(scene.calibration, **PACE, **options), frames)
     assert picture.frames == len(frames)
+    assert SAID.get(name, ", one PSF for all of the field, ") in picture.quality
     assert picture.method == stream_problem(frames[0], scene.calibration, **options).solver.name
     assert apart(picture.image, alone) < within
     problem = stream_problem(frames[0], scene.calibration, **options)
