@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import make_folder, sync_folder, write_json
 from instrument.files.errors import FileError
-from instrument.files.reading import parse_json, read_bytes
+from instrument.files.reading import parse_json, read_bytes, require_file
 from instrument.files.volumes import ome_attributes
 
 Image = npt.NDArray[Any]
@@ -209,14 +209,13 @@ class FrameArray:
         Raises FileNotFoundError when the frame is not there; FileError when its file has the wrong size.
         """
         path = self.chunk_path(index)
-        flat = np.fromfile(path, dtype=self.dtype.newbyteorder("<"))
-        if flat.size != int(np.prod(self.frame_shape)):
-            right = int(np.prod(self.frame_shape)) * self.dtype.itemsize
+        if (there := require_file(path)) != self.frame_bytes:
             raise FileError(
                 path,
-                f"has {path.stat().st_size} bytes; frame {index} takes {right}: it is damaged.",
+                f"has {there} bytes; frame {index} takes {self.frame_bytes}: it is damaged.",
                 "diffuserbench verify RUN names every damaged frame.",
             )
+        flat = np.fromfile(path, dtype=self.dtype.newbyteorder("<"))
         crc32 = zlib.crc32(flat.data)
         flat = flat.astype(self.dtype, copy=False)
         if self.is_colour:

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from instrument.bench.photograph import PHOTOGRAPHS, Progress
-from instrument.files.errors import ranges
+from instrument.files.errors import FileError, ranges
 from instrument.files.figures import save_figure
 from instrument.files.images import image_metadata
 from instrument.files.seen import as_seen
 from instrument.runs.repair import file_problems
 from instrument.runs.run import DamagedFrame, FinishReason, Run, RunCondition
-from instrument.runs.run_files import LOG, FileProblem, RunError, is_run
+from instrument.runs.run_files import LOG, FileProblem, is_run
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,5 +264,5 @@ def summary(path: Path) -> RunSummary:
             run.error,
             not run.is_being_written and not verify(run, read=False).is_sound,
         )
-    except RunError as error:
+    except FileError as error:
         return RunSummary(path, problem=error.problem)

@@ -22,7 +22,7 @@ import numpy as np
 
 from drivers.frame import FrameMetadata
 from instrument.files.atomic import sync_folder
-from instrument.files.reading import parse_json, require_plausible, stored_bytes
+from instrument.files.reading import parse_json, require_file, require_plausible, stored_bytes
 from instrument.files.record import plain, value_of
 from instrument.runs.run_files import RunError
 
@@ -278,7 +278,7 @@ def read_lines(path: Path, *, unread: bool = False) -> tuple[list[dict[str, Any]
     """
     records: list[dict[str, Any]] = []
     bad: list[BadLine] = []
-    require_plausible(path, path.stat().st_size, stored_bytes(path))
+    require_plausible(path, require_file(path, error=RunError), stored_bytes(path), error=RunError)
     with path.open("rb") as file:
         for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), start=1):
             if unread and (frame := _frame_line(line)) is not None:

@@ -5,6 +5,7 @@ Nothing is thrown away: what is replaced or cut out goes into the run's folder `
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -130,7 +131,7 @@ def mend_files(path: Path) -> list[str]:
             continue
         target = path / problem.name
         words = f"{problem.name} was made again"
-        if target.is_file():
+        if os.path.lexists(target):  # a folder or a pipe, too
             words += f"; the old one is kept in {KEPT}/{keep_beside(path, problem.name).name}"
         write_bytes(target, problem.text.encode())
         done.append(words)

@@ -277,7 +277,7 @@ class RunWriter:
         """Keep beside what these frames are about to take the place of."""
         for frame in frames:
             image = array.chunk_path(frame.index)
-            if image.is_file():
+            if os.path.lexists(image):  # a folder or a pipe, too
                 keep_beside(self.path, str(image.relative_to(self.path)))
 
     def keep_text(self, name: str, text: str) -> None:

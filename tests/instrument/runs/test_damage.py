@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 
 from instrument.cli import main
+from instrument.files.errors import FileError
 from instrument.plan import Part, Plan
 from instrument.runs import writer
 from instrument.runs.acquire import look, prepare, prepare_resume, settle
-from instrument.runs.inspection import verify
+from instrument.runs.inspection import summary, verify
 from instrument.runs.log import AppendOnlyLog
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_files import UNCHANGING, RunError
@@ -145,6 +146,53 @@ def test_each_damage_of_each_file_is_said_and_mended(
         kept = [p.read_bytes() for p in path.rglob("*") if p.is_file()]
         rewritten = path / "state.json", path / "log.jsonl", path / "damaged.json"
         assert all(data in kept for file, data in files.items() if file not in rewritten)
+
+
+def piped(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def endless(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("/dev/zero")
+
+
+def a_folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def hollow(path: Path) -> None:
+    os.truncate(path, 20 << 30)
+
+
+@pytest.mark.parametrize("puts", [piped, endless, a_folder, hollow])
+@pytest.mark.parametrize("name", [*FILES, "lock", "damaged.json"])
+def test_what_is_no_file_in_a_files_place_is_said_and_not_waited_for(
+    tmp_path: Path, runs: tuple[Path, Path], name: str, puts: Callable[[Path], None]
+) -> None:
+    path = tmp_path / "run"
+    shutil.copytree(runs[0], path)
+    whole = [Run.open(path).frame(index) for index in range(3)]
+    (path / name).touch()
+    puts(path / name)
+    if name in ("log.jsonl", "state.json"):
+        with pytest.raises(RunError, match=name):
+            Run.open(path)
+        assert summary(path).problem
+        return
+    if name in FILES:
+        found = verify(Run.open(path))
+        assert FILES[name] in "\n".join(found.lines())
+        for index in found.todo:
+            with pytest.raises(FileError, match=r"damaged|file is expected"):
+                Run.open(path).frame(index)
+        with RunWriter.reopen(path) as again:
+            again.write([FrameToStore(i, whole[i], frame(i).metadata) for i in found.todo])
+            again.finish(FinishReason.COMPLETED)
+    assert verify(Run.open(path)).is_sound
+    assert all(np.array_equal(Run.open(path).frame(index), whole[index]) for index in range(3))
 
 
 def test_no_two_commands_contradict_each_other_about_a_changed_pixel(
