@@ -31,6 +31,7 @@ from instrument.reconstruction.preparation import (
     FloatImage,
     auto_binning,
     bin_image,
+    both_raw,
     calibrated_dark,
     check_pair,
     check_psf,
@@ -345,7 +346,7 @@ def _refuse_constant(image: ImageFile) -> None:
 def _converted(psf: ImageFile, image: ImageFile) -> tuple[str, ...]:
     """Doubt a photograph that was made into fractions while its PSF is raw."""
     kinds = psf.pixels.dtype.kind, image.pixels.dtype.kind
-    if kinds != ("u", "f"):
+    if kinds != ("u", "f") or both_raw(psf, image):
         return ()
     return (
         f"The photograph is {image.pixels.dtype} and its PSF {psf.pixels.dtype}: it was converted, and its "

@@ -263,13 +263,13 @@ def dark_from_corners(psf: ImageFile, image: ImageFile) -> Dark:
     """Estimate a constant offset where no dark frame is at hand.
 
     The PSF's darkest corner tells it (mean of 10 x 10 pixels, 5 from the border: light rarely reaches there);
-    the image, whose corners are lit, has the same offset when both are integers of one depth, that is, raw
-    frames of one camera. Otherwise the image's offset is the mean of its darkest 10 x 10 pixels. It is never
+    the image, whose corners are lit, has the same offset when both are raw frames of one camera
+    (:func:`both_raw`). Otherwise the image's offset is the mean of its darkest 10 x 10 pixels. It is never
     more than those, so that nothing is pushed below zero by an offset that the image does not have.
     """
     corner, name = _darkest_corner(psf.pixels)
     darkest = darkest_block(image.pixels)
-    if psf.pixels.dtype.kind == "u" and psf.pixels.dtype == image.pixels.dtype:
+    if both_raw(psf, image):
         if corner <= darkest:
             reason = f"{corner:.1f} counts from both: mean of the PSF's {name} corner"
             return Dark(corner, corner, f"{reason} (estimated; --dark FILE or COUNTS to give it)")
@@ -278,6 +278,17 @@ def dark_from_corners(psf: ImageFile, image: ImageFile) -> Dark:
         why = "the image's darkest 10 x 10 pixels"
     reason = f"{darkest:.4g} from the image ({why}), {corner:.4g} from the PSF (its {name} corner)"
     return Dark(darkest, corner, f"{reason} (estimated; --dark FILE or COUNTS to give it)")
+
+
+def both_raw(psf: ImageFile, image: ImageFile) -> bool:
+    """Whether a PSF and an image are integers of one depth, be it that the image's bad pixels are NaN."""
+    dtype, pixels = psf.pixels.dtype, image.pixels
+    if dtype.kind != "u" or dtype == pixels.dtype or pixels.dtype.kind != "f" or not np.isnan(pixels).any():
+        return dtype.kind == "u" and dtype == pixels.dtype
+    counts = pixels[np.isfinite(pixels)]
+    most = 2 ** (8 * dtype.itemsize) - 1
+    fewest = most >> 8  # no eight bits that were put into sixteen
+    return bool(fewest < counts.max() <= most and counts.min() >= 0 and not (counts % 1).any())
 
 
 def _darkest_corner(pixels: npt.NDArray[Any]) -> tuple[float, str]:

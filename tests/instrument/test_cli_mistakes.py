@@ -24,7 +24,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     ([*RECONSTRUCT, "--psf", "eight.tif", "--image", "photo.tif"], "--mixed-depth"),
     ([*RECONSTRUCT, "--psf", "black.tif", "--image", "photo.tif"], "Was the point source on?"),
     ([*RECONSTRUCT, "--psf", "psf.tif", "--image", "black.tif"], "Was the scene lit?"),
-    ([*RECONSTRUCT, "--psf", "holes.tif", "--image", "photo.tif"], "no finite numbers"),
+    ([*RECONSTRUCT, "--psf", "holes.tif", "--image", "photo.tif"], "no finite number"),
     ([*RECONSTRUCT, "--psf", "absent.tif", "--image", "photo.tif"], "there is no such file"),
     ([*RECONSTRUCT, "--psf", "plain", "--image", "photo.tif"], "in a folder are given by --volume"),
     ([*RECONSTRUCT, "--psf", "/proc", "--image", "photo.tif"], "is a folder; a file is expected"),

@@ -244,7 +244,7 @@ BAD = {
     "channels": (["--psf", "colour.tif"], "colour.tif: the PSF is colour"),
     "bit depth": (["--psf", "eight.png"], "8 bit, but the image raw.tif has 16 bit"),
     "saturated": (["--psf", "burnt.tif"], "are saturated (at 4095)"),
-    "nan psf": (["--psf", "nan.npy"], "no finite numbers"),
+    "nan psf": (["--psf", "nan.npy"], "no finite number"),
     "black image": (["--image", "zero.tif"], "zero.tif: the image is constant"),
     "crop": (["--crop", "100x100"], "--crop asks for 100 x 100"),
     "crop text": (["--crop", "middle"], "TOP,LEFT,HEIGHT,WIDTH"),

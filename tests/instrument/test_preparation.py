@@ -19,6 +19,7 @@ from instrument.reconstruction.preparation import (
     Crop,
     auto_binning,
     bin_image,
+    both_raw,
     check_pair,
     check_psf,
     dark_from_corners,
@@ -106,6 +107,18 @@ def test_raw_frames_of_one_camera_share_the_offset_of_the_psfs_darkest_corner() 
     dark = dark_from_corners(file(psf), file(image))
     assert dark.image == dark.psf == 34
     assert "estimated" in dark.reason
+
+
+def test_a_raw_frame_with_holes_is_raw_and_fractions_are_not() -> None:
+    psf, image = psf_pixels(offset=100), psf_pixels(offset=100)
+    image[:] = image + 500.0
+    holes = image.astype(np.float32)
+    holes[3, 4:9] = np.nan
+    assert both_raw(file(psf), file(holes))
+    assert dark_from_corners(file(psf), file(holes)).image == dark_from_corners(file(psf), file(image)).image
+    for other in (image.astype(np.float32), holes + 0.5, holes / 1000 // 1, -holes):
+        assert not both_raw(file(psf), file(other))
+    assert not both_raw(file(psf.astype(np.float32)), file(image))
 
 
 def test_a_float_psf_tells_nothing_about_the_images_offset() -> None:
