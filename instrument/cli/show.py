@@ -367,7 +367,7 @@ def _show_run(run: Path, picture: Path | None) -> None:
 
 
 def _facts(run: Run) -> list[tuple[str, str]]:
-    from instrument.files.errors import size
+    from instrument.files.errors import ranges, size
 
     origin = run.provenance
     facts = [
@@ -378,11 +378,12 @@ def _facts(run: Run) -> list[tuple[str, str]]:
     if run.plan is not None:
         facts += [(part.label, f"{len(part)} frames, mean of {part.average}") for part in run.plan.parts]
     else:
-        lost = sum(gap.count for gap in run.gaps)
-        facts.append(("lost", f"{lost} in {len(run.gaps)} gaps"))
-        if run.lost or run.unlisted:
-            words = f"{len(run.lost)} after they were stored; {len(run.unlisted)} images have no metadata"
-            facts.append(("damaged", words))
+        words = f"{sum(gap.count for gap in run.gaps)} in {len(run.gaps)} gaps"
+        if run.lost:
+            words += f"; {len(run.lost)} after they were stored: {ranges(sorted(run.lost), 8)}"
+        facts.append(("lost", words))
+        if run.unlisted:
+            facts.append(("no metadata", f"{len(run.unlisted)} images: {ranges(sorted(run.unlisted), 8)}"))
         if run.frame_period_s:
             facts.append(("rate", f"{1 / run.frame_period_s:.3f} frames/s"))
     if run.has_frames:

@@ -325,6 +325,12 @@ def _job(request: VideoRequest, plan: VideoPlan, force: bool) -> tuple[VideoJob 
         begun = VideoJob(folder)
         if plain(plan) == plain(begun.plan):
             return begun, True
+        if (anew := begun.goes_on_without(plan)) is not None:  # frames were marked as lost since
+            pictures = VideoPictures(request.out, write=True)
+            for index in (index for number in anew for index in begun.blocks[number]):
+                pictures.remove(index)
+            begun.go_on_without(plan, anew)
+            return begun, True
     if request.out.exists() and not force:
         if begun is not None:
             raise FileError(

@@ -187,6 +187,10 @@ class VideoPictures:
         with self._file(index).open("rb") as written:
             os.fsync(written.fileno())
 
+    def remove(self, index: int) -> None:
+        """Take a picture away, where there is one."""
+        self._file(index).unlink(missing_ok=True)
+
     def remove_litter(self) -> None:
         """Remove what killed programs had begun to write; nobody may be writing now."""
         for begun in self.path.rglob("*.partial"):  # zarr's own name for it

@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
@@ -118,6 +119,26 @@ class VideoJob:
         _VIDEO_JOB.write(folder / _JSON, plain(plan))
         return cls(folder)
 
+    def goes_on_without(self, plan: VideoPlan) -> list[int] | None:
+        """Return the blocks that begin anew where ``plan`` is this one's but for frames lost since.
+
+        None where more differs, or no frame of a block is left: then the others would have other numbers.
+        """
+        frames = self.plan.frames
+        alike = plain(replace(plan, frames=frames)) == plain(self.plan) and set(plan.frames) <= set(frames)
+        ours, theirs = (_blocks(p.frames, p.block) for p in (self.plan, plan))
+        if not alike or len(ours) != len(theirs):
+            return None
+        return [number for number, (one, other) in enumerate(zip(ours, theirs, strict=True)) if one != other]
+
+    def go_on_without(self, plan: VideoPlan, anew: Sequence[int]) -> None:
+        """Take a plan of fewer frames; the blocks ``anew`` are to be computed again."""
+        for number in anew:
+            (self.folder / _DONE / str(number)).unlink(missing_ok=True)
+        sync_folder(self.folder / _DONE)
+        _VIDEO_JOB.write(self.folder / _JSON, plain(plan))
+        self.plan = plan
+
     def remove(self) -> None:
         """Delete the job, whose video is complete."""
         (self.folder / _JSON).unlink()
@@ -130,8 +151,7 @@ class VideoJob:
 
         By number and not by count, so that blocks stay what they are when frames are missing or added.
         """
-        block = self.plan.block
-        return [tuple(frames) for _, frames in groupby(self.plan.frames, lambda index: index // block)]
+        return _blocks(self.plan.frames, self.plan.block)
 
     def done(self) -> set[int]:
         """Return the numbers of the blocks whose pictures are on the disk."""
@@ -193,6 +213,10 @@ class VideoJob:
         mosaic = mosaic_named(str(a.get("mosaic", "")) or "none")  # none in jobs of before
         assert mosaic != "auto"
         return Reduction(first, dark, crop, last, mosaic)
+
+
+def _blocks(frames: Sequence[int], block: int) -> list[tuple[int, ...]]:
+    return [tuple(of_one) for _, of_one in groupby(frames, lambda index: index // block)]
 
 
 def _problem_arrays(problem: Problem) -> dict[str, Any]:

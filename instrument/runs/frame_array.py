@@ -154,15 +154,25 @@ class FrameArray:
             raise TypeError(f"Frames are stored as {', '.join(_DTYPES)}, not {data_type}.")
         array = description_of(n_frames, frame_shape, data_type)
         # Under another name until it is whole, so that a crash here leaves no half array behind.
-        draft = path.with_name(f".{path.name}.draft")
-        shutil.rmtree(draft, ignore_errors=True)
-        for folder in (draft, draft / _LEVEL, draft / _LEVEL / "c"):
-            make_folder(folder)
-        write_json(draft / DESCRIPTIONS[0], array)
-        write_json(draft / DESCRIPTIONS[1], group_of(array["dimension_names"], pixel_pitch_um, name))
-        draft.rename(path)
+        draft = cls.remove_draft(path)
+        try:
+            for folder in (draft, draft / _LEVEL, draft / _LEVEL / "c"):
+                make_folder(folder)
+            write_json(draft / DESCRIPTIONS[0], array)
+            write_json(draft / DESCRIPTIONS[1], group_of(array["dimension_names"], pixel_pitch_um, name))
+            draft.rename(path)
+        except BaseException:  # a signal too: a recording that ends without a frame makes no other array
+            cls.remove_draft(path)
+            raise
         sync_folder(path.parent)
         return cls(path)
+
+    @staticmethod
+    def remove_draft(path: Path) -> Path:
+        """Take away what a crash left of an array that was being made; returns where it would be."""
+        draft = path.with_name(f".{path.name}.draft")
+        shutil.rmtree(draft, ignore_errors=True)
+        return draft
 
     def write(self, items: Sequence[tuple[int, Image]]) -> list[StoredChunk]:
         """Store frames and return once all of them are on the disk.

@@ -135,6 +135,7 @@ def mend_files(path: Path) -> list[str]:
             words += f"; the old one is kept in {KEPT}/{keep_beside(path, problem.name).name}"
         write_bytes(target, problem.text.encode())
         done.append(words)
+    FrameArray.remove_draft(path / FRAMES)
     if FrameArray.is_there(path / FRAMES):
         run.array.remove_half_written()
     beyond = [index for index in run.without_a_line() if run.plan is not None and index >= len(run.plan)]

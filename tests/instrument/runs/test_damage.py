@@ -382,12 +382,14 @@ def test_a_recording_keeps_images_without_a_line_and_marks_the_rest_as_lost(tmp_
     log.write_bytes(data)
     (chunks / "5/0/0").write_bytes(b"short")
     (chunks / "6/0/0").unlink()
+    (path / f".{FRAMES}.draft" / "0").mkdir(parents=True)  # as a kill leaves it
     found = verify(Run.open(path))
     assert [f.index for f in found.damaged] == [5, 6]
     assert found.without_a_line == (3,)
     assert "marks frames 5-6 as lost" in found.remedy()
     said = "\n".join(settle(path))
     assert "marked as lost: frames 5-6" in said
+    assert not (path / f".{FRAMES}.draft").exists()
     assert "images of frames 3" in said
     run = Run.open(path)
     assert verify(run).is_sound, verify(run).lines()

@@ -134,6 +134,13 @@ def test_an_array_keeps_what_was_written_and_nothing_half_written(
     array = FrameArray.create(tmp_path / "frames", dtype="uint16", **made)
     with pytest.raises(TypeError, match="not int64"):
         FrameArray.create(tmp_path / "other", dtype="int64", **made)
+    with monkeypatch.context() as signals:
+        signals.setattr(
+            "instrument.runs.frame_array.group_of", lambda *_: (_ for _ in ()).throw(SystemExit(143))
+        )
+        with pytest.raises(SystemExit):
+            FrameArray.create(tmp_path / "other", dtype="uint16", **made)
+    assert [path.name for path in tmp_path.iterdir()] == ["frames"]
     scale = json.loads((array.path / "zarr.json").read_text())["attributes"]["ome"]["multiscales"][0]
     assert scale["datasets"][0]["coordinateTransformations"][0]["scale"] == [1, 2.5, 2.5]
     assert [axis["name"] for axis in scale["axes"]] == ["t", "y", "x"]

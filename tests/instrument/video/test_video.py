@@ -39,6 +39,7 @@ from instrument.reconstruction.video import (
 from instrument.reconstruction.video_files import VideoPictures, levels_of, require_video
 from instrument.reconstruction.video_job import VideoJob
 from instrument.reconstruction.video_work import BlockReport, cluster, on_cluster
+from instrument.runs.acquire import settle
 from instrument.runs.run import Run
 from recon import reconstruct
 from recon.base.metrics import psnr
@@ -198,6 +199,38 @@ def test_a_kill_between_pictures_and_mark_loses_nothing(
     assert sorted((r.block, r.solved, r.written) for r in reports) == [(0, 4, 4), (1, 3, 0), (2, 3, 3)]
     assert_same(pictures(tmp_path), pictures(video))
     assert not begun.exists()
+
+
+def test_a_video_goes_on_without_a_frame_that_was_lost_meanwhile(
+    recording: Path, video: Path, tmp_path: Path
+) -> None:
+    """Its block begins anew, as its pictures hang together; blocks that are done stay."""
+    run = tmp_path / "recording"
+    shutil.copytree(recording, run)
+    shutil.copy(recording.parent / "psf.npy", tmp_path)
+    wanted = request(run, tmp_path)
+    prepared = prepare_video(wanted)
+    for block in (0, 1):
+        block_module.solve_block(str(prepared.job.folder), str(wanted.out), block)
+    stamps = [VideoPictures(wanted.out)._file(t).stat().st_mtime_ns for t in range(4)]
+    os.truncate(run / "frames.ome.zarr/0/c/6/0/0", 1000)
+    assert "marked as lost: frames 6" in "\n".join(settle(run))
+    with pytest.raises(FileError, match=r"frames, warm_iterations"):
+        prepare_video(request(run, tmp_path, warm_iterations=7))
+    again = prepare_video(wanted)
+    assert (again.resumed, again.left) == (True, [1, 2])
+    assert not VideoPictures(wanted.out).is_written(6)
+    plan = again.job.plan
+    assert again.job.goes_on_without(replace(plan, frames=plan.frames[1:])) == [0]
+    assert again.job.goes_on_without(replace(plan, frames=plan.frames[4:])) is None, (
+        "blocks have other numbers"
+    )
+    assert solve_video(again, lambda _: None, threading.Event())
+    assert [VideoPictures(wanted.out)._file(t).stat().st_mtime_ns for t in range(4)] == stamps
+    whole, found = pictures(video), pictures(tmp_path)
+    assert np.isnan(found[6]).all()
+    left = [t for t in range(11) if t not in (MISSING, *range(4, 8))]
+    assert_same(found[left], whole[left])
 
 
 def test_other_settings_do_not_go_on_and_finished_videos_stay(
