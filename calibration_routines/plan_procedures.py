@@ -18,6 +18,7 @@ from calibration_routines.procedure import (
     outlook_of,
     routines,
 )
+from calibration_routines.psf.exposure import expose_patterns
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError
 from instrument.plan import Plan, check, estimate
@@ -55,15 +56,31 @@ class IlluminationProcedure(Procedure):
     asked: IlluminationOptions
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
-        """Hold its plan against the bench."""
-        return self._planned(bench).outlook(bench, folder)
+        """Hold its plan against the bench; an exposure that is to be found counts as the camera's present."""
+        plan = self.asked.plan(bench.led_array, bench.camera.exposure_ms)
+        found = PlanProcedure(plan).outlook(bench, folder)
+        if self.asked.exposure_ms is not None:
+            return found
+        words = "The exposure is found first, by all LEDs and then each pattern: the brightest sets it."
+        return replace(found, reasons=(*found.reasons, words))
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
-        """Take the frames."""
-        return self._planned(bench).perform(bench, folder, control, listener)
+        """Find the exposure where none was asked for, and take the frames."""
+        if self.asked.exposure_ms is None:
+            listener.step("finding the exposure")
+        plan = illumination_plan_for(bench, self.asked)
+        listener.said(f"Exposure: {plan.parts[0].exposures_ms[0]:.4g} ms.")
+        return PlanProcedure(plan).perform(bench, folder, control, listener)
 
-    def _planned(self, bench: Bench) -> PlanProcedure:
-        return PlanProcedure(self.asked.plan(bench.led_array))
+
+def illumination_plan_for(bench: Bench, asked: IlluminationOptions) -> Plan:
+    """Return the plan, its exposure found with what stands before the camera where none was asked for."""
+    if asked.exposure_ms is not None:
+        return asked.plan(bench.led_array)
+    array = bench.led_array
+    lights = asked.lights(array)
+    patterns = [light.pattern() if array is None else light.on(array).pattern() for light in lights]
+    return asked.plan(array, expose_patterns(bench, patterns))
 
 
 @dataclass(frozen=True, slots=True)

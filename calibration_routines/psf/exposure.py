@@ -13,7 +13,7 @@ An exposure is returned as reached only after a frame taken with exactly that ex
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -23,9 +23,11 @@ import numpy.typing as npt
 from calibration_routines.procedure import CalibrationError
 from drivers.camera import Camera
 from drivers.frame import Frame
+from drivers.led_array import LedPattern
 from instrument.bench.bench import Bench
 
 Counts = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+_DARK = 0.01  # of full scale: below this nothing lights the scene
 _DIMMEST_USABLE = 0.05  # of full scale: below this a PSF drowns in read noise
 
 
@@ -281,6 +283,38 @@ def expose_light(
     if found.outcome in (ExposureOutcome.TOO_BRIGHT, ExposureOutcome.UNSTEADY):
         raise CalibrationError(found.message)
     return found
+
+
+def expose_patterns(bench: Bench, patterns: Sequence[LedPattern], *, target: float = 0.7) -> float:
+    """Find one exposure in ms for all patterns, so that the brightest is exposed as a PSF is; ends dark.
+
+    All LEDs together are exposed, then each pattern is photographed once at that: it is dimmer, however dim,
+    and the sensor linear.
+
+    Raises CalibrationError without an LED array; else errors as :func:`expose_light`.
+    """
+    leds, camera = bench.led_array, bench.camera
+    if leds is None:
+        raise CalibrationError("Patterned light needs an LED array, and this bench has none.")
+    levels: dict[int, tuple[int, int, int]] = {}
+    for index, rgb in (level for pattern in patterns for level in pattern.levels):
+        red, green, blue = (max(pair) for pair in zip(rgb, levels.get(index, (0, 0, 0)), strict=True))
+        levels[index] = red, green, blue
+    together = LedPattern("all patterns", tuple(levels.items()))
+    try:
+        found = expose_light(bench, lambda: leds.set_pattern(together), target=target, dimmest=_DARK, looks=1)
+        leds.off()
+        dark = camera.snap()
+        hot = hot_pixels(dark.image, dark.full_scale)
+        factors = []
+        for pattern in patterns:
+            leds.set_pattern(pattern)
+            trial = measure_exposure(camera.snap(), found.exposure_ms, 99.9, hot)
+            factors.append(_linear_step(trial, target, 0.9, 0.1))
+    finally:
+        leds.off()
+    shortest, longest = camera.exposure_limits_ms
+    return float(np.clip(found.exposure_ms * min(factors), shortest, longest))
 
 
 def expose_source(bench: Bench, *, target: float = 0.7) -> AutoExposure:

@@ -121,7 +121,7 @@ def new(
 
 @app.command(
     epilog=examples(
-        "diffuserbench plan illumination --lattice 3 --exposure-ms 20 lit.toml",
+        "diffuserbench plan illumination --lattice 3 lit.toml",
         'diffuserbench plan illumination --groups "0-3;4-7;8,9" --exposure-ms 20 lit.toml',
         'diffuserbench plan illumination --pattern "half na=0.3" --exposure-ms 20 lit.toml',
     )
@@ -135,20 +135,25 @@ def illumination(
 ) -> None:
     """Write a plan of active illumination: the scene lit by one group of LEDs after the other.
 
-    Run it twice, with the scene and with a plain white sheet in its place; then
+    Run it with the scene in place, and another one with a plain white sheet there, which is brighter; then
     diffuserbench reconstruct SCENE --patterned SHEET solves all frames together.
     """
     if out.suffix.lower() not in (".toml", ".json"):
         raise FileError(out, "a plan's name ends in .toml or .json.")
     require_new(out)
-    if options.needs_places:
+    from calibration_routines.plan_procedures import illumination_plan_for  # reads much: where it is needed
+
+    if options.needs_bench:
         with open_and_say(bench) as opened:
-            plan = options.plan(opened.led_array)
+            plan = illumination_plan_for(opened, options)
     else:
         plan = options.plan(None)
     save_plan(plan, out)
     count = len(plan.parts[-1].light)
-    typer.echo(f"Wrote {out}: {count} patterns. Look at it with: diffuserbench plan show {out}")
+    exposure = f"{plan.parts[-1].exposures_ms[0]:.4g} ms"
+    typer.echo(
+        f"Wrote {out}: {count} patterns, {exposure} each. Look at it with: diffuserbench plan show {out}"
+    )
 
 
 @app.command(epilog=examples("diffuserbench plan patterns"))

@@ -47,7 +47,13 @@ def illumination_plan(lights: Sequence[Light], *, exposure_ms: float, average: i
 class IlluminationOptions:
     """Which LEDs light each frame, and how it is exposed."""
 
-    exposure_ms: float = option(help="Of every frame.", unit="ms", least=1e-3)
+    exposure_ms: float | None = option(
+        None,
+        help="Of every frame.",
+        default_words="found with what stands before the camera now",
+        unit="ms",
+        least=1e-3,
+    )
     groups: list[list[int]] | None = option(
         None,
         help="LEDs of each pattern: '0-3,8;4;5,6'.",
@@ -78,18 +84,23 @@ class IlluminationOptions:
             raise SettingsError([("groups", either)])
 
     @property
-    def needs_places(self) -> bool:
-        """Whether the bench must say where its LEDs are."""
-        return self.groups is None
+    def needs_bench(self) -> bool:
+        """Whether the bench must say where its LEDs are, or find the exposure."""
+        return self.groups is None or self.exposure_ms is None
 
-    def plan(self, array: LedPlaces | None) -> Plan:
-        """Return the plan; ``array``: the bench's LEDs.
+    def plan(self, array: LedPlaces | None, exposure_ms: float | None = None) -> Plan:
+        """Return the plan; ``array``: the bench's LEDs; ``exposure_ms``: where none was asked for.
 
-        Raises BenchError where there is none and places are needed, or a pattern is not known.
+        Raises BenchError where there is no array and places are needed, or a pattern is not known; ValueError
+        without an exposure.
         """
-        return illumination_plan(self._lights(array), exposure_ms=self.exposure_ms, average=self.average)
+        exposed_ms = self.exposure_ms or exposure_ms
+        if exposed_ms is None:
+            raise ValueError("The frames of a plan have an exposure.")
+        return illumination_plan(self.lights(array), exposure_ms=exposed_ms, average=self.average)
 
-    def _lights(self, array: LedPlaces | None) -> Sequence[Light]:
+    def lights(self, array: LedPlaces | None) -> Sequence[Light]:
+        """Return the lights in turn; errors as :meth:`plan`."""
         if self.groups is not None:
             return group_lights(self.groups, self.level)
         shape = led_shape(*shape_from_text(self.pattern or f"grid side={self.lattice}"))

@@ -24,15 +24,17 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
 from instrument.reconstruction.job import Job
+from instrument.reconstruction.patterned import PatternedRequest
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from recon.base.declare import identity
+from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.base import IterationRecord, Solver, StopReason
 
 _FINISHED = (StopReason.CONVERGED, StopReason.NOISE_LEVEL)
 
 
-def require_kept(request: PictureRequest | VolumeRequest) -> None:
+def require_kept(request: PictureRequest | VolumeRequest | PatternedRequest) -> None:
     """Refuse to keep what has no iterations.
 
     Raises BenchError.
@@ -43,11 +45,15 @@ def require_kept(request: PictureRequest | VolumeRequest) -> None:
 
 
 def checkpoint_for(
-    folder: Path | None, job: Job, request: PictureRequest | VolumeRequest
+    folder: Path | None,
+    job: Job,
+    request: PictureRequest | VolumeRequest | PatternedRequest,
+    patterned: Measurement | None = None,
 ) -> CheckpointFolder | None:
     """Return the folder that was asked for, checked against what is to be reconstructed.
 
-    What only says when to stop may differ from the earlier run.
+    ``patterned``: all frames under their patterns, of which the job has the sum. What only says when to stop
+    may differ from the earlier run.
 
     Raises BenchError as :func:`require_kept`; FileError when the folder keeps something else.
     """
@@ -65,6 +71,12 @@ def checkpoint_for(
         # As it will be used: the photograph's metadata may have told it.
         "noise": str(job.binned_noise(request.inputs.noise)),
     }
+    if patterned is not None:
+        problem |= {
+            "measurement": digest(np.asarray(patterned.image)),
+            "valid pixels": digest(None if patterned.erasures is None else np.asarray(patterned.erasures)),
+            "patterns": digest(np.asarray(patterned.patterns)),
+        }
     return CheckpointFolder(folder, problem)
 
 

@@ -216,14 +216,14 @@ class OutputOptions:
     figure: Path | None = option(
         None,
         help="Also a summary figure (.png, .pdf, .svg).",
-        applies=_KEPT,
+        applies=(*_KEPT, "patterned picture"),
         group=_OUTPUT,
     )
     checkpoint: Path | None = option(
         None,
         help="Keep the work here once a minute; the same command goes on from it.",
         metavar="FOLDER",
-        applies=_KEPT,
+        applies=(*_KEPT, "patterned picture"),
         group=_OUTPUT,
     )
     force: bool = option(False, help="Overwrite files that exist.", label="Overwrite", group=_OUTPUT)

@@ -25,7 +25,7 @@ from instrument.runs.run import Run
 from recon import Measurement, reconstruct
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.result import Reconstruction
-from recon.solvers.base import IterationRecord
+from recon.solvers.base import IterationRecord, Keeper
 from recon.types import Calibration
 
 Floats = npt.NDArray[np.float32]
@@ -136,6 +136,7 @@ def solve_patterned(
     *,
     watch: Callable[[IterationRecord], object] | None = None,
     cancel: threading.Event | None = None,
+    keeper: Keeper | None = None,
 ) -> Reconstruction:
     """Reconstruct the one picture that explains all frames, in the brightness of all groups together."""
     request = prepared.request
@@ -145,6 +146,7 @@ def solve_patterned(
         request.options,
         on_progress=None if watch is None else lambda record, _: watch(record),
         cancel=cancel,
+        keeper=keeper,
     )
 
 

@@ -95,7 +95,7 @@ def patterned(
     source: Annotated[SourceOptions, Only("patterned", "calibration")],
     inputs: Annotated[InputOptions, Only("crop", "binning", "erasures", "mosaic", "noise")],
     options: ReconstructionOptions,
-    output: Annotated[OutputOptions, Only("out", "rotate_deg", "force")],
+    output: Annotated[OutputOptions, Only("out", "rotate_deg", "figure", "checkpoint", "force")],
 ) -> Done:
     """Reconstruct one picture of a scene that was lit by patterns in turn (Kuo 2020, Section 8.2)."""
     if source.patterned is None or source.calibration is None:
@@ -110,7 +110,7 @@ def patterned(
         inputs=inputs,
         options=options,
     )
-    return reconstruct_patterns(desk, request, Outputs.named(output.out or PICTURE), output)
+    return reconstruct_patterns(desk, request, Outputs.named(output.out or PICTURE, output.figure), output)
 
 
 def reconstruct_patterns(
@@ -124,6 +124,7 @@ def reconstruct_patterns(
         job = prepared.job
         outputs.check(job.measurement.size, overwrite=output.force)
         _tell_job(desk, job, "calibration or frames come from the simulated bench")
+        keeper = checkpoint_for(output.checkpoint, job, request, prepared.measurement)
         with (
             desk.interruptible() as cancel,
             desk.step("picture", request.options.iterations or ITERATIONS) as advance,
@@ -132,9 +133,11 @@ def reconstruct_patterns(
             def show(record: IterationRecord) -> None:
                 advance(record.iteration, note=f"change {record.change:.1e}")
 
-            result = solve_patterned(prepared, watch=show, cancel=cancel)
+            result = solve_patterned(prepared, watch=show, cancel=cancel, keeper=keeper)
         _tell(desk, result)
-        write_reconstruction(outputs, result, job, rotate_deg=int(output.rotate_deg))
+        _write_picture(outputs, result, job, int(output.rotate_deg))
+        for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
+            desk.fact(name, text)
     return _ended(outputs, result, "picture")
 
 

@@ -95,10 +95,12 @@ def test_one_picture_of_all_patterns(
     status = main(
         [
             *("reconstruct", str(run), "--patterned", str(sheet), "--calibration", str(calibration)),
-            *("--out", str(out), "--iterations", "200"),
+            *("--out", str(out), "--iterations", "200", "--checkpoint", str(tmp_path / "kept")),
+            *("--figure", str(tmp_path / "page.png")),
         ]
     )
     assert status == 0
+    assert (tmp_path / "page.png").is_file()
     image = tifffile.imread(out)
     truth = scene() * lights().sum(axis=0)  # as bright as all groups together make it
     gain = float(np.vdot(image, truth) / np.vdot(image, image))
@@ -225,7 +227,7 @@ def test_saturated_frames_are_told(files: tuple[Path, Path, Path], tmp_path: Pat
         ["--psf", "x.tif"],
         ["--workers", "2"],
         ["--dark", "3"],
-        ["--figure", "x.png"],
+        ["--explain"],
     ],
 )
 def test_options_that_do_not_apply_are_named(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -239,6 +241,26 @@ def test_a_run_and_a_calibration_are_needed(capsys: pytest.CaptureFixture[str]) 
 
 
 # The plan -------------------------------------------------------------------------------------------
+def test_the_work_is_kept_and_gone_on_with(
+    files: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, sheet, calibration = files
+    command = ["reconstruct", str(run), "--patterned", str(sheet), "--calibration", str(calibration)]
+    command += ["--tolerance", "0", "--force", "--out"]
+    kept = [str(tmp_path / "parts.tif"), "--checkpoint", str(tmp_path / "kept")]
+    for iterations in ("5", "12"):
+        assert main([*command, *kept, "-n", iterations]) == 0
+    assert "from iteration 5 in" in capsys.readouterr().out
+    assert main([*command, str(tmp_path / "whole.tif"), "-n", "12"]) == 0
+    parts, whole = (tifffile.imread(tmp_path / f"{name}.tif") for name in ("parts", "whole"))
+    np.testing.assert_allclose(parts, whole, rtol=1e-4, atol=1e-5 * whole.max())
+    # The same frames under other patterns are another picture.
+    np.save(tmp_path / "even.npy", np.ones((3, *SHAPE)))
+    command[3] = str(tmp_path / "even.npy")
+    assert main([*command, *kept]) == 2
+    assert "patterns" in capsys.readouterr().err
+
+
 def test_the_plan_command_writes_what_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "lit.toml"
     command = ["plan", "illumination", str(file), "--groups", "0-2; 4,6 ;8", "--exposure-ms", "20"]

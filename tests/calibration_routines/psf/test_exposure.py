@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import UTC, datetime
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,11 +14,14 @@ import pytest
 from calibration_routines.psf.exposure import (
     AutoExposure,
     ExposureOutcome,
+    TooDarkError,
     auto_expose,
+    expose_patterns,
     hot_pixels,
     measure_exposure,
 )
 from drivers.frame import Frame, FrameMetadata
+from drivers.led_array import LedPattern
 
 BITS = 12
 FULL = (1 << BITS) - 1
@@ -172,3 +177,28 @@ def test_colour_frames_and_masks_of_another_shape() -> None:
 def test_a_target_above_the_ceiling_is_refused() -> None:
     with pytest.raises(ValueError, match="target <= ceiling"):
         auto_expose(LinearCamera(caustic()), target=0.95)
+
+
+def test_all_patterns_have_one_exposure_by_the_brightest_of_them() -> None:
+    spots, light = np.zeros((2, *SHAPE)), np.zeros(SHAPE)
+    spots[0, 10:20, 10:20], spots[1, 30:40, 10:20] = 40.0, 4.0  # counts per ms
+    camera = LinearCamera(light)
+
+    class Leds:
+        def set_pattern(self, pattern: LedPattern) -> None:
+            light[...] = sum(spots[n] * rgb[0] / 255 for n, rgb in pattern.levels)
+
+        def off(self) -> None:
+            light[...] = 0
+
+    bench: Any = SimpleNamespace(camera=camera, led_array=Leds(), scene_off=lambda: 0, source_off=lambda: 0)
+    white = (255, 255, 255)
+    bright, dim = LedPattern("bright", ((0, white),)), LedPattern("dim", ((1, white),))
+    span = 4095 - BLACK
+    for patterns, counts_per_ms in (([dim, bright], 40.0), ([dim], 4.0)):
+        found_ms = expose_patterns(bench, patterns)
+        assert found_ms * counts_per_ms / span == pytest.approx(0.7, rel=0.05)
+        assert not light.any()
+    spots[:] /= 1e9
+    with pytest.raises(TooDarkError):
+        expose_patterns(bench, [dim])
