@@ -166,7 +166,7 @@ class PsfTable(QWidget):
         for place, (name, tip) in enumerate(_COLUMNS):
             self.table.setHorizontalHeaderItem(place, cell(name, tip))
         self.table.currentCellChanged.connect(lambda row, *_: self.chosen.emit(row))
-        self.plot: Any = plot_widget("PSF", "signal / noise")
+        self.plot: Any = plot_widget("signal / noise of each PSF")  # beside an axis so low it is cut off
         self.plot.setMinimumHeight(90)
         self._points: Any = self.plot.plot([], [])
         self._least: Any = pg.InfiniteLine(angle=0, pos=MIN_SNR)
