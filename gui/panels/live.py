@@ -257,8 +257,12 @@ class LivePanel(Panel):
         seconds = time.monotonic() - self._came_s
         if not self.session.live.is_running or seconds < _PATIENCE_S + 3 * exposure_s:
             return False
+        state = self.form.state
         words = f"Waiting for {'the first' if frame is None else 'a'} frame for {seconds:.0f} s."
-        if self.session.state("camera").simulated:
+        if state is not None and state.trigger_mode != "free_run":
+            by = f"pulse on {state.trigger_line}" if state.trigger_mode == "hardware" else "program's trigger"
+            words += f" Trigger is “{state.trigger_mode}”: each {by} takes one; “free_run” needs none."
+        elif self.session.state("camera").simulated:
             words += " The simulated scene is computed once for each new light, at 5 megapixels some 5 s."
         self.status.setText(words)
         return True

@@ -15,7 +15,8 @@ from gui.widgets.building import button, choice, fill, narrow
 class KeptBar(QWidget):
     """Names to choose from, and to type; a button that uses what is chosen; Save and Remove.
 
-    Wheel, keys and typing only choose: the stage moves by the button alone.
+    Wheel, keys and typing only choose: the stage moves by the button alone. What is saved without a name gets
+    one.
 
     Parameters
     ----------
@@ -43,6 +44,7 @@ class KeptBar(QWidget):
     ) -> None:
         super().__init__()
         self._session, self._kind, self._take, self._apply = session, kind, take, apply
+        self._one = words.lower().removesuffix("s")
         self.names = narrow(choice((), f"{words}, kept with the bench: choose one, or type a name and save"))
         self.names.setEditable(True)
         self.names.setInsertPolicy(QComboBox.InsertPolicy.NoInsert)
@@ -55,6 +57,7 @@ class KeptBar(QWidget):
         self.save_button = button("Save", "Keep what is set now under this name", self.save)
         self.remove_button = button("Remove", "Keep it no longer", self.remove)
         fill(self, (self.names, 1), self.use_button, self.save_button, self.remove_button, across=True)
+        self.names.currentTextChanged.connect(lambda _: self._set_usable())
         session.kept_changed.connect(self.show_names)
         self.show_names()
 
@@ -65,12 +68,21 @@ class KeptBar(QWidget):
             self.names.clear()
             self.names.addItems(sorted(self._session.kept.of(self._kind)))
             self.names.setCurrentText(typed)
+        self._set_usable()
+
+    def _set_usable(self) -> None:
+        is_kept = self.names.currentText().strip() in self._session.kept.of(self._kind)
+        self.use_button.setEnabled(is_kept)
+        self.remove_button.setEnabled(is_kept)
 
     def save(self) -> None:
         """Keep what is set now."""
-        name, value = self.names.currentText().strip(), self._take()
-        if name and value is not None:
+        kept = self._session.kept.of(self._kind)
+        free = (f"{self._one} {number}" for number in range(1, len(kept) + 2))
+        name = self.names.currentText().strip() or next(name for name in free if name not in kept)
+        if (value := self._take()) is not None:
             self._session.keep(self._kind, name, value)
+            self.names.setCurrentText(name)
 
     def remove(self) -> None:
         """Keep what is chosen no longer."""

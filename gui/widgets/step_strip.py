@@ -64,7 +64,7 @@ class StepStrip(QFrame):
         if self._session.is_closing:
             return
         facts = facts_of(self._session, self._made)
-        if (self._running or facts.light == "held") and self._light != "unknown":
+        if (self._running or facts.light in ("held", "unknown")) and self._light != "unknown":
             facts = replace(facts, light=self._light)  # which says nothing against it
         self._light = facts.light
         self.show_facts(facts)

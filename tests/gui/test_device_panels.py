@@ -157,6 +157,14 @@ def test_a_place_is_kept_with_the_bench_and_gone_to_again(
     qtbot.mouseClick(stage.places.remove_button, LEFT)
     assert not stage.all_button.isEnabled()
     assert not stage.places.names.count()
+    assert not stage.places.use_button.isEnabled()
+    assert not stage.places.remove_button.isEnabled()
+    for name in ("place 1", "place 2"):  # without a name it gets one
+        stage.places.names.setCurrentText("")
+        qtbot.mouseClick(stage.places.save_button, LEFT)
+        assert stage.places.names.currentText() == name
+        assert stage.places.use_button.isEnabled()
+    assert sorted(session.kept.of("places")) == ["place 1", "place 2"]
 
 
 def test_a_stage_that_is_unplugged_is_noticed_and_the_rest_goes_on(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -118,6 +119,21 @@ def test_what_comes_is_shown_coarsely_first_and_says_so(
     monkeypatch.undo()
     qtbot.waitUntil(lambda: not live.picture.is_coarse and not view.caution, timeout=WAIT_MS)
     assert view.caption.endswith("SIMULATED")
+
+
+@pytest.mark.parametrize(
+    ("mode", "words"), [("software", "program's trigger"), ("hardware", "pulse on Line1")]
+)
+def test_a_camera_that_waits_for_triggers_says_so_and_not_that_light_is_computed(
+    live: LivePanel, monkeypatch: pytest.MonkeyPatch, mode: str, words: str
+) -> None:
+    state = live.form.state
+    assert state is not None
+    live.form.state = replace(state, trigger_mode=mode)
+    monkeypatch.setattr(live, "_came_s", time.monotonic() - 10)
+    assert live._waits()
+    assert f"each {words} takes one" in live.status.text()
+    assert "computed" not in live.status.text()
 
 
 def test_exposure_typed_reaches_the_camera_and_is_read_back(qtbot: QtBot, live: LivePanel) -> None:
