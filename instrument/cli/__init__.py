@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import os
+import signal
 import sys
 import threading
 from collections.abc import Mapping, Sequence
@@ -132,6 +133,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         words.remove("--debug")
     if words and words[0] == "help":
         words = [*words[1:], "--help"]  # help COMMAND is COMMAND --help
+    try:
+        status = _carried_out(words, debug=debug)
+        if sys.stdout is not None and not sys.stdout.closed:
+            sys.stdout.flush()
+    except KeyboardInterrupt:  # so early, or so late, that run_command could not say it
+        sys.stderr.write("interrupted.\n")
+        return 130
+    except BrokenPipeError as error:
+        if not is_unread(error):
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # where the rest goes
+        return 128 + signal.SIGPIPE
+    return status
+
+
+def is_unread(error: BaseException) -> bool:
+    """Whether whoever read what the program prints has gone: ``| head`` has seen enough."""
+    return isinstance(error, BrokenPipeError) and error.filename is None
+
+
+def _carried_out(words: Sequence[str], *, debug: bool) -> int:
     if not words or words[0] in ("--help", "-h"):
         sys.stdout.write(overview())
         return 0
@@ -145,13 +167,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if command is None:
         sys.stderr.write(_unknown(name))
         return 2
-    try:
-        from instrument.cli.app import run_command
+    from instrument.cli.app import run_command
 
-        return run_command(name, command, rest, debug=debug)
-    except KeyboardInterrupt:  # so early, or so late, that run_command could not say it
-        sys.stderr.write("interrupted.\n")
-        return 130
+    return run_command(name, command, rest, debug=debug)
 
 
 def overview() -> str:

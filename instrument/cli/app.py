@@ -18,6 +18,7 @@ from zlib import crc32
 import typer
 
 from drivers.errors import DeviceError, LimitError
+from instrument.cli import Command, is_unread
 from instrument.cli.options import USAGE_ERROR, GroupedCommand, flat
 from instrument.files import kept_times
 from instrument.files.errors import BenchError, OperatorNeededError, in_words
@@ -26,7 +27,6 @@ from recon.base.declare import option
 if TYPE_CHECKING:
     from instrument.bench.bench import Bench
     from instrument.bench.config import BenchConfig
-    from instrument.cli import Command
     from instrument.runs.run import Run
 
 
@@ -301,6 +301,9 @@ def report(error: BaseException) -> int:
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         _say("interrupted.", error)
         return INTERRUPTED
+    if is_unread(error):
+        _say("", error)
+        raise error
     if isinstance(error, BenchError):
         _say(str(error), error)
         return error.exit_code

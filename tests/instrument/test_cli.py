@@ -96,6 +96,22 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.startswith("diffuserbench ")
 
 
+@pytest.mark.parametrize("asked", ["--help", "drivers"])
+def test_whoever_has_read_enough_sees_no_traceback(asked: str) -> None:
+    reads, writes = os.pipe()
+    os.close(reads)
+    with os.fdopen(writes) as unread:
+        shown = subprocess.run(
+            [sys.executable, "-m", "diffuserbench", asked],
+            stdout=unread,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+            timeout=60,
+        )
+    assert (shown.returncode, shown.stderr) == (141, "")
+
+
 def test_the_module_is_the_program() -> None:
     shown = subprocess.run(
         [sys.executable, "-m", "diffuserbench", "snpa"], capture_output=True, text=True, timeout=60
