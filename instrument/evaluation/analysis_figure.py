@@ -23,6 +23,8 @@ _COLUMNS = 3
 _WIDTH_IN, _HEAD_IN, _ROW_IN, _FOOT_IN, _NOTE_IN = 15.5, 1.35, 3.35, 0.3, 0.185
 _GAP_IN, _FACT_IN, _LINE_IN = 0.09, 0.28, 0.2
 """In the column of figures: above a name, with the name, of a line."""
+_BELOW_CHARACTERS, _BESIDE_CHARACTERS = 112, 98
+"""Of a line of notes below the panels, and in two panels' room of the last row where that is free."""
 _COLORS = ("#00798c", "#d1495b", "#edae49", "#30638e", "#6a4c93")
 
 
@@ -44,7 +46,9 @@ def draw_analysis(analysis: Analysis, title: str, subtitle: str = "", *, simulat
 
     panels = _panels(analysis)
     rows = -(-len(panels) // _COLUMNS)
-    columns = _note_columns(analysis.notes)
+    lines = [line for block in _blocks(analysis.notes, _BESIDE_CHARACTERS) for line in block]
+    beside = rows * _COLUMNS - len(panels) == 2 and len(lines) <= _ROW_IN * 0.8 / _NOTE_IN
+    columns = ([], []) if beside else _note_columns(analysis.notes)
     note_rows = max(map(len, columns))
     notes_in = _NOTE_IN * note_rows + (0.35 if note_rows else 0.0)
     body_in = max(_ROW_IN * rows, _facts_in(analysis))  # neither panels nor words run into the notes
@@ -60,9 +64,12 @@ def draw_analysis(analysis: Analysis, title: str, subtitle: str = "", *, simulat
             f"({chr(97 + number)}) {axes.get_title(loc='left')}", fontsize=12, color=INK, loc="left", pad=6
         )
     _facts(figure, analysis, 0.745, top, height_in)
-    y = (_FOOT_IN + notes_in - 0.15) / height_in
-    for x, lines in zip((0.05, 0.53), columns, strict=True):
-        for row, line in enumerate(lines):
+    place = grid[rows - 1, 1:].get_position(figure)
+    below = [(x, (_FOOT_IN + notes_in - 0.15) / height_in) for x in (0.05, 0.53)]
+    for (x, y), written in zip(
+        [*below, (place.x0, place.y1)], [*columns, lines if beside else []], strict=True
+    ):
+        for row, line in enumerate(written):
             figure.text(x, y - row * _NOTE_IN / height_in, line, fontsize=9, color=INK, va="top")
     figure.text(0.05, 1 - 0.42 / height_in, title, fontsize=18, color=INK, weight="bold", va="center")
     figure.text(0.05, 1 - 0.78 / height_in, subtitle, fontsize=10.5, color=INK, va="center")
@@ -96,12 +103,7 @@ def _panels(analysis: Analysis) -> list[Panel]:
 
 def _note_columns(notes: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the notes as the lines of two columns below the panels, whole notes in each."""
-    import textwrap
-
-    blocks = []
-    for note in notes:
-        first, *others = textwrap.wrap(note, 112)
-        blocks.append([f"•  {first}", *(f"    {line}" for line in others)])
+    blocks = _blocks(notes, _BELOW_CHARACTERS)
     left: list[str] = []
     right: list[str] = []
     half = sum(map(len, blocks)) / 2
@@ -110,28 +112,40 @@ def _note_columns(notes: Sequence[str]) -> tuple[list[str], list[str]]:
     return left, right
 
 
+def _blocks(notes: Sequence[str], width: int) -> list[list[str]]:
+    """Return each note's lines."""
+    import textwrap
+
+    wrapped = [textwrap.wrap(note, width) for note in notes]
+    return [[f"•  {first}", *(f"    {line}" for line in others)] for first, *others in wrapped]
+
+
 def facts(analysis: Analysis) -> list[tuple[str, str]]:
     """Return the figures in words, for the page and for the terminal."""
     a = analysis
     near, far = a.axial.depth_of_field_um(a.z_um)
-    lines = [
-        ("depth analysed", f"{a.z_um / 1e3:.3g} mm"),
+    lines = [("depth analysed", f"{a.z_um / 1e3:.3g} mm")]
+    if (reached := a.reached) is not None:
+        lines += _reached(a, reached)
+    if (volumes := a.in_volumes) is not None:
+        lines += _in_volumes(a, volumes)
+    lines += [
         (
-            "resolution, 70 % half width",
+            "optics: 70 % half width",
             f"{a.lateral.mean_px:.2f} px (x {a.lateral.half_width_px[1]:.2f}, "
             f"y {a.lateral.half_width_px[0]:.2f}), "
             f"{a.lateral.angle_deg(a.pitch_um, a.distance_um):.3f}°, "
             f"{a.lateral.object_um(a.pitch_um, a.distance_um, a.z_um):.3g} µm",
         ),
         (
-            "inner product 0.8",
+            "optics: inner product 0.8",
             f"{a.lateral_inner.mean_px:.2f} px (x {a.lateral_inner.half_width_px[1]:.2f}, "
             f"y {a.lateral_inner.half_width_px[0]:.2f}), "
             f"{a.lateral_inner.object_um(a.pitch_um, a.distance_um, a.z_um):.3g} µm across; "
             f"{1e6 * a.axial_inner.step_per_um:.3g} /m along",
         ),
-        ("depth of field, optics", f"-{_mm(near)}, +{_mm(far)}"),
-        ("hyperfocal distance", _mm(a.axial.hyperfocal_um)),
+        ("optics: depth of field", f"-{_mm(near)}, +{_mm(far)}"),
+        ("optics: hyperfocal distance", _mm(a.axial.hyperfocal_um)),
         (
             "usable field (half light)",
             f"±{a.half_light_deg[1]:.1f}° x ±{a.half_light_deg[0]:.1f}°",
@@ -139,10 +153,6 @@ def facts(analysis: Analysis) -> list[tuple[str, str]]:
         ("field of view (any light)", f"±{a.view_x.half_deg:.1f}° x ±{a.view_y.half_deg:.1f}°"),
         ("  limited by", a.view_x.limited_by),
     ]
-    if (reached := a.reached) is not None:
-        lines += _reached(a, reached)
-    if (volumes := a.in_volumes) is not None:
-        lines += _in_volumes(a, volumes)
     if (tests := a.points) is not None:
         if tests.lateral_px is not None:
             um = tests.lateral_px * a.pitch_um * a.z_um / a.distance_um
@@ -286,7 +296,7 @@ def _field(axes: Axes, a: Analysis) -> None:
     )
     axes.plot(angles, [p.spot for p in a.field], "s", color=ACCENT, markersize=4, label="spot size / axis")
     axes.legend(fontsize=9, frameon=False)
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, 1.08 * max(1.0, *(p.similarity for p in a.field), *(p.spot for p in a.field)))
     style(axes, "Across the field, against the central PSF", "angle, degrees")
 
 
