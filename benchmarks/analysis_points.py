@@ -1,9 +1,10 @@
 """The distances that ``analyze`` states, held against points whose light is propagated.
 
     python benchmarks/analysis_points.py [--pairs 20] [--only across along sixteen]
+    python benchmarks/analysis_points.py --bench tiny lenslets pointgrey microscope --only across
     python benchmarks/analysis_points.py --pairs 12 --only volume
 
-The simulated bench's preset ``tiny``, calibrated at two depths with noise. Then points alone, at places
+Benches of :data:`BENCHES`, calibrated at two depths with noise. Then points alone, at places
 between pixels and planes that the analysis has not seen, by wave optics: pairs across in a picture as the
 default reconstruction makes it; pairs along the axis and sixteen in x and z in the window that states them.
 Printed is how many are told apart at the stated distance and at 0.8 of it. ``volume``: pairs along the axis
@@ -16,7 +17,9 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -26,36 +29,70 @@ from recon import reconstruct
 from recon.analysis import Analysis, analyse
 from recon.analysis.gram import WindowProblem
 from recon.analysis.points import DIP, HALF_WINDOW, Noise, PointGrid, planes_about, smallest_dip, try_points
-from recon.camera.refocus import psf_at
+from recon.camera.refocus import at_depth, psf_at
 from recon.evaluation.points_in_volumes import in_volumes
-from recon.evaluation.two_points import reached
-from recon.types import Calibration
+from recon.evaluation.two_points import cells, reached
+from recon.types import Calibration, Geometry
 
 GREEN = (0.0, 1.0, 0.0)
+BENCHES: dict[str, tuple[dict[str, Any], int, tuple[float, float]]] = {
+    "tiny": ({"preset": "tiny"}, 1, (60e3, 75e3)),
+    "fine": ({"preset": "tiny", "feature_size_um": 90.0, "diffuser_seed": 5}, 1, (30e3, 40e3)),
+    "coarse": ({"preset": "tiny", "feature_size_um": 220.0, "diffuser_seed": 9}, 1, (100e3, 150e3)),
+    "lenslets": (
+        {"preset": "tiny", "diffuser": "random_microlens", "lenslet_um": 250.0, "focal_length_um": 8900.0},
+        1,
+        (60e3, 75e3),
+    ),
+    "pointgrey": ({"preset": "pointgrey"}, 4, (60e3, 80e3)),
+    "microscope": ({"preset": "microscope"}, 4, (2.2e3, 2.6e3)),
+    "pco": ({"preset": "pco"}, 8, (60e3, 75e3)),
+}
+"""The world's options, the binning, and the calibrated depths."""
 SHARES = (1.0, 0.8)
 CELL_PX = 30
 
 
-def calibrated(world: SimulatedWorld, depths_um: tuple[float, ...], electrons: float = 1e5) -> Calibration:
+@dataclass(frozen=True)
+class Camera:
+    """A simulated world seen on binned pixels."""
+
+    world: SimulatedWorld
+    binning: int
+
+    @classmethod
+    def of(cls, bench: str) -> Camera:
+        """Return a bench's, steady."""
+        options, binning, _ = BENCHES[bench]
+        return cls(SimulatedWorld(WorldOptions(**options, time_scale=0.0)), binning)
+
+    @cached_property
+    def geometry(self) -> Geometry:
+        """Of the binned pixels."""
+        pitch_um = self.binning * self.world.sensor.pitch_um
+        return replace(self.world.geometry, pixel_pitch_um=pitch_um)
+
+    def light(self, row: float, column: float, z_um: float) -> np.ndarray:
+        """Return the image of a point so many pixels from the axis."""
+        by = -float(self.geometry.pixel_pitch_um or 0.0) * z_um / self.world.distance_um
+        return self.world.psf((column * by, row * by, z_um), GREEN, self.binning)
+
+
+def calibrated(camera: Camera, depths_um: tuple[float, ...], electrons: float = 1e5) -> Calibration:
     """Return PSFs of a world with the noise of such a brightest pixel."""
     rng = np.random.default_rng(7)
-    psfs = [Noise(electrons).expose(world.psf((0.0, 0.0, z), GREEN), rng) for z in depths_um]
+    psfs = [Noise(electrons).expose(camera.light(0.0, 0.0, z), rng) for z in depths_um]
     places = np.array([(0.0, 0.0, z) for z in depths_um])
     lit = np.maximum(np.stack(psfs), 0).astype(np.float32)[:, None]
-    return Calibration(lit, places, geometry=world.geometry)
+    return Calibration(lit, places, geometry=camera.geometry)
 
 
 class Truth:
     """Light of points by wave optics."""
 
-    def __init__(self, world: SimulatedWorld, found: Analysis) -> None:
-        self.world, self.z_um = world, found.z_um
+    def __init__(self, camera: Camera, found: Analysis) -> None:
+        self.light, self.geometry, self.z_um = camera.light, camera.geometry, found.z_um
         self.planes = planes_about(found.z_um, found.axial_inner.step_per_um)
-
-    def light(self, row: float, column: float, z_um: float) -> np.ndarray:
-        """Return the image of a point so many pixels from the axis."""
-        by = -self.world.sensor.pitch_um * z_um / self.world.distance_um
-        return self.world.psf((column * by, row * by, z_um), GREEN)
 
     def point(self, columns: float, plane: float) -> np.ndarray:
         """Return the same at a place between the window's planes."""
@@ -63,18 +100,33 @@ class Truth:
         return self.light(0.0, columns, z_um)
 
 
-def across(truth: Truth, calibration: Calibration, axis: int, px: float, rng: np.random.Generator) -> bool:
-    """Tell whether one pair is told apart in a picture of its own."""
-    first = rng.uniform(-20.5, 20.5, 2)
-    places = [first, first + px * np.eye(2)[axis]]
-    light = np.sum([truth.light(*place, truth.z_um) for place in places], axis=0)
-    image = reconstruct(
-        Noise().expose(light, rng), calibration, z_um=truth.z_um, estimate_background=False, judged=False
-    ).image
-    seen, place = (image, first) if axis == 1 else (image.T, first[::-1])
-    row, column = place + np.array(seen.shape) // 2
-    line = seen[round(row) - 2 : round(row) + 3].sum(axis=0, dtype=np.float64)[None]
-    return smallest_dip(line, np.array([[[0.0, column], [0.0, column + px]]])) >= DIP
+def across(
+    truth: Truth, calibration: Calibration, axis: int, px: float, rng: np.random.Generator, count: int = 1
+) -> list[bool]:
+    """Tell which pairs of one picture are told apart, each in its own cell, with the noise of one alone."""
+    middles = rng.permutation(cells(calibration.psfs[0, 0], px, CELL_PX))[:count]
+    if count == 1:
+        middles = rng.uniform(-20, 20, (1, 2))
+    pairs = [
+        middle + rng.uniform(-0.5, 0.5, 2) + px * np.outer((0, 1), np.eye(2)[axis]) for middle in middles
+    ]
+    each = [np.sum([truth.light(*place, truth.z_um) for place in pair], axis=0) for pair in pairs]
+    seen = exposed(np.sum(each, axis=0), len(pairs), max(float(one.max()) for one in each), rng)
+    image = reconstruct(seen, at_depth(calibration, truth.z_um)[0], z_um=truth.z_um, judged=False).image
+    found = []
+    for first, _ in pairs:
+        picture, (row, column) = (image, first) if axis == 1 else (image.T, first[::-1])
+        row, column = np.array((row, column)) + np.array(picture.shape) // 2
+        line = picture[round(row) - 2 : round(row) + 3].sum(axis=0, dtype=np.float64)[None]
+        found.append(smallest_dip(line, np.array([[[0.0, column], [0.0, column + px]]])) >= DIP)
+    return found
+
+
+def exposed(light: np.ndarray, count: int, peak: float, rng: np.random.Generator) -> np.ndarray:
+    """Return light of several groups of points with the photon noise that one of them alone would have."""
+    scale = Noise().electrons / peak
+    noise = rng.poisson(scale * light / count) - scale * light / count
+    return np.asarray(light + (noise + rng.normal(0, Noise().read_e, light.shape)) / scale)
 
 
 def in_a_volume(
@@ -97,12 +149,9 @@ def in_a_volume(
         alone = np.sum([truth.light(row, float(c), one) for one in depths for c in x], axis=0)
         light, peak = light + alone, max(peak, float(alone.max()))
         places.append((row, np.stack(np.meshgrid(z, x, indexing="ij"), axis=-1)))
-    # Photons of all are there; noise is that of one.
-    scale = Noise().electrons / peak
-    noise = rng.poisson(scale * light / len(places)) - scale * light / len(places)
-    seen = light + (noise + rng.normal(0, Noise().read_e, light.shape)) / scale
+    seen = exposed(light, len(places), peak, rng)
     at = np.array([(0.0, 0.0, float(1 / v)) for v in truth.planes])
-    calibration = Calibration(stack[:, None].astype(np.float32), at, geometry=truth.world.geometry)
+    calibration = Calibration(stack[:, None].astype(np.float32), at, geometry=truth.geometry)
     made = reconstruct(seen, calibration, estimate_background=False, judged=False)
     found = 0
     for row, where in places:
@@ -154,36 +203,42 @@ def _volumes(
             )
 
 
-def main() -> None:
-    """Analyse, then count."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--pairs", type=int, default=20)
-    parser.add_argument("--only", nargs="+", choices=["across", "along", "sixteen", "volume"], default=None)
-    parser.add_argument("--shares", nargs="+", type=float, default=SHARES, help="Of a volume's points.")
-    arguments = parser.parse_args()
-    wanted = arguments.only or ["across", "along", "sixteen"]
-    world = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
-    calibration = calibrated(world, (60e3, 75e3))
+def held(bench: str, wanted: Sequence[str], count: int, shares: Sequence[float], together: int = 1) -> None:
+    """Analyse a bench's calibration, then count."""
+    camera = Camera.of(bench)
+    calibration = calibrated(camera, BENCHES[bench][2])
     began = time.process_time()
     found = analyse(calibration, reach=reached if "across" in wanted else None)
-    print(f"analysed at {found.z_um / 1e3:.4g} mm in {time.process_time() - began:.1f} CPU s", flush=True)
-    truth, points = Truth(world, found), found.points
+    print(
+        f"{bench}: {calibration!r}, analysed at {found.z_um / 1e3:.4g} mm in "
+        f"{time.process_time() - began:.1f} CPU s",
+        flush=True,
+    )
+    truth, points = Truth(camera, found), found.points
     assert points is not None
     if found.reached is not None:
         for axis, px in enumerate(found.reached.across_px):
             for share in SHARES if px is not None else ():
-                count = told(
-                    arguments.pairs,
-                    lambda rng, d=share * px, axis=axis: across(truth, calibration, axis, d, rng),
+                told_apart = [
+                    one
+                    for seed in range(-(-count // together))
+                    for one in across(
+                        truth, calibration, axis, share * px, np.random.default_rng(1000 + seed), together
+                    )
+                ]
+                print(
+                    f"across, {'yx'[axis]} {share * px:.2f} px ({share:g} of stated): "
+                    f"{sum(told_apart)} of {len(told_apart)}",
+                    flush=True,
                 )
-                print(f"across, {'yx'[axis]} {share * px:.2f} px ({share:g} of stated): {count}", flush=True)
+    if not {"volume", "along", "sixteen"}.intersection(wanted):
+        return
     stack = np.stack([psf_at(replace(calibration), float(1 / v)) for v in truth.planes])
-    per_plane = found.axial_inner.step_per_um / 2
     assert points.axial_per_um is not None
     assert points.lateral_px is not None
-    along = points.axial_per_um / per_plane
+    along = points.axial_per_um / (found.axial_inner.step_per_um / 2)
     if "volume" in wanted:
-        _volumes(truth, calibration, stack, found, arguments.pairs, arguments.shares)
+        _volumes(truth, calibration, stack, found, count, shares)
     for name, half in (("along", (4, 4)), ("sixteen", HALF_WINDOW)):
         if name not in wanted or (name == "sixteen" and points.sixteen_factor is None):
             continue
@@ -194,8 +249,8 @@ def main() -> None:
             else:
                 factor = share * float(points.sixteen_factor or 1.0)
                 grid = PointGrid(4, 4, factor * points.lateral_px, factor * along)
-            count = told(
-                arguments.pairs,
+            told_apart = told(
+                count,
                 lambda rng, window=window, grid=grid: (
                     try_points(
                         window, truth.point, grid, Noise(), seed=int(rng.integers(1 << 30)), trials=1
@@ -204,9 +259,22 @@ def main() -> None:
             )
             print(
                 f"{name}, {grid.separation_px:.2f} px, {grid.separation_planes:.2f} half steps "
-                f"({share:g} of stated): {count}",
+                f"({share:g} of stated): {told_apart}",
                 flush=True,
             )
+
+
+def main() -> None:
+    """Hold each bench's figures against its own points."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--pairs", type=int, default=20)
+    parser.add_argument("--only", nargs="+", choices=["across", "along", "sixteen", "volume"], default=None)
+    parser.add_argument("--bench", nargs="+", choices=list(BENCHES), default=["tiny"])
+    parser.add_argument("--shares", nargs="+", type=float, default=SHARES, help="Of a volume's points.")
+    parser.add_argument("--together", type=int, default=1, help="Pairs across in one picture, far apart.")
+    asked = parser.parse_args()
+    for bench in asked.bench:
+        held(bench, asked.only or ["across", "along", "sixteen"], asked.pairs, asked.shares, asked.together)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ DIP = 0.2
 """Dip between two points that counts as resolved (the Rayleigh criterion's)."""
 TRIALS = 3
 """Noise draws and sub-pixel positions that all must be resolved."""
-TOLD = 0.95
+TOLD = 0.97
 """Share of pairs, at all places between pixels, that the curve tells apart at the stated distance: nine in
 ten are promised."""
 ROUNDS, DRAWS = 3, 8
@@ -83,7 +83,7 @@ class Reached:
     """What the default reconstruction reaches, with the noise of the tests."""
 
     across_px: tuple[float | None, float | None]
-    """Distance along y and along x at which 95 % of the pairs are told apart, at the least the smallest one
+    """Distance along y and along x at which 97 % of the pairs are told apart, at the least the smallest one
     tried; None: at none tried."""
     focus_um: tuple[float, float] | None
     """Nearest and farthest depth (possibly infinite) at which pairs half as far again apart are told apart in
@@ -101,7 +101,7 @@ class InVolumes:
     """What default volumes reach, with the noise of the tests."""
 
     along_per_um: float | None
-    """Difference in 1/z of two points along the axis of which 95 % are told apart; None: at none tried."""
+    """Difference in 1/z of two points along the axis of which 97 % are told apart; None: at none tried."""
     sixteen_factor: float | None
     """By how much the optics' two distances had to grow for 4 x 4 points in x and z; None: more than there is
     room for."""

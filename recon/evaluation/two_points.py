@@ -21,19 +21,22 @@ from recon.analysis.correlation import lit_extent
 from recon.analysis.middle import Middle
 from recon.analysis.points import DIP, Noise, Reached, TriedPair, smallest_dip, stated_px
 from recon.base import fft
+from recon.camera.refocus import at_depth
 from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
 
-PICTURES, PAIRS = 3, 22
+PICTURES, PAIRS = 4, 22
 """Pictures that are reconstructed, and pairs in each, half of them along each axis.
 
-Where there is no room for so many, up to three times as many pictures.
+Where there is no room for so many, up to three times as many pictures. More in a picture cost resolution:
+with 35 the stated distance is 7 % more than with 10 or 22.
 """
 _RANGE = 3.0  # of the first distances, largest over smallest
-_ABOUT = 1.3  # of later distances about what was found, to both sides
+_BELOW = 1.12  # the stated distance over the middle of an axis' later ones: there the curve rises
+_ABOUT = 1.2  # of these, to both sides
 _CELL_PX = 20  # for a pair, at least; more where its points lie farther apart
 _FIELD = 0.25  # of the sensor to both sides of its middle, where pairs stand
 _BESIDE = 2  # rows to both sides of a pair's line that the picture is summed over
@@ -69,7 +72,8 @@ class _Tests:
 
     def __init__(self, middle: Middle, z_um: float, noise: Noise, seed: int) -> None:
         self.z_um, self.rng = z_um, np.random.default_rng(seed)
-        self.calibration = middle.calibration
+        # As people have pictures of this depth made, who name it: between calibrated ones of what is between.
+        self.calibration, _ = at_depth(middle.calibration, z_um)
         self.psf = middle.psf_at
         self.noise = middle.noise(noise)
         self.method = ""
@@ -135,18 +139,23 @@ def reached(
     tests = _Tests(middle, z_um, noise or Noise(), seed)
     psf = tests.psf(z_um)
     low = max(start_px, 1.2)
-    about, wide = low * np.sqrt(_RANGE), np.sqrt(_RANGE)
+    about, wide = np.full(2, low * np.sqrt(_RANGE)), np.sqrt(_RANGE)
     tried: list[TriedPair] = []
     for number in range(3 * PICTURES):
         if len(tried) > (PICTURES - 1) * PAIRS:
             break
         share = (tests.rng.permutation(PAIRS // 2).repeat(2) + tests.rng.uniform(0, 1)) / (PAIRS / 2)
-        pairs = tests.pairs([float(v) for v in about * wide ** (2 * share - 1)], len(tried))
+        axes = (len(tried) + np.arange(PAIRS)) % 2
+        pairs = tests.pairs([float(v) for v in about[axes] * wide ** (2 * share - 1)], len(tried))
         light = shifted(psf, np.concatenate([pair.points for pair in pairs]))
         told = tests.told_apart(pairs, light)
         tried += [TriedPair(p.px, p.axis, t) for p, t in zip(pairs, told, strict=True)]
-        if (found := [px for px in stated_px(tried) if px is not None]) or not any(told):
-            about, wide = (float(np.mean(found)), _ABOUT) if found else (about * _RANGE / 2, wide)
+        stated = stated_px(tried)
+        if found := [px for px in stated if px is not None]:
+            about = np.array([px or float(np.mean(found)) for px in stated]) / _BELOW
+            wide = _ABOUT
+        elif not any(told):
+            about = about * _RANGE / 2
         if on_progress is not None:
             on_progress(max(len(tried) / PAIRS, (number + 1) / 3) / (PICTURES + 1))
     across = stated_px(tried)

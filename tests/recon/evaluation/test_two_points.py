@@ -14,6 +14,7 @@ from recon.analysis.correlation import half_light_deg
 from recon.analysis.middle import Middle
 from recon.analysis.points import Noise, Reached, TriedPair
 from recon.analysis.resolution import axial_resolution
+from recon.camera.camera_model import one_depth
 from recon.evaluation import two_points
 from recon.evaluation.two_points import reached, shifted, stated_px
 from recon.types import Calibration, Geometry
@@ -40,7 +41,7 @@ def test_the_stated_distance_is_that_of_a_curve_through_the_pairs() -> None:
         for axis, middle in enumerate((2.0, 2.6))
         for px in np.geomspace(1.2, 4.5, 80)
     ]
-    beyond = np.exp(np.log(19) / 20)  # a curve of this slope has 95 % there
+    beyond = np.exp(np.log(97 / 3) / 20)  # a curve of this slope has 97 % there
     for stated, centre in zip(stated_px(tried), (2.0, 2.6), strict=True):
         assert stated is not None
         assert stated == pytest.approx(centre * beyond, rel=0.08)
@@ -70,6 +71,20 @@ def test_the_default_picture_reaches_a_little_less_than_the_pixels(monkeypatch: 
     assert found.focus_um is not None
     assert 30e3 < found.focus_um[0] < 50.001e3
     assert 49.999e3 < found.focus_um[1] < 200e3
+
+
+def test_between_calibrated_depths_pictures_have_the_psf_of_between() -> None:
+    near = _calibration((80, 90))
+    both = replace(
+        near,
+        psfs=np.concatenate([near.psfs, near.psfs]),
+        source_positions_um=np.array([(0.0, 0.0, 40e3), (0.0, 0.0, 60e3)]),
+    )
+    for z_um in (48e3, 60e3):
+        tests = two_points._Tests(Middle.of(both, z_um, 2e-6), z_um, Noise(), 0)
+        seen = one_depth(tests.calibration, z_um)
+        assert seen.source_positions_um[0, 2] == pytest.approx(z_um)
+        np.testing.assert_allclose(seen.psfs[0, 0], tests.psf(z_um), atol=0.02)
 
 
 def test_depths_of_the_middle_are_spread_as_its_extent_is_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
