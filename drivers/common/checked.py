@@ -62,6 +62,8 @@ _ENDED_BY = {"snap": "stop_sequence", **dict.fromkeys(_MOVES, "stop")}
 _UNDONE_BY = {"open": "close", "set_pattern": "off", **_ENDED_BY}
 """What is done after a call that ended when it had been given up: it may have lit or moved something."""
 _INTERRUPTED_S = 2.0
+_LONGEST_WAIT_S = 7 * 86_400.0
+"""No camera takes longer for a frame."""
 _AT_ONCE = {"name", "is_open", "pattern", "displayed"}
 """Properties that no driver asks its device for: errors, what makes a bench safe and windows need them."""
 _READING = "reading "
@@ -183,13 +185,18 @@ def _guarded_read(made: type, name: str) -> Callable[[Any], Any]:
     def read(self: Device) -> Any:
         within_driver, _here.within_driver = _is_within_driver(), True
         try:
-            return getattr(super(made, self), name)
+            said = getattr(super(made, self), name)
         except DeviceError:
             raise
         except Exception as error:
             raise _driver_failed(self, name, error) from error
         finally:
             _here.within_driver = within_driver
+        if isinstance(said, float) and not math.isfinite(said):
+            raise _refuse(self, name, f"{said:g}")
+        if name == "longest_wait_s" and not 0 < said <= _LONGEST_WAIT_S:
+            raise _refuse(self, "how long a frame may take", f"{said:g} s")
+        return said
 
     if name in _AT_ONCE:
         return read

@@ -30,7 +30,7 @@ def in_words(n_bytes: float) -> str:
 
 VOLUMES = {"tv": 6, "l1": 2}
 """Volumes that each solver keeps: X, g and four states; z and the transfer functions."""
-LOW_MODES = 5.5 * 2**20
+LOW_MODES = 3.4 * 2**20
 """Bytes of the matrices of a preconditioner's lowest modes, of pictures and volumes of any size."""
 KEPT_FREE = 0.1
 """Share of the available memory that is left to everybody else."""

@@ -312,7 +312,7 @@ _add(
     iterations=20,
     **{k: v for k, v in SPARSE.items() if k != "iterations"},
 )
-_add("volume-scratch", adapter.scratch_volume, beads, axial, memory_gib=6.7e-3, **SPARSE | {"prior": "tv"})
+_add("volume-scratch", adapter.scratch_volume, beads, axial, memory_gib=4.65e-3, **SPARSE | {"prior": "tv"})
 for model in ("local", "lowrank"):
     for prior in ("tv", "l1"):
         _add(

@@ -792,7 +792,14 @@ def test_a_picture_says_which_depths_it_is_of(plane: int | None) -> None:
 
     def picture(planes: tuple[int, ...], volume: np.ndarray, done: int | None, **known: Any) -> LivePicture:
         level: Any = SimpleNamespace(
-            **{"detail": Detail(2, planes), "binning": 2, "method": "admm", "solver": solver} | known
+            **{
+                "detail": Detail(2, planes),
+                "binning": 2,
+                "method": "admm",
+                "solver": solver,
+                "camera": lambda **_: "",
+            }
+            | known
         )
         return reconstructor._picture(level, volume, done, Spent(0.0, 0.0))
 
