@@ -114,6 +114,7 @@ def linear_algebra_on_one_thread() -> Iterator[None]:
     libraries = _libraries()
     with _lock:
         if not _LinearAlgebra.users:
+            _let_anyone_set(libraries)
             _LinearAlgebra.before = libraries.limit(limits=1, user_api="blas")
         _LinearAlgebra.users += 1
     try:
@@ -122,7 +123,16 @@ def linear_algebra_on_one_thread() -> Iterator[None]:
         with _lock:
             _LinearAlgebra.users -= 1
             if not _LinearAlgebra.users:
-                for library in libraries.lib_controllers:  # which listen to the first thread that asked, and
-                    if hasattr(library, "clear_controlling_thread"):  # this may be another
-                        library.clear_controlling_thread(force=True)
+                _let_anyone_set(libraries)
                 _LinearAlgebra.before.restore_original_limits()
+                _let_anyone_set(libraries)
+
+
+def _let_anyone_set(libraries: Any) -> None:
+    """Have libraries listen to this thread, which may be another than the one that they listened to last.
+
+    They go on listening to whoever set anything, and to nobody else, as long as that thread lives.
+    """
+    for library in libraries.lib_controllers:
+        if hasattr(library, "clear_controlling_thread"):
+            library.clear_controlling_thread(force=True)

@@ -108,6 +108,7 @@ def test_a_photograph_waits_for_the_exposure_that_is_still_being_typed(qtbot: Qt
 
 def test_a_region_is_drawn_with_the_mouse(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:
     qtbot.mouseClick(live.picture.region_button, LEFT)
+    qtbot.wait(100)  # a layout that settles moves it, too
     before = live.picture.view.box.viewRange()
     graphics = live.picture.view.graphics
 

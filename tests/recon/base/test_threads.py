@@ -55,3 +55,19 @@ def test_it_comes_back_after_an_error_and_when_the_last_has_ended() -> None:
     leave.set()
     thread.join(10)
     assert threads() == {2}
+
+
+def test_it_is_one_in_whichever_thread_asks_after_another() -> None:
+    seen = []
+
+    def ask() -> None:
+        with linear_algebra_on_one_thread():
+            seen.append(threads())
+
+    ask()  # this thread lives on: libraries go on listening to it
+    for thread in [threading.Thread(target=ask) for _ in range(2)]:
+        thread.start()
+        thread.join(10)
+    ask()
+    assert seen == [{1}] * 4
+    assert threads() == {2}
