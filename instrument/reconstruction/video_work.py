@@ -303,8 +303,10 @@ def _dask() -> Any:
     # Its own configuration says INFO; silence_logs of a local cluster is taken back too early. What becomes
     # of workers is told in our own words.
     logging.getLogger("distributed").setLevel(logging.WARNING)
-    for quiet in ("nanny", "scheduler"):
+    for quiet in ("nanny", "client"):
         logging.getLogger(f"distributed.{quiet}").setLevel(logging.ERROR)
+    # A result that was lost with its worker before it was fetched is an error there, and is made again.
+    logging.getLogger("distributed.scheduler").setLevel(logging.CRITICAL)
     return distributed
 
 
