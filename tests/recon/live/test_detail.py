@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from recon.streams.detail import SENSOR_WORK, Detail, _held_by_pixels, _held_by_planes, _spread, ladder
 
@@ -96,3 +97,27 @@ def test_a_rung_costs_four_fifths_at_most_and_is_the_best_at_its_price() -> None
     apart = [(d.binning, len(d.planes)) for d in ladder(alike(64, 0.1), (1, 2), None).values()]
     assert apart[0] == (1, 64)
     assert (2, 64) in apart
+
+
+def test_planes_that_are_the_same_go_before_pixels_but_never_of_two() -> None:
+    halves = np.repeat((np.indices((16, 16))[1] % 8 < 4)[None, None].astype(np.float32), 4, axis=0)
+    for depths, planes in ((2, (0, 1)), (3, (0, 2)), (4, (0, 3))):
+        offered = list(ladder(halves[:depths], (1, 2), None).values())
+        assert [(d.binning, d.planes) for d in offered] == [(1, tuple(range(depths))), (2, planes)]
+
+
+def test_pixels_are_judged_by_the_depth_in_the_middle() -> None:
+    rng = np.random.default_rng(0)
+    fine = rng.random((1, 16, 16)).astype(np.float32)
+    coarse = gaussian_filter(rng.random((1, 16, 16)), (0, 3, 3), mode="wrap").astype(np.float32)
+    for middle, planes_first in ((coarse, False), (fine, True)):
+        planes = np.array([fine, fine, coarse, middle, coarse, fine, fine])
+        planes[[0, 1, 2, 4, 5, 6]] += 0.01 * rng.random((6, 1, 16, 16)).astype(np.float32)
+        offered = [(d.binning, d.planes) for d in ladder(planes, (1, 2), None).values()]
+        assert ((1, (0, 6)) in offered) == planes_first
+
+
+def test_binned_pixels_lie_about_the_axis() -> None:
+    psf = np.zeros((1, 6, 6), np.float32)
+    psf[0, :, 0] = 1
+    assert _held_by_pixels(psf, 2) == 0, "half a block's column is left out at each side"
