@@ -290,11 +290,11 @@ def check_writable(path: Path | str, n_bytes: int = 0) -> None:
     if not folder.is_dir():
         found = "is no folder" if folder.exists() else "does not exist"
         raise FileError(path, f"its folder {folder} {found}.", "Make it first.")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise FileError(path, f"no permission to write in {folder.absolute()}.", "Choose another place.")
     disk = os.statvfs(folder)
     if disk.f_flag & os.ST_RDONLY:
         raise FileError(path, f"{folder} is on a read-only disk.", "Choose another place.")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise FileError(path, f"no permission to write in {folder.absolute()}.", "Choose another place.")
     if disk.f_blocks == 0 and folder.resolve().is_relative_to("/proc"):
         raise FileError(
             path, f"{folder} is the system's own and holds no files of ours.", "Choose another place."

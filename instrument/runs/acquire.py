@@ -116,6 +116,8 @@ def free_bytes(folder: Path) -> int:
     there = there_now(folder)
     if not there.is_dir():
         raise FileError(folder, f"{there} is a file, not a folder; nothing can be kept there.")
+    if os.statvfs(there).f_flag & os.ST_RDONLY:
+        raise FileError(folder, f"{there} is on a read-only disk; nothing can be kept there.")
     if not os.access(there, os.W_OK):
         raise FileError(folder, f"you may not write to {there}; nothing can be kept there.")
     return shutil.disk_usage(there).free

@@ -270,7 +270,7 @@ def test_what_is_there_is_left_unless_it_may_be_overwritten(tmp_path: Path) -> N
         ("none/a", {}, True, "its folder .* does not exist."),
         ("file/a", {}, True, "its folder .* is no folder."),
         ("a", {}, False, "no permission to write in"),
-        ("a", {"f_flag": os.ST_RDONLY | os.ST_NOSUID}, True, "is on a read-only disk."),
+        ("a", {"f_flag": os.ST_RDONLY | os.ST_NOSUID}, False, "is on a read-only disk."),  # nobody may
         ("a", {"f_blocks": 0}, True, ""),  # a FUSE disk that does not say its size
         ("/proc/self/a", {"f_blocks": 0}, True, "is the system's own and holds no files of ours."),
         ("/proc/self/a", {"f_blocks": 1}, True, ""),

@@ -357,6 +357,9 @@ def test_a_folder_where_nothing_can_be_kept_is_named(tmp_path: Path, monkeypatch
     monkeypatch.setattr(os, "access", lambda there, mode: there != tmp_path or mode != os.W_OK)
     with pytest.raises(FileError, match=f"you may not write to {tmp_path}; nothing can be kept there"):
         free_bytes(tmp_path / "runs")
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_flag=os.ST_RDONLY | os.ST_NOSUID))
+    with pytest.raises(FileError, match=f"{tmp_path} is on a read-only disk; nothing can be kept there"):
+        free_bytes(tmp_path / "runs")
     monkeypatch.setattr(Path, "exists", lambda _: False)
     with pytest.raises(FileError, match="not even its disk"):
         there_now(tmp_path)
