@@ -160,5 +160,5 @@ def _end(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseExcep
 
 def _where(writer: RunWriter) -> str:
     if not (writer.path / LOG).exists():
-        return f"What was acquired was in {writer.path}, which is gone."
+        return f"What was acquired was in {writer.path}, which is gone or moved."
     return f"What was acquired is in {writer.path}"

@@ -7,6 +7,7 @@ speed. Tests read the result back with zarr-python and hold it against the OME-Z
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import shutil
@@ -25,6 +26,7 @@ from instrument.files.atomic import make_folder, sync_folder, write_json
 from instrument.files.errors import FileError
 from instrument.files.reading import parse_json, read_bytes, require_file
 from instrument.files.volumes import ome_attributes
+from instrument.runs.log import GONE
 
 Image = npt.NDArray[Any]
 _LEVEL = "0"
@@ -278,6 +280,10 @@ class FrameArray:
         planes = np.moveaxis(image, -1, 0) if self.is_colour else image
         data = np.ascontiguousarray(planes, dtype=self.dtype.newbyteorder("<")).data.cast("B")
         target = self.chunk_path(index)
+        try:
+            (self.path / _LEVEL / "c" / str(index)).mkdir(exist_ok=True)  # never a run's folder anew
+        except FileNotFoundError as error:
+            raise FileNotFoundError(errno.ENOENT, GONE, str(self.path)) from error
         target.parent.mkdir(parents=True, exist_ok=True)
         path = target.with_name("part")
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)

@@ -149,6 +149,7 @@ class BadLine:
 
 
 _CLOSED = -1
+GONE = "it was deleted or moved meanwhile"
 
 
 class AppendOnlyLog:
@@ -174,7 +175,7 @@ class AppendOnlyLog:
         """Append records and wait until they are on the disk; all of them, or (raising) none."""
         data = b"".join(log_line(record) for record in records)
         if not os.fstat(self._handle).st_nlink:  # what is written to it now nobody can read
-            raise FileNotFoundError(errno.ENOENT, "was deleted meanwhile", str(self.path))
+            raise FileNotFoundError(errno.ENOENT, GONE, str(self.path))
         try:
             written = 0
             while written < len(data):

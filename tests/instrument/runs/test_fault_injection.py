@@ -228,5 +228,24 @@ def test_a_run_whose_folder_is_deleted_meanwhile_ends_dark_and_says_so(tmp_path:
         with pytest.raises(RunError) as caught:
             runner.execute()
         assert_safe(bench)
-    assert "which is gone" in "".join(caught.value.__notes__)
+    assert "which is gone or moved" in "".join(caught.value.__notes__)
     assert "no run folder" not in str(caught.value)
+
+
+def test_a_run_whose_folder_is_moved_meanwhile_keeps_what_its_log_says(tmp_path: Path) -> None:
+    moved = tmp_path / "moved"
+
+    def move(status: RunStatus) -> None:
+        if status.done == 3 and runner.path.exists():
+            runner.path.rename(moved)
+
+    with open_mock_bench() as bench:
+        runner = prepare(bench, PLAN, tmp_path / "runs", on_progress=move)
+        with pytest.raises(RunError, match="deleted or moved meanwhile") as caught:
+            runner.execute()
+        assert_safe(bench)
+    assert "which is gone or moved" in "".join(caught.value.__notes__)
+    assert not runner.path.exists(), "nothing is made anew under the old name"
+    run = Run.open(moved)
+    assert 3 <= len(run.records) < len(PLAN)
+    assert all(run.frame(index).size for index in run.records)

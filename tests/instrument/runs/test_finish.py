@@ -37,7 +37,7 @@ def test_a_run_keeps_the_words_of_what_ended_it(error: BaseException | None, tex
     assert run == "the run"
     writer.finish.assert_called_once_with(FinishReason.FAILED, text)
     notes = getattr(error, "__notes__", [])
-    assert notes == ([] if error is None else ["What was acquired was in runs/one, which is gone."])
+    assert notes == ([] if error is None else ["What was acquired was in runs/one, which is gone or moved."])
 
 
 def test_without_an_error_the_first_failure_is_raised_with_the_others_and_the_place() -> None:

@@ -200,7 +200,7 @@ def test_a_log_only_grows_by_whole_lines(tmp_path: Path, monkeypatch: pytest.Mon
         log.append([first])
     assert path.read_bytes() == whole  # all of them or none
     path.unlink()
-    with pytest.raises(FileNotFoundError, match="was deleted meanwhile"):
+    with pytest.raises(FileNotFoundError, match="was deleted or moved meanwhile"):
         log.append([first])
     handle = log._handle
     for _ in range(2):
