@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy import fft, ndimage
 
 from calibration_routines.psf.exposure import hot_pixels
+from calibration_routines.psf.frame_noise import FrameNoise, PhotonTransfer
 from calibration_routines.psf.mount_fit import MountFit, fit_mount, with_pitch
 from calibration_routines.psf.psf_quality import (
     PsfQuality,
@@ -89,6 +90,11 @@ class DarkModel:
         hot meanwhile."""
         self.late_hot = 0
         """Pixels among them that were not so in the first dark frames."""
+        self.variance = float("nan")
+        """Of a pixel from frame to frame in the dark, counts squared; nan of a single frame."""
+        if len(some := stack[:first, :: max(1, stack[0].size // _NOISE_PX)]) > 1:
+            steady = ~self.hot[:: max(1, stack[0].size // _NOISE_PX)]
+            self.variance = float(some[:, steady].astype(np.float32).var(axis=0, ddof=1).mean())
         self.brightening_per_ms = 0.0
         """Counts a millisecond by which the last dark frames are brighter than the first, in the median."""
         if first < len(stack):
@@ -128,6 +134,8 @@ class SweepAnalysis:
     """Where the source stands by the central PSFs; None where they do not tell."""
     structure: Structure | None = None
     """How wide the central PSFs' finest structure is; None where they do not tell."""
+    noise: FrameNoise | None = None
+    """Of one frame; None where the frames do not tell."""
 
 
 def analyse_sweep(
@@ -159,6 +167,7 @@ def analyse_sweep(
     ambient: list[float] = []
     off_axis: list[bool] = []
     structure: dict[float, float] = {}
+    transfer = PhotonTransfer(dark.variance, binning)
     removed_in_all: Float | None = None
     reference_ms = 0.0
     for plane in planes:
@@ -173,6 +182,8 @@ def analyse_sweep(
         cleaned, stray = remove_low_frequencies(light, dct_order)
         quality.append(measure_point(plane, light - stray, steady, dark, binning))
         psfs.append(cleaned * scale)
+        still = steady.scatter.motion_px == 0
+        transfer.look(steady.frames, cleaned, still=still, off_axis=plane.off_axis)
         if not plane.off_axis and len(steady.frames) > 1:
             structure.setdefault(plane.source_um[2], _structure_px(steady, binning))
         removed = channels_first(replace_hot(dark.at(reference_ms), dark.hot))
@@ -206,6 +217,7 @@ def analyse_sweep(
         ),
         mount=mount,
         structure=fit_structure(list(structure), list(structure.values()), binned(geometry, binning)),
+        noise=transfer.found(),
     )
 
 

@@ -327,6 +327,7 @@ class _TakenSweep:
                 "late_hot_pixels": self.dark.late_hot,
                 "mount": None if analysis.mount is None else plain(analysis.mount),
                 "structure": None if analysis.structure is None else plain(analysis.structure),
+                "noise": None if analysis.noise is None else plain(analysis.noise),
                 "good": not doubted,
             },
             provenance=self._provenance(exposures, analysis.reference_exposure_ms),

@@ -11,7 +11,7 @@ from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError, FileError
 from instrument.files.figures import check_figure
 from instrument.tasks.task import Desk, Done, Given, saying_what_is_left, task
-from recon.analysis import AnalysisSettings, Noise
+from recon.analysis import AnalysisSettings, AskedNoise
 from recon.base.declare import option
 from recon.camera.grid import FAR_UM, depth_in_words
 from recon.types import Calibration
@@ -93,7 +93,9 @@ class CompareOptions:
     "diffuserbench analyze calibration --volumes            points in default volumes, too: minutes",
     "diffuserbench analyze calibration --no-points          without reconstructions: seconds",
 )
-def analyze(desk: Desk, files: AnalysisFiles, settings: AnalysisSettings, noise: Noise, given: Given) -> Done:
+def analyze(
+    desk: Desk, files: AnalysisFiles, settings: AnalysisSettings, noise: AskedNoise, given: Given
+) -> Done:
     """Resolution, depth of field, field of view, conditioning, point tests and a voxel grid, on one page.
 
     Everything follows from the calibration's PSFs and its geometry; what they cannot tell (the sensor's

@@ -25,7 +25,16 @@ from recon.analysis.correlation import (
 )
 from recon.analysis.gram import ConditionCurve, Direction, condition_curve
 from recon.analysis.middle import RIM_PX, Middle
-from recon.analysis.points import PLANES, InVolumes, Noise, PointTests, Reached, planes_about, point_tests
+from recon.analysis.points import (
+    PLANES,
+    AskedNoise,
+    InVolumes,
+    Noise,
+    PointTests,
+    Reached,
+    planes_about,
+    point_tests,
+)
 from recon.analysis.resolution import (
     AxialResolution,
     DepthSimilarity,
@@ -135,7 +144,7 @@ class AnalysisSettings:
         help="Two points along the axis and 16 points in default volumes, too: minutes.",
         group="Point tests",
     )
-    noise: Noise = field(default_factory=Noise)
+    noise: AskedNoise = field(default_factory=AskedNoise)
 
 
 @dataclass(frozen=True)
@@ -182,6 +191,8 @@ class Analysis:
     grid: VoxelGrid
     model: str
     model_reason: str
+    noise: Noise
+    """Of the tests' images."""
     settings: AnalysisSettings
     notes: tuple[str, ...]
 
@@ -229,6 +240,7 @@ def analyse(
     on_progress = on_progress or (lambda _what, _share: None)
     pitch_um, distance_um = _geometry(calibration)
     notes: list[str] = []
+    noise, noise_source = settings.noise.of(calibration.quality)
     small, sensor_shape = _cut_to_light(calibration)
     depths, stack = central_psfs(small)
     planes = stack.mean(axis=1)
@@ -290,7 +302,7 @@ def analyse(
             z_um,
             lateral_px=lateral_inner.mean_px,
             step_per_um=step * middle.spread,
-            noise=middle.noise(settings.noise),
+            noise=middle.noise(noise),
             on_progress=lambda share: on_progress("point tests", 0.5 + 0.2 * share),
         )
         if tests.axial_per_um is not None:
@@ -303,14 +315,14 @@ def analyse(
             z_um,
             lateral_inner.mean_px,
             step,
-            settings.noise,
+            noise,
             on_progress=lambda share: on_progress("two points by default", 0.7 + 0.2 * share),
         )
-        notes.extend(_conditions(z_um, settings.noise, found))
+        notes.extend(_conditions(z_um, noise, noise_source, found))
     volumes = None
     if tests is not None and settings.volumes and reach_in_volumes is not None:
         on_progress("points in default volumes", 0.9)
-        volumes = _in_volumes(reach_in_volumes, calibration, z_um, tests, step, settings.noise, notes)
+        volumes = _in_volumes(reach_in_volumes, calibration, z_um, tests, step, noise, notes)
     resolution_px = lateral.mean_px
     if tests is not None:
         resolution_px = tests.lateral_px or resolution_px
@@ -354,6 +366,7 @@ def analyse(
         ),
         model=model,
         model_reason=reason,
+        noise=noise,
         settings=settings,
         notes=tuple(notes),
     )
@@ -417,13 +430,13 @@ def _condition(planes: Array, *, with_depth: bool) -> tuple[ConditionCurve, ...]
     return tuple(curve for curve in curves if curve.separations)
 
 
-def _conditions(z_um: float, noise: Noise, found: Reached) -> list[str]:
+def _conditions(z_um: float, noise: Noise, source: str, found: Reached) -> list[str]:
     """Return under which conditions the default reconstruction tells two points apart."""
     words = [
         "Two points and depth of field, picture: as the default reconstruction has them, alone in the dark, "
-        f"equally bright, at {z_um / 1e3:.3g} mm, the brightest pixel at {noise.electrons:g} electrons, read "
-        f"noise {noise.read_e:g}; a dip of 20 % at nine in ten places between pixels. More in a scene costs "
-        "resolution."
+        f"equally bright, at {z_um / 1e3:.3g} mm, the brightest pixel at {noise.electrons:.5g} electrons, "
+        f"read noise {noise.read_e:.3g} ({source}); a dip of 20 % at nine in ten places between pixels. More "
+        "in a scene costs resolution."
     ]
     if found.part < 1:
         words.append(

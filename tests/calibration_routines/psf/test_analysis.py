@@ -114,3 +114,18 @@ def test_frames_that_do_not_fit_are_refused() -> None:
         analyse_sweep([small], dark_model(), GEOMETRY)
     with pytest.raises(ValueError, match="one or two exposures"):
         DarkModel((), (), FULL)
+
+
+def test_frames_tell_their_noise_in_electrons() -> None:
+    depths = [(100e3, 60.0), (140e3, 120.0), (200e3, 200.0)]
+    for binning in (1, 2):
+        noise = analyse_sweep([plane(z, e) for z, e in depths], dark_model(), GEOMETRY, binning=binning).noise
+        assert noise is not None
+        assert noise.counts_per_electron == pytest.approx(0.1, rel=0.05)
+        # Variances of 1, and of 1/12 by whole counts.
+        assert noise.read_e == pytest.approx(binning * np.hypot(1.0, 12**-0.5) / 0.1, rel=0.05)
+        brightest = float(np.median([e * light_at(z).max() for z, e in depths]))
+        assert noise.electrons == pytest.approx(binning**2 * brightest / 0.1, rel=0.15)
+    alone = [PlaneFrames((0.0, 0.0, 100e3), 60.0, frames(light_at(100e3), 60.0, 1), FULL)]
+    assert analyse_sweep(alone, dark_model(), GEOMETRY).noise is None
+    assert analyse_sweep([plane(100e3, 60.0)], dark_model(1), GEOMETRY).noise is None

@@ -8,7 +8,7 @@ import pytest
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.gram import WindowProblem
-from recon.analysis.points import Noise, PointGrid, try_points
+from recon.analysis.points import AskedNoise, Noise, PointGrid, try_points
 
 WORLD = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0, aperture_mm=(1.0, 1.0)))
 Z_UM = 60e3
@@ -48,3 +48,15 @@ def test_the_dip_is_found_where_a_reconstruction_on_the_whole_sensor_finds_it() 
     seen = whole[row - 4 : row + 5, column - 12 : column + 13].sum(axis=0)
     assert set(np.argsort(seen)[-2:]) <= set(np.argsort(window)[-4:])
     assert seen[12] / seen.max() == pytest.approx(window[12] / window.max(), abs=0.25)
+
+
+def test_noise_is_the_calibrations_unless_it_is_given() -> None:
+    quality = {"noise": {"electrons": 21_000.0, "read_e": 3.5, "counts_per_electron": 0.1}}
+    assert AskedNoise().of(quality) == (Noise(21_000.0, 3.5), "measured in its frames")
+    assert AskedNoise(read_e=1.0).of(quality) == (
+        Noise(21_000.0, 1.0),
+        "measured in its frames; the read noise given",
+    )
+    assert AskedNoise(500.0, 0.0).of(quality) == (Noise(500.0, 0.0), "given")
+    for unknown in ({}, {"noise": None}, {"noise": {"electrons": float("nan"), "read_e": "2"}}):
+        assert AskedNoise().of(unknown) == (Noise(), "assumed")
