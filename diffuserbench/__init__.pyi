@@ -20,7 +20,7 @@ from instrument.notebook.reconstruct import run as run
 from instrument.notebook.result import Result as Result
 from instrument.notebook.result import show as show
 from instrument.notebook.result import show_figure as show_figure
-from instrument.reconstruction.stored_result import open_result as open_result
+from instrument.notebook.words import open_result as open_result
 from recon.analysis.compare import compare as compare
 from recon.analysis.report import AnalysisSettings as AnalysisSettings
 from recon.analysis.report import analyse as analyse

@@ -14,6 +14,7 @@ import pytest
 import diffuserbench as db
 from instrument.files.errors import BenchError
 from instrument.files.images import write_image
+from instrument.notebook.words import in_python
 from recon.base.declare import options_of
 from recon.errors import InputError
 from recon.evaluation.scene import make_scene
@@ -59,7 +60,7 @@ def test_the_ten_lines_of_the_readme_run(
     np.testing.assert_array_equal(np.asarray(names["tv"]), names["tv"].image)
     assert names["l1"].prior == "l1"
     facts = names["tv"].facts()
-    assert "`dark` FILE or COUNTS to give it" in facts["Dark"]
+    assert "a frame or counts may be given by `dark`" in facts["Dark"]
     assert not [text for text in facts.values() if "--" in text], "the terminal's flags"
 
 
@@ -167,6 +168,35 @@ def test_refusals_name_options_as_python_does(scene: tuple[np.ndarray, np.ndarra
     photo = db.read(tmp_path / "photo.tif")
     with pytest.raises(BenchError, match=r"\(diffuserbench snap --dark\), or leave `dark` out"):
         db.reconstruct(photo, scene[1], dark=photo)
+    result = db.reconstruct(*plain(scene), iterations=2, stop_at_noise=False)
+    result.save(tmp_path / "scene.tif")
+    with pytest.raises(BenchError, match="`overwrite=True`"):
+        result.save(tmp_path / "scene.tif")
+    with pytest.raises(BenchError, match="one by `psf` FILE"):
+        db.calibration(tmp_path / "scene.tif")
+
+
+def test_verdicts_and_warnings_do_too_and_are_written_down_as_typed(
+    scene: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    dim = np.random.default_rng(0).normal(plain(scene)[0] / 1000, 10.0)
+    result = db.reconstruct(dim, plain(scene)[1])
+    said = (*result.verdict.sentences, *(f.help for f in result.verdict.findings), *result.warnings)
+    assert "`model='local'`" in " ".join(said)
+    assert not [sentence for sentence in said if "--" in sentence]
+    result.save(tmp_path / "scene.tif")
+    assert "(--model local)" in (tmp_path / "scene.json").read_text()
+    assert db.open_result(tmp_path / "scene.tif").verdict == result.verdict.sentences
+
+
+def test_values_are_given_as_python_gives_them() -> None:
+    assert in_python("larger pixels (--bin 2) or --model local") == (
+        "larger pixels (`binning=2`) or `model='local'`"
+    )
+    assert (
+        in_python("--refine-psf fits it; --no-background")
+        == "`refine_psf` fits it; `estimate_background` off"
+    )
 
 
 def test_nan_pixels_are_erased_and_said(scene: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from instrument.evaluation.figures import write_charts
 from instrument.files.atomic import write_json
 from instrument.files.errors import BenchError
 from instrument.notebook.result import Result, figure_png, show_figure
+from instrument.notebook.words import speaking
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,6 +43,7 @@ class Chart(ChartData):
         """Show it: below the cell of a notebook, else in a window."""
         show_figure(self.figure())
 
+    @speaking
     def save(self, folder: Path | str) -> tuple[Path, ...]:
         """Write chart.png, .html, .csv and .json into a folder; errors as ``write_text``."""
         folder = Path(folder)
@@ -51,6 +53,7 @@ class Chart(ChartData):
         return (record, *write_charts(folder, self))
 
 
+@speaking
 def chart(
     subject: Result | str,
     *,

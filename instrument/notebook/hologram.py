@@ -26,7 +26,8 @@ from instrument.display.hologram_files import HologramFiles, hologram_figure
 from instrument.files.images import ImageFile, read_image
 from instrument.files.sample_images import SAMPLES
 from instrument.notebook.reconstruct import bench_config
-from instrument.notebook.result import figure_png, in_python, show_figure
+from instrument.notebook.result import figure_png, show_figure
+from instrument.notebook.words import in_python, speaking
 from recon.base.declare import with_overrides
 from recon.holography import HologramOptions, HologramRecord
 
@@ -74,6 +75,7 @@ class HologramShown(HologramResult):
         """Show the page: below the cell of a notebook, else in a window."""
         show_figure(self.figure())
 
+    @speaking
     def save(self, out: Path | str, *, overwrite: bool = False) -> tuple[Path, ...]:
         """Write pattern, description and preview as the terminal does; ``.png``, of a complex SLM ``.npy``.
 
@@ -85,6 +87,7 @@ class HologramShown(HologramResult):
         return tuple(files.files())
 
 
+@speaking
 def hologram(
     picture: Picture | Sequence[Path | str | ImageFile],
     bench: BenchConfig | Path | str | None = None,
@@ -129,7 +132,7 @@ def hologram(
     depths = [float(z) for z in np.broadcast_to(np.asarray(z_mm, float), (len(pictures),))]
     pixels = [_pixels(one) for one in pictures]
     if said := next(filter(None, (crop_words(p, options.fit) for p in pixels)), ""):
-        warnings.warn(in_python(said, HologramOptions), stacklevel=2)
+        warnings.warn(in_python(said), stacklevel=3)
     targets = [prepare_target(p, display, options, z_mm=z) for p, z in zip(pixels, depths, strict=True)]
     found = compute_and_judge(display, targets, options, callback=on_progress, cancel=cancel)
     files = HologramFiles(Path("slm.png"), config.display.slm_binning, options, [display])

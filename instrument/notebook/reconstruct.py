@@ -22,7 +22,8 @@ from instrument.bench.source_and_scene import Ask
 from instrument.files.calibration_file import is_calibration, load_calibration
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, read
-from instrument.notebook.result import Result, in_python
+from instrument.notebook.result import Result
+from instrument.notebook.words import speaking
 from instrument.reconstruction.job import Job, find_calibration, job_from_files, job_with
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import refocused, volume_job
@@ -46,6 +47,7 @@ _INPUTS = {f.name for f in fields(InputOptions)}
 _FILES_ONLY = _INPUTS - set(one_door.FACTS)
 
 
+@speaking
 def calibration(folder: Path | str) -> Calibration:
     """Read a calibration: its folder, or the run that it was made in.
 
@@ -54,6 +56,7 @@ def calibration(folder: Path | str) -> Calibration:
     return load_calibration(find_calibration(Path(folder)))
 
 
+@speaking
 def run(folder: Path | str) -> Run:
     """Open a run for reading, by its folder or that of the calibration in it.
 
@@ -63,6 +66,7 @@ def run(folder: Path | str) -> Run:
     return Run.open(folder.parent if is_calibration(folder) and is_run(folder.parent) else folder)
 
 
+@speaking
 def bench(config: BenchConfig | Path | str | None = None, *, ask: Ask | None = None) -> Bench:
     """Open a bench, to be used as a context manager.
 
@@ -88,6 +92,7 @@ def bench_config(config: BenchConfig | Path | str | None) -> BenchConfig:
     return load_config(config)
 
 
+@speaking
 def reconstruct(
     image: Image,
     psf: Psf,
@@ -142,9 +147,6 @@ def reconstruct(
             )
         found = one_door.reconstruct(image, psf, options, **further, **overrides)  # type: ignore[arg-type]
         return Result.of(found, _job_of_arrays(image, psf))
-    except (BenchError, InputError) as error:
-        error.args = tuple(in_python(said) if isinstance(said, str) else said for said in error.args)
-        raise
     finally:
         if isinstance(told, _Told):
             told.end()

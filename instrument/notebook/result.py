@@ -20,6 +20,7 @@ from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, write_image
 from instrument.files.seen import as_seen, png_bytes
+from instrument.notebook.words import in_python, job_in_python, result_in_python, speaking
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.result_file import (
     Outputs,
@@ -27,8 +28,6 @@ from instrument.reconstruction.result_file import (
     write_reconstruction,
     write_volume,
 )
-from recon.base.declare import in_other_words, options_of
-from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.result import Reconstruction
 from recon.types import Calibration
 
@@ -47,14 +46,19 @@ class Result(Reconstruction):
     ----------
     job : Job
         Photograph, calibration, and what was done to them; in ``job.notes`` in words.
+    typed : (Reconstruction, Job)
+        The same with options named as in a terminal, which is how they are written down.
     """
 
     job: Job = field(kw_only=True)
+    typed: tuple[Reconstruction, Job] = field(kw_only=True)
 
     @classmethod
     def of(cls, found: Reconstruction, job: Job) -> Result:
         """Return a reconstruction with what it was made of."""
-        return cls(**{f.name: getattr(found, f.name) for f in fields(Reconstruction)}, job=job)
+        told = result_in_python(found)
+        values = {f.name: getattr(told, f.name) for f in fields(Reconstruction)}
+        return cls(**values, job=job_in_python(job), typed=(found, job))
 
     def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
         """Return the picture's pixels, (height, width) or with colours last; of a volume all its planes."""
@@ -102,6 +106,7 @@ class Result(Reconstruction):
         """Show the page: below the cell of a notebook, else in a window."""
         show_figure(self.figure(rotate_deg=rotate_deg))
 
+    @speaking
     def save(
         self,
         out: Path | str,
@@ -147,9 +152,9 @@ class Result(Reconstruction):
             )
             outputs.check(self.volume.size, overwrite=overwrite)
             if volume:
-                write_volume(outputs, self, self.job)
+                write_volume(outputs, *self.typed)
             else:
-                write_reconstruction(outputs, self, self.job, rotate_deg=rotate_deg)
+                write_reconstruction(outputs, *self.typed, rotate_deg=rotate_deg)
             written = outputs.written(self)
         if page is not None:
             from instrument.files.figures import save_figure
@@ -171,14 +176,6 @@ class Result(Reconstruction):
             f"<img style='max-width:100%;min-width:256px' src='data:image/png;base64,{picture}'/>"
             f"<details><summary>How it was made</summary><table>{rows}</table></details>{doubts}"
         )
-
-
-def in_python(text: str, *classes: type) -> str:
-    """Return a message with options named as Python names them; those of reconstructions without a class."""
-    from instrument.reconstruction.options import InputOptions
-
-    options = [o for cls in classes or (ReconstructionOptions, InputOptions) for o in options_of(cls)]
-    return in_other_words(text, options, lambda o: f"`{o.name}`")
 
 
 def _turns(rotate_deg: int) -> int:

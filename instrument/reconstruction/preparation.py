@@ -272,12 +272,12 @@ def dark_from_corners(psf: ImageFile, image: ImageFile) -> Dark:
     if both_raw(psf, image):
         if corner <= darkest:
             reason = f"{corner:.1f} counts from both: mean of the PSF's {name} corner"
-            return Dark(corner, corner, f"{reason} (estimated; --dark FILE or COUNTS to give it)")
+            return Dark(corner, corner, f"{reason} (estimated; a frame or counts may be given by --dark)")
         why = "the image's darkest 10 x 10 pixels, darker than the PSF's corners"
     else:
         why = "the image's darkest 10 x 10 pixels"
     reason = f"{darkest:.4g} from the image ({why}), {corner:.4g} from the PSF (its {name} corner)"
-    return Dark(darkest, corner, f"{reason} (estimated; --dark FILE or COUNTS to give it)")
+    return Dark(darkest, corner, f"{reason} (estimated; a frame or counts may be given by --dark)")
 
 
 def both_raw(psf: ImageFile, image: ImageFile) -> bool:

@@ -67,8 +67,8 @@ class Outputs:
                 out,
                 "a volume is written as OME-TIFF or OME-Zarr: the name must end in .tif or .ome.zarr."
                 if volume
-                else "a picture is written as float32 TIFF: the name must end in .tif (a volume, --volume "
-                "CALIBRATION, may be .ome.zarr).",
+                else "a picture is written as float32 TIFF: the name must end in .tif (a volume, by "
+                "--volume, may be .ome.zarr).",
                 "A preview .png and a .json with the settings are written beside it.",
             )
         deviation = out.with_name(f"{out.stem}-deviation{out.suffix}") if uncertainty else None

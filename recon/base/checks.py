@@ -219,8 +219,8 @@ def select_psf(calibration: Calibration, z_um: float | None) -> tuple[npt.NDArra
     if z_um is None:
         depths = ", ".join(f"{v:g}" for v in np.unique(z))
         raise InputError(
-            f"The calibration holds {n} PSFs (z_um: {depths}): say which depth with z_um "
-            "(--z-mm on the command line; --volume CALIBRATION makes a volume of all)."
+            f"The calibration holds {n} PSFs (z_um: {depths}): say which depth with "
+            "--z-mm (z_um in Python); --volume makes a volume of all."
         )
     if not np.isfinite(z).all():
         raise InputError(

@@ -204,7 +204,7 @@ def uncertain(
 def refused(problem: Problem) -> str | None:
     """Say why there is no uncertainty of a problem; None where there is."""
     if problem.n_planes > 1:
-        return "uncertainty is for pictures: leave it out, or give one depth by z_um (--z-mm)"
+        return "uncertainty is for pictures: leave it out, or give one depth by --z-mm"
     return "uncertainty is for photographs in one light: leave it out" if problem.patterned else None
 
 
@@ -359,7 +359,7 @@ def _power_ratio(data: tuple[Array, Array], explained: tuple[Array, Array]) -> t
     (seen, counts), (fit, _) = data, explained
     each = seen / np.maximum(counts, 1)
     noise = each.min()
-    fit = np.maximum(fit, 1e-12 * fit.max())
+    fit = np.maximum(fit, 1e-12 * (fit.max() or seen.max() or 1))  # an empty picture explains nothing
     ratio = np.maximum((each - noise) * counts / fit, 1)
     told = np.sqrt(2 / np.maximum(counts, 1)) * seen / fit < TELLS
     told[0] = True  # a few frequencies: chance moves it, whatever the noise
