@@ -418,6 +418,11 @@ class SimulatedCamera(SimulatedCameraSettings):
         """
         return self._coarse
 
+    def awaits_light(self) -> bool:
+        """Whether the next frame's light would have to be computed first: it is neither here nor on disk."""
+        filters = self._filters()
+        return any(self.world.awaits_light(sensitivity, self._binning) for sensitivity, _ in filters)
+
     def _coarsely(self, region: tuple[slice, slice], binning: int) -> tuple[Pixels, int] | None:
         efficiency = self._spec.quantum_efficiency
         weights = (0.0, efficiency[1], 0.0) if self.options.color else efficiency

@@ -129,6 +129,11 @@ class Surroundings(SharedPart):
         del weights, binning
         return None
 
+    def awaits_light(self, weights: tuple[float, float, float], binning: int = 1) -> bool:
+        """Whether :meth:`photons_per_s` would take seconds now, and only once."""
+        del weights, binning
+        return False
+
     @abstractmethod
     def light_key(self) -> tuple[Any, ...]:
         """Something that changes whenever :meth:`photons_per_s` does."""

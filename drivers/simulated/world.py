@@ -229,16 +229,21 @@ class SimulatedWorld(Surroundings):
         """
         height, width = (side // binning for side in self.sensor.shape)
         factor = int((height * width / COARSE_PIXELS) ** 0.5)
+        scene = self._scene
+        if factor < 2 or scene is None or not self.awaits_light(weights, binning):
+            return None
+        seen = product(self._glow(self.options.scene_rgb), weights)
+        return self._render(scene, (0.0, sum(seen), 0.0), factor * binning, COARSE), factor
+
+    def awaits_light(self, weights: Rgb, binning: int = 1) -> bool:
+        """Whether the light of a scene that glows now would have to be computed first."""
         with self._lock:
             scene, number = self._scene, self._scene_number
             kept = any(key[:3] == ("scene", number, None) and key[-1] == binning for key in self._cache)
-        if factor < 2 or kept or scene is None or self.animal is not None or not self.scene_lit:
-            return None
-        seen = product(self._glow(self.options.scene_rgb), weights)
-        name = self._kept_by(scene, seen, binning)
-        if name and kept_light.is_kept(name):
-            return None
-        return self._render(scene, (0.0, sum(seen), 0.0), factor * binning, COARSE), factor
+        if kept or scene is None or self.animal is not None or not self.scene_lit:
+            return False
+        name = self._kept_by(scene, product(self._glow(self.options.scene_rgb), weights), binning)
+        return not (name and kept_light.is_kept(name))
 
     def _picture(
         self, what: tuple[Any, ...], scene: Scene, leds: SceneLight | None, weights: Rgb, binning: int

@@ -193,7 +193,8 @@ def open_and_say(bench: BenchConfig | Path | None, *, as_is: bool = False) -> Be
         opened = open_bench(config, ask=_taken_for_done if as_is else operator())
     if "camera" in opened.simulated_kinds:
         height, width = opened.camera.sensor_shape
-        kept_times.about(of, simulated_megapixels=1e-6 * height * width)
+        awaits_light = getattr(opened.camera, "awaits_light", bool)
+        kept_times.about(of, simulated_megapixels=1e-6 * height * width, awaits_light=awaits_light)
     typer.echo(f"Bench: {opened.label}", err=True)
     return opened
 

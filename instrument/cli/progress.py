@@ -55,12 +55,12 @@ class _Left(TimeRemainingColumn):
     """The time left: by what is done; else by what such a step took last time, or takes elsewhere."""
 
     def render(self, task: Task) -> Text:
-        if task.total is not None:
+        expected: kept_times.Expected | None = task.fields.get("expected")
+        if task.total is not None and (task.completed or expected is None):
             if task.time_remaining is None and task.completed and task.elapsed:  # the first step of several
                 left_s = task.elapsed * (task.total / task.completed - 1)
                 return Text(f"left about {duration(left_s)}")
             return Text("left ") + super().render(task)
-        expected: kept_times.Expected | None = task.fields.get("expected")
         if expected is None or task.elapsed is None:
             return Text()
         if task.elapsed > expected.seconds:
@@ -145,10 +145,11 @@ def one_task(
 ) -> Iterator[Advance]:
     """Show the bar of a single task while the block runs; gives what advances it.
 
-    Without a total it takes as long as last time.
+    Without a total, and until the first of it is done, it takes as long as last time.
     """
-    with progress_bar() as bar, kept_times.kept(description) if total is None else nullcontext():
-        expected = kept_times.expected(description) if total is None else None
+    whole = description if total is None else f"{description} of {total:g}"
+    with progress_bar() as bar, nullcontext() if done else kept_times.kept(whole):
+        expected = kept_times.expected(whole) or kept_times.expected(description)
         task = bar.add_task(description, total=total, completed=done, note=note, expected=expected)
 
         def advance(done: float, total: float | None = None, *, note: str | None = None) -> None:

@@ -1,6 +1,7 @@
 """How long steps took on this machine: what tells of no progress is expected to take as long as last time.
 
 Steps of a simulated bench that compute light say something the first time, too: by how quick transforms are.
+Light that is kept from then on is not waited for again: with it a step is another one.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,20 +23,22 @@ WORTH_S = 0.5
 """Shorter ones need not be foretold."""
 _LARGEST = 1e9  # thirty years; frames, too
 _TRANSFORMS_PER_MEGAPIXEL = {
-    "Looking for hot pixels": 10.0,
-    "Finding the scene's exposure": 120.0,
-    "finding the scene's exposure": 120.0,
-    "finding exposures": 48.0,
-    "photographing bead slides": 120.0,
+    "Looking for hot pixels": (10.0, 10.0),
+    "Finding the scene's exposure": (120.0, 20.0),
+    "finding the scene's exposure": (120.0, 20.0),
+    "Frames": (110.0, 0.0),
+    "finding exposures": (48.0, 48.0),
+    "photographing bead slides": (120.0, 120.0),
 }
 """Steps that compute light on a simulated bench: their time of the processor, in that of a picture of
-1024 x 1024 which is transformed and back."""
+1024 x 1024 which is transformed and back; where light has to be computed first, and where it is there."""
 _FEW, _TRIED_S = 50.0, 0.05
 """Transforms that are not worth a try, and seconds of the processor that it takes."""
 _ALONE = 1.2
 """Times as long as if all of it were shared among the threads."""
 _of = ""
 _simulated_megapixels = 0.0
+_awaits_light: Callable[[], bool] = bool
 _window = False
 
 
@@ -46,10 +49,13 @@ class Expected(NamedTuple):
     by: str
 
 
-def about(what: str, *, simulated_megapixels: float = 0.0) -> None:
-    """Say what the following steps belong to: a command, and then its bench, with its sensor if simulated."""
-    global _of, _simulated_megapixels
-    _of, _simulated_megapixels = what, simulated_megapixels
+def about(what: str, *, simulated_megapixels: float = 0.0, awaits_light: Callable[[], bool] = bool) -> None:
+    """Say what the following steps belong to: a command, and then its bench, with its sensor if simulated.
+
+    ``awaits_light`` says whether a simulated frame would have its light computed first.
+    """
+    global _of, _simulated_megapixels, _awaits_light
+    _of, _simulated_megapixels, _awaits_light = what, simulated_megapixels, awaits_light
 
 
 def place() -> Path:
@@ -73,7 +79,8 @@ def expected(what: str) -> Expected | None:
     try:
         return Expected(sane(recall(_key(what))), "last time")
     except (LookupError, TypeError, ValueError):
-        transforms = _TRANSFORMS_PER_MEGAPIXEL.get(what, 0.0) * _simulated_megapixels
+        awaited, here = _TRANSFORMS_PER_MEGAPIXEL.get(what, (0.0, 0.0))
+        transforms = (awaited if _awaits_light() else here) * _simulated_megapixels
         if transforms < _FEW or not seen():
             return None
         return Expected(transforms * transform_s() * _waiting(), "a first guess")
@@ -108,11 +115,11 @@ def _waiting() -> float:
 @contextmanager
 def kept(what: str) -> Iterator[None]:
     """Remember how long the block takes, unless it fails or nobody sees it."""
-    began_s = time.monotonic()
+    key, began_s = _key(what), time.monotonic()
     yield
     took_s = time.monotonic() - began_s
     if took_s >= WORTH_S:
-        remember(_key(what), round(took_s, 2))
+        remember(key, round(took_s, 2))
 
 
 def sane(number: Any) -> float:
@@ -144,7 +151,8 @@ def remember(key: str, value: Any) -> None:
 
 
 def _key(what: str) -> str:
-    return f"{_of}: {what}"
+    computed = " with its light" if what in _TRANSFORMS_PER_MEGAPIXEL and _awaits_light() else ""
+    return f"{_of}: {what}{computed}"
 
 
 def _read() -> dict[str, Any]:

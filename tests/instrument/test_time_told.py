@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from instrument.cli import main, progress
-from instrument.cli.progress import _Left, _Note
+from instrument.cli.progress import _Left, _Note, one_task
 from instrument.files import kept_times
 
 
@@ -64,7 +64,7 @@ def test_the_first_time_a_simulated_scene_is_exposed_goes_by_how_quick_this_mach
     assert kept_times.expected(step) is None
     kept_times.about("small", simulated_megapixels=0.08)
     assert kept_times.expected(step) is None, "not worth a word"
-    kept_times.about("large", simulated_megapixels=5.5)
+    kept_times.about("large", simulated_megapixels=5.5, awaits_light=lambda: True)
     told = kept_times.expected(step)
     assert told is not None
     assert 1 < told.seconds < 20
@@ -77,8 +77,40 @@ def test_the_first_time_a_simulated_scene_is_exposed_goes_by_how_quick_this_mach
     waiting = kept_times.expected(step)
     assert waiting is not None
     assert waiting.seconds > 2 * busy.seconds
-    kept_times.remember("large: " + step, 4.0)
+    kept_times.remember(f"large: {step} with its light", 4.0)
     assert kept_times.expected(step) == (4.0, "last time")
+
+
+def test_light_that_was_kept_is_not_waited_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    step, awaited = "Finding the scene's exposure", [True]
+    monkeypatch.setattr(kept_times, "transform_s", lambda: 0.01)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
+    kept_times.about("large", simulated_megapixels=5.5, awaits_light=lambda: awaited[0])
+    first = kept_times.expected(step)
+    with kept_times.kept(step):
+        awaited.clear()
+        awaited.append(False)  # it is computed, and kept
+    second = kept_times.expected(step)
+    assert first is not None
+    assert second is not None
+    assert second.by == "a first guess"
+    assert second.seconds < first.seconds / 4
+    assert kept_times.expected("Frames") is None, "a moment"
+    awaited[0] = True
+    assert kept_times.expected("Frames") is not None
+
+
+def test_a_step_of_several_parts_is_expected_to_take_as_long_until_the_first_is_done() -> None:
+    kept_times.about("compare")
+    kept_times.remember("compare: comparing of 100", 50.0)
+    kept_times.remember("compare: Frames", 7.0)
+    with one_task("comparing", 100):
+        pass
+    assert kept_times.expected("comparing of 100") != (50.0, "last time"), "what it took now"
+    before = kept_times.expected("comparing of 100")
+    with one_task("comparing", 100, done=50):
+        pass
+    assert kept_times.expected("comparing of 100") == before, "half of it is not all"
 
 
 def test_the_oldest_times_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,6 +141,8 @@ def test_a_bar_says_what_is_left_and_what_is_compiled() -> None:
     clock_s[0] += 2
     assert "longer than last time" in str(_Left().render(task))
     bar.update(task.id, total=10, completed=0)
+    assert "longer than last time" in str(_Left().render(task)), "until the first of them is done"
+    task.fields["expected"] = None
     assert str(_Left().render(task)).startswith("left -")
     task.start_time = task.get_time() - 30
     task.completed = 3  # the first that was done: there is no speed yet
