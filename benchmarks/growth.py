@@ -34,7 +34,9 @@ from instrument.files import kept_times
 from instrument.files.figures import ACCENT, INK, SECOND, save_figure, style
 from instrument.reconstruction.forecast import Foretold, Like, forecast
 from recon import Calibration, Geometry, reconstruct
+from recon.base.blocks import block_mean
 from recon.base.threads import set_threads
+from recon.evaluation.measured_sets import MEASURED, measured_set
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
@@ -176,26 +178,45 @@ KINDS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "beads, l1": ("beads", {"size": 96}, {"prior": "l1"}),
     "volume": ("dense-volume", {"size": 96}, {}),
     "volume, 9 PSFs": ("microscope", {"size": 64, "grid": 3}, {}),
+    "hand": ("hand", {"binning": 4}, {}),
+    "hand, l1": ("hand", {"binning": 4}, {"prior": "l1"}),
+    "hand, small": ("hand", {"binning": 8}, {}),
+    "USAF, 9 planes": ("usaf", {"binning": 2, "every": 5}, {}),
+    "USAF, 32 planes": ("usaf", {"binning": 2, "first": 32}, {}),
+    "USAF, 44, l1": ("usaf", {"binning": 2}, {"prior": "l1"}),
 }
-"""Scenes by family, sizes and options, whose reconstructions are explained."""
+"""Scenes by family, sizes and options, whose reconstructions are explained; the last are measured sets."""
+
+
+def made_of(family: str, seed: int, **sizes: Any) -> tuple[np.ndarray, Calibration]:
+    """Return photograph and calibration of a scene, or of a measured set: binned, and some of its depths."""
+    if family not in MEASURED:
+        scene = make_scene(family, seed=seed, **sizes)  # type: ignore[arg-type]
+        return scene.measurement, scene.calibration
+    psfs, photograph = (block_mean(a, sizes["binning"]) for a in measured_set(family))
+    psfs = psfs[: sizes.get("first")][:: sizes.get("every", 1)]
+    positions = np.zeros((len(psfs), 3))
+    positions[:, 2] = np.arange(1.0, len(psfs) + 1)
+    return photograph, Calibration(psfs[:, None], positions)
 
 
 def explain_or_take(kind: str, seed: int, foretold: bool, answer: Any) -> None:
     """Forecast a kind, or run it, judged, by default options; sends processor seconds and bytes."""
     time.perf_counter = time.process_time  # a machine that others use too tells no other time
     family, sizes, options = KINDS[kind]
-    small = make_scene(family, seed=seed, **{**sizes, "size": 48})  # type: ignore[arg-type]
+    alike = {"hand": "dense-picture", "usaf": "dense-volume"}.get(family)
+    small = made_of(alike or family, seed, **({} if alike else sizes) | {"size": 48})
     asked = ReconstructionOptions(**options)
-    reconstruct(small.measurement, small.calibration, asked, iterations=3)  # kernels are compiled
-    made = make_scene(family, seed=seed, **sizes)  # type: ignore[arg-type]
+    reconstruct(*small, asked, iterations=3)  # kernels are compiled
+    photograph, calibration = made_of(family, seed, **sizes)
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
     meter, began = MemoryMeter(), time.process_time()
     if foretold:
-        told = forecast(Measurement(made.measurement), made.calibration, asked)
+        told = forecast(Measurement(photograph), calibration, asked)
         answer.send((told.seconds, told.memory_bytes, time.process_time() - began, told.settles or np.nan))
         return
-    found = reconstruct(made.measurement, made.calibration, asked)
+    found = reconstruct(photograph, calibration, asked)
     longest = max(len(history) for history in found.histories)
     answer.send((time.process_time() - began, meter.peak_mib() * 2**20, 0.0, longest))
 

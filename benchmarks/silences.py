@@ -54,7 +54,7 @@ STEPS = {
     "analyze": "analyze SWEEP --out page.png",
     "compare": "compare SWEEP SWEEP",
     "refocus": "refocus SWEEP --z-mm 150 --out near --figure near.png",
-    "reconstruct": "reconstruct --psf psf.tif --image photo.tif --bin 8 --out scene.tif --figure scene.jpg",
+    "reconstruct": "reconstruct --psf psf.tif --image photo.tif --bin 8 --out scene.tif --figure page2.png",
     "calibrated": "reconstruct --calibration SWEEP --z-mm 200 --image photo.tif --bin 8 --out two.tif",
     "etendue": "etendue",
     "hologram": "hologram photo.png --out slm.png --iterations 20",

@@ -1,6 +1,7 @@
 """How long steps took on this machine: what tells of no progress is expected to take as long as last time.
 
-Steps of a simulated bench that compute light say something the first time, too: by how quick transforms are.
+Steps of a simulated bench that compute light, and drawing, say something the first time, too: by how quick
+transforms are.
 Light that is kept from then on is not waited for again: with it a step is another one.
 """
 
@@ -32,6 +33,8 @@ _TRANSFORMS_PER_MEGAPIXEL = {
 }
 """Steps that compute light on a simulated bench: their time of the processor, in that of a picture of
 1024 x 1024 which is transformed and back; where light has to be computed first, and where it is there."""
+_DRAWING = 140.0
+"""Transforms that drawing a page takes the first time, with its library and the list of fonts."""
 _FEW, _TRIED_S = 50.0, 0.05
 """Transforms that are not worth a try, and seconds of the processor that it takes."""
 _ALONE = 1.2
@@ -81,9 +84,11 @@ def expected(what: str) -> Expected | None:
     except (LookupError, TypeError, ValueError):
         awaited, here = _TRANSFORMS_PER_MEGAPIXEL.get(what, (0.0, 0.0))
         transforms = (awaited if _awaits_light() else here) * _simulated_megapixels
+        shared = what.casefold() != "drawing"
+        transforms = transforms if shared else _DRAWING
         if transforms < _FEW or not seen():
             return None
-        return Expected(transforms * transform_s() * _waiting(), "a first guess")
+        return Expected(transforms * transform_s() * _waiting(shared=shared), "a first guess")
 
 
 def transform_s() -> float:
@@ -100,16 +105,16 @@ def transform_s() -> float:
     return (time.process_time() - began_s) / count
 
 
-def _waiting() -> float:
+def _waiting(*, shared: bool) -> float:
     """Return how many times as long by the clock, as busy as the machine was during the last minute."""
     from recon.base.threads import get_threads
 
-    threads, cores = get_threads(), len(os.sched_getaffinity(0))
+    threads, cores = get_threads() if shared else 1, len(os.sched_getaffinity(0))
     try:
         load = os.getloadavg()[0]
     except OSError:
         load = 0.0
-    return _ALONE / min(threads, cores) * max((load + threads) / cores, 1.0)
+    return (_ALONE if shared else 1.0) / min(threads, cores) * max((load + threads) / cores, 1.0)
 
 
 @contextmanager

@@ -100,6 +100,16 @@ def test_light_that_was_kept_is_not_waited_for_again(monkeypatch: pytest.MonkeyP
     assert kept_times.expected("Frames") is not None
 
 
+def test_the_first_page_is_drawn_in_about_so_long_on_any_bench(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_times, "transform_s", lambda: 0.01)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
+    kept_times.about("analyze")
+    for what in ("Drawing", "drawing"):
+        told = kept_times.expected(what)
+        assert told is not None
+        assert 0.5 < told.seconds < 3
+
+
 def test_a_step_of_several_parts_is_expected_to_take_as_long_until_the_first_is_done() -> None:
     kept_times.about("compare")
     kept_times.remember("compare: comparing of 100", 50.0)
