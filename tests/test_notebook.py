@@ -174,6 +174,9 @@ def test_refusals_name_options_as_python_does(scene: tuple[np.ndarray, np.ndarra
         result.save(tmp_path / "scene.tif")
     with pytest.raises(BenchError, match="one by `psf` FILE"):
         db.calibration(tmp_path / "scene.tif")
+    for asks in (lambda: db.compare("old", "new"), lambda: db.analyse("sweep")):
+        with pytest.raises(InputError, match=r"not str: in Python db.calibration\(folder\) reads one"):
+            asks()
 
 
 def test_verdicts_and_warnings_do_too_and_are_written_down_as_typed(

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from recon.analysis.correlation import correlate, cut_to_light, lit_extent, similarity, spot_px
 from recon.analysis.what_moved import Explanation, Seen, moved_across, moved_along
 from recon.base.blocks import block_mean
+from recon.base.checks import require_calibration
 from recon.camera.refocus import central_psfs, psf_at
 from recon.camera.registration import register
 from recon.camera.transformed import geometric_centre, resampled
@@ -155,6 +156,8 @@ def compare(
 
     Raises InputError when the PSFs are of other regions or cameras, or depths are not known.
     """
+    for given in (old, new):
+        require_calibration(given)
     old, new, ratio = binned_alike(old, new)
     depths, planes = central_psfs(new)
     chosen = sorted({0, len(depths) // 2, len(depths) - 1})

@@ -49,6 +49,7 @@ from recon.analysis.resolution import (
     voxel_grid,
 )
 from recon.base.brief import brief
+from recon.base.checks import require_calibration
 from recon.base.declare import option
 from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.camera_model import choose_model, sort_by_depth
@@ -236,6 +237,7 @@ def analyse(
     on_progress : callable, optional
         Called with what is being done and the share done.
     """
+    require_calibration(calibration)
     settings = settings or AnalysisSettings()
     on_progress = on_progress or (lambda _what, _share: None)
     pitch_um, distance_um = _geometry(calibration)

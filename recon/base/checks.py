@@ -181,6 +181,15 @@ def _details(image: npt.NDArray[np.float32]) -> tuple[float, float]:
     return fine**0.5 / max(light * small.size, 1e-30), fine / max(coarse, 1e-30)
 
 
+def require_calibration(given: object) -> None:
+    """Raise InputError for what is no calibration: a folder's name, an array, a result."""
+    if not isinstance(given, Calibration):
+        raise InputError(
+            f"A Calibration is expected, not {type(given).__name__}: in Python db.calibration(folder) reads "
+            "one."
+        )
+
+
 def saturated_share(image: npt.NDArray[Any]) -> float:
     """Return the share of pixels at exactly the maximum when it is suspicious, else 0.
 
