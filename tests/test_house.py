@@ -1,8 +1,9 @@
-"""The structure of the packages: no two files import each other in a circle, no folder is crowded."""
+"""The structure: no two files import each other in a circle, no folder is crowded, links lead somewhere."""
 
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -77,6 +78,23 @@ def test_no_folder_is_crowded() -> None:
     assert not crowded, (
         f"more than {MOST_MODULES} modules: split the room, or merge what has one reason to change"
     )
+
+
+def headings(page: str) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub and the site make them."""
+    plain = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", found) for found in re.findall(r"^#+ (.*)$", page, re.M))
+    return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in plain}
+
+
+def test_every_link_between_pages_leads_somewhere() -> None:
+    lost = []
+    for page in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")):
+        for link in re.findall(r"\]\(([^)\s:]+)\)", page.read_text(encoding="utf-8")):
+            name, _, anchor = link.partition("#")
+            there = page.parent / name if name else page
+            if not there.exists() or (anchor and anchor not in headings(there.read_text(encoding="utf-8"))):
+                lost.append(f"{page.relative_to(ROOT)}: {link}")
+    assert lost == []
 
 
 @pytest.mark.parametrize("inside", [False, True])
