@@ -174,6 +174,8 @@ def test_refusals_name_options_as_python_does(scene: tuple[np.ndarray, np.ndarra
         result.save(tmp_path / "scene.tif")
     with pytest.raises(BenchError, match="one by `psf` FILE"):
         db.calibration(tmp_path / "scene.tif")
+    with pytest.raises(InputError, match="several depths are a Calibration, or a folder or stack"):
+        db.reconstruct(scene[0], np.stack([scene[1]] * 2))
     for asks in (lambda: db.compare("old", "new"), lambda: db.analyse("sweep")):
         with pytest.raises(InputError, match=r"not str: in Python db.calibration\(folder\) reads one"):
             asks()

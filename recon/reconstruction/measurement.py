@@ -216,9 +216,10 @@ def require_same_channels(psfs: Array, data: Array) -> None:
     """Raise InputError when PSFs (n, n_channels, height, width) do not serve the data's channels."""
     if psfs.shape[1] not in (1, len(data)):
         has = "PSF has" if len(psfs) == 1 else "PSFs have"
+        stack = " PSFs of several depths are a Calibration, or a folder or stack of files."
         raise InputError(
             f"The {has} {psfs.shape[1]} channels and the measurement {len(data)}: give one PSF for all "
-            "channels or one for each."
+            f"channels or one for each.{stack if psfs.shape[1] > 4 else ''}"
         )
 
 
