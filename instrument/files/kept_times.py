@@ -83,7 +83,7 @@ def expected(what: str) -> Expected | None:
         return Expected(sane(recall(_key(what))), "last time")
     except (LookupError, TypeError, ValueError):
         awaited, here = _TRANSFORMS_PER_MEGAPIXEL.get(what, (0.0, 0.0))
-        transforms = (awaited if _awaits_light() else here) * _simulated_megapixels
+        transforms = (awaited if _computes_light() else here) * _simulated_megapixels
         shared = what.casefold() != "drawing"
         transforms = transforms if shared else _DRAWING
         if transforms < _FEW or not seen():
@@ -155,8 +155,15 @@ def remember(key: str, value: Any) -> None:
         write_json(path, dict(list(times.items())[-MOST:]))
 
 
+def _computes_light() -> bool:
+    try:
+        return seen() and bool(_awaits_light())
+    except Exception:  # noqa: BLE001 - a device that fails says so in the step itself
+        return False
+
+
 def _key(what: str) -> str:
-    computed = " with its light" if what in _TRANSFORMS_PER_MEGAPIXEL and _awaits_light() else ""
+    computed = " with its light" if what in _TRANSFORMS_PER_MEGAPIXEL and _computes_light() else ""
     return f"{_of}: {what}{computed}"
 
 
