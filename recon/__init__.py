@@ -1,30 +1,13 @@
-"""Numbers only: optics, operators, priors, solvers, analysis. Knows no device, no file format, no window."""
+"""Numbers only: optics, operators, priors, solvers, analysis. Knows no device, no file format, no window.
 
-from recon.base.noise import NoiseModel
-from recon.camera.grid import Grid
-from recon.errors import InputError
-from recon.reconstruction.measurement import Measurement
-from recon.reconstruction.options import Options, ReconstructionOptions
-from recon.reconstruction.problem import Problem
-from recon.reconstruction.reconstruct import judged, reconstruct
-from recon.reconstruction.result import Reconstruction
-from recon.reconstruction.selection import choose
-from recon.reconstruction.solve import solve
-from recon.types import Calibration, Geometry
+What it offers stands in ``__init__.pyi``, and is imported when it is first asked for.
+"""
 
-__all__ = [
-    "Calibration",
-    "Geometry",
-    "Grid",
-    "InputError",
-    "Measurement",
-    "NoiseModel",
-    "Options",
-    "Problem",
-    "Reconstruction",
-    "ReconstructionOptions",
-    "choose",
-    "judged",
-    "reconstruct",
-    "solve",
-]
+from recon.base.handed_on import handed_on
+
+_HOMES, __getattr__ = handed_on(globals())
+__all__ = sorted(_HOMES)
+
+
+def __dir__() -> list[str]:
+    return __all__
