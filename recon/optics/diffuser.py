@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
-from scipy.spatial import cKDTree
 
 LINE_D_NM = 589.3
 LINE_F_NM = 486.1
@@ -101,6 +99,8 @@ def smooth_diffuser(
     seed : int
         The same seed gives the same surface.
     """
+    from scipy import fft  # late: a quarter of a second
+
     rng = np.random.default_rng(seed)
     sigma_um = feature_size_um / (2 * np.sqrt(2 * np.log(2)))
     shape = map_shape(aperture_um, pitch_um)
@@ -142,6 +142,8 @@ def microlens_diffuser(
     regular : bool
         Lenslets on a square lattice of period ``lenslet_um`` instead of random ones.
     """
+    from scipy.spatial import cKDTree  # late: a quarter of a second
+
     shape = map_shape(aperture_um, pitch_um)
     extent = np.array(shape) * pitch_um
     rng = np.random.default_rng(seed)

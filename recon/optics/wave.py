@@ -20,25 +20,19 @@ import itertools
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
 
+from recon.base.fft import fast_length
 from recon.base.threads import in_blocks, over_rows
 from recon.optics.diffuser import Diffuser
 from recon.optics.grid import FloatArray, PixelGrid, Spectrum, resample_energy
-from recon.optics.wave_kernels import (
-    COLUMNS,
-    ComplexArray,
-    add_intensity,
-    modulate,
-    propagate,
-    transform_rows,
-)
 
+ComplexArray = npt.NDArray[np.complex64]
 Emission = Literal["lambertian", "isotropic"]
 Source = tuple[float, float, float]
 
@@ -293,11 +287,12 @@ class WavePropagator:
         top, left = tile.rows.start - first_row, tile.columns.start - first_column
         wanted = field[top : top + len(tile.rows)]
         inner = wanted[:, left : left + len(tile.columns)].view(np.float32)
+        kernels = _kernels()
         for number, (wavelength_nm, weight) in enumerate(spectrum):
             if number:
                 field[...] = 0
             wavelength_um = wavelength_nm * 1e-3
-            modulate(
+            kernels.modulate(
                 pairs,
                 diffuser.heights_um,
                 row_window,
@@ -316,23 +311,34 @@ class WavePropagator:
             over_rows(_transform, field[: len(row_window)], True, 1.0)
             _propagate(field, tile, pitch, np.pi * wavelength_um * rho_um / tile.cos)
             over_rows(_transform, wanted, False, 1 / field.size)
-            add_intensity(energy, inner, weight)
+            kernels.add_intensity(energy, inner, weight)
+
+
+@cache
+def _kernels() -> Any:
+    """Import transforms on first use: 0.25 s that a scene whose light was kept need not pay."""
+    from recon.optics import wave_kernels
+
+    return wave_kernels
 
 
 def _transform(start: int, stop: int, field: ComplexArray, forward: bool, scale: float) -> None:
-    transform_rows(field[start:stop], forward, scale)
+    _kernels().transform_rows(field[start:stop], forward, scale)
 
 
 def _propagate(field: ComplexArray, tile: _Tile, pitch: float, strength: float) -> None:
     """Take a field whose rows are transformed through a distance, columns shared among threads."""
     height, width = field.shape
-    rows, columns = fft.fftfreq(height, pitch), fft.fftfreq(width, pitch)
+    rows, columns = np.fft.fftfreq(height, pitch), np.fft.fftfreq(width, pitch)
+    kernels = _kernels()
     pairs = field.view(np.float32)
 
     def some(start: int, stop: int) -> None:
-        propagate(field, pairs, start, stop, rows, columns, strength, tile.tan_squared, *tile.direction)
+        kernels.propagate(
+            field, pairs, start, stop, rows, columns, strength, tile.tan_squared, *tile.direction
+        )
 
-    in_blocks(some, -(-width // COLUMNS))
+    in_blocks(some, -(-width // kernels.COLUMNS))
 
 
 def disc_kernel(diameter: float) -> npt.NDArray[np.float32]:
@@ -396,4 +402,4 @@ def _window(
     first = min(begin, span.start)
     reach = margin + margin // 2
     length = max(end + reach - span.start, span.stop + reach - begin, span.stop - first, end - first)
-    return first, amplitude[first - index[0] : end - index[0]].astype(np.float32), fft.next_fast_len(length)
+    return first, amplitude[first - index[0] : end - index[0]].astype(np.float32), fast_length(length)
