@@ -8,7 +8,7 @@ the package that brings them. A driver is imported only when it is asked for.
 from __future__ import annotations
 
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -148,7 +148,9 @@ def _points() -> tuple[EntryPoint, ...]:
     found = _read.get(there)
     if found is None:
         points = entry_points(group=GROUP)
-        found = tuple({(p.name, p.value, p.dist and p.dist.name): p for p in points}.values())
+        alike = Counter((p.name, p.value) for p in points)
+        owners = {p: p.dist and p.dist.name for p in points if alike[p.name, p.value] > 1}  # 1.5 ms each
+        found = tuple({(p.name, p.value, owners.get(p)): p for p in points}.values())
         _read.clear()
         _read[there] = found
     return found
