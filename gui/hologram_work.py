@@ -35,8 +35,8 @@ from instrument.display.hologram_files import HologramFiles, drawn_pattern
 from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
+from instrument.files.results import free_result
 from instrument.files.slm_image import load_slm_correction
-from instrument.reconstruction.stored_result import free_result
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from recon.base.declare import Imports, expression, option
 from recon.holography import Display, HologramOptions, HologramRecord, Target

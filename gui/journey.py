@@ -13,7 +13,7 @@ from instrument.bench.config import BenchConfig
 from instrument.bench.photograph import PHOTOGRAPHS
 from instrument.files.atomic import DOUBTFUL
 from instrument.files.calibration_file import newest_calibration
-from instrument.reconstruction.stored_result import find_results
+from instrument.files.results import find_results
 
 _DARK = 0.05
 """Below this share of full scale a picture's brightest pixels are lost in the noise of most cameras."""

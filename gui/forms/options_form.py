@@ -24,7 +24,7 @@ from gui.forms.fields import (
 from gui.jobs import JobRunner
 from gui.widgets.building import fill, in_row, label, mark
 from instrument.files.errors import BenchError
-from instrument.reconstruction.stored_result import free_result
+from instrument.files.results import free_result
 from recon.base.declare import Option, in_other_words, options_of
 from recon.errors import InputError
 

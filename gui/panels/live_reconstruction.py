@@ -15,10 +15,11 @@ from PySide6.QtGui import QHideEvent
 from PySide6.QtWidgets import QComboBox, QWidget
 
 from drivers.frame import FrameMetadata
-from gui.background import LiveFollower, NewestOnly
+from gui.background import NewestOnly
 from gui.forms.options_form import FOLDED, OptionsForm
 from gui.jobs import Job, JobContext
 from gui.journey import SATURATED
+from gui.live_follower import LiveFollower
 from gui.panel import Panel, on_bench
 from gui.session import BenchSession
 from gui.widgets.building import Hint, button, choice, every, fill, in_row, label, offer, scrolled

@@ -5,6 +5,8 @@ from __future__ import annotations
 import builtins
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -109,3 +111,18 @@ def test_sigterm_ends_it_with_everything_closed(tmp_path: Path, bench_text: str)
     assert not any(device.is_open for device in window.session.bench.devices.values())
     assert (tmp_path / "settings").exists()
     window.deleteLater()
+
+
+def test_first_frame_waits_for_no_import_that_it_does_not_need() -> None:
+    late = (
+        "scipy.fft",
+        "scipy.spatial",
+        "recon.reconstruction",
+        "recon.solvers",
+        "dask",
+        "matplotlib",
+        "zarr",
+    )
+    code = f"import sys, gui.app, drivers.simulated.world; print([m for m in {late} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

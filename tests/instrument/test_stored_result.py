@@ -12,9 +12,10 @@ import zarr
 from instrument.cli import main
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
+from instrument.files.results import find_results, free_result
 from instrument.files.volumes import open_volume, volume_in_memory, write_volume_zarr
 from instrument.reconstruction.result_figures import in_colour_of_depth, project
-from instrument.reconstruction.stored_result import find_results, free_result, open_result, record_file
+from instrument.reconstruction.stored_result import open_result, record_file
 from recon.camera.grid import Grid
 
 SHAPE = (5, 40, 30)
