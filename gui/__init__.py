@@ -2,3 +2,14 @@
 
 Needs the extra ``[gui]`` (PySide6 and pyqtgraph). Started by ``diffuserbench gui``.
 """
+
+import contextlib
+
+with contextlib.suppress(ImportError, AttributeError):  # without Qt, or with another PySide
+    import shiboken6  # noqa: F401 # brings the next
+    from shibokensupport import feature
+
+    # Each import after Qt's has its module's source read again, for the name of PySide, and kept in memory:
+    # a seventh of the processor time of a start. It tells whether spellings that nobody here uses may be
+    # switched off in a module; in all of them they may.
+    feature._mod_uses_pyside = lambda _: True
