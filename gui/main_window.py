@@ -23,7 +23,7 @@ from PySide6.QtWidgets import (
 
 from gui.help import help_of
 from gui.jobs import Job
-from gui.making import REST_MS, PanelMaker, take_slice
+from gui.making import PICTURE_MS, REST_MS, PanelMaker, take_slice
 from gui.panel import Panel
 from gui.panels import PANELS
 from gui.panels.unserved import UnservedPanel
@@ -48,8 +48,6 @@ _SIZE = QSize(1600, 980)
 _ROOMY = QSize(1500, 860)
 """From here on the log and the panels at the right stand side by side with the live view."""
 
-_PREPARE_MS = 3000
-"""Rest after the bench was opened, for the first frame, before panels are prepared that nobody asked for."""
 _COMPACT_PX = 480
 """Width of the panels at the right of a small screen."""
 _BY_HAND, _BREAKS_OFF = QMessageBox.Icon.Information, QMessageBox.Icon.Warning
@@ -92,7 +90,6 @@ class MainWindow(QMainWindow):
             | QMainWindow.DockOption.AnimatedDocks
         )
         self.tabs = tabs({})
-        self.tabs.currentChanged.connect(self._fill_current)
         self.setCentralWidget(self.tabs)
         self._make_top_bar()
         self._make_status_bar()
@@ -105,7 +102,7 @@ class MainWindow(QMainWindow):
         session.bench_wanted.connect(self.change_bench)
         session.closed.connect(self._close_now)
         session.opened.connect(
-            lambda: QTimer.singleShot(_PREPARE_MS if session.kinds else 0, self, self.maker.prepare)
+            lambda: QTimer.singleShot(PICTURE_MS if session.kinds else 0, self, self.maker.prepare)
         )
         session.jobs.job_started.connect(self._job_started)
         session.jobs.job_ended.connect(self._job_ended)
@@ -113,6 +110,7 @@ class MainWindow(QMainWindow):
         self._restore_layout()
         self._show_simulated()
         self.panel("log")  # from the first line on
+        self.tabs.currentChanged.connect(self._fill_current)
         self._fill_current()
 
     def change_bench(self, config: BenchConfig) -> None:
@@ -200,7 +198,7 @@ class MainWindow(QMainWindow):
     def _dock_seen(self, name: str, visible: bool) -> None:
         self._places[name].set_seen(visible)
         if visible:
-            self.maker.ask(name)
+            self.maker.ask_later(name)
 
     def _fill_current(self, _index: int = 0) -> None:
         place = self.tabs.currentWidget()

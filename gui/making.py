@@ -20,6 +20,8 @@ from instrument.bench.config_file import parse_config, template
 
 _SLICE_S = 0.008
 """Of the window's thread at once; a part that takes longer is the only one of its slice."""
+PICTURE_MS = 3000
+"""That panels at the side give the live view for its first picture, at most, before they are made."""
 REST_MS = 1
 """Between two slices: what was made is laid out and painted, and clicks are taken, in turns of their own."""
 
@@ -64,6 +66,9 @@ class PanelMaker(QObject):
         self._slices: dict[str, Generator[str | None, None, Panel]] = {}
         self._then: dict[str, list[Callable[[Panel], object]]] = {}
         """What is done with each panel that was asked for, once it is made."""
+        self._later: list[str] | None = [] if "camera" in session.kinds else None
+        """What waits for the live view's first picture; None: nothing does any more."""
+        session.pictured.connect(self._ask_rest)
 
     def whole(self, name: str) -> Panel:
         """Return a panel, made now, or to its end, if it was not yet."""
@@ -88,12 +93,31 @@ class PanelMaker(QObject):
             self._then[name].append(then)
             return
         self._then[name] = [then]
-        waits = label("Opening …", "dim")
-        waits.setAlignment(Qt.AlignmentFlag.AlignCenter)
-        self._places[name].hold(waits)
+        self._say_opening(name)
         job = self._session.jobs.watch(f"Opening {PANELS[name].title}", lambda _: PANELS[name].load())
         job.succeeded.connect(lambda _: self._begin(name))
         job.failed.connect(lambda why: self._failed(name, why))
+
+    def ask_later(self, name: str) -> None:
+        """Have a panel made that stands beside the live view, whose first picture comes before it."""
+        if self._later is None:
+            self.ask(name)
+            return
+        if not self._later:
+            QTimer.singleShot(PICTURE_MS, self, self._ask_rest)
+        self._later.append(name)
+        if name not in self.panels and name not in self._then:
+            self._say_opening(name)
+
+    def _ask_rest(self) -> None:
+        names, self._later = self._later or [], None
+        for name in names:
+            self.ask(name)
+
+    def _say_opening(self, name: str) -> None:
+        waits = label("Opening …", "dim")
+        waits.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self._places[name].hold(waits)
 
     def prepare(self) -> None:
         """Import and compile in a job what the panels need, before they are asked for."""

@@ -65,6 +65,8 @@ class BenchSession(QObject):
         Another bench is to be opened in this one's place: its BenchConfig.
     kept_changed
         Something else is kept with the bench.
+    pictured
+        The live view shows something: its first frame, or what will be on it coarsely.
     opened, closed
         Every device was tried; everything was closed.
     """
@@ -79,6 +81,7 @@ class BenchSession(QObject):
     bench_wanted = Signal(object)
     kept_changed = Signal()
     opened = Signal()
+    pictured = Signal()
     closed = Signal()
     _from_thread = Signal(object)
 

@@ -195,6 +195,7 @@ class LivePanel(Panel):
         if shown is None:
             self.picture.frame = frame
             self.count()
+            self.session.pictured.emit()
         self.picture.show_frame(frame)
         self.picture.view.set_caption(self._caption(frame))
         self.picture.view.caution_against("")
@@ -207,6 +208,7 @@ class LivePanel(Panel):
             return
         counts, factor = found
         self.picture.show_coarse(counts, factor)
+        self.session.pictured.emit()
         view = self.picture.view
         view.set_caption("What the next frame will show, SIMULATED")
         view.caution_against(

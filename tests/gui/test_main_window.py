@@ -51,6 +51,20 @@ def test_every_panel_opens_and_copies_python(qtbot: QtBot, window: MainWindow) -
     assert len(set(shortcuts)) == len(shortcuts)
 
 
+def test_panels_at_the_side_come_after_the_first_picture(
+    qtbot: QtBot, make_session: Callable[[], BenchSession], settings: QSettings
+) -> None:
+    window = MainWindow(make_session(), settings)
+    qtbot.addWidget(window)
+    window.show()
+    qtbot.waitUntil(lambda: "live" in window.maker.panels, timeout=WAIT_MS)
+    assert set(window.maker.panels) == {"log", "live"}
+    assert not {"stage", "live_reconstruction"} & set(window.maker._then)
+    with qtbot.waitSignal(window.session.pictured, timeout=WAIT_MS):
+        window.session.open()
+    qtbot.waitUntil(lambda: {"stage", "live_reconstruction"} <= set(window.maker.panels), timeout=WAIT_MS)
+
+
 def test_stop_is_heard_while_a_panel_is_made_and_breaks_off_no_check_for_good(
     qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
