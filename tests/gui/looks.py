@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from PySide6.QtCore import QPoint, QRect, QSize, Qt
+from PySide6.QtCore import QCoreApplication, QEvent, QPoint, QRect, QSize, Qt
 from PySide6.QtGui import QAccessible
 from PySide6.QtWidgets import (
     QAbstractButton,
@@ -33,6 +33,8 @@ _WITH_KEYS = (QAbstractButton, QComboBox, QLineEdit, QListView, QPlainTextEdit, 
 
 def faults(root: QWidget) -> list[str]:
     """Return all faults of what is visible in a window or panel, one sentence each."""
+    for _ in range(3):  # words that were set just now have their place first, and what holds that
+        QCoreApplication.sendPostedEvents(None, QEvent.Type.LayoutRequest.value)
     stop = root.findChild(QWidget, "stop")
     hidden = stop is not None and stop.visibleRegion().boundingRect() != stop.rect()
     gone = ["STOP is not wholly in sight"] if hidden else []
