@@ -141,7 +141,7 @@ class PanelMaker(QObject):
     def _begin(self, name: str) -> None:
         if name not in self.panels:
             self._slices[name] = PANELS[name].slices(self._session)
-            self._go_on(name)
+            QTimer.singleShot(REST_MS, self, partial(self._go_on, name))  # the job's news took its turn
 
     def _go_on(self, name: str) -> None:
         """Make parts for as long as a slice may take; one that fails says why in the panel's place."""

@@ -36,8 +36,9 @@ class LedPanel(DevicePanel):
 
     @classmethod
     def prepare(cls) -> None:
-        """Look for patterns that installed packages add: each has a button."""
+        """Look for patterns that installed packages add: each has a button; import what draws the first."""
         shape_buttons()
+        _spacing(np.eye(2))
 
     def parts(self) -> Iterator[None]:
         """Make the widgets."""

@@ -124,5 +124,6 @@ def test_first_frame_waits_for_no_import_that_it_does_not_need() -> None:
         "zarr",
     )
     code = f"import sys, gui.app, drivers.simulated.world; print([m for m in {late} if m in sys.modules])"
+    code += "; from gui.panels.led_array import LedPanel; LedPanel.prepare(); sys.modules['scipy.spatial']"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
