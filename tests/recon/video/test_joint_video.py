@@ -82,6 +82,16 @@ def test_low_rank_plus_sparse_settles_at_the_minimum_and_tells_the_parts() -> No
     assert np.abs(rest).max() == pytest.approx(0.3, rel=1e-2)
 
 
+def test_the_value_of_low_rank_plus_sparse_is_that_of_the_parts_last_found() -> None:
+    rng = np.random.default_rng(0)
+    sparse, low = rng.standard_normal((2, 3, 4, 5))
+    prior = LowRankPlusSparse(2.0, 0.3)
+    alone = 2 * np.linalg.svd(low.reshape(3, -1), compute_uv=False).sum()
+    assert prior.value(low) == pytest.approx(alone)
+    prior.sparse = sparse
+    assert prior.value(low + sparse) == pytest.approx(alone + 0.3 * np.abs(sparse).sum())
+
+
 def problem(n_frames: int = 4) -> tuple[Convolution, np.ndarray]:
     rng = np.random.default_rng(1)
     psf = rng.random((1, 12, 14)) ** 6
@@ -189,6 +199,24 @@ def test_a_changed_penalty_leaves_the_multiplier_over_time_as_it_is() -> None:
     kept = joint._t_time.copy()
     joint._adapt()  # as it is already
     np.testing.assert_array_equal(joint._t_time, kept)
+
+
+def test_the_prior_over_time_is_asked_with_the_step_of_its_penalty() -> None:
+    class Noting(TemporalTotalVariation):
+        """Notes what it is asked for."""
+
+        def prox(self, stack: np.ndarray, step: float) -> np.ndarray:
+            self.asked = stack.copy(), step
+            return super().prox(stack, step)
+
+    camera, data = problem()
+    noting = Noting(0.5)
+    joint = JointAdmm(camera, data, NonNegativity(), noting)
+    joint._t_time[...] = np.random.default_rng(0).standard_normal(joint._t_time.shape)
+    before, mu = joint._t_time.copy(), joint._mu_time
+    joint._update(1)
+    np.testing.assert_array_equal(noting.asked[0], before)
+    assert noting.asked[1] == 1 / mu
 
 
 @pytest.mark.parametrize("erased", [False, True])

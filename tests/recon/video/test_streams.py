@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -300,9 +302,14 @@ class Moves(OtherMoves, SensorAdmm):
     """One of pictures, as :meth:`VideoSolver.advance` tells them apart."""
 
 
-def video_of(*solvers: OtherMoves, **counts: int) -> VideoSolver:
+@cache
+def small_problem() -> Problem:
     scene = make_scene("sparse-picture", size=24, grid=3)
-    video = VideoSolver(stream_problem(scene.measurement, scene.calibration), **counts)
+    return stream_problem(scene.measurement, scene.calibration, choosing=False)
+
+
+def video_of(*solvers: OtherMoves, **counts: int) -> VideoSolver:
+    video = VideoSolver(small_problem(), times_noise=1.0, **counts)
     video.solvers = list(solvers)
     return video
 
@@ -352,17 +359,82 @@ def test_a_frame_has_its_iterations_and_as_many_again_where_a_depth_takes_part_a
 
 
 def test_iterations_are_counted_from_the_last_frame_that_began_cold() -> None:
-    scene = make_scene("sparse-picture", size=24, grid=3, photons=2000.0)
-    problem = stream_problem(scene.measurement, scene.calibration)
     with pytest.raises(InputError, match="got 1 cold and 0 warm"):
-        VideoSolver(problem, cold_iterations=1, warm_iterations=0)
-    video = VideoSolver(problem, cold_iterations=1, warm_iterations=1)
+        VideoSolver(small_problem(), cold_iterations=1, warm_iterations=0)
+    video = video_of(cold_iterations=1, warm_iterations=1)
+    video.solvers = [None]
     assert video.iterations == 0
     counts = []
     for begins in (False, False, False, True, False):
         if begins:
             video.begin()
-        video.take(scene.measurement)
+        video.take(np.asarray(small_problem().measurement.image))
         video.advance(0.0)
         counts.append(video.iterations)
     assert counts == [1, 2, 3, 1, 2]
+
+
+@pytest.mark.parametrize("depths", [1, 2])
+def test_of_one_depth_there_is_a_picture_of_several_a_volume(
+    depths: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(VideoSolver, "volume", lambda _: np.zeros((depths, 4, 5), np.float32))
+    video = video_of()
+    video.problem = SimpleNamespace(n_planes=depths)  # type: ignore[assignment]
+    assert video.picture().shape == ((4, 5) if depths == 1 else (2, 4, 5))
+
+
+@pytest.mark.parametrize("asked", [None, True])
+@pytest.mark.parametrize("background", [False, True])
+@pytest.mark.parametrize("margin", [None, 0.5])
+def test_what_is_chosen_for_a_film_is_taken_and_said(
+    asked: bool | None, background: bool, margin: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Problem] = []
+    whys = [SimpleNamespace(name=name, why=f"why {name}") for name in ("model", "background", "field")]
+
+    def chosen(posed: Problem, *, film: bool) -> SimpleNamespace:
+        assert film
+        seen.append(posed)
+        return SimpleNamespace(
+            model="local", psf_window=None, acceptance_px=None, margin=margin, background=background,
+            decisions=whys,
+        )  # fmt: skip
+
+    monkeypatch.setattr("recon.streams.video.choice_for", chosen)
+    monkeypatch.setattr("recon.streams.video._by_one_psf", lambda *_: ("doubt", "reason"))
+    scene = make_scene("sparse-picture", size=24, grid=3)
+    frame = scene.measurement
+    problem = stream_problem(
+        frame, scene.calibration, others=[frame + 4, frame + 2], estimate_background=asked, noise=1.5
+    )
+    (posed,) = seen
+    np.testing.assert_allclose(posed.measurement.image, frame + 2, rtol=1e-5)
+    assert posed.measurement.noise == 1.5
+    assert posed.options.choose == Overrides(
+        planes="all", between=False, beyond=False, binning=1, channels="all"
+    )
+    assert problem.options.model == "local"
+    assert problem.extent.margin == margin
+    where = "" if margin is None else "; the object lies where PSFs were measured: why field"
+    assert problem.reason == f"by the mean of 3 frames: why model{where}"
+    said = "A smooth background is estimated as well: why background."
+    assert (said in problem.warnings) == (background and asked is None)
+    assert "" not in problem.warnings
+
+
+def test_a_camera_that_is_named_has_the_background_that_it_needs_and_two_images(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr("recon.streams.video.require_two_images", lambda _: asked.append("images"))
+    monkeypatch.setattr(
+        "recon.streams.video.with_background", lambda problem, _: asked.append("background") or problem
+    )
+    scene = make_scene("sparse-picture", size=24, grid=3)
+    quick = stream_problem(scene.measurement, scene.calibration, choosing=False)
+    assert asked == []
+    assert sum("One PSF serves the whole field" in text for text in quick.warnings) == 1
+    named = stream_problem(scene.measurement, scene.calibration, model="convolution")
+    assert asked == ["images", "background"]
+    assert "" not in named.warnings
