@@ -161,31 +161,42 @@ def jumping_clock() -> None:
 
 
 def run_in_window() -> int:
-    """Open the window on the bench of this folder, and carry the plan out from it."""
+    """Open the program's own window on the bench of this folder, carry the plan out from it, and close it.
+
+    Returns what a command would: 128 and the signal that closed it, where one did.
+    """
     os.environ["QT_QPA_PLATFORM"] = "offscreen"
     from PySide6.QtCore import QSettings
-    from PySide6.QtTest import QTest
 
-    from gui.app import application
-    from gui.main_window import MainWindow
+    from gui import app
     from gui.session import BenchSession
     from instrument.bench.config_file import load_config
     from instrument.runs.acquire import prepare
 
-    application()
-    session = BenchSession(load_config(Path("bench.toml")))
-    window = MainWindow(session, QSettings("window.ini", QSettings.Format.IniFormat))
-    window.show()
-    opening = session.open()
-    while not opening.is_over:
-        QTest.qWait(5)
-    work = session.exclusive_job("A plan", lambda _: prepare(session.bench, PLAN, Path("runs")).execute())
-    while not work.is_over:
-        QTest.qWait(5)
-    session.close()
-    while not session.is_closed:
-        QTest.qWait(5)
-    return 0
+    ended_by: list[int] = []
+
+    class AtWork(BenchSession):
+        """A session that carries the plan out once its bench is open, and closes the window after it."""
+
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            self.opened.connect(self._carry_out)
+
+        def _carry_out(self) -> None:
+            work = self.exclusive_job("A plan", lambda _: prepare(self.bench, PLAN, Path("runs")).execute())
+            work.ended.connect(self.close)
+
+        def log(self, level: Any, text: str) -> None:
+            """Notice which signal closes the window."""
+            names = (name for name in ("SIGINT", "SIGTERM", "SIGHUP") if text.startswith(f"Signal {name}"))
+            ended_by.extend(128 + signal.Signals[name] for name in names)
+            super().log(level, text)
+
+    app.BenchSession = AtWork  # type: ignore[misc]
+    for scope in (QSettings.Scope.UserScope, QSettings.Scope.SystemScope):
+        QSettings.setPath(QSettings.Format.NativeFormat, scope, "settings")
+    status = app.run(load_config(Path("bench.toml")))
+    return ended_by[0] if ended_by else status
 
 
 def in_folder(command: Sequence[str], folder: Path) -> list[str]:
@@ -208,4 +219,4 @@ def tree(folder: Path) -> set[str]:
     for path in folder.rglob("*"):
         parts = path.relative_to(folder).parts
         found.add("/".join(runs.get(part, part) for part in parts))
-    return found - {"out", "said", "tmp", "window.ini"}
+    return found - {"out", "said", "tmp", "settings"}

@@ -856,3 +856,73 @@ def test_a_level_has_its_pixels_and_depths_and_is_judged_by_all_depths(
     own = level.whole.depths.central[shown, 0]
     seen = level.preview.problem.depths.central[0, 0]
     np.testing.assert_allclose(seen / seen.sum(), own / own.sum(), atol=1e-6)
+
+
+@pytest.mark.parametrize("channels", [None, 3])
+def test_a_whole_picture_has_the_frame_on_the_calibration_s_pixels(
+    channels: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr("recon.streams.live.reconstruct", lambda *given, **more: asked.append((given, more)))
+    reconstructor = live()
+    frame = np.random.default_rng(0).random((2 * SHAPE[0], 2 * SHAPE[1], channels or 1)) * 99
+    frame = frame if channels else frame[..., 0]
+    reconstructor.full(frame, cancel=None)
+    ((measurement, psf, options), more) = asked[0]
+    binned = frame.reshape(SHAPE[0], 2, SHAPE[1], 2, -1).mean(axis=(1, 3))
+    np.testing.assert_allclose(
+        measurement.image,
+        binned if channels else binned[..., 0],
+        rtol=1e-5,
+        err_msg="height, width, channels",
+    )
+    assert measurement.background == 20.0
+    assert options is reconstructor.options
+    np.testing.assert_array_equal(psf, spots_psf())
+    assert more == {"on_progress": None, "cancel": None}
+    frame[3, 4] = np.nan
+    with pytest.raises(InputError, match="frame"):
+        reconstructor.full(frame)
+    assert len(asked) == 1
+
+
+def test_the_filter_s_time_is_noted_where_frames_come_too_fast_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    affordable = [5.0]
+    monkeypatch.setattr(Pace, "affordable", lambda *_: affordable[-1])
+    reconstructor = live(average=1)
+    iterated(reconstructor, photograph(0, 0))
+    noted: list[float] = []
+    monkeypatch.setattr(Pace, "note_filter", lambda _, took: noted.append(took.wall_ms))
+    assert reconstructor.feed(photograph(0, 2)[:, ::-1]).method == "wiener"
+    assert noted == [], "another scene"
+    reconstructor.feed(photograph(0, 3)[:, ::-1])
+    affordable.append(0.5)
+    fast = reconstructor.feed(photograph(0.7, 4)[:, ::-1])
+    assert (fast.scene, fast.method) == (SceneState.MOVING, "wiener")
+    assert len(noted) == 1
+
+
+def test_the_options_of_live_pictures_are_settled_before_the_first_frame() -> None:
+    with pytest.raises(InputError, match="no iterations"):
+        live(solver="wiener")
+    assert live()._options.estimate_background is False, "a known background is not estimated"
+    assert live(estimate_background=True)._options.estimate_background is True
+    psfs = spots_psf()[None, None] * np.ones((2, 1, 1, 1), np.float32)
+    places = np.array([[0.0, 0, 1e4], [0, 0, 2e4]], np.float32)
+    for at, many in ((places, False), (places[[0, 0]] + [[0, 0, 0], [50, 0, 0]], True)):
+        calibration = Calibration(psfs, at)
+        assert LiveReconstructor(calibration, noise=NOISE)._one_of_many == many
+
+
+def test_a_frame_that_no_level_takes_settles_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    reconstructor = live()
+
+    def refuses(*_: object) -> Level:
+        raise InputError("no way")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LiveReconstructor, "_level_of", refuses)
+        with pytest.raises(InputError, match="no way"):
+            reconstructor.feed(photograph(0, 0))
+    assert reconstructor._shape == ()
+    assert reconstructor.feed(photograph(0, 0)).method == "wiener"
