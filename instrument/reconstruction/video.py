@@ -149,8 +149,8 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
     )
     job, resumed = _job(request, plan, force)
     if job is None:
-        _create(request, run, plan, problem)
         job = VideoJob.create(request.out, plan, problem, reduction, times_noise)
+        _create(request, run, plan, problem)  # last, and whole: without it the same command begins anew
     saturated = sum(record.metadata.saturated_fraction > 0 for record in run.records.values())
     warnings = list(dict.fromkeys((*picture.warnings, *problem.warnings)))
     if saturated:

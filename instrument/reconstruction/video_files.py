@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
-from instrument.files.atomic import refuse_input
+from instrument.files.atomic import whole_folder
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import FileError
 from instrument.files.volumes import grid_facts, ome_attributes, voxel_um
@@ -109,27 +109,27 @@ def create_output(
     """
     import zarr
 
-    refuse_input(path)
     deep = grid is not None and grid.shape[0] > 1
     colour = len(picture_shape) == 3 + deep
     shape = (picture_shape[-1], *picture_shape[:-1]) if colour else picture_shape
     names = ["t", *(["c"] if colour else []), *(["z"] if deep else []), "y", "x"]
-    group = zarr.open_group(path, mode="w", zarr_format=3)
-    group.create_array(
-        "0",
-        shape=(n_frames, *shape),
-        chunks=(1, *shape),
-        dtype="float32",
-        fill_value=np.nan,
-        dimension_names=names,
-    )
     steps: dict[str, float | None] = {"t": period_s}
     if grid is not None:
         attributes = attributes | grid_facts(grid)
         pitch = float(grid.pitch_um[0])
         steps |= voxel_um(grid) if deep else dict.fromkeys("yx", pitch if np.isfinite(pitch) else None)
-    group.attrs["ome"] = ome_attributes(path.name, names, steps)
-    group.attrs["diffuserbench"] = attributes
+    with whole_folder(path) as draft:
+        group = zarr.open_group(draft, mode="w", zarr_format=3)
+        group.create_array(
+            "0",
+            shape=(n_frames, *shape),
+            chunks=(1, *shape),
+            dtype="float32",
+            fill_value=np.nan,
+            dimension_names=names,
+        )
+        group.attrs["ome"] = ome_attributes(path.name, names, steps)
+        group.attrs["diffuserbench"] = attributes
 
 
 class VideoPictures:

@@ -682,6 +682,23 @@ def test_a_full_disk_is_said_with_what_is_kept_and_the_video_goes_on(
     assert "4 frames are done already" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("what", ["numpy.savez", "zarr.Group.create_array"])
+def test_a_disk_that_is_full_at_the_beginning_leaves_nothing_in_the_way(
+    what: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    wanted = request(recording, tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(what, full)
+        with pytest.raises(OSError, match="No space left"):
+            prepare_video(wanted)
+    assert not wanted.out.exists()
+    assert not prepare_video(wanted).resumed
+    assert {path.name for path in tmp_path.iterdir()} == {"v.ome.zarr", ".v.job"}
+
+
 def test_a_calibration_of_another_camera_is_said(recording: Path, tmp_path: Path) -> None:
     right = prepare_video(request(recording, tmp_path))
     assert not any("calibration" in text for text in right.warnings)
