@@ -25,8 +25,8 @@ WORTH_S = 0.5
 _LARGEST = 1e9  # thirty years; frames, too
 _TRANSFORMS_PER_MEGAPIXEL = {
     "Looking for hot pixels": (10.0, 10.0),
-    "Finding the scene's exposure": (120.0, 20.0),
-    "finding the scene's exposure": (120.0, 20.0),
+    "Finding the scene's exposure": (120.0, 10.0),
+    "finding the scene's exposure": (120.0, 10.0),
     "Frames": (110.0, 0.0),
     "finding exposures": (48.0, 48.0),
     "photographing bead slides": (120.0, 120.0),
