@@ -15,6 +15,11 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _DEPTH = re.compile(r"(?:(?<=[a-zA-Z_=])-)?\d+(?:\.\d+)?(?= ?_?(nm|um|µm|μm|mm|cm)(?![a-zA-Z]))")
 _UM = {"nm": 1e-3, "um": 1.0, "µm": 1.0, "μm": 1.0, "mm": 1e3, "cm": 1e4}
 MICRO_MANAGER = "metadata.txt"
+_MICRO_MANAGERS = (
+    re.compile(r"img_channel(?P<channel>.+)_position(?P<position>.+)_time(?P<time>\d+)_z(?P<z>\d+)"),
+    re.compile(r"img_(?P<time>\d+)_(?P<channel>.*)_(?P<z>\d+)"),
+)
+"""What Micro-Manager calls its images, versions 2.0 and 1.4."""
 
 
 def images_in(folder: Path) -> list[Path]:
@@ -29,7 +34,10 @@ def in_order(folder: Path, paths: Sequence[Path]) -> tuple[list[Path], tuple[flo
 
     Depths are what Micro-Manager's ``metadata.txt`` says, else the only length in each name (``z60.5mm``,
     ``psf_-50um``). Without them the order stays.
+
+    Raises FileError where Micro-Manager's names tell that there are images along two axes.
     """
+    _require_one_axis(folder, paths)
     depths = _micro_managers(folder, paths)
     if None in depths or not depths:  # none, or of other files
         depths = [_depth(path.name) for path in paths]
@@ -38,6 +46,21 @@ def in_order(folder: Path, paths: Sequence[Path]) -> tuple[list[Path], tuple[flo
         return list(paths), ()
     pairs = sorted(zip(known, range(len(paths)), strict=True))
     return [paths[number] for _, number in pairs], tuple(depth for depth, _ in pairs)
+
+
+def _require_one_axis(folder: Path, paths: Sequence[Path]) -> None:
+    for pattern in _MICRO_MANAGERS:
+        named = [found for path in paths if (found := pattern.fullmatch(path.stem))]
+        if len(named) < len(paths):
+            continue
+        counts = {axis: len({found[axis] for found in named}) for axis in pattern.groupindex}
+        several = [f"{count} ({axis})" for axis, count in counts.items() if count > 1]
+        if len(several) > 1:
+            raise FileError(
+                folder,
+                f"holds images in {' x '.join(several)}; one stack is expected.",
+                "Copy those of one stack to a folder of their own, with metadata.txt where there is one.",
+            )
 
 
 def order_in_words(paths: Sequence[Path], depths_um: Sequence[float]) -> str:

@@ -291,6 +291,10 @@ def _folders_that_do(folder: Path) -> str:
 
 
 def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> ImageFile:
+    if array.ndim > 3 and array.shape[-1] == 1:
+        array = array[..., 0]
+    while array.ndim > 3 and array.shape[0] == 1:
+        array = array[0]
     if array.ndim == 2 or (array.ndim == 3 and array.shape[-1] in (3, 4) and not _is_npy(path)):
         array, more = _one_image(path, array)
         array = array[None]
@@ -333,7 +337,11 @@ def _one_image(path: Path, array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], t
         array = array[..., 0] if array.shape[-1] == 1 else array
         notes += dropped
     elif array.ndim == 3:
-        raise FileError(path, f"holds {array.shape[0]} images; a single one is expected.")
+        raise FileError(
+            path,
+            f"holds {array.shape[0]} images; a single one is expected.",
+            "Where a stack is expected, give the file itself instead of its folder.",
+        )
     elif array.ndim != 2:
         raise FileError(path, f"holds an array of shape {array.shape}; an image is expected.")
     if 0 in array.shape:

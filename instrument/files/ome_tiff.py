@@ -150,7 +150,10 @@ def depths_in_words(depths: Sequence[float] | npt.NDArray[np.float64]) -> str:
     if np.ptp(steps) <= 1e-3 * abs(steps[0]):
         every = f"planes every {abs(steps[0]):g} um as it says"
         return every if depths[0] == 0 else f"{every}, {depths[0] / 1e3:g} to {depths[-1] / 1e3:g} mm"
-    return f"planes at {depths[0] / 1e3:g} to {depths[-1] / 1e3:g} mm as it says, not evenly spaced"
+    near, far = (f"{depth / 1e3:g}" for depth in (min(depths), max(depths)))
+    turns = steps.min() < 0 < steps.max()
+    order = "not in the order of depths" if turns else "not evenly spaced"
+    return f"planes at {near} to {far} mm as it says, {order}"
 
 
 def _parts(where: str | ElementTree.Element, name: str) -> list[ElementTree.Element]:

@@ -62,6 +62,16 @@ def test_micro_managers_z_positions_give_the_order(tmp_path: Path) -> None:
     assert stack.metadata["depths_um"] == [-10.0, 0.0, 10.0]
 
 
+@pytest.mark.parametrize(
+    "name", ["img_channel{}_position000_time000000000_z{:03d}.tif", "img_000000000_{}_{:03d}.tif"]
+)
+def test_micro_managers_channels_are_no_depths(tmp_path: Path, name: str) -> None:
+    for number in range(6):
+        tifffile.imwrite(tmp_path / name.format(("DAPI", "FITC")[number % 2], number // 2), PICTURE)
+    with pytest.raises(FileError, match=r"holds images in 2 .channel. x 3 .z.; one stack is expected"):
+        read_stack(tmp_path)
+
+
 def test_axes_of_imagej_and_ome(tmp_path: Path) -> None:
     colours = RNG.integers(0, 255, (5, 3, 8, 6)).astype(np.uint8)
     path = tmp_path / "a.tif"
@@ -150,6 +160,9 @@ def test_depths_that_a_stack_tells_are_said_and_kept(tmp_path: Path) -> None:
     stack = read_stack(path)
     assert stack.metadata == {"depths_um": places}
     assert stack.notes == ("planes at 2 to 3.6 mm as it says, not evenly spaced",)
+    said["PositionZ"] = [2000.0, 3600.0, 2250.0, 2571.4, 3000.0]
+    tifffile.imwrite(path, STACK, ome=True, metadata={"axes": "ZYX", "Plane": said})
+    assert read_stack(path).notes == ("planes at 2 to 3.6 mm as it says, not in the order of depths",)
     tifffile.imwrite(
         path, STACK, ome=True, metadata={"axes": "ZYX", "PhysicalSizeZ": 5, "PhysicalSizeZUnit": "nm"}
     )
@@ -287,6 +300,9 @@ def test_arrays_of_hdf5_and_matlab_files(tmp_path: Path) -> None:
         file["measurement/psf"] = STACK
         file["gain"] = 3.0
     np.testing.assert_array_equal(read_stack(h5).pixels, STACK)
+    with h5py.File(tmp_path / "t z y x c.h5", "w") as file:
+        file["exported_data"] = STACK[None, ..., None]
+    np.testing.assert_array_equal(read_stack(tmp_path / "t z y x c.h5").pixels, STACK)
     with h5py.File(h5, "a") as file:
         file["photograph"] = PICTURE
     with pytest.raises(FileError, match=r"2 arrays that could be images: measurement/psf \(5, 8, 6\), photo"):
