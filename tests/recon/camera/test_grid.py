@@ -40,6 +40,34 @@ def test_beads_come_out_at_their_places_with_their_light(voxel_um, order):
         assert light == pytest.approx(5, rel=0.1)
 
 
+@pytest.mark.parametrize(
+    ("z_mm", "most_voxels"),
+    [
+        (np.linspace(10, 20, 21), 0.5),
+        (1 / np.linspace(1 / 10, 1 / 20, 21), 0.5),
+        (
+            (10, 10.2, 11, 11.5, 13, 13.6, 15, 18, 20),
+            2.0,
+        ),  # steps of 0.2 to 3 mm
+    ],
+)
+def test_a_bead_between_planes_is_within_half_a_voxel_unless_steps_differ_widely(z_mm, most_voxels):
+    """Its light is on the two planes beside it, at one pixel, shared by its place in 1/z."""
+    z_um = 1e3 * np.asarray(z_mm, float)
+    grid = Grid((len(z_um), 64, 80), (32, 40), z_um, 8e-4 * z_um)
+    rng, rows, columns = np.random.default_rng(0), *np.mgrid[:64, :80]
+    off = []
+    for near in 1 / rng.uniform(1 / z_um[-1], 1 / z_um[0], 12):
+        row, column = rng.uniform((10, 10), (54, 70))
+        spot = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / 2 / 0.8**2)
+        shares = np.stack([np.interp(1 / near, 1 / z_um[::-1], one) for one in np.eye(len(z_um))[:, ::-1]])
+        metric, placed = metric_volume(np.float32(shares[:, None, None] * spot), grid)
+        (x, y, depth), _ = _middle(np.where(metric > 0.3 * metric.max(), metric, 0), placed)
+        place = 8e-4 * near * np.array([40 - column, 32 - row])
+        off.append([*(np.abs([x, y] - place) / placed.pitch_um[0]), abs(depth - near) / placed.spacing_um[0]])
+    assert np.max(off) < most_voxels
+
+
 def test_an_even_glow_is_even_and_colours_stay_apart():
     """As much light a cubic micrometre everywhere is as much a voxel: wide voxels of far planes hold more."""
     size = GRID.pitch_um**2 * np.gradient(Z_UM)
