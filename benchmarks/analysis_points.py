@@ -29,7 +29,7 @@ from recon import reconstruct
 from recon.analysis import Analysis, analyse
 from recon.analysis.gram import WindowProblem
 from recon.analysis.points import DIP, HALF_WINDOW, Noise, PointGrid, planes_about, smallest_dip, try_points
-from recon.camera.refocus import at_depth, psf_at
+from recon.camera.refocus import psf_at
 from recon.evaluation.points_in_volumes import in_volumes
 from recon.evaluation.two_points import cells, reached
 from recon.types import Calibration, Geometry
@@ -112,7 +112,7 @@ def across(
     ]
     each = [np.sum([truth.light(*place, truth.z_um) for place in pair], axis=0) for pair in pairs]
     seen = exposed(np.sum(each, axis=0), len(pairs), max(float(one.max()) for one in each), rng)
-    image = reconstruct(seen, at_depth(calibration, truth.z_um)[0], z_um=truth.z_um, judged=False).image
+    image = reconstruct(seen, calibration, z_um=truth.z_um, judged=False).image
     found = []
     for first, _ in pairs:
         picture, (row, column) = (image, first) if axis == 1 else (image.T, first[::-1])

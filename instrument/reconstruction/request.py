@@ -225,45 +225,16 @@ def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOpt
     )
 
 
-def require_distance(z_um: float) -> None:
-    """Check a scene's distance, micrometres; BenchError says it in millimetres, as it was given."""
-    if not z_um > 0:
-        raise BenchError(f"The scene's distance must be above 0 mm, not {z_um / 1e3:g} mm.")
-
-
 def refocused(job: Job, z_um: float, *, beside: bool = False) -> Job:
     """Return the job with a PSF for a depth that its calibration does not contain, and a note that says so.
 
-    With ``beside`` the calibrated depths stay beside it, for a fit of the depth.
-
-    Where the calibration has the depth the job is returned as it is. Where it has several, but the distance
-    from diffuser to sensor is not known, the nearest is taken, and a note says so.
-
-    Raises BenchError when ``z_um`` is no distance, or there is one PSF that nothing can bring there.
+    With ``beside`` the calibrated depths stay beside it, for a fit of the depth. What could not be brought
+    there stays as it is, and a note says so. Raises InputError as :func:`recon.camera.refocus.at_depth`.
     """
-    require_distance(z_um)
-    calibration, asked = job.calibration, depth_in_words(z_um)
-    z = calibration.source_positions_um[:, 2]
-    as_it_is = "Leave the distance (--z-mm) out to take the PSF as it is, or give a calibration"
-    if not bool((z > 0).all()):
-        raise BenchError(
-            f"The PSF is not known to be of any depth, so it cannot be brought to {asked}. {as_it_is} with "
-            "the depths of its PSFs."
-        )
-    if calibration.geometry.diffuser_distance_mm is None:
-        if np.isclose(z, z_um).any():
-            return job
-        if len(members_of_depths(calibration.source_positions_um)) == 1:
-            raise BenchError(
-                f"The calibration has one depth, {z[0] / 1e3:g} mm, and the diffuser's distance from the "
-                f"sensor is not known, so it cannot be brought to {asked}. {as_it_is} of several depths."
-            )
-        why = "the diffuser's distance from the sensor is not known; the nearest is taken"
-        said, read = f"not refocused to {asked}: {why}", job.notes.get("PSF")
-        return replace(job, notes={**job.notes, "PSF": f"{read}, {said}" if read else said})
-    calibration, made = at_depth(calibration, z_um)
+    calibration, made = at_depth(job.calibration, z_um)
     if made is None:
-        return job
+        said = [job.notes.get("PSF"), calibration.provenance.get("not_refocused")]
+        return replace(job, notes={**job.notes, "PSF": ", ".join(filter(None, said))}) if said[1] else job
     if beside and len(members_of_depths(job.calibration.source_positions_um)) > 1:
         own = (job.calibration, calibration)
         calibration = replace(
@@ -274,15 +245,6 @@ def refocused(job: Job, z_um: float, *, beside: bool = False) -> Job:
     return replace(
         job,
         calibration=calibration,
-        notes={**job.notes, "PSF": f"refocused to {asked}: {made}"},
-        provenance={
-            **job.provenance,
-            "refocused": {
-                "z_um": made.z_um,
-                "from_z_um": list(made.from_z_um),
-                "displacement_error_um": made.displacement_error_um,
-                "expected_similarity": made.expected_similarity,
-                "similarity_within": made.similarity_within,
-            },
-        },
+        notes={**job.notes, "PSF": f"refocused to {depth_in_words(z_um)}: {made}"},
+        provenance={**job.provenance, "refocused": made.to_json()},
     )

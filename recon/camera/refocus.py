@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.camera_model import members_of_depths
+from recon.camera.camera_model import members_of_depths, one_depth
 from recon.camera.depth_likeness import likeness_range
 from recon.camera.field_registration import remembered_field
-from recon.camera.grid import FAR_UM
+from recon.camera.grid import FAR_UM, depth_in_words
 from recon.camera.registration import displacement, moved, register, rescaled
 from recon.camera.transformed import geometric_centre, resampled
 from recon.camera.varying_psfs import interpolation_weights
@@ -81,6 +81,16 @@ class Refocused:
         """Whether the depth lies outside the calibrated ones, by more than a stage's repeatability."""
         near, far = self.calibrated_um
         return not (1 - SAME_DEPTH) * near <= self.z_um <= (1 + SAME_DEPTH) * far
+
+    def to_json(self) -> dict[str, Any]:
+        """Return how it was made, for a record."""
+        return {
+            "z_um": self.z_um,
+            "from_z_um": list(self.from_z_um),
+            "displacement_error_um": self.displacement_error_um,
+            "expected_similarity": self.expected_similarity,
+            "similarity_within": self.similarity_within,
+        }
 
     def __str__(self) -> str:
         """Say it in words."""
@@ -285,18 +295,48 @@ def _of_equal_places(sides: list[_Side]) -> list[_Side]:
 
 
 def at_depth(calibration: Calibration, z_um: float) -> tuple[Calibration, Refocused | None]:
-    """Return a calibration at ``z_um`` alone, and how it was made (None where it was calibrated).
+    """Return a calibration for the picture at a depth: at ``z_um`` alone, wherever PSFs can be brought there.
 
-    Where the calibration has the depth (to :data:`SAME_DEPTH` of the pattern's scale), its PSFs are returned
-    as they are. Raises as :func:`refocus`.
+    Returns
+    -------
+    Calibration
+        As it is where it has the depth (to :data:`SAME_DEPTH` of the pattern's scale). How it was made is in
+        its provenance, ``refocused``; where nothing can be brought because the diffuser's distance is not
+        known, it is the nearest of its depths, and ``not_refocused`` says so.
+    Refocused or None
+        How it was made; None where it is as it was measured.
+
+    Raises InputError where ``z_um`` is no distance, the depths are not known, or there is one that nothing
+    can bring to ``z_um``.
     """
-    distance_um, z_um = _distance_um(calibration), min(z_um, FAR_UM)
-    z, _ = central_psfs(calibration)
-    same = np.array([abs(paraxial_scale(v, z_um, distance_um) - 1) < SAME_DEPTH for v in z])
-    if same.any():
+    asked, z_um = depth_in_words(z_um), min(z_um, FAR_UM)
+    if not z_um > 0:
+        raise InputError(f"The scene's distance must be above 0 mm, not {asked}.")
+    z = calibration.source_positions_um[:, 2]
+    as_it_is = "Leave the distance (z_um, --z-mm) out to take the PSF as it is, or give a calibration"
+    if not (z > 0).all():
+        raise InputError(
+            f"The depths of the calibration's PSFs are not known, so they cannot be brought to {asked}. "
+            f"{as_it_is} with the depths of its PSFs."
+        )
+    if calibration.geometry.diffuser_distance_mm is None:
+        why = "the diffuser's distance from the sensor is not known; the nearest is taken"
+        said = f"not refocused to {asked}: {why}"
+        if np.isclose(z, z_um).any() or calibration.provenance.get("not_refocused") == said:
+            return calibration, None
+        if len(members_of_depths(calibration.source_positions_um)) == 1:
+            raise InputError(
+                f"The calibration has one depth, {z[0] / 1e3:g} mm, and the diffuser's distance from the "
+                f"sensor is not known, so it cannot be brought to {asked}. {as_it_is} of several depths."
+            )
+        provenance = {**calibration.provenance, "not_refocused": said}
+        return replace(one_depth(calibration, z_um), provenance=provenance), None
+    depths, _ = central_psfs(calibration)
+    distance_um = _distance_um(calibration)
+    if any(abs(paraxial_scale(v, z_um, distance_um) - 1) < SAME_DEPTH for v in depths):
         return calibration, None
     made = refocus(calibration, z_um)
-    provenance = {**calibration.provenance, "refocused_to_um": z_um, "refocused_from_um": made.from_z_um}
+    provenance = {**calibration.provenance, "refocused": made.to_json()}
     return replace(refocus_field(calibration, z_um), provenance=provenance), made
 
 

@@ -14,6 +14,7 @@ from recon.base.checks import as_channels, check_psf
 from recon.base.declare import settled
 from recon.camera.camera_model import Depths, Extent, ModelName, choose_model, energies, levelled
 from recon.camera.grid import Grid
+from recon.camera.refocus import at_depth
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (
@@ -115,7 +116,8 @@ class Problem:
             PSFs, or one PSF image (height, width[, n_channels]) without background, which is taken as it is:
             one convolution of everything. One channel serves all.
         options : ReconstructionOptions, optional
-            With ``z_um`` the picture of one depth: PSFs of the nearest calibrated one. Else all depths.
+            With ``z_um`` the picture of one depth, which PSFs are brought to where the calibration does not
+            have it (:func:`recon.camera.refocus.at_depth`). Else all depths.
         extent : Extent, optional
             How much of the PSFs and of the field to model; default all.
 
@@ -145,6 +147,8 @@ class Problem:
         if measurement.patterns is not None and options.model == "auto":
             options = settled(options, model="convolution")
         stack = None if options.z_um is None else calibration
+        if options.z_um is not None:
+            calibration, _ = at_depth(calibration, options.z_um)
         calibration, depths, doubts = depths_of(calibration, options)
         require_same_channels(calibration.psfs, counts.data[:: measurement.frames])
         require_same_pixels(calibration.psfs[0], counts.data)
@@ -159,6 +163,8 @@ class Problem:
             if measurement.patterns is not None and model == "convolution":
                 reason = "patterned light takes one PSF a depth where no other model is asked for"
         asked = True if options.positive_background else options.estimate_background
+        unmoved = calibration.provenance.get("not_refocused")
+        said = (holes, unmoved and f"The PSF was {unmoved}.")
         deviation = measurement.deviations(counts).astype(np.float32)
         problem = cls(
             measurement,
@@ -173,7 +179,7 @@ class Problem:
             (not one and measurement.background is None) if asked is None else asked,
             "float32" if options.precision == "auto" else options.precision,
             extent,
-            tuple(dict.fromkeys((*filter(None, (holes,)), *doubts, *depths.warnings, *counts.warnings))),
+            tuple(dict.fromkeys((*filter(None, said), *doubts, *depths.warnings, *counts.warnings))),
             stack=stack,
         )
         if options.axis_weights is not None:
@@ -452,6 +458,7 @@ class Problem:
             "model": self.model,
             "model_reason": self.reason,
             **({"patterns": self.measurement.frames} if self.patterned else {}),
+            **({"refocused": made} if (made := self.calibration.provenance.get("refocused")) else {}),
             "options": record(self.options),
         }
 

@@ -31,6 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.blocks import block_sum
+from recon.base.declare import settled
 from recon.camera.camera_model import CAMERAS, Depths, choose_model, one_depth
 from recon.camera.grid import FAR_UM
 from recon.camera.refocus import central_psfs, paraxial_scale
@@ -221,8 +222,12 @@ def refined(
         return problem, None
     if not refinement.helps:
         return problem, refinement
-    calibration = refinement.of(problem.calibration if refinement.of_z_um is None else _stack(problem))
-    return Problem.of(problem.measurement, calibration, problem.options), refinement
+    if refinement.of_z_um is None:
+        calibration, options = refinement.of(problem.calibration), problem.options
+    else:
+        calibration = refinement.of(_stack(problem))
+        options = settled(problem.options, z_um=refinement.of_z_um)
+    return Problem.of(problem.measurement, calibration, options), refinement
 
 
 class _CancelledError(Exception):
@@ -319,8 +324,11 @@ def _depth_um(problem: Problem, place: Floats) -> float | None:
 
 def _nearer(problem: Problem, z_um: float) -> Problem | None:
     """Return the problem with the PSFs of the calibrated depth nearest to another, where these are others."""
-    other = Problem.of(problem.measurement, _stack(problem), replace(problem.options, z_um=z_um))
-    return None if other.depths.z_um[0] == problem.depths.z_um[0] else other
+    nearest = one_depth(_stack(problem), z_um)
+    own = float(nearest.source_positions_um[nearest.nearest_to_axis(), 2])
+    other = Problem.of(problem.measurement, nearest, settled(problem.options, z_um=own))
+    same = other.depths.z_um[0] == problem.depths.z_um[0]
+    return None if same else replace(other, stack=_stack(problem))
 
 
 def _transformation(place: Floats) -> Transformation:

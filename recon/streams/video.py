@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.camera_model import Extent, choose_model
+from recon.camera.refocus import at_depth
 from recon.errors import InputError
 from recon.reconstruction.first_look import look_at
 from recon.reconstruction.measurement import Floats, Measurement, depths_of
@@ -88,6 +89,8 @@ def stream_problem(
             "Of the choices only field=all is for films: they keep all depths, pixels and channels; --model "
             "and --background say the rest."
         )
+    if options.z_um is not None and isinstance(calibration, Calibration):
+        calibration, _ = at_depth(calibration, options.z_um)
     if options.model == "auto":
         doubt, reason = _by_one_psf(calibration, options)
         if doubt and choosing and isinstance(calibration, Calibration):

@@ -15,7 +15,10 @@ import pytest
 from recon import Calibration, Geometry, InputError, NoiseModel
 from recon import reconstruct as reconstruct_and_judge
 from recon.base.metrics import psnr
+from recon.camera.refocus import refocus
 from recon.priors import PRIORS
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.problem import Problem
 from recon.solvers import StopReason
 
 ROOT = Path(__file__).parents[2]
@@ -203,7 +206,10 @@ def test_grid_tells_where_pixels_lie(shot):
     assert result.grid.pitch_um[0] == pytest.approx(10 * 21 / 5)
     assert result.grid.z_um.tolist() == [21_000.0]
     assert result.grid.centre == (32, 40)
-    assert result.provenance["psf_z_um"] == 20_000
+    assert result.provenance["psf_z_um"] == 21_000  # brought there, as the terminal's --z-mm has it
+    problem = Problem.of(shot.measurement, calibration, ReconstructionOptions(z_um=21_000.0))
+    np.testing.assert_array_equal(problem.calibration.psfs[0], refocus(calibration, 21_000.0).psf)
+    assert result.provenance["refocused"]["from_z_um"][0] == 20_000
     full = reconstruct(shot.measurement, calibration, z_um=21_000.0, iterations=2, field="full")
     assert full.image.shape == (129, 161)
     row, column = (f - s for f, s in zip(full.grid.centre, result.grid.centre, strict=True))
@@ -263,7 +269,11 @@ def test_a_depth_is_chosen_where_there_are_several_and_all_are_taken_where_none_
     assert not volume.is_picture
     with pytest.raises(ValueError, match="volume of 2 planes"):
         assert volume.image.any()
-    assert reconstruct(GOOD, calibration, z_um=1.1e4, iterations=1).image.shape == (12, 14)
+    nearest = reconstruct(GOOD, calibration, z_um=1.1e4, iterations=1)
+    assert nearest.image.shape == (12, 14)
+    assert "not refocused to 11 mm: the diffuser's distance" in " ".join(nearest.warnings)
+    with pytest.raises(InputError, match=r"one depth, 10 mm, .* cannot be brought to 11 mm"):
+        reconstruct(GOOD, calibration.part([0]), z_um=1.1e4)
     with pytest.raises(InputError, match="above 0"):
         reconstruct(GOOD, calibration, z_um=0)
     unknown = Calibration(psfs, np.full((2, 3), np.nan))

@@ -118,7 +118,7 @@ def test_a_calibrated_depth_is_left_as_it_is() -> None:
     assert made is not None
     assert len(other.psfs) == 1
     assert other.source_positions_um[0, 2] == 75e3
-    assert other.provenance["refocused_to_um"] == 75e3
+    assert other.provenance["refocused"]["z_um"] == 75e3
 
 
 def test_the_displacement_error_grows_with_distance_and_deflection() -> None:
