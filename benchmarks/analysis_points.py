@@ -101,14 +101,21 @@ class Truth:
 
 
 def across(
-    truth: Truth, calibration: Calibration, axis: int, px: float, rng: np.random.Generator, count: int = 1
+    truth: Truth, calibration: Calibration, axis: int, px: float, number: int, count: int = 1
 ) -> list[bool]:
-    """Tell which pairs of one picture are told apart, each in its own cell, with the noise of one alone."""
+    """Tell which pairs of one picture are told apart, each in its own cell, with the noise of one alone.
+
+    Pictures of ever larger ``number`` go on with a sequence that takes all places between pixels evenly.
+    """
+    rng = np.random.default_rng(1000 + number)
     middles = rng.permutation(cells(calibration.psfs[0, 0], px, CELL_PX))[:count]
     if count == 1:
-        middles = rng.uniform(-20, 20, (1, 2))
+        middles = np.round(rng.uniform(-20, 20, (1, 2)))
+    on = np.arange(len(middles)) + number * len(middles)
+    between = (0.5 + on[:, None] * np.array((0.754878, 0.569840))) % 1 - 0.5
     pairs = [
-        middle + rng.uniform(-0.5, 0.5, 2) + px * np.outer((0, 1), np.eye(2)[axis]) for middle in middles
+        middle + place + px * np.outer((0, 1), np.eye(2)[axis])
+        for middle, place in zip(middles, between, strict=True)
     ]
     each = [np.sum([truth.light(*place, truth.z_um) for place in pair], axis=0) for pair in pairs]
     seen = exposed(np.sum(each, axis=0), len(pairs), max(float(one.max()) for one in each), rng)
@@ -222,12 +229,11 @@ def held(bench: str, wanted: Sequence[str], count: int, shares: Sequence[float],
                 told_apart = [
                     one
                     for seed in range(-(-count // together))
-                    for one in across(
-                        truth, calibration, axis, share * px, np.random.default_rng(1000 + seed), together
-                    )
+                    for one in across(truth, calibration, axis, share * px, seed, together)
                 ]
                 print(
-                    f"across, {'yx'[axis]} {share * px:.2f} px ({share:g} of stated): "
+                    f"across, {'yx'[axis]} {share * px:.2f} px ({share:g} of stated, "
+                    f"{found.reached.shares[axis][share < 1]:.0%} foretold): "
                     f"{sum(told_apart)} of {len(told_apart)}",
                     flush=True,
                 )

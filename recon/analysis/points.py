@@ -27,8 +27,8 @@ DIP = 0.2
 TRIALS = 3
 """Noise draws and sub-pixel positions that all must be resolved."""
 TOLD = 0.97
-"""Share of pairs, at all places between pixels, that the curve tells apart at the stated distance: nine in
-ten are promised."""
+"""Share of groups that the curve through groups in windows and volumes tells apart at the stated distance:
+nine in ten are promised."""
 ROUNDS, DRAWS = 3, 8
 """Rounds of two points, later ones about what earlier ones found; pairs of other distances in each."""
 
@@ -113,6 +113,8 @@ class TriedPair:
     axis: int
     """0: along y, 1: along x."""
     told: bool
+    place: float = 0.0
+    """Of its first point along the axis: 0 in the middle of a pixel, up to 1 in the next one's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +122,8 @@ class Reached:
     """What the default reconstruction reaches, with the noise of the tests."""
 
     across_px: tuple[float | None, float | None]
-    """Distance along y and along x at which 97 % of the pairs are told apart, at the least the smallest one
-    tried; None: at none tried."""
+    """Distance along y and along x at which 90 % of the pairs are told apart, and at 0.8 of it at most 30 %
+    (:mod:`recon.analysis.told_apart`); at the least the smallest one tried; None: at none tried."""
     focus_um: tuple[float, float] | None
     """Nearest and farthest depth (possibly infinite) at which pairs half as far again apart are told apart in
     a picture focused at the depth analysed; None where no distance was found along an axis, or the sensor
@@ -131,6 +133,8 @@ class Reached:
     """Solver and prior."""
     part: float
     """Part of the sensor's pixels that was used."""
+    shares: tuple[tuple[float, float] | None, tuple[float, float] | None] = (None, None)
+    """Along y and along x: the share of the pairs told apart at the stated distance, and at 0.8 of it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,8 +3,9 @@
 The tests of :mod:`recon.analysis.points` solve for points alone, in a window, without a prior. Here pairs of
 points of equal light stand in a picture, each pair at another distance and other places between pixels, far
 from the others, with the noise that one pair alone would have; the whole is reconstructed as pictures are by
-default. A pair is told apart where the picture dips by 20 % between its points. A logistic curve through what
-was told apart gives the stated distance.
+default. A pair is told apart where the picture dips by 20 % between its points. What was told apart gives the
+share at each distance, over all places between pixels (:mod:`recon.analysis.told_apart`), and that the stated
+distance.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ import numpy.typing as npt
 
 from recon.analysis.correlation import lit_extent
 from recon.analysis.middle import Middle
-from recon.analysis.points import DIP, Noise, Reached, TriedPair, smallest_dip, stated_px
+from recon.analysis.points import DIP, Noise, Reached, TriedPair, smallest_dip
+from recon.analysis.told_apart import NEARER, Told, stated_apart
 from recon.base import fft
 from recon.camera.refocus import at_depth
 from recon.reconstruction.reconstruct import reconstruct
@@ -28,16 +30,18 @@ from recon.types import Calibration
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
 
-PICTURES, PAIRS = 4, 22
+PICTURES, PAIRS = 10, 12
 """Pictures that are reconstructed, and pairs in each, half of them along each axis.
 
-Where there is no room for so many, up to three times as many pictures. More in a picture cost resolution:
-with 35 the stated distance is 7 % more than with 10 or 22.
+Where there is no room for so many, up to three times as many pictures. More in a picture cost resolution, of
+which a pair alone knows nothing: with 22 in cells of 20 pixels the stated distance is 3 % more.
 """
 _RANGE = 3.0  # of the first distances, largest over smallest
-_BELOW = 1.12  # the stated distance over the middle of an axis' later ones: there the curve rises
+_BELOW = 1.12  # the stated distance over the middle of an axis' later ones: there the share rises
+_ON = np.array((0.754878, 0.569840))  # of a pixel, to the next pair: places between pixels come evenly
+_MORE = 1.6  # times as many pairs, before the next ones' distances are chosen anew
 _ABOUT = 1.2  # of these, to both sides
-_CELL_PX = 20  # for a pair, at least; more where its points lie farther apart
+_CELL_PX = 30  # for a pair, at least; more where its points lie farther apart
 _FIELD = 0.25  # of the sensor to both sides of its middle, where pairs stand
 _BESIDE = 2  # rows to both sides of a pair's line that the picture is summed over
 _WIDER = 1.5  # times the stated distance: pairs that tell the depth of field
@@ -52,6 +56,11 @@ class _Pair:
     first: Floats
     """``(row, column)`` of the first point, pixels from the middle ``n // 2``; the second one is ``px``
     farther along the axis."""
+
+    @property
+    def place(self) -> float:
+        """Of the first point between two pixels, along the axis."""
+        return float(self.first[self.axis] % 1)
 
     @property
     def points(self) -> Floats:
@@ -83,8 +92,13 @@ class _Tests:
     def pairs(self, distances: Sequence[float], before: int = 0) -> list[_Pair]:
         """Return pairs in cells of their own, after others along each axis in turn; fewer without room."""
         places = self.rng.permutation(cells(self.psf(self.z_um), max(distances)))
+        between = np.empty((len(distances), 2))
+        for axis in (0, 1):
+            mine = np.flatnonzero((before + np.arange(len(distances))) % 2 == axis)
+            mine = mine[np.argsort(np.asarray(distances)[mine])]
+            between[mine] = (self.rng.uniform(0, 1, 2) + _ON * np.arange(len(mine))[:, None]) % 1 - 0.5
         return [
-            _Pair(px, (before + n) % 2, cell + self.rng.uniform(-0.5, 0.5, 2))
+            _Pair(px, (before + n) % 2, cell + between[n])
             for n, (px, cell) in enumerate(zip(distances, places, strict=False))
         ]
 
@@ -141,27 +155,43 @@ def reached(
     low = max(start_px, 1.2)
     about, wide = np.full(2, low * np.sqrt(_RANGE)), np.sqrt(_RANGE)
     tried: list[TriedPair] = []
+    fitted, last = 0, False
     for number in range(3 * PICTURES):
-        if len(tried) > (PICTURES - 1) * PAIRS:
+        if last:
             break
+        if on_progress is not None:
+            on_progress(max(len(tried) / PAIRS, number / 3) / (PICTURES + 1))
         share = (tests.rng.permutation(PAIRS // 2).repeat(2) + tests.rng.uniform(0, 1)) / (PAIRS / 2)
         axes = (len(tried) + np.arange(PAIRS)) % 2
         pairs = tests.pairs([float(v) for v in about[axes] * wide ** (2 * share - 1)], len(tried))
         light = shifted(psf, np.concatenate([pair.points for pair in pairs]))
         told = tests.told_apart(pairs, light)
-        tried += [TriedPair(p.px, p.axis, t) for p, t in zip(pairs, told, strict=True)]
-        stated = stated_px(tried)
+        tried += [TriedPair(p.px, p.axis, t, p.place) for p, t in zip(pairs, told, strict=True)]
+        last = len(tried) > (PICTURES - 1) * PAIRS or number == 3 * PICTURES - 1
+        if not last and len(tried) < _MORE * fitted:
+            continue
+        fitted, laws = len(tried), stated_apart(tried)
+        stated = [_within(law, tried) for law in laws]
         if found := [px for px in stated if px is not None]:
             about = np.array([px or float(np.mean(found)) for px in stated]) / _BELOW
             wide = _ABOUT
         elif not any(told):
             about = about * _RANGE / 2
-        if on_progress is not None:
-            on_progress(max(len(tried) / PAIRS, (number + 1) / 3) / (PICTURES + 1))
-    across = stated_px(tried)
-    known = [px for px in across if px is not None]
+    known = [px for px in stated if px is not None]
     focus = _focus_um(tests, _WIDER * max(known), step_per_um, middle.spread) if len(known) == 2 else None
-    return Reached(across, focus, tuple(tried), tests.method, middle.part)
+    y, x = (
+        None if px is None or law is None else (law.share(px), law.share(NEARER * px))
+        for px, law in zip(stated, laws, strict=True)
+    )
+    return Reached((stated[0], stated[1]), focus, tuple(tried), tests.method, middle.part, (y, x))
+
+
+def _within(law: Told | None, tried: Sequence[TriedPair]) -> float | None:
+    """Return the stated distance, of what was tried: none beyond it, at least the smallest."""
+    distances = [one.px for one in tried]
+    if law is None or law.stated_px > max(distances):
+        return None
+    return max(law.stated_px, min(distances))
 
 
 def _focus_um(

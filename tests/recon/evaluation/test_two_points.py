@@ -9,14 +9,15 @@ import pytest
 from scipy import ndimage
 
 from instrument.evaluation.analysis_figure import draw_analysis, facts
-from recon.analysis import analyse, middle
+from recon.analysis import analyse, middle, told_apart
 from recon.analysis.correlation import half_light_deg
 from recon.analysis.middle import Middle
-from recon.analysis.points import Noise, Reached, TriedPair
+from recon.analysis.points import Noise, Reached, TriedPair, smallest_dip, stated_px
 from recon.analysis.resolution import axial_resolution
+from recon.analysis.told_apart import Told, stated_apart
 from recon.camera.camera_model import one_depth
 from recon.evaluation import two_points
-from recon.evaluation.two_points import reached, shifted, stated_px
+from recon.evaluation.two_points import _within, reached, shifted
 from recon.types import Calibration, Geometry
 
 
@@ -51,6 +52,65 @@ def test_the_stated_distance_is_that_of_a_curve_through_the_pairs() -> None:
     y, x = stated_px([one for one in tried if one.axis == 1])
     assert y is None
     assert x is not None
+
+
+def _tried(law: Told, axis: int, count: int) -> list[TriedPair]:
+    """Return pairs at places and distances that come evenly, told apart as a law has it for each."""
+    on = np.arange(count)
+    px = 1.5 * (2.6 / 1.5) ** ((on + 0.5) / count)
+    places = on * 0.754878 % 1
+    odds = [
+        told_apart._log_odds(told_apart._dips(law.sigma, *one), one[0], *law.law)
+        for one in zip(px[:, None], places[:, None], strict=True)
+    ]
+    return [
+        TriedPair(float(p), axis, bool(o > 0), float(f)) for p, f, (o,) in zip(px, places, odds, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(("sigma", "offset", "slope"), [(0.2, 0.06, 0.8), (0.45, 0.0, 0.5)])
+def test_the_stated_distance_is_that_of_the_shares_over_all_places(
+    sigma: float, offset: float, slope: float
+) -> None:
+    """44 pairs are enough for both shares that are promised, where a curve in the distance alone was off."""
+    law = Told(sigma, offset, slope, 0.02)
+    found, nothing = stated_apart(_tried(law, 0, 44))
+    assert nothing is None
+    assert found is not None
+    assert found.stated_px == pytest.approx(law.stated_px, rel=0.015)
+    assert law.share(found.stated_px) >= 0.88
+    assert law.share(0.8 * found.stated_px) <= 0.32
+    assert law.share(1.3) < 0.01
+    assert law.share(4.0) > 0.999
+
+
+def test_the_dip_of_two_points_on_pixels_is_that_of_a_picture() -> None:
+    rng = np.random.default_rng(0)
+    px, places = rng.uniform(1.0, 4.0, 60), rng.uniform(0, 1, 60)
+    t, kernel = told_apart._kernel(0.3)
+    for apart, place, dip in zip(px, places, told_apart._dips(0.3, px, places), strict=True):
+        pixels = np.arange(12)
+        line = np.interp(pixels - 3 - place, t, kernel) + np.interp(pixels - 3 - place - apart, t, kernel)
+        where = np.array([[[0.0, 3 + place], [0.0, 3 + place + apart]]])
+        assert dip == pytest.approx(smallest_dip(line[None], where), abs=1e-9)
+
+
+def test_pixels_alone_leave_no_distance_with_both_shares() -> None:
+    """Points as narrow as pixels: half of the pairs are told apart at 0.8 of where nine in ten are."""
+    sharp = Told(0.0, 0.0, 0.0, 0.02)
+    assert sharp.share(sharp.stated_px) == pytest.approx(0.92, abs=0.03)
+    assert sharp.share(0.8 * sharp.stated_px) > 0.4
+    wide = Told(1.5, 0.0, 0.0, 0.02)
+    assert wide.share(0.8 * wide.stated_px) < 0.05
+
+
+def test_nothing_is_stated_beyond_what_was_tried_and_nothing_below_it() -> None:
+    pairs = [TriedPair(px, 0, True, 0.3) for px in (4.0, 4.2, 4.4)]
+    (law, _) = stated_apart(pairs)
+    assert _within(law, pairs) == 4.0
+    few = [TriedPair(px, 0, px > 1.99, 0.0) for px in (1.2, 1.4, 1.6, 2.0)]
+    assert _within(stated_apart(few)[0], [one for one in few if one.px < 1.7]) is None
+    assert _within(None, few) is None
 
 
 def test_a_shift_between_pixels_moves_the_centre_of_light_and_keeps_it() -> None:
