@@ -8,6 +8,7 @@ import signal
 import struct
 import sys
 import tempfile
+import threading
 import time
 import traceback
 import zlib
@@ -169,9 +170,11 @@ def run_in_window() -> int:
     from PySide6.QtCore import QSettings
 
     from gui import app
+    from gui.jobs import JobContext
     from gui.session import BenchSession
     from instrument.bench.config_file import load_config
     from instrument.runs.acquire import prepare
+    from instrument.runs.run_control import RunControl
 
     ended_by: list[int] = []
 
@@ -183,8 +186,14 @@ def run_in_window() -> int:
             self.opened.connect(self._carry_out)
 
         def _carry_out(self) -> None:
-            work = self.exclusive_job("A plan", lambda _: prepare(self.bench, PLAN, Path("runs")).execute())
+            work = self.exclusive_job("A plan", self._plan)
+            work.failed.connect(lambda text: sys.stderr.write(f"{text}\n"))
             work.ended.connect(self.close)
+
+        def _plan(self, context: JobContext) -> object:
+            control = RunControl()
+            context.on_cancel(lambda: threading.Thread(target=control.stop, name="STOP").start())
+            return prepare(self.bench, PLAN, Path("runs"), control=control).execute()
 
         def log(self, level: Any, text: str) -> None:
             """Notice which signal closes the window."""

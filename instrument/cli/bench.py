@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from instrument.cli.app import App, BenchOption, examples, load_and_say
+from instrument.cli.app import App, BenchOption, examples, load_and_say, signals_wait
 from instrument.cli.progress import one_task
 from instrument.files.errors import BenchError, FileError
 
@@ -409,7 +409,8 @@ def gui(
         _show_too(error)
         raise
     try:
-        from gui.app import run
+        with signals_wait():
+            from gui.app import run
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in _OF_THE_WINDOW:
             raise

@@ -74,6 +74,26 @@ def test_without_the_extra_one_sentence_says_what_to_install(
     assert 'pip install "diffuserbench[gui]"' in capsys.readouterr().err
 
 
+def test_ctrl_c_waits_while_the_window_s_library_is_read(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real, read = builtins.__import__, []
+
+    def interrupted(name: str, *rest: Any, **named: Any) -> Any:
+        if name == "gui.app":
+            signal.raise_signal(signal.SIGINT)  # Qt's bindings would abort the program
+            signal.raise_signal(signal.SIGINT)
+            read.append(name)
+        return real(name, *rest, **named)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(builtins, "__import__", interrupted)
+    assert main(["gui"]) == 130
+    assert read == ["gui.app"]
+    assert "interrupted." in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_without_a_screen_it_says_so(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
