@@ -5,6 +5,7 @@ from __future__ import annotations
 _RUNS = tuple(
     f"tests/instrument/runs/test_{name}.py"
     for name in (
+        "acquire",
         "acquisition_simulated",
         "damage",
         "fault_injection",
