@@ -243,6 +243,7 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
     )
     for chatty in ("numba", "numcodecs", "matplotlib", "asyncio"):  # numba prints 30,000 lines a kernel
         logging.getLogger(chatty).setLevel(logging.WARNING)
+    logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # the bar says that it is drawn
     _end_on_signals()
     kept_times.about(name)
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import re
 import sys
@@ -139,6 +140,7 @@ def test_a_terminal_is_told_that_a_command_is_on_its_way(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)  # this test's own
     assert main(["drivers"]) == 0
     assert capsys.readouterr().err.startswith("starting drivers ...\r\x1b[2K")
+    assert not logging.getLogger("matplotlib.font_manager").isEnabledFor(logging.WARNING)  # the first page's
 
 
 def test_a_bar_says_what_is_left_and_what_is_compiled() -> None:
