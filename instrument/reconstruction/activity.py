@@ -109,6 +109,16 @@ class Activity:
         return self.search.regions
 
 
+def require_frames(path: Path, count: int) -> None:
+    """Raise FileError where a film is too short for its activity to be told from noise."""
+    if count < LEAST_FRAMES:
+        raise FileError(
+            path,
+            f"has {count} pictures; activity is looked for in {LEAST_FRAMES} at least.",
+            "In fewer nothing tells it from noise: record for longer.",
+        )
+
+
 def find_activity(
     video: VideoPictures, settings: ActivitySettings | None = None, *, free_bytes: int | None = None
 ) -> Activity:
@@ -121,12 +131,7 @@ def find_activity(
     """
     settings = settings or ActivitySettings()
     indices = [index for index in range(len(video)) if video.is_written(index)]
-    if len(indices) < LEAST_FRAMES:
-        raise FileError(
-            video.path,
-            f"has {len(indices)} pictures; activity is looked for in {LEAST_FRAMES} at least.",
-            "In fewer nothing tells it from noise: record for longer.",
-        )
+    require_frames(video.path, len(indices))
     height, width = video.flat(indices[0]).shape[:2]
     need = COPIES * len(indices) * height * width * 4
     if free_bytes is not None and need > free_bytes:

@@ -9,10 +9,11 @@ from typing import Annotated
 
 from instrument.files.errors import BenchError, FileError
 from instrument.files.volumes import is_zarr_name
-from instrument.reconstruction.activity import ActivitySettings, find_activity, write_activity
+from instrument.reconstruction.activity import ActivitySettings, find_activity, require_frames, write_activity
 from instrument.reconstruction.film import open_video
 from instrument.reconstruction.options import InputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.video import VideoRequest
+from instrument.runs.run import Run
 from instrument.runs.run_files import STATE
 from instrument.tasks.task import Desk, Done, Only, saying_what_is_left, task
 from instrument.tasks.video import make_video
@@ -70,6 +71,7 @@ def activity(
         raise FileError(out, "is no folder.")
     with saying_what_is_left(out):
         if is_recording := _is_recording(files.video, source):
+            require_frames(files.video, len(Run.open(files.video).records))  # before minutes of solving
             made = make_video(desk, _request(files, source, inputs, scene), force=files.force)
             if made.kept:
                 return made

@@ -111,6 +111,16 @@ def test_a_recording_too_short_to_tell_is_refused(tmp_path: Path, capsys: pytest
     assert "6 pictures; activity" in capsys.readouterr().err.replace("\n", " ")
 
 
+def test_a_recording_too_short_is_refused_before_it_is_reconstructed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = Path(__file__).parents[1] / "fixtures" / "v813d646" / "recording"
+    words = ["activity", str(recording), "--psf", str(tmp_path / "psf.tif"), "--out", str(tmp_path / "found")]
+    assert main(words) == 2  # nobody has looked for the PSF
+    assert "pictures; activity" in capsys.readouterr().err.replace("\n", " ")
+    assert not (tmp_path / "found").exists()
+
+
 def test_what_is_dark_has_no_baseline_to_be_divided_by(tmp_path: Path) -> None:
     film = static_point(tmp_path / "static.ome.zarr", 60)
     found = find_activity(VideoPictures(film), ActivitySettings(least_correlation=0.0))
