@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -346,6 +347,8 @@ def write_chart(path: Path, cells: Sequence[Cell], note: str) -> None:
             ax.set_title(f"{q}x expansion, {'middle quarter' if crop else 'whole field'}", loc="left")
             if column == 0:
                 ax.set_ylabel("PSNR of the low-passed image, dB")
-    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    figure.suptitle(f"Table 7.1 (computed). {note}", x=0.01, ha="left", fontsize=11)
+    columns = len(found) if len(found) < 3 else 4  # what is wider than the plots would be cut off
+    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=columns)
+    title = textwrap.fill(f"Table 7.1 (computed). {note}", 60 * len(found))
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11)
     save_figure(figure, path)

@@ -391,7 +391,9 @@ def test_table_7_1_keeps_the_dissertations_order_on_both_grids(capsys):
             assert whole["one-step"] < whole["none"] < whole["frequency"]
             assert whole["spatial"] < whole["frequency"]
             assert crop["one-step"] < crop["none"] < crop["frequency"] < crop["spatial"]
-    assert read_image("t.png").is_colour
+    picture = read_image("t.png")
+    assert picture.is_colour
+    assert (picture.pixels[:, [0, -1]] == 255).all(), "words are cut off"
     assert main(["table7.1", "--pictures", "cat"]) == 2
     assert "no sample picture 'cat'" in capsys.readouterr().err
 
