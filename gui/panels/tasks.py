@@ -18,6 +18,7 @@ from gui.forms.options_form import OptionsForm, SuggestedName
 from gui.panel import Panel
 from gui.procedure_run import RunBar
 from gui.session import BenchSession
+from gui.session_news import OwnFiles
 from gui.task_run import TaskRun, Told
 from gui.widgets.building import (
     button,
@@ -377,13 +378,22 @@ class TasksPanel(Panel):
             return "films"
         if self._running == "spots" and path.suffix == ".png" and "slm" in self.session.kinds:
             return "slm"
-        return "reconstructions" if path in self._calibrations else ""
+        return "reconstructions" if path in self._calibrations or self._is_picture(path) else ""
+
+    def _is_picture(self, path: Path) -> bool:
+        """Whether a file is a reconstruction with its record."""
+        return self._running == "patterned" and path == self._out
+
+    def _hand_on(self, path: Path) -> bool:
+        """Take a result to the panel that works with it, if there is one."""
+        if panel := self._panel_for(path):
+            what = OwnFiles(result=path) if self._is_picture(path) else path
+            self.session.handed_on.emit(panel, what)
+        return bool(panel)
 
     def _open_result(self, path: Path) -> None:
         """Open a file in the panel that works with it, else as the desktop does."""
-        if panel := self._panel_for(path):
-            self.session.handed_on.emit(panel, path)
-        else:
+        if not self._hand_on(path):
             self._open(path)
 
     def _open(self, path: Path) -> None:
@@ -394,10 +404,7 @@ class TasksPanel(Panel):
             self._open(self.files[0].parent)
 
     def _use(self) -> None:
-        for path in self.files:
-            if panel := self._panel_for(path):
-                self.session.handed_on.emit(panel, path)
-                return
+        any(map(self._hand_on, self.files))  # the first that a panel works with
 
     def shutdown(self) -> None:
         """End the task."""

@@ -17,6 +17,7 @@ from gui.jobs import JobCancelledError
 from gui.panel import whole
 from gui.panels.tasks import TasksPanel
 from gui.session import BenchSession
+from gui.session_news import OwnFiles
 from instrument.files.calibration_file import save_calibration
 from instrument.files.images import write_image
 from instrument.reconstruction.video_files import VideoPictures, create_output
@@ -187,6 +188,18 @@ def test_what_reconstructs_recordings_can_be_asked_for(
     )
     assert panel.objects() is not None, panel._note.text()
     assert "carry_out" in panel.as_python()
+
+
+def test_a_picture_in_patterned_light_is_opened_as_a_result(
+    qtbot: QtBot, panel: TasksPanel, tmp_path: Path
+) -> None:
+    shown(qtbot, panel, "patterned")
+    panel._out = tmp_path / "patterned.tif"
+    panel._succeeded(Done((panel._out, tmp_path / "patterned.json")))
+    handed: list[object] = []
+    panel.session.handed_on.connect(lambda *what: handed.extend(what))
+    qtbot.mouseClick(panel.use_button, Qt.MouseButton.LeftButton)
+    assert handed == ["reconstructions", OwnFiles(result=panel._out)]
 
 
 def test_a_task_waits_ends_and_keeps_what_it_can(qtbot: QtBot, panel: TasksPanel) -> None:
