@@ -26,9 +26,8 @@ DIP = 0.2
 """Dip between two points that counts as resolved (the Rayleigh criterion's)."""
 TRIALS = 3
 """Noise draws and sub-pixel positions that all must be resolved."""
-TOLD = 0.97
-"""Share of groups that the curve through groups in windows and volumes tells apart at the stated distance:
-nine in ten are promised."""
+PROMISED, NEARER, AT_NEARER = 0.9, 0.8, 0.3
+"""Share of the pairs that are told apart at the stated distance, and at ``NEARER`` of it at the most."""
 ROUNDS, DRAWS = 3, 8
 """Rounds of two points, later ones about what earlier ones found; pairs of other distances in each."""
 
@@ -142,7 +141,8 @@ class InVolumes:
     """What default volumes reach, with the noise of the tests."""
 
     along_per_um: float | None
-    """Difference in 1/z of two points along the axis of which 97 % are told apart; None: at none tried."""
+    """Difference in 1/z of two points along the axis of which 90 % are told apart, and at 0.8 of it at most
+    30 %; None: at none tried."""
     sixteen_factor: float | None
     """By how much the optics' two distances had to grow for 4 x 4 points in x and z; None: more than there is
     room for."""
@@ -251,7 +251,7 @@ def smallest_told(
     list of PointTrial
         All that were made, the last one at the separation found.
     float or None
-        The separation at which :data:`TOLD` of them are resolved.
+        The separation at which nine in ten of them are resolved, and at 0.8 of it at most three in ten.
     """
     trials: list[PointTrial] = []
     tried: list[TriedPair] = []
@@ -270,10 +270,11 @@ def smallest_told(
 
 
 def stated_px(tried: Sequence[TriedPair]) -> tuple[float | None, float | None]:
-    """Return where a logistic curve in the logarithm of the distance reaches :data:`TOLD`, along y and x.
+    """Return the distance stated by a logistic curve in the logarithm of the distance, along y and x.
 
-    Both axes share its slope. Never below the smallest distance tried; None where no pair of an axis was told
-    apart, or none beyond.
+    The middle of the distances at which it has :data:`PROMISED`, and at ``NEARER`` of which
+    :data:`AT_NEARER` at most; the nearest with the first where none has both. Both axes share its slope.
+    Never below the smallest distance tried; None where no pair of an axis was told apart, or none beyond.
     """
     from scipy.optimize import minimize  # late: importing recon stays light
 
@@ -292,7 +293,8 @@ def stated_px(tried: Sequence[TriedPair]) -> tuple[float | None, float | None]:
         )
 
     slope, *middles = minimize(misfit, np.array([np.log(20.0), 0.0, 0.0]), method="Nelder-Mead").x
-    beyond = np.log(TOLD / (1 - TOLD)) / np.exp(slope)
+    nearest, farthest = (np.log(share / (1 - share)) / np.exp(slope) for share in (PROMISED, AT_NEARER))
+    beyond = (nearest + max(farthest - np.log(NEARER), nearest)) / 2
     stated = [float(np.exp(centre + middle + beyond)) for middle in middles]
     least, most = min(one.px for one in tried), max(one.px for one in tried)
     y, x = (max(px, least) if px <= most and axis in axes else None for axis, px in enumerate(stated))

@@ -26,6 +26,7 @@ from recon.analysis.correlation import (
 from recon.analysis.gram import ConditionCurve, Direction, condition_curve
 from recon.analysis.middle import RIM_PX, Middle
 from recon.analysis.points import (
+    AT_NEARER,
     PLANES,
     AskedNoise,
     InVolumes,
@@ -48,7 +49,6 @@ from recon.analysis.resolution import (
     support_extent_px,
     voxel_grid,
 )
-from recon.analysis.told_apart import AT_NEARER
 from recon.base.brief import brief
 from recon.base.checks import require_calibration
 from recon.base.declare import option

@@ -22,12 +22,10 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from recon.analysis.points import DIP, FARTHEST, TriedPair
+from recon.analysis.points import AT_NEARER, DIP, FARTHEST, NEARER, PROMISED, TriedPair
 
 Floats = npt.NDArray[np.float64]
 
-PROMISED, NEARER, AT_NEARER = 0.9, 0.8, 0.3
-"""Share of the pairs that are told apart at the stated distance, and at ``NEARER`` of it at the most."""
 _SIGMAS = np.concatenate([np.arange(0.0, 0.6, 0.05), np.geomspace(0.6, 4.5, 20)])
 _USUAL = np.array([0.0, 0.55, np.log(0.03)])  # offset, slope, logarithm of the softness
 _ABOUT = np.array([0.08, 0.4, 0.7])  # by which they differ from camera to camera

@@ -20,8 +20,8 @@ import numpy.typing as npt
 
 from recon.analysis.correlation import lit_extent
 from recon.analysis.middle import Middle
-from recon.analysis.points import DIP, Noise, Reached, TriedPair, smallest_dip
-from recon.analysis.told_apart import NEARER, Told, stated_apart
+from recon.analysis.points import DIP, NEARER, Noise, Reached, TriedPair, smallest_dip
+from recon.analysis.told_apart import Told, stated_apart
 from recon.base import fft
 from recon.camera.refocus import at_depth
 from recon.reconstruction.reconstruct import reconstruct
