@@ -186,7 +186,7 @@ class Work:
                 if self.kind.makes_run:
                     look(runs_in(folder / "runs"), promised, kept, tally)
             elif done.code and done.code not in (-signal.SIGKILL,):
-                tally.found("failed", 1, f"{command}: exit {done.code}: {done.said[-600:]}")
+                tally.found("failed", 1, f"{command}: exit {done.code}: {done.said[-6000:]}")
                 break
             else:
                 break

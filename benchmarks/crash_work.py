@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import random
 import signal
@@ -103,6 +104,7 @@ def work(folder: Path, command: Sequence[str], promises: int, *, clock_jumps: bo
         os.chdir(folder)
         for handle, name in ((1, "out"), (2, "said")):
             os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), handle)
+        faulthandler.enable()
         (folder / "tmp").mkdir(exist_ok=True)
         tempfile.tempdir = os.environ["TMPDIR"] = str(folder / "tmp")
         promising(promises)
@@ -164,7 +166,7 @@ def jumping_clock() -> None:
 def run_in_window() -> int:
     """Open the program's own window on the bench of this folder, carry the plan out from it, and close it.
 
-    Returns what a command would: 128 and the signal that closed it, where one did.
+    Returns what a command would: 128 and the signal that closed it, where one did; 1 where the plan failed.
     """
     os.environ["QT_QPA_PLATFORM"] = "offscreen"
     from PySide6.QtCore import QSettings
@@ -187,8 +189,12 @@ def run_in_window() -> int:
 
         def _carry_out(self) -> None:
             work = self.exclusive_job("A plan", self._plan)
-            work.failed.connect(lambda text: sys.stderr.write(f"{text}\n"))
+            work.failed.connect(self._failed)
             work.ended.connect(self.close)
+
+        def _failed(self, text: str) -> None:
+            ended_by.append(1)
+            sys.stderr.write(f"{text}\n")
 
         def _plan(self, context: JobContext) -> object:
             control = RunControl()
