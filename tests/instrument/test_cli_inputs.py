@@ -210,7 +210,7 @@ stability_file: CellLog.add|video_files: VideoPictures.__init__|video_files: Vid
 video_files: VideoPictures.remove_litter|video_job: VideoJob.go_on_without|video_job: VideoJob.mark_done
 video_job: VideoJob.remove|writer: lock_run|serve: _token"""
 _REFUSED_BEFORE = """
-film: _write_zarr|result_file: _take_away_others|video: _job|video_files: create_output"""
+film: _write_zarr|result_file: _take_away_others|video: _job"""
 _NOWHERE = "__init__: main"  # the null device
 
 
