@@ -15,7 +15,15 @@ from recon.camera.points import FieldFunctions, PointImages, Points
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.point_errors import points_of, points_problem
 from recon.reconstruction.result import Reconstruction
-from recon.reconstruction.uncertainty import REPEATS, Mosaic, Replicas, Uncertainty
+from recon.reconstruction.uncertainty import (
+    REPEATS,
+    Mosaic,
+    Replicas,
+    Uncertainty,
+    _missing,
+    _power_ratio,
+    _rings,
+)
 
 
 @pytest.fixture(scope="module")
@@ -207,3 +215,11 @@ def test_a_black_picture_has_no_points() -> None:
     assert own is not None
     assert len(points_of(solve(problem), own).light) == 0
     assert points_problem(Problem.of(psf, psf, Options(prior="tv"))) is None
+
+
+def test_an_empty_picture_explains_nothing_and_nothing_is_divided_by_it() -> None:
+    dark, noise = np.zeros((32, 32)), np.random.default_rng(0).standard_normal((32, 32))
+    for seen in (noise, dark):
+        ratio, last = _power_ratio(_rings(seen), _rings(dark))
+        assert np.isfinite(ratio).all()
+        assert np.isfinite(_missing(ratio, last, dark))
