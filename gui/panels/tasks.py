@@ -34,7 +34,7 @@ from gui.widgets.building import (
     tabs,
     text_view,
 )
-from gui.widgets.orientation import orientation_of
+from gui.widgets.orientation import orientation_of, read_turned
 from gui.widgets.sweep_views import Picture
 from gui.widgets.tab_order import tab_in_order
 from gui.words import in_the_window
@@ -362,7 +362,8 @@ class TasksPanel(Panel):
     # Results -------------------------------------------------------------------------------------
     def _show(self, path: Path) -> None:
         if path.suffix in _PICTURES:
-            self._reader.ask(lambda: QImage(str(path)), self._show_picture)
+            seen = orientation_of(self.session, "results")
+            self._reader.ask(lambda: read_turned(path, seen), self._show_picture)
 
     def _show_picture(self, picture: QImage) -> None:
         self.picture.show_pixmap(QPixmap.fromImage(picture))

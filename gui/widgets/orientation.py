@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
+from PySide6.QtGui import QImage, QTransform
 from PySide6.QtWidgets import QMenu, QPushButton
 
 from gui.session import BenchSession
+from instrument.files.errors import FileError
 from instrument.files.orientation import AS_IT_IS, Kind, Orientation
+from instrument.files.reading import parse_json, read_bytes
 
 _KEPT = "orientation"
 
@@ -28,6 +32,19 @@ def orientation_of(session: BenchSession, kind: Kind) -> Orientation:
     """Return how pictures of a kind are turned."""
     kept = session.kept.of(_KEPT).get(kind)
     return usual_orientation(session, kind) if kept is None else Orientation.of(kept)
+
+
+def read_turned(path: Path, orientation: Orientation) -> QImage:
+    """Read a picture from a file; the preview of a result, beside its record, is turned as results are."""
+    picture = QImage(str(path))
+    try:
+        record = parse_json(read_bytes(path.with_suffix(".json")))
+    except (OSError, ValueError, FileError):  # there is none, or another program's
+        return picture
+    if not isinstance(record, dict) or "preview" not in record:
+        return picture
+    a, b, c, d = orientation.matrix
+    return picture.transformed(QTransform(a, c, b, d, 0, 0))
 
 
 def follow_orientation(session: BenchSession, kind: Kind, show: Callable[[Orientation], object]) -> None:

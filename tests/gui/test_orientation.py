@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PySide6.QtCore import QPoint, Qt
@@ -13,6 +15,7 @@ from gui.panel import whole
 from gui.session import BenchSession
 from gui.widgets.image_view import ImageView
 from gui.widgets.live_picture import LivePicture
+from gui.widgets.orientation import read_turned
 from instrument.files.orientation import Orientation
 
 ALL = [Orientation(quarters, mirrored) for quarters in range(4) for mirrored in (False, True)]
@@ -30,6 +33,25 @@ def test_steps_and_further_turns_agree_with_the_pixels() -> None:
             x, y = (int(part) for part in orientation.step_of(across, down))
             if 0 <= row + down < seen.shape[0] and 0 <= column + across < seen.shape[1]:
                 assert seen[row + down, column + across] == picture[1 + y, 1 + x]
+
+
+@pytest.mark.parametrize("orientation", ALL)
+def test_the_preview_of_a_result_is_turned_and_other_pictures_are_not(
+    tmp_path: Path, orientation: Orientation
+) -> None:
+    path = tmp_path / "picture.png"
+    pixels = np.arange(12, dtype=np.uint8).reshape(3, 4) * 20
+    cv2.imwrite(str(path), pixels)
+
+    def seen() -> np.ndarray:
+        image = read_turned(path, orientation)
+        return np.array(
+            [[image.pixelColor(x, y).red() for x in range(image.width())] for y in range(image.height())]
+        )
+
+    np.testing.assert_array_equal(seen(), pixels)
+    path.with_suffix(".json").write_text('{"preview": {}}')
+    np.testing.assert_array_equal(seen(), orientation.apply(pixels))
 
 
 def test_what_makes_no_sense_in_the_file_turns_nothing() -> None:
