@@ -20,6 +20,7 @@ from recon.camera.depth_likeness import likeness_range
 from recon.camera.field_registration import remembered_field
 from recon.camera.grid import FAR_UM, depth_in_words
 from recon.camera.registration import displacement, moved, register, rescaled
+from recon.camera.spot_flow import met
 from recon.camera.transformed import geometric_centre, resampled
 from recon.camera.varying_psfs import interpolation_weights
 from recon.errors import InputError
@@ -134,9 +135,9 @@ def refocus(
 ) -> Refocused:
     """Return the PSF at a depth that need not have been calibrated.
 
-    The central PSFs of the calibrated depths on both sides are scaled to ``z_um``, registered to each other,
-    and mixed by distance in 1/z (sec. 5.2); outside the calibrated range, or where the neighbours are too
-    unlike to be mixed, the nearest one is scaled.
+    The central PSFs of the calibrated depths on both sides are scaled to ``z_um`` and registered to each
+    other, their spots are moved to between them, and both are mixed by distance in 1/z (sec. 5.2); outside
+    the calibrated range, or where the neighbours are too unlike to be mixed, the nearest one is scaled.
 
     Parameters
     ----------
@@ -401,6 +402,9 @@ class _Mixture:
             parts.append((brought * np.float32(dimmed), shown[0][:, None] & shown[1]))
         if len(parts) == 1:
             return parts[0][0]
+        (first, in_first), (second, in_second) = parts
+        both = met(first, second, self.weights[1], in_first & in_second)
+        parts = [(both[0], in_first), (both[1], in_second)]
         mixed = sum(w * psf * seen for w, (psf, seen) in zip(self.weights, parts, strict=True))
         total = sum(w * seen for w, (_, seen) in zip(self.weights, parts, strict=True))
         return np.asarray(mixed / np.where(total > 0, total, 1), np.float32)

@@ -1,0 +1,37 @@
+"""Spots of two sizes become spots of the size between, not both of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.analysis.correlation import similarity
+from recon.camera.spot_flow import met
+
+ROWS, COLUMNS = np.mgrid[:96, :120]
+PLACES = np.random.default_rng(2).uniform((10, 10), (86, 110), (30, 2))
+
+
+def rings(radius: float) -> np.ndarray:
+    """Return rings (1, 96, 120) as lenslets out of focus show them, all as bright in sum."""
+    away = np.hypot(ROWS - PLACES[:, :1, None], COLUMNS - PLACES[:, 1:, None])
+    return np.float32(np.exp(-0.5 * ((away - radius) / 1.2) ** 2).sum(axis=0)[None] / radius)
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5])
+def test_light_of_two_sizes_meets_between_them(share: float) -> None:
+    small, large, true = rings(4.0), rings(6.0), rings(4.0 + 2 * share)
+    shown = np.ones(small.shape[1:], bool)
+    first, second = met(small, large, share, shown)
+    mixed = (1 - share) * small + share * large
+    moved = (1 - share) * first + share * second
+    assert 1 - similarity(moved, true) < 0.75 * (1 - similarity(mixed, true))
+    assert moved.sum() == pytest.approx(true.sum(), rel=0.02)
+
+
+def test_what_one_alone_shows_and_what_is_alike_stays() -> None:
+    small, large = rings(4.0), rings(5.0)
+    hidden = np.zeros(small.shape[1:], bool)
+    np.testing.assert_allclose(met(small, large, 0.5, hidden)[0], small, atol=1e-6)
+    for same in met(small, small, 0.3, ~hidden):
+        np.testing.assert_allclose(same, small, atol=0.02 * small.max())
