@@ -13,7 +13,7 @@ from instrument.plan import Plan
 from instrument.runs import acquire
 from instrument.runs.acquire import abilities_of, prepare, prepare_resume, settle
 from instrument.runs.run import FinishReason, RunCondition
-from instrument.runs.run_files import RunError
+from instrument.runs.run_files import SLM_IMAGES, RunError
 from tests.instrument.runs.test_runner import open_mock_bench, plan
 
 CUT = (FinishReason.ABORTED, "its program ended without finishing it")
@@ -81,12 +81,15 @@ def test_a_run_is_made_in_the_folder_named_else_in_the_bench_s_own(
         folders.append(folder)
         return Mock(path=folder, mended=())
 
-    monkeypatch.setattr(acquire, "check", lambda *_: None)
+    checked, control = Mock(), Mock()
+    monkeypatch.setattr(acquire, "check", checked)
     monkeypatch.setattr(acquire.RunWriter, "create", create)
     with open_mock_bench() as bench:
-        prepare(bench, plan(1), str(tmp_path))
+        runner = prepare(bench, plan(1), str(tmp_path), control=control)
         prepare(bench, plan(1))
         assert folders == [tmp_path, bench.config.data_folder]
+    assert checked.call_count == 2
+    control.follow.assert_called_once_with(runner)
 
 
 def test_an_slm_is_read_where_there_is_one() -> None:
@@ -104,3 +107,67 @@ def test_a_run_whose_slm_image_is_another_is_not_gone_on_with(
     with pytest.raises(RunError, match="not the image that the run began with"):
         prepare_resume(Mock(), "runs/one", found(RunCondition.CRASHED, recording=False, todo=(1,)))
     writer.close.assert_called_once_with()
+
+
+@pytest.mark.parametrize("homed", [False, True])
+def test_a_stage_says_where_it_is_when_it_is_homed(homed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = SimpleNamespace(axes=("x",), position=lambda: {"x_um": 3.0}, is_homed=homed)
+    abilities = abilities_of(MagicMock(stage=stage))
+    assert (abilities.stage_axes, abilities.stage_position) == (("x",), {"x_um": 3.0})
+    assert abilities.stage_homed == homed
+    monkeypatch.setattr(acquire, "camera_settings", lambda _: {})
+    for there, expected in ((stage, {"x_um": 3.0} if homed else {}), (None, {})):
+        bench = MagicMock(stage=there, devices={})
+        assert acquire.record_of(bench).stage == expected
+
+
+def test_a_bench_without_stage_and_lights_is_read_too() -> None:
+    abilities = abilities_of(MagicMock(stage=None, led_array=None))
+    assert (abilities.stage_axes, abilities.stage_position, abilities.stage_homed) == ((), {}, True)
+    assert (abilities.n_leds, abilities.stage_target) == (0, None)
+
+
+@pytest.mark.parametrize(
+    ("damaged", "there", "todo", "refused"),
+    [
+        ((), True, (1,), False),
+        ((), False, (), False),
+        ((), True, (), False),
+        ((), False, (1,), True),
+        ((f"{SLM_IMAGES}/a.png",), True, (), True),
+        (("other.png",), True, (1,), False),
+    ],
+)
+def test_an_slm_image_is_asked_for_where_it_is_to_be_shown(
+    damaged: tuple[str, ...], there: bool, todo: tuple[int, ...], refused: bool, tmp_path: Path
+) -> None:
+    image = tmp_path / "a.png"
+    if there:
+        image.touch()
+    findings: Any = SimpleNamespace(files=[SimpleNamespace(name=name) for name in damaged], todo=todo)
+    if refused:
+        with pytest.raises(RunError, match="not the image that the run began with"):
+            acquire._require_slm_images(findings, MagicMock(slm_images=[image]))
+    else:
+        acquire._require_slm_images(findings, MagicMock(slm_images=[image]))
+
+
+def test_what_goes_on_is_checked_from_where_it_is_with_the_camera_as_it_was(
+    writer: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = SimpleNamespace(
+        plan=MagicMock(slm_images=()), provenance={"camera": {"gain": 2}}, path="p", start={}
+    )
+    checked, restored = Mock(), Mock()
+    monkeypatch.setattr(acquire.Run, "open", lambda _: run)
+    for name, value in (("check", checked), ("restore_camera", restored), ("Runner", Mock())):
+        monkeypatch.setattr(acquire, name, value)
+    monkeypatch.setattr(acquire, "abilities_of", lambda *_: "abilities")
+    bench = Mock()
+    prepare_resume(bench, "runs/one", found(RunCondition.CRASHED, recording=False, todo=(1,)))
+    checked.assert_called_once_with(run.plan, "abilities", todo=(1,), start={})
+    restored.assert_called_once_with(bench.camera, {"gain": 2})
+    assert writer.note.call_args.kwargs["text"].endswith("a file")
+    monkeypatch.setattr(acquire.Run, "open", lambda _: SimpleNamespace(path="p", is_being_written=True))
+    with pytest.raises(RunError, match="another program is writing to this run"):
+        acquire.look("runs/one")
