@@ -149,6 +149,16 @@ def test_between_calibrated_depths_pictures_have_the_psf_of_between() -> None:
         np.testing.assert_allclose(seen.psfs[0, 0], tests.psf(z_um), atol=0.02)
 
 
+def test_pairs_of_a_field_are_seen_by_the_psf_on_the_axis_that_makes_their_light() -> None:
+    one = _calibration((80, 90))
+    places = np.array([(x, 0.0, z) for z in (40e3, 60e3) for x in (-3e3, 0.0, 3e3)])
+    psfs = np.concatenate([np.roll(one.psfs, int(x // 1e3), axis=-1) for x, _, _ in places])
+    field = replace(one, psfs=psfs, source_positions_um=places)
+    tests = two_points._Tests(Middle.of(field, 60e3, 2e-6), 60e3, Noise(), 0)
+    np.testing.assert_array_equal(tests.calibration.source_positions_um, [(0, 0, 40e3), (0, 0, 60e3)])
+    np.testing.assert_array_equal(tests.calibration.psfs, np.stack([one.psfs[0]] * 2))
+
+
 def test_depths_of_the_middle_are_spread_as_its_extent_is_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = _calibration((160, 180))
     step = axial_resolution(whole.psfs[0, 0], 50e3, 5e3).step_per_um
