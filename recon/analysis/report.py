@@ -439,7 +439,7 @@ def _conditions(z_um: float, noise: Noise, source: str, found: Reached) -> list[
         "Two points and depth of field, picture: as the default reconstruction has them, alone in the dark, "
         f"equally bright, at {z_um / 1e3:.3g} mm, the brightest pixel at {noise.electrons:.5g} electrons, "
         f"read noise {noise.read_e:.3g} ({source}); a dip of 20 % at nine in ten places between pixels, and "
-        "at 0.8 of the distance at three in ten at most. More in a scene costs resolution."
+        "at 0.8 of the distance at three in ten at most by these pairs. More in a scene costs resolution."
     ]
     for axis, shares in zip("yx", found.shares, strict=True):
         if shares is not None and shares[1] > AT_NEARER:
