@@ -314,7 +314,7 @@ def at_depth(calibration: Calibration, z_um: float) -> tuple[Calibration, Refocu
     if not z_um > 0:
         raise InputError(f"The scene's distance must be above 0 mm, not {asked}.")
     z = calibration.source_positions_um[:, 2]
-    as_it_is = "Leave the distance (z_um, --z-mm) out to take the PSF as it is, or give a calibration"
+    as_it_is = "Leave the distance (--z-mm) out to take the PSF as it is, or give a calibration"
     if not (z > 0).all():
         raise InputError(
             f"The depths of the calibration's PSFs are not known, so they cannot be brought to {asked}. "
