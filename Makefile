@@ -1,6 +1,7 @@
 # Two commands on a fresh machine: `make demo` and `make test`. Both make their own virtual environment.
 PYTHON ?= python3
 VENV ?= .venv
+WORKERS ?= 2
 BIN := $(VENV)/bin
 PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
@@ -37,8 +38,8 @@ docs: $(STAMP) ## the site of all documentation, with search, gallery and refere
 
 test: lint types tests ## every check and every test
 
-tests: $(STAMP) ## the tests alone
-	$(BIN)/python -m pytest -n 2 --dist worksteal --durations=40
+tests: $(STAMP) ## the tests alone, in WORKERS=2 processes of up to 2 GB
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --durations=40
 
 mutants: $(STAMP) ## change the program a little again and again, and see whether a test notices (half an hour)
 	$(BIN)/python -m tests.mutants

@@ -32,7 +32,7 @@ MockDevice._call = call
 """
 RUN = SETUP + "from instrument.cli import main\nsys.exit(main(['run', 'plan.toml']))\n"
 BENCH = "".join(f'[{kind}]\ndriver = "mock"\n' for kind in ("camera", "stage", "led_array"))
-PLAN = 'label = "long"\n[[parts]]\nlabel = "a"\nlight = "source"\nrepeats = 100000\n'
+PLAN = 'label = "long"\n[[parts]]\nlabel = "a"\nlight = "source"\nrepeats = 5000\n'
 
 
 @pytest.fixture
