@@ -25,6 +25,8 @@ _NARROW = 3.0
 """Times the least value up to which an axis is linear, whatever it should be."""
 _PANEL, _LEFT, _NAME_GAP = 4.9, 0.75, 0.22
 """Inches: of a panel, of its scale and words at the left, from it to the names at its right."""
+_MARK = 2.2
+"""Beside the title, inches: SIMULATED and what is free about it."""
 _LINE_HEIGHT = 0.068
 """Of a name, in the height of a panel."""
 
@@ -43,8 +45,10 @@ def chart_figure(data: ChartData) -> Figure:
             draw_chart(axes, own, cost, score, colours)
             axes.set_title(group, fontsize=11, loc="left", color=INK)
     top = 1 - 0.6 / figure.get_figheight()
-    _make_room(figure, grid, top)
-    figure.text(0.02, (top + 1) / 2, title_of(data), fontsize=13, color=INK, weight="bold", va="center")
+    title = figure.text(
+        0.02, (top + 1) / 2, title_of(data), fontsize=13, color=INK, weight="bold", va="center"
+    )
+    _make_room(figure, grid, top, title.get_window_extent().width / figure.dpi + _MARK)
     most = max(len({p.setting for p in data.points if p.group == group}) for group in groups)
     grey = "; grey: the other settings, by name in chart.html" if most > MOST_LINES else ""
     note = f"black: nothing is both cheaper and better; bold: on it, with its score and cost there{grey}"
@@ -54,8 +58,11 @@ def chart_figure(data: ChartData) -> Figure:
     return figure
 
 
-def _make_room(figure: Figure, grid: npt.NDArray[np.object_], top: float) -> None:
-    """Place the panels, each as wide as another, with room for the longest name beside each column."""
+def _make_room(figure: Figure, grid: npt.NDArray[np.object_], top: float, least: float) -> None:
+    """Place the panels, each as wide as another, with room for the longest name beside each column.
+
+    The figure becomes ``least`` inches wide or more.
+    """
     from matplotlib.text import Text
 
     height = figure.get_figheight()
@@ -64,7 +71,7 @@ def _make_room(figure: Figure, grid: npt.NDArray[np.object_], top: float) -> Non
         for column in grid.T
     ]
     lefts = np.cumsum([_LEFT, *(_PANEL + _NAME_GAP + name + _LEFT for name in names)])
-    width = float(lefts[-1]) - _LEFT / 2
+    width = max(float(lefts[-1]) - _LEFT / 2, least)
     figure.set_figwidth(width)
     figure.subplots_adjust(
         hspace=0.3, top=top - 0.5 / height, bottom=0.6 / height, left=0.0, right=1.0, wspace=0.0

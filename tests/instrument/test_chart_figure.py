@@ -89,3 +89,12 @@ def test_long_names_are_cut_by_no_edge_and_no_panel() -> None:
     ends = [max(Text.get_window_extent(text).x1 for text in axes.texts) for axes in (left, right)]
     assert ends[0] < right.get_tightbbox(for_layout_only=True).x0  # type: ignore[union-attr]
     assert ends[1] < figure.bbox.x1
+
+
+def test_a_long_title_ends_before_the_mark_of_what_is_simulated() -> None:
+    about = {"simulated": True, "scene": "the photograph of the demo", "pixels": (270, 320)}
+    points = tuple(replace(p, setting=p.setting[-2:], peak_mib=float("nan")) for p in _points(4))
+    figure = chart_figure(ChartData("reconstruction", about, points, {}, ()))
+    title = next(text for text in figure.texts if text.get_text().endswith("pixels"))
+    mark = next(text for text in figure.texts if text.get_text() == "SIMULATED")
+    assert title.get_window_extent().x1 < mark.get_window_extent().x0 - 10
