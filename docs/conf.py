@@ -23,6 +23,7 @@ html_static_path: list[str] = []
 autodoc_typehints = "none"
 autodoc_class_signature = "separated"
 napoleon_google_docstring = False
+napoleon_use_ivar = True  # what is listed under Attributes may have a docstring of its own
 suppress_warnings = [
     "myst.xref_missing",  # to files of the repository beside this folder, which a reader on GitHub follows
     "misc.highlighting_failure",
@@ -98,8 +99,8 @@ def on_source(app: Any, docname: str, source: list[str]) -> None:
     if docname.startswith("tutorials/"):
         folder = Path(app.srcdir)
         source[0] = with_outputs(source[0], folder / f"{docname}.ipynb", folder / "_tutorials")
-    if docname == root_doc:
-        source[0] += contents()
+    if docname == root_doc:  # a site shows no folder
+        source[0] = source[0].replace("](decisions/)", "](decisions/0001-dependencies.md)") + contents()
     if docname == "reference/python":
         source[0] = source[0].replace("<!-- names -->", names())
 

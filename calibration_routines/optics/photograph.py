@@ -130,8 +130,10 @@ def photograph(
     control : RunControl, optional
         To pause, abort or stop the run from another thread.
 
-    Raises as :func:`instrument.runs.acquire.acquire`, and CalibrationError when the run was ended before its
-    last frame.
+    Raises
+    ------
+    CalibrationError
+        When the run was ended before its last frame; others as :func:`instrument.runs.acquire.acquire`.
     """
     control, listener = control or RunControl(), listener or Listener()
     if exposure_ms is None:

@@ -78,7 +78,10 @@ def bench(config: BenchConfig | Path | str | None = None, *, ask: Ask | None = N
     ask : callable, optional
         Asks whoever stands at the bench to do something by hand.
 
-    Raises ConfigError, FileError or DeviceError as :func:`~instrument.bench.bench.open_bench`.
+    Raises
+    ------
+    ConfigError, FileError, DeviceError
+        As :func:`~instrument.bench.bench.open_bench`.
     """
     return open_bench(bench_config(config), ask=ask)
 
