@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
-from PySide6.QtGui import QColor, QTransform
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QColor, QPen, QTransform
 from PySide6.QtWidgets import QGraphicsItem, QGraphicsRectItem, QGraphicsSimpleTextItem, QWidget
 
 from gui.theme import colours, contrast, luminance
@@ -23,6 +24,8 @@ _SPAN = 1.0
 """The colours reach from a tenth of the severity at the boundary to ten times of it."""
 _STRENGTH = 0.75
 """Of the colours: figures are read on them."""
+_PATCH_ALPHA = 190
+"""Of a figure's ground over the boundaries, out of 255: they are seen through it, dimly."""
 
 
 class StabilityView(QWidget):
@@ -117,12 +120,18 @@ class StabilityView(QWidget):
         for (iy, ix), error in np.ndenumerate(errors):
             if np.isfinite(error):
                 ground = "#{:02x}{:02x}{:02x}".format(*cells[iy, ix])
-                text = QGraphicsSimpleTextItem(f"{error:.2g}", figures)
+                patch = QGraphicsRectItem(figures)  # dims boundaries under the figure
+                text = QGraphicsSimpleTextItem(f"{error:.2g}", patch)
                 text.setBrush(QColor(max((colours().window, colours().text), key=partial(contrast, ground))))
-                text.setFlag(QGraphicsItem.GraphicsItemFlag.ItemIgnoresTransformations)
                 size = text.boundingRect()
-                text.setTransform(QTransform.fromTranslate(-size.width() / 2, -size.height() / 2))
-                text.setPos(ix, iy)
+                patch.setRect(size)
+                patch.setPen(QPen(Qt.PenStyle.NoPen))
+                shade = QColor(ground)
+                shade.setAlpha(_PATCH_ALPHA)
+                patch.setBrush(shade)
+                patch.setFlag(QGraphicsItem.GraphicsItemFlag.ItemIgnoresTransformations)
+                patch.setTransform(QTransform.fromTranslate(-size.width() / 2, -size.height() / 2))
+                patch.setPos(ix, iy)
         figures.setZValue(2)  # above the boundaries
         self.plot.addItem(figures, ignoreBounds=True)
 

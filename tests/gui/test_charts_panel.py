@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QApplication
+from PySide6.QtWidgets import QApplication, QGraphicsSimpleTextItem
 from pytestqt.qtbot import QtBot
 
 from gui.panel import whole
@@ -94,6 +94,22 @@ def test_boundaries_colours_and_words_are_those_of_the_file(
     assert view.describe(3, 0) == ""
     view.method.setCurrentText("fista")
     assert len(np.unique(view.image.image.reshape(-1, 3), axis=0)) == 1
+
+
+def test_figures_stand_on_their_cells_colour_above_the_boundaries(
+    qtbot: QtBot, panel: ChartsPanel, tmp_path: Path
+) -> None:
+    panel.open(made(tmp_path))
+    view = panel.stability
+    qtbot.waitUntil(lambda: view.map.currentText() == "Planted", timeout=WAIT_MS)
+    texts = [i for i in view.plot.scene().items() if isinstance(i, QGraphicsSimpleTextItem)]
+    assert len(texts) == 5
+    for text in texts:
+        patch = text.parentItem()
+        cell = view.image.image[round(patch.pos().y()), round(patch.pos().x())]
+        assert patch.brush().color().getRgb()[:3] == tuple(cell)
+        assert patch.rect().contains(text.boundingRect())
+        assert patch.parentItem().zValue() > 0, "lines and ends are at 0"
 
 
 def test_cells_by_arrow_keys(qtbot: QtBot, panel: ChartsPanel) -> None:
