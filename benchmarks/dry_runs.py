@@ -1,0 +1,95 @@
+"""What ``calibrate ... --dry-run`` tells of the time, held against what the routine then takes.
+
+    python benchmarks/dry_runs.py [--only axial angular beads stage]
+
+Each on the preset ``tiny`` in real time, told and then taken in two processes, in a folder of its own without
+what other runs took. The time that the program takes to start is in neither: taken is what goes by from its
+first words on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+BENCH = """
+camera.driver = "simulated"
+stage.driver = "simulated"
+led_array.driver = "simulated"
+source.rgb = [0, 255, 0]
+scene.control = "simulated"
+[simulated]
+preset = "tiny"
+"""
+BEADS = 'scene = "beads"\nbeads = 20\n'
+ROUTINES = {
+    "axial": "--z-min 60 --z-max 150 --planes 6",
+    "angular": "",
+    "stage": "",
+    "beads": "--binning 4",
+}
+TYPED = "import sys; from instrument.cli import main; sys.exit(main(sys.argv[1:]))"
+
+
+def carried_out(routine: str, words: list[str], folder: Path) -> tuple[float, str]:
+    """Return the seconds by the clock that a routine took, from its first words on, and what it said."""
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "PYTHONUNBUFFERED": "1",
+        "XDG_CACHE_HOME": str(folder / "cache"),
+    }
+    said, began_s = [], 0.0
+    with subprocess.Popen(
+        [sys.executable, "-c", TYPED, "calibrate", routine, *words],
+        cwd=folder,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as process:
+        for line in process.stdout or ():
+            began_s = began_s or time.monotonic()
+            said.append(line)
+    if process.returncode:
+        raise SystemExit(f"calibrate {routine} ended with {process.returncode}:\n{''.join(said)}")
+    return time.monotonic() - began_s, "".join(said)
+
+
+def told_by(said: str) -> str:
+    """Return the sentence with the time."""
+    found = re.search(r"^(In all, |Up to the end of ).*", said, re.MULTILINE)
+    return found[0] if found else "nothing"
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--only", nargs="+", choices=list(ROUTINES), default=list(ROUTINES))
+    asked = parser.parse_args()
+    print("| `calibrate` | told | took, s | load |\n|---|---|---|---|", flush=True)
+    for routine in asked.only:
+        with tempfile.TemporaryDirectory() as made:
+            folder = Path(made)
+            (folder / "bench.toml").write_text(BENCH + (BEADS if routine == "beads" else ""))
+            words = ROUTINES[routine].split()
+            before = os.getloadavg()[0]
+            _, said = carried_out(routine, [*words, "--dry-run"], folder)
+            took_s, _ = carried_out(routine, words, folder)
+            print(
+                f"| {' '.join((f'`{routine}`', *words))} | {told_by(said)} | {took_s:.1f} | "
+                f"{before:.0f} to {os.getloadavg()[0]:.0f} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
