@@ -3,7 +3,8 @@
 Scaled to one depth (Kuo 2020, Eq. 5.2) the patterns lie on one another, but the spots of which they are made
 are not of one size: what a lenslet has out of focus grows with the distance from its focus, not with the
 pattern. Their mean shows every spot twice. Here the displacement from one to the other is found pixel by
-pixel, and both are moved their share of the way.
+pixel, and both are moved their share of the way. Where that leaves them far less alike than they were, no
+light was followed (depths too far apart, caustics that are no spots): then they stay.
 """
 
 from __future__ import annotations
@@ -17,12 +18,17 @@ Floats = npt.NDArray[np.float32]
 
 FINE_PX, MOST_PX = 700, 1400
 """Longer sides of images that are looked at on half pixels, and of the largest that are looked at."""
+MOST_LOST = 2.0
+"""What two patterns may lack of likeness after they were moved, relative to before: beyond that none of 57
+pairs by wave optics gained by it, and some lost much (docs/decisions/0254)."""
 _WINDOW_PX, _LEVELS, _ROUNDS, _POLYNOMIAL_PX, _DEVIATION_PX = 7, 3, 3, 5, 1.1
 _BRIGHT = 0.999
 
 
 def met(first: Floats, second: Floats, share: float, shown: npt.NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """Return two patterns (n_channels, height, width), both with their light moved to between them.
+
+    As they are where that leaves them less alike by more than :data:`MOST_LOST`.
 
     Parameters
     ----------
@@ -35,7 +41,14 @@ def met(first: Floats, second: Floats, share: float, shown: npt.NDArray[np.bool_
     flow = _displacement(first.mean(axis=0) * shown, second.mean(axis=0) * shown)
     flow[~shown] = 0
     spread = np.gradient(flow[..., 0], axis=1) + np.gradient(flow[..., 1], axis=0)
-    return _moved(first, flow, spread, -share), _moved(second, flow, spread, 1 - share)
+    both = _moved(first, flow, spread, -share), _moved(second, flow, spread, 1 - share)
+    lost, before = 1 - _likeness(*both, shown), 1 - _likeness(first, second, shown)
+    return both if lost <= MOST_LOST * before else (first, second)
+
+
+def _likeness(first: Floats, second: Floats, shown: npt.NDArray[np.bool_]) -> float:
+    a, b = (image[:, shown].ravel() for image in (first, second))
+    return float(a @ b) / max(float(np.linalg.norm(a)) * float(np.linalg.norm(b)), 1e-30)
 
 
 def _displacement(first: Floats, second: Floats) -> Floats:

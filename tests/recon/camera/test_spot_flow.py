@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from recon.analysis.correlation import similarity
 from recon.camera.spot_flow import met
@@ -35,3 +36,16 @@ def test_what_one_alone_shows_and_what_is_alike_stays() -> None:
     np.testing.assert_allclose(met(small, large, 0.5, hidden)[0], small, atol=1e-6)
     for same in met(small, small, 0.3, ~hidden):
         np.testing.assert_allclose(same, small, atol=0.02 * small.max())
+
+
+def test_patterns_in_which_no_light_can_be_followed_stay() -> None:
+    """Alike but for fine structure of their own, which leads the flow astray."""
+    rng = np.random.default_rng(3)
+    smooth = np.hypot(ROWS - 48, COLUMNS - 60) < 40
+    own = [gaussian_filter(rng.normal(0, 1, smooth.shape), 1.5) for _ in range(2)]
+    first, second = (np.float32(smooth * (1 + fine))[None] for fine in own)
+    shown = np.ones(smooth.shape, bool)
+    assert similarity(first, second) > 0.9
+    assert all(
+        np.array_equal(*pair) for pair in zip(met(first, second, 0.5, shown), (first, second), strict=True)
+    )
