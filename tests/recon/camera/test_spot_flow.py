@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, shift
 
 from recon.analysis.correlation import similarity
+from recon.camera.registration import displacement, rescaled
 from recon.camera.spot_flow import met
+from recon.errors import InputError
+from recon.evaluation.measured_sets import measured_set
 
 ROWS, COLUMNS = np.mgrid[:96, :120]
 PLACES = np.random.default_rng(2).uniform((10, 10), (86, 110), (30, 2))
@@ -49,3 +52,32 @@ def test_patterns_in_which_no_light_can_be_followed_stay() -> None:
     assert all(
         np.array_equal(*pair) for pair in zip(met(first, second, 0.5, shown), (first, second), strict=True)
     )
+
+
+@pytest.mark.parametrize("depth", [8, 16, 32])
+def test_measured_patterns_of_depths_left_out_lose_nothing(depth: int) -> None:
+    """Planes four apart on both sides, each put onto the measured one between them."""
+    try:
+        psfs = measured_set("usaf")[0]
+    except InputError as absent:
+        pytest.skip(str(absent))
+    middle = psfs[depth]
+
+    def put_onto_it(psf: np.ndarray) -> np.ndarray:
+        put = []
+        for scale in np.linspace(0.97, 1.03, 7):
+            brought = rescaled(psf, float(scale))
+            put.append(shift(brought, [-v for v in displacement(brought, middle)]))
+        return np.asarray(max(put, key=lambda one: alike(one, middle)), np.float32)
+
+    both = [put_onto_it(psfs[depth + step])[None] for step in (-4, 4)]
+    moved = met(both[0], both[1], 0.5, np.ones(middle.shape, bool))
+    inner = np.s_[20:-20, 20:-20]
+    mixed, now = (alike(sum(pair)[0][inner], middle[inner]) for pair in (both, moved))
+    print(f"{mixed:.4f} mixed, {now:.4f} moved")
+    assert now > mixed - 5e-4
+    assert now > 0.96
+
+
+def alike(found: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.corrcoef(found.ravel(), truth.ravel())[0, 1])
