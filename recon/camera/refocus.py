@@ -137,7 +137,8 @@ def refocus(
 
     The central PSFs of the calibrated depths on both sides are scaled to ``z_um`` and registered to each
     other, their spots are moved to between them where they can be followed, and both are mixed by distance
-    in 1/z (sec. 5.2); outside the calibrated range, or where the neighbours are too unlike to be mixed, the nearest one is scaled.
+    in 1/z (sec. 5.2); outside the calibrated range, or where the neighbours are too unlike to be mixed, the
+    nearest one is scaled.
 
     Parameters
     ----------
