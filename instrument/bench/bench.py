@@ -25,7 +25,14 @@ from instrument.bench.camera_settings import apply_table
 from instrument.bench.config import BenchConfig, CameraTable, DeviceConfig, Kind, SlmTable, StageTable
 from instrument.bench.config_file import load_config
 from instrument.bench.photograph import Progress, Snapshot, photograph
-from instrument.bench.safety import ClosingAtExit, SafeStep, StepsFailedError, safe_steps, try_all
+from instrument.bench.safety import (
+    ClosingAtExit,
+    SafeStep,
+    StepsFailedError,
+    note_failures,
+    safe_steps,
+    try_all,
+)
 from instrument.bench.source_and_scene import Ask, Lights, Position, SceneSwitch, SourceMount, known_geometry
 from instrument.files.errors import BenchError
 from recon.types import Geometry
@@ -407,9 +414,7 @@ class Bench:
         try:
             self.close()
         except StepsFailedError as failure:
-            if str(failure) not in getattr(error, "__notes__", ()):  # how a run ended says the same
-                _log.error("%s", failure)
-                error.add_note(str(failure))
+            note_failures(error, failure)
 
     def __enter__(self) -> Self:
         return self

@@ -110,8 +110,25 @@ class StepsFailedError(BenchError):
 
     def __init__(self, failures: Iterable[tuple[str, BaseException]]) -> None:
         self.failures = tuple(failures)
-        listed = "".join(f"\n  {step}: {_without_its_name(step, error)}" for step, error in self.failures)
+        listed = "".join(f"\n{_line(step, error)}" for step, error in self.failures)
         super().__init__(f"The bench may not be safe. Check by eye what could not be done:{listed}")
+
+
+def note_failures(error: BaseException, failure: BaseException) -> None:
+    """Note on an error what failed on its way out, less what it or its notes say already."""
+    if isinstance(failure, StepsFailedError):
+        told = "\n".join([str(error), *getattr(error, "__notes__", ())])
+        new = [(step, why) for step, why in failure.failures if _line(step, why) not in told]
+        new = [(step, why) for step, why in new if str(why) != str(error)]
+        if new:
+            error.add_note(str(StepsFailedError(new)))
+    elif str(failure) not in (str(error), *getattr(error, "__notes__", ())):
+        error.add_note(str(failure))
+
+
+def _line(step: str, error: BaseException) -> str:
+    """Return a failed step's line in the words of all that failed."""
+    return f"  {step}: {_without_its_name(step, error)}"
 
 
 def _without_its_name(step: str, error: BaseException) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -11,7 +10,7 @@ from types import FrameType
 from typing import Any
 
 from instrument.bench.bench import Bench
-from instrument.bench.safety import StepsFailedError, try_all
+from instrument.bench.safety import StepsFailedError, note_failures, try_all
 from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_files import LOG, RunError
 from instrument.runs.writer import RunWriter
@@ -97,9 +96,6 @@ def interrupts_held() -> Iterator[Held]:
             signal.signal(number, handler)
 
 
-_log = logging.getLogger(__name__)
-
-
 def end_run(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseException | None) -> Run:
     """Make the bench safe (light off, motion stopped), then finish the run: both tried whatever happens.
 
@@ -140,12 +136,11 @@ def _end(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseExcep
         first, *others = (problem for _, problem in failure.failures)
         if error is None:
             for other in others:
-                first.add_note(str(other))
+                note_failures(first, other)
             first.add_note(_where(writer))
             raise first from None
         for problem in (first, *others):
-            _log.error("%s", problem)
-            error.add_note(str(problem))
+            note_failures(error, problem)
     if error is not None:
         error.add_note(_where(writer))
     if ended:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from instrument.bench.bench import Bench
-from instrument.bench.safety import StepsFailedError, stop_until
+from instrument.bench.safety import StepsFailedError, note_failures, stop_until
 from instrument.files.errors import BenchError
 from instrument.runs.run import FinishReason
 from instrument.runs.runner import Runner
@@ -101,7 +101,7 @@ class RunControl:
             try:
                 bench.stop()
             except StepsFailedError as failure:
-                error.add_note(str(failure))
+                note_failures(error, failure)
             raise
         finally:
             with self._condition:

@@ -15,8 +15,9 @@ from drivers.sequence import SequenceLimits
 from instrument.bench import bench as bench_module
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
-from instrument.bench.safety import StepsFailedError, stop_until, try_all
+from instrument.bench.safety import StepsFailedError, note_failures, stop_until, try_all
 from instrument.files.errors import BenchError, OperatorNeededError
+from instrument.runs.run_control import RunControl
 from tests.mocks.devices import MockCamera, MockDevice, MockLedArray, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")
@@ -115,6 +116,23 @@ def test_an_error_inside_the_context_stays_the_error_and_carries_what_could_not_
         raise ZeroDivisionError
     assert calls(bench)[len(KINDS) :] == SAFE_STEPS + CLOSING
     assert "light off, led_array (mock)" in "".join(caught.value.__notes__)
+
+
+def test_what_fails_twice_on_the_way_out_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    bench = bench_with({"led_array": ["off", "close"]}).open()
+    with pytest.raises(ZeroDivisionError) as caught, bench, RunControl().procedure(bench):
+        raise ZeroDivisionError("by zero")
+    told = "\n".join(caught.value.__notes__)
+    assert [told.count(words) for words in ("light off, led_array", "close led_array")] == [1, 1]
+    assert not caplog.messages
+
+    note_failures(caught.value, DeviceError("stage", "was unplugged."))
+    said = [*caught.value.__notes__]
+    assert said[-1] == "stage: was unplugged."
+    for again in (DeviceError("stage", "was unplugged."), ValueError("by zero")):
+        note_failures(caught.value, again)
+        note_failures(caught.value, StepsFailedError([("close stage", ValueError("by zero"))]))
+    assert caught.value.__notes__ == said
 
 
 @pytest.mark.parametrize(
