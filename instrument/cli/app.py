@@ -59,9 +59,12 @@ class RunFolder:
     )
 
     def check(self) -> None:
-        """Refuse a page that cannot be written, before anything moves."""
+        """Refuse a page that cannot be written, and a folder within another run, before anything moves."""
         from instrument.files.figures import check_figure
+        from instrument.runs.run_files import refuse_within
 
+        if self.out is not None:
+            refuse_within(self.out)
         if self.figure is not None:
             check_figure(self.figure, overwrite=None)
 

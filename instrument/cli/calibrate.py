@@ -54,6 +54,7 @@ from instrument.runs.acquire import abilities_of, free_bytes
 from instrument.runs.rehearsal import rehearsed
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
+from instrument.runs.run_files import refuse_within
 from instrument.runs.runner import RunState, RunStatus
 from instrument.tasks.task import Given
 from recon.base.declare import options_of
@@ -180,6 +181,8 @@ def carry_out(
     routine: Routine, options: Any, bench: Path | None, folder: Path | None = None, *, dry_run: bool = False
 ) -> None:
     """Say what a routine will do and why, then do it and say how good it is; a dry run ends before that."""
+    if folder is not None:
+        refuse_within(folder)
     console = Console()
     procedure = routine.procedure(options)
     with open_and_say(_config_for(routine, bench)) as opened:

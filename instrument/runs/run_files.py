@@ -211,3 +211,18 @@ def refuse_own_files(path: Path) -> None:
                     f"is a {kind}, and {own} is part of it; no output replaces it.",
                     "Choose another name.",
                 )
+
+
+def refuse_within(folder: Path) -> None:
+    """Refuse to keep a run within another, however deep: who lists the runs would not find it there.
+
+    Raises RunError naming the folder that it may go to instead.
+    """
+    for place in (folder.resolve(), *folder.resolve().parents):
+        if is_run(place) and (place / LOG).is_file():
+            where = "is a run" if place == folder.resolve() else f"is within the run {place.name}"
+            raise RunError(
+                folder,
+                f"{where}; no other run is kept there.",
+                f"Name the folder that runs are in, e.g. {place.parent}",
+            )

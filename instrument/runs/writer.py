@@ -53,6 +53,7 @@ from instrument.runs.run_files import (
     RunError,
     copies_of,
     log_size,
+    refuse_within,
     slm_image_name,
 )
 
@@ -186,9 +187,10 @@ class RunWriter:
 
         The folder appears under its name only when it is whole.
 
-        Raises RunError when the folder cannot be written to.
+        Raises RunError when the folder cannot be written to, or is within another run.
         """
         parent = Path(parent)
+        refuse_within(parent)
         with _disk(parent, "no run can be kept there"):
             parent.mkdir(parents=True, exist_ok=True)
             path = free_name(parent, dated_name(label))

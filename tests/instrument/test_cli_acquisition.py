@@ -13,6 +13,7 @@ from instrument.plan import Plan
 from instrument.plan.model import load_plan, plan_toml, save_plan
 from instrument.runs.inspection import verify
 from instrument.runs.run import FinishReason, Run, RunCondition
+from instrument.runs.run_files import RunError, refuse_within
 from instrument.runs.writer import RunWriter
 from tests.mocks.devices import MockCamera, MockStage
 
@@ -280,6 +281,16 @@ def test_no_output_is_written_to_a_runs_own_files(here: Path, capsys: pytest.Cap
     for name in ("log.jsonl", "state.json", "frames.ome.zarr/c/0/0/0", "kept/a.tif", "slm"):
         assert main(["snap", "--dark", "--force", "--out", str(run.path / name)]) == 2
         assert "is part of it; no output replaces it" in capsys.readouterr().err
+    beside = {path.name for path in run.path.iterdir()}
+    for words, place in (("is a run", run.path), (f"is within the run {run.path.name}", run.path / "a/b")):
+        for command in (["run", "plan.toml"], ["record"], ["calibrate", "axial", "--z-min", "20"]):
+            assert main([*command, "--out", str(place)]) == 2
+            said = capsys.readouterr().err
+            assert f"{words}; no other run is kept there" in said
+            assert "Bench:" not in said  # refused before anything is opened
+        with pytest.raises(RunError, match=words):
+            refuse_within(place)
+    assert {path.name for path in run.path.iterdir()} == beside
     assert verify(Run.open(run.path)).is_sound
     assert main(["snap", "--dark", "--out", str(run.path / "beside.tif")]) == 0
     (calibration := here / "calibration").mkdir()
