@@ -169,11 +169,14 @@ def run_in_window() -> int:
     Returns what a command would: 128 and the signal that closed it, where one did; 1 where the plan failed.
     """
     os.environ["QT_QPA_PLATFORM"] = "offscreen"
-    from PySide6.QtCore import QSettings
+    from instrument.cli.app import signals_wait
 
-    from gui import app
-    from gui.jobs import JobContext
-    from gui.session import BenchSession
+    with signals_wait():  # as the command has it: Qt's bindings abort a program that is interrupted in them
+        from PySide6.QtCore import QSettings
+
+        from gui import app
+        from gui.jobs import JobContext
+        from gui.session import BenchSession
     from instrument.bench.config_file import load_config
     from instrument.runs.acquire import prepare
     from instrument.runs.run_control import RunControl

@@ -54,6 +54,7 @@ def working_folder() -> Path:
 
 def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple[int, BenchConfig | None]:
     """Show the window for a bench until it is closed; returns the exit status, and which bench is next."""
+    status = 0
     apply_theme(app, theme_of(settings))  # which the window before may have changed
     session = BenchSession(config)
     sys.excepthook = _ToLog(session)
@@ -77,7 +78,8 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
     try:
         window = MainWindow(session, settings, app.primaryScreen().availableSize() - _FRAME)
         show_and_open(window)
-        status = app.exec()
+        if not session.is_closed:  # by a signal while the window was made: a loop begun after that never ends
+            status = app.exec()
         session.join()
     finally:
         gc.unfreeze()  # of this window

@@ -14,6 +14,7 @@ import pytest
 from PySide6.QtCore import QSettings, QTimer
 from PySide6.QtWidgets import QApplication
 
+from gui import app
 from gui.main_window import MainWindow
 from gui.widgets.dialogues import TextWindow
 from instrument.cli import main
@@ -102,6 +103,30 @@ def test_without_a_screen_it_says_so(
         monkeypatch.delenv(variable, raising=False)
     assert main(["gui"]) == 2
     assert "no screen" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("qapp")
+def test_ctrl_c_while_the_window_is_made_ends_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, bench_text: str
+) -> None:
+    for scope in (QSettings.Scope.UserScope, QSettings.Scope.SystemScope):
+        QSettings.setPath(QSettings.Format.NativeFormat, scope, str(tmp_path / "settings"))
+    (tmp_path / "bench.toml").write_text(bench_text)
+    show, ends = app.show_and_open, QTimer(singleShot=True, interval=20_000)
+    ends.timeout.connect(QApplication.quit)
+
+    def interrupted(window: MainWindow) -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        show(window)
+        while not window.session.is_closed:
+            QApplication.processEvents()
+        ends.start()
+        window.deleteLater()
+
+    monkeypatch.setattr(app, "show_and_open", interrupted)
+    assert main(["gui", str(tmp_path / "bench.toml")]) == 0
+    assert ends.isActive()  # nothing had to end it
 
 
 @pytest.mark.usefixtures("qapp")
