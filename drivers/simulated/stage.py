@@ -146,6 +146,7 @@ class CarriageStage(SimulatedDevice, PolledStage):
             self._began_s = time.monotonic()
             way_s = self.carriage.start({spec.name: spec.home for spec in self.carriage.axes.values()})
             self._referenced_after_s = way_s + REFERENCE_S
+            self.world.clock.skip(REFERENCE_S)
 
     def _halt(self) -> None:
         with self._lock:
