@@ -116,7 +116,7 @@ class ResumeProcedure(Procedure):
         run, routine = Run.open(self.run), routine_of(self.run)
         home_if_needed(bench, listener, run.plan)
         if routine is not None and routine.restore is not None:
-            routine.restore(run, bench)
+            routine.restore(run, bench, looked.todo[0])
         runner = prepare_resume(bench, self.run, looked, on_progress=listener.frame)
         with discarded(runner):
             listener.said(f"Found {looked}")

@@ -360,8 +360,9 @@ class Routine:
     listener."""
     finish_takes_frames: bool = False
     """Whether that needs the bench, to take the frames of further runs."""
-    restore: Callable[[Run, Bench], None] | None = None
-    """Brings back what no plan tells, before such a run takes the frames that it lacks."""
+    restore: Callable[[Run, Bench, int], None] | None = None
+    """Brings back what no plan tells, before such a run takes the frames that it lacks; takes the first step
+    of these, too."""
     watch: Callable[[Bench, Runner, Listener], None] | None = None
     """Makes the runner of such a run that goes on look at its frames as from its beginning."""
     files: FromFiles | None = None

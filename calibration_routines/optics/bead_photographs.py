@@ -356,7 +356,7 @@ class _Series:
         self.photographs.append(taken)
 
 
-def show_slide_again(run: Run, bench: Bench) -> None:
+def show_slide_again(run: Run, bench: Bench, _first: int) -> None:
     """Have the slide before the camera that the first frames of a run saw."""
     record = BEADS.read(run.path)
     if (changer := _slide_changer(bench)) is not None:

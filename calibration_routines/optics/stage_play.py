@@ -242,6 +242,16 @@ def stage_plan(record: StageRecord, asked: StageCheck, exposure_ms: float) -> Pl
     return Plan(label="stage check", parts=tuple(parts))
 
 
+def _come_again(run: Run, bench: Bench, first: int) -> None:
+    """Go where the stage was before a step, on the way that it came: homed, its axes lie otherwise."""
+    assert run.plan is not None
+    assert bench.stage is not None
+    places = [dict(step.stage) for step in run.plan.steps() if step.index < first and step.stage]
+    ways = [place for number, place in enumerate(places) if number == 0 or place != places[number - 1]]
+    for place in (*ways[:1], *ways[-2:]):  # all axes from below; then this one as it went
+        bench.stage.move_to(place)
+
+
 def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: Listener) -> Outcome:
     """Judge the stage by a complete run; CalibrationError when the pattern or a play is not seen whole."""
     listener.step("analysing")
@@ -411,6 +421,7 @@ ROUTINES = (
         needs=("stage",),
         purpose=STAGE,
         finish=_finish,
+        restore=_come_again,
         examples=("diffuserbench calibrate stage --dry-run", "diffuserbench calibrate stage --reach-um 500"),
     ),
 )

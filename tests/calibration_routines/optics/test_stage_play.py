@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from calibration_routines.optics.stage_play import StageCheck, StageProcedure
+from calibration_routines.optics.stage_play import ROUTINES, StageCheck, StageProcedure, planned, stage_plan
 from drivers.simulated.world import SimulatedWorld
 from drivers.stage import approached
 from instrument.bench.bench import Bench, open_bench
@@ -61,6 +62,28 @@ def test_play_and_scale_of_each_axis_are_found_and_said(tmp_path: Path) -> None:
     assert done.verdict[-1].startswith("For [stage] of bench.toml: play = { x_um = 2")
     with pytest.raises(SettingsError, match="choose another place or a smaller reach"), tiny() as bench:
         StageProcedure(StageCheck(z_um=8.2e3)).outlook(bench)
+
+
+def test_a_check_that_goes_on_comes_to_its_places_from_where_it_came() -> None:
+    asked = StageCheck(turns=2, average=1)
+    with tiny(LOOSE) as bench:
+        assert bench.stage is not None
+        world = bench.shared["simulated"]
+        assert isinstance(world, SimulatedWorld)
+        plan = stage_plan(planned(bench, asked), asked, 1.0)
+        steps = [step for step in plan.steps() if step.stage]
+        bench.stage.home()
+        came = []
+        for step in steps:
+            bench.stage.move_to(step.stage)
+            came.append(world.source_position_um)
+        restore = ROUTINES[0].restore
+        assert restore is not None
+        for step, place in list(zip(steps, came, strict=True))[1:]:
+            bench.stage.home()
+            restore(Mock(plan=plan), bench, step.index)
+            bench.stage.move_to(step.stage)
+            assert world.source_position_um == pytest.approx(place, abs=10), step.label
 
 
 def there_and_back(z_um: float) -> Plan:
