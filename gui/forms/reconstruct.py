@@ -18,7 +18,7 @@ from gui.jobs import JobContext
 from gui.widgets.building import button, fill, in_row, label, scrolled, share_bar
 from instrument.files.errors import BenchError
 from instrument.reconstruction.checkpointing import checkpoint_for, require_kept, settle_checkpoint
-from instrument.reconstruction.forecast import Foretold, Like
+from instrument.reconstruction.foretold import Foretold, Like
 from instrument.reconstruction.job import Job as Prepared
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
 from instrument.reconstruction.request import (

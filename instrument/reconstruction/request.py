@@ -101,9 +101,9 @@ class _Request:
         require_two_images(problem)
         return choice_for(refined(problem)[0] if self.options.refine_psf else problem)
 
-    def forecast(self, job: Job) -> Forecast:
+    def forecast(self, job: Job, on_stage: Stage | None = None) -> Forecast:
         """Say what time and memory it will take, by its first iterations; errors as :meth:`solve`."""
-        return forecast(self._measurement(job), job.calibration, self.options)
+        return forecast(self._measurement(job), job.calibration, self.options, on_stage)
 
     def _measurement(self, job: Job) -> Measurement:
         """Return a job's photograph with what is known of it."""

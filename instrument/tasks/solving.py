@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 from instrument.files.errors import BenchError
+from instrument.files.orientation import AS_IT_IS
 from instrument.files.volumes import uneven_steps
 from instrument.reconstruction.checkpointing import checkpoint_for, settle_checkpoint
-from instrument.reconstruction.forecast import Foretold, Like
+from instrument.reconstruction.foretold import Foretold, Like
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned, solve_patterned
@@ -38,8 +39,8 @@ def reconstruct_photograph(
         with desk.step("choosing"):
             choice = request.explain(job)
         _tell_choice(desk, choice)
-        with desk.step("the first iterations"):
-            told = request.forecast(job)
+        with desk.step("the first iterations", 100) as advance:
+            told = request.forecast(job, lambda share, what: advance(round(100 * share), note=what))
         desk.fact("Will take", str(told))
         return Done()
     outputs.check(0, overwrite=output.force)
@@ -49,7 +50,10 @@ def reconstruct_photograph(
             job = request.prepare()
         planes = len(job.calibration.psfs) if is_volume else 1
         outputs.check(planes * job.measurement.size, overwrite=output.force)
-        _tell_job(desk, job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench")
+        turned = "" if is_volume else _turned(desk, output)
+        _tell_job(
+            desk, job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench{turned}"
+        )
         keeper = checkpoint_for(output.checkpoint, job, request)
         what = "volume" if is_volume else "picture"
         with desk.interruptible() as cancel, desk.step(what, 100) as advance:
@@ -123,7 +127,7 @@ def reconstruct_patterns(
             prepared = prepare_patterned(request, advance)
         job = prepared.job
         outputs.check(job.measurement.size, overwrite=output.force)
-        _tell_job(desk, job, "calibration or frames come from the simulated bench")
+        _tell_job(desk, job, f"calibration or frames come from the simulated bench{_turned(desk, output)}")
         keeper = checkpoint_for(output.checkpoint, job, request, prepared.measurement)
         with (
             desk.interruptible() as cancel,
@@ -155,6 +159,12 @@ def _tell_verdict(desk: Desk, verdict: Verdict | None) -> None:
     """Print the verdict, one sentence a line; nothing where none was asked for."""
     for index, sentence in enumerate(verdict.sentences if verdict is not None else ()):
         desk.say(f"{'Verdict' if not index else '':<12}{sentence}")
+
+
+def _turned(desk: Desk, output: OutputOptions) -> str:
+    """Say how a picture of the simulated bench stands, which turns nothing: as on the sensor."""
+    upside_down = output.rotate_deg == "0" and desk.seen("results") == AS_IT_IS
+    return ", where pictures stand upside down: --rotate 180 turns them" if upside_down else ""
 
 
 def _tell_job(desk: Desk, job: Job, simulated: str) -> None:

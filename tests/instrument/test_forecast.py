@@ -13,14 +13,15 @@ from numba.core import event
 
 from instrument.files import kept_times
 from instrument.reconstruction import forecast as module
-from instrument.reconstruction.forecast import TRIED, Forecast, Foretold, Like, _settling, _stretch, forecast
+from instrument.reconstruction.forecast import TRIED, Forecast, Trial, forecast
+from instrument.reconstruction.foretold import Foretold, Like
 from instrument.reconstruction.job import Job
 from recon import Calibration, reconstruct
 from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
-from recon.solvers.base import IterationRecord, StopReason
+from recon.solvers.base import StopReason
 
 
 @pytest.fixture(scope="module")
@@ -33,77 +34,58 @@ def scene() -> tuple[Measurement, Calibration]:
     return Measurement(photograph), Calibration(psf, np.full((1, 3), np.nan))
 
 
+def test_what_is_soon_over_is_carried_out_and_told_as_it_was() -> None:
+    made = make_scene("sparse-picture", size=64)
+    asked = ReconstructionOptions(judged=False)
+    took = len(reconstruct(made.measurement, made.calibration, asked).history)
+    told = forecast(Measurement(made.measurement), made.calibration, asked)
+    assert (told.settles, told.iterations, told.counted) == (took, took, True)
+    assert told.seconds == pytest.approx(told.beside_s + took * told.iteration_s)
+    assert told.between_s == (told.seconds, told.seconds)
+    assert f" ms an iteration, {took} of them; " in f"{told}; "
+
+
+def test_what_is_not_is_told_by_the_course_of_its_first_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "SOLVED_S", 0.0)
+    made = make_scene("beads", size=64, depths=2)
+    photograph, asked = Measurement(made.measurement), ReconstructionOptions(prior="tv", judged=False)
+    took = len(reconstruct(made.measurement, made.calibration, asked).history)
+    assert took > TRIED
+    told = forecast(photograph, made.calibration, asked)
+    assert told.settles == pytest.approx(took, rel=0.5)
+    assert not told.counted
+    least_s, most_s = told.between_s
+    assert told.beside_s < least_s < told.seconds <= most_s
+    all_of_them = forecast(photograph, made.calibration, replace(asked, tolerance=0.0, iterations=90))
+    assert (all_of_them.settles, all_of_them.counted) == (90, True)
+    until_noise = forecast(photograph, made.calibration, replace(asked, stop_at_noise=True, iterations=90))
+    assert until_noise.settles is None
+    assert str(until_noise).startswith("at most ")
+
+
 def test_a_forecast_counts_iterations_of_all_channels_and_stops_at_a_time(
     scene: tuple[Measurement, Calibration],
 ) -> None:
-    asked = ReconstructionOptions(model="convolution", iterations=50, judged=False)
+    asked = ReconstructionOptions(model="convolution", iterations=50, tolerance=0.0, judged=False)
     told = forecast(*scene, asked)
-    assert told.iterations == 50
+    assert (told.iterations, told.settles) == (50, 50)
     assert told.iteration_s > 0
-    assert told.seconds == pytest.approx(told.beside_s + 50 * told.iteration_s)
-    assert f"({TRIED} were tried)" in str(told)
-    short = Forecast(1.0, 0.1, 1000, 2.0**30, time_s=5.0)
-    assert short.seconds == 6.0
-    assert str(short) == "at most 6.0 s, 100 ms an iteration (16 were tried); 1.00 GiB of memory"
+    short = forecast(*scene, replace(asked, iterations=None, time_s=1e-4))
+    assert short.counted, "its own time ended it"
+    assert short.settles == 1
+    words = "about 16.0 s (11.0 s to 21.0 s), 100 ms an iteration, about 150 of them by the course of"
+    assert str(Forecast(1.0, 0.1, 200, 2.0**30, 150)) == f"{words} the first; 1.00 GiB of memory"
+    assert str(Forecast(1.0, 0.1, 50, float("nan"))) == "at most 6.0 s, 100 ms an iteration"
 
 
-@pytest.fixture
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No copy is given up, however busy the machine."""
-    monkeypatch.setattr(module, "COPY_S", 1e6)
-
-
-@pytest.mark.usefixtures("patient")
-def test_it_is_told_by_how_a_copy_on_blocks_settles() -> None:
-    made = make_scene("sparse-picture", size=64)
-    asked = ReconstructionOptions(judged=False)
-    told = forecast(Measurement(made.measurement), made.calibration, asked)
-    took = len(reconstruct(made.measurement, made.calibration, asked).history)
-    assert told.settles == pytest.approx(took, rel=0.4)
-    assert told.seconds == pytest.approx(told.beside_s + told.settles * told.iteration_s)
-    assert f", {told.settles} of them (by how a copy on blocks" in str(told)
-    limited = forecast(Measurement(made.measurement), made.calibration, replace(asked, tolerance=0.0))
-    assert limited.settles is None, "it takes as many as were asked for"
-
-
-@pytest.mark.usefixtures("patient")
-def test_volumes_are_told_so_too() -> None:
-    made = make_scene("beads", size=64, depths=2)
-    asked = ReconstructionOptions(model="convolution", prior="tv", judged=False)
-    told = forecast(Measurement(made.measurement), made.calibration, asked)
-    took = len(reconstruct(made.measurement, made.calibration, asked).history)
-    assert told.settles == pytest.approx(took, rel=0.25)
-
-
-def test_so_are_erased_pixels_and_varying_psfs() -> None:
-    made = make_scene("sparse-picture", size=64, grid=2, aberration=1.0)
-    photograph = Measurement(made.measurement, erasures=np.arange(64)[:, None] % 16 == np.arange(64))
-    asked = ReconstructionOptions(model="lowrank", tolerance=1e-2)
-    first = _records([1 / n for n in range(1, TRIED + 1)])
-    assert _settling(photograph, made.calibration, asked, first, 1e6) is not None
-
-
-def _records(unrest: list[float]) -> list[IterationRecord]:
-    return [IterationRecord(n, float(n), change=u) for n, u in enumerate(unrest, 1)]
-
-
-def test_a_copy_that_settles_twice_as_fast_is_stretched() -> None:
-    copy = _records([1 / n for n in range(1, 100)])
-    assert _stretch(_records([2 / n for n in range(1, TRIED + 1)]), copy) == pytest.approx(2, rel=0.02)
-    assert _stretch(copy[:TRIED], copy) == pytest.approx(1, rel=0.02)
-    from_nothing = [0.0, *(2 / n for n in range(2, TRIED + 1))]  # as volumes and varying PSFs begin
-    begun = _records([0.0, *(1 / n for n in range(2, 201))])
-    assert _stretch(_records(from_nothing), begun) == pytest.approx(2, rel=0.02)
-    assert _stretch(_records([0.0] * TRIED), begun) == 1
-    assert _stretch(_records([0.0] * TRIED), copy) == 1, "nothing can be told of an empty picture"
-
-
-def test_a_copy_is_given_up_after_its_time(scene: tuple[Measurement, Calibration]) -> None:
-    made = make_scene("sparse-picture", size=64)
-    photograph, asked = Measurement(made.measurement), ReconstructionOptions(model="convolution")
-    first = _records([1 / n for n in range(1, TRIED + 1)])
-    assert _settling(photograph, made.calibration, asked, first, 1e-6) is None
-    assert _settling(*scene, asked, first, 1e6) is None, "too small for blocks"
+def test_held_out_pixels_take_a_third_of_the_iterations_more(scene: tuple[Measurement, Calibration]) -> None:
+    asked = ReconstructionOptions(model="convolution", iterations=60, tolerance=0.0)
+    trial = Trial.of(*scene, asked, lambda *_: None)
+    assert trial.found.verdict is not None
+    held_out = replace(trial, found=replace(trial.found, verdict=replace(trial.found.verdict, held_out=1.0)))
+    runs = len(trial.found.histories)
+    more_s = held_out.beside_s(120) - held_out.beside_s(60)
+    assert more_s == pytest.approx((40 - 20) / runs * trial.iteration_s)
 
 
 def test_solvers_in_one_step_are_forecast_too(scene: tuple[Measurement, Calibration]) -> None:
