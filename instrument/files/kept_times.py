@@ -30,11 +30,15 @@ _TRANSFORMS_PER_MEGAPIXEL = {
     "Frames": (110.0, 0.0),
     "finding exposures": (48.0, 48.0),
     "photographing bead slides": (120.0, 120.0),
+    "Rehearsing all of it on a simulated bench of its own": (170.0, 170.0),
 }
 """Steps that compute light on a simulated bench: their time of the processor, in that of a picture of
 1024 x 1024 which is transformed and back; where light has to be computed first, and where it is there."""
-_DRAWING = 140.0
-"""Transforms that drawing a page takes the first time, with its library and the list of fonts."""
+_TRANSFORMS = {"drawing": 140.0, "optics": 4200.0}
+"""Transforms that steps take the first time, of any sensor: drawing a page with its library and the list of
+fonts; all optics by default options."""
+_ALONE_IN_IT = "drawing"
+"""Keeps to one thread."""
 _FEW, _TRIED_S = 50.0, 0.05
 """Transforms that are not worth a try, and seconds of the processor that it takes."""
 _ALONE = 1.2
@@ -84,8 +88,8 @@ def expected(what: str) -> Expected | None:
     except (LookupError, TypeError, ValueError):
         awaited, here = _TRANSFORMS_PER_MEGAPIXEL.get(what, (0.0, 0.0))
         transforms = (awaited if _computes_light() else here) * _simulated_megapixels
-        shared = what.casefold() != "drawing"
-        transforms = transforms if shared else _DRAWING
+        transforms = _TRANSFORMS.get(what.casefold(), transforms)
+        shared = what.casefold() != _ALONE_IN_IT
         if transforms < _FEW or not seen():
             return None
         return Expected(transforms * transform_s() * _waiting(shared=shared), "a first guess")

@@ -64,7 +64,8 @@ def optics(desk: Desk, files: OpticsFiles, options: OpticsOptions) -> Done:
         "their light a pixel at most from a bead, in its plane."
     )
     desk.say(BEADS)
-    save_figure(optics_figure(compared), files.out)
+    with desk.step("drawing"):
+        save_figure(optics_figure(compared), files.out)
     write_text(table, optics_csv(compared.found))
     return Done((files.out, table))
 

@@ -31,6 +31,8 @@ BLOCKS = 4
 """Blocks along each side of the pattern."""
 ROUNDS = 3
 """Times the blocks are measured, each time on what the last fit left."""
+PARTS = ROUNDS + 3
+"""Of comparing two PSFs: the whole of them, the rounds, their likeness as they lie, and turned about."""
 WIDER = 1.1
 """Spot that the old PSF makes of the new camera's light, over the sharpest: above this, calibrate again."""
 EDGE_PX = 0.5
@@ -167,12 +169,12 @@ def compare(
         reference = _at(old, float(depths[k]))
         done = len(changes)
 
-        def round_done(number: int, done: int = done) -> None:
+        def part_done(number: int, done: int = done) -> None:
             if on_progress is not None:
-                on_progress((done + number / ROUNDS) / len(chosen))
+                on_progress((done + number / PARTS) / len(chosen))
 
         plane = planes[k].mean(axis=0)
-        changes.append(compare_psfs(plane, reference, float(depths[k]), exposure, round_done))
+        changes.append(compare_psfs(plane, reference, float(depths[k]), exposure, part_done))
     changes, binning = _of_binned(changes, ratio)
     due, reasons = _verdict(changes, new.geometry)
     return Comparison(tuple(changes), due, (*binning, *reasons))
@@ -183,18 +185,22 @@ def compare_psfs(
     old: Array,
     z_um: float = float("nan"),
     exposure: float = 1.0,
-    on_round: Callable[[int], object] = lambda _: None,
+    on_part: Callable[[int], object] = lambda _: None,
 ) -> Change:
     """Compare two PSFs (height, width); ``exposure`` is the new one's over the old one's.
 
-    ``on_round`` gets how many of ``ROUNDS`` are done.
+    ``on_part`` gets how many of ``PARTS`` are done.
     """
     whole = register(new, old)
+    on_part(1)
     light = cut_to_light(old)
     extent = 0.5 * float(np.hypot(*light.shape))
-    factor, shift, errors = _fit(new, old, complex(whole.rows, whole.columns), on_round)
+    factor, shift, errors = _fit(new, old, complex(whole.rows, whole.columns), lambda n: on_part(1 + n))
     moved = _undone(new, factor, shift)
     correlation = correlate(old, new)
+    on_part(PARTS - 1)
+    turned = correlate(old, np.ascontiguousarray(new[::-1, ::-1]))
+    on_part(PARTS)
     return Change(
         z_um=z_um,
         rows=shift.real,
@@ -205,7 +211,7 @@ def compare_psfs(
         aligned=similarity(moved, old),
         spot=correlation.spot_px / spot_px(new),
         edge_px=abs(factor - 1) * extent,
-        decoy=correlate(old, np.ascontiguousarray(new[::-1, ::-1])).maximum,
+        decoy=turned.maximum,
         brightness=float(new.sum(dtype=np.float64) / old.sum(dtype=np.float64)) / exposure,
         place_error_px=math.inf if errors is None else errors[0],
         scale_error=math.inf if errors is None else errors[1],
