@@ -56,7 +56,7 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def __repr__(self) -> str:
         """Say which there are."""
-        return f"<{self.what}s: {', '.join(self)}>"
+        return f"<{self.what}s: {', '.join(self) or 'none beside those built in'}>"
 
     def register(self, registered: T) -> T:
         """Offer an object under its name, for the rest of the program.
