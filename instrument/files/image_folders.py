@@ -12,7 +12,10 @@ from instrument.files.errors import FileError
 
 SUFFIXES = {".tif", ".tiff", ".png", ".bmp", ".npy", ".jpg", ".jpeg"}
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
-_DEPTH = re.compile(r"(?:(?<=[a-zA-Z_=])-)?\d+(?:\.\d+)?(?= ?_?(nm|um|µm|μm|mm|cm)(?![a-zA-Z]))")
+_DEPTH = re.compile(
+    r"(?<!\de)(?<!\de-)(?:(?<=[a-zA-Z_=])-)?\d+(?:[.,p]\d+)?(?= ?_?(nm|um|µm|μm|mm|cm)(?![a-zA-Z]))"
+)
+"""A length in a name; 1.5, 1,5 and 1p5 are the same."""
 _UM = {"nm": 1e-3, "um": 1.0, "µm": 1.0, "μm": 1.0, "mm": 1e3, "cm": 1e4}
 MICRO_MANAGER = "metadata.txt"
 _MICRO_MANAGERS = (
@@ -97,7 +100,9 @@ def _natural(name: str, plain: Container[tuple[str, ...]]) -> tuple[list[tuple[i
 
 def _depth(name: str) -> float | None:
     found = list(_DEPTH.finditer(name))
-    return float(found[0][0]) * _UM[found[0][1]] if len(found) == 1 else None
+    if len(found) != 1:
+        return None
+    return float(found[0][0].replace(",", ".").replace("p", ".")) * _UM[found[0][1]]
 
 
 def _micro_managers(folder: Path, paths: Sequence[Path]) -> list[float | None]:

@@ -20,10 +20,10 @@ import tifffile
 
 from instrument.files import reading
 from instrument.files.atomic import whole_file, write_text
-from instrument.files.decoding import READABLE, decode
+from instrument.files.decoding import decode
 from instrument.files.errors import BenchError, FileError
 from instrument.files.image_folders import images_in, in_order, order_in_words
-from instrument.files.named_arrays import is_zarr, read_zarr
+from instrument.files.named_arrays import is_zarr, read_zarr, zarr_facts
 from instrument.files.ome_tiff import (
     MICROMETRES,
     MOST_PLANES,
@@ -35,8 +35,10 @@ from instrument.files.ome_tiff import (
     photograph_fields,
     resolution,
 )
+from instrument.files.pictures import ALPHA, READABLE
 from instrument.files.seen import as_seen, levels_of, png_bytes
 from instrument.files.tiff_pages import open_tiff
+from instrument.files.tiffs import files_of
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
 
@@ -204,7 +206,7 @@ def image_metadata(path: Path) -> dict[str, Any]:
 
     Empty where there are none, or the file cannot be read.
     """
-    said: dict[str, Any] = {}
+    said: dict[str, Any] = zarr_facts(path) if is_zarr(path) else {}
     try:
         if path.suffix.lower() in (".tif", ".tiff"):
             with open_tiff(path) as tiff:
@@ -257,6 +259,8 @@ def _read_folder(folder: Path, leave_out: Path | None) -> ImageFile:
         raise FileError(folder, f"holds no images ({READABLE}).", _folders_that_do(folder))
     if len(paths) == 1:  # Micro-Manager's folders may hold one file of all planes
         return read_stack(paths[0])
+    if files_of(paths[0]) == {path.name for path in paths}:  # OME-TIFF with a file an image
+        return read_stack(paths[0])
     paths, depths = in_order(folder, paths)
     first = read_image(paths[0])
     images = [first.pixels]
@@ -305,7 +309,7 @@ def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> Im
     else:
         raise FileError(path, f"holds an array of shape {array.shape}; a stack of images is expected.")
     pixels, converted = _standard_dtype(path, array)
-    told = image_metadata(path) if path.is_file() else {}
+    told = image_metadata(path) if path.is_file() or is_zarr(path) else {}
     depths = told.pop("depths_um", [])
     words: tuple[str, ...] = ()
     if len(depths) == len(pixels) > 1:
@@ -355,7 +359,7 @@ def _is_npy(path: Path) -> bool:
 
 def _drop_alpha(array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
     if array.shape[-1] in (2, 4):
-        return array[..., :-1], ("alpha channel left out",)
+        return array[..., :-1], (ALPHA,)
     return array, ()
 
 

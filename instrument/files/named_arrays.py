@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,14 @@ import numpy.typing as npt
 
 from instrument.files import matlab, reading
 from instrument.files.errors import FileError
+from instrument.files.ome_tiff import MICROMETRES, MOST_PLANES
 
 Read = tuple[npt.NDArray[Any], tuple[str, ...]]
+_AXES = ("t", "c", "z", "y", "x", "s")
+_COLOURS = {"S": (1, 2, 3, 4), "C": (3,)}
+"""How many samples a pixel may have, or channels an image, to be colours; one may be alpha."""
+_SECONDS = {"second": 1.0, "millisecond": 1e-3, "microsecond": 1e-6, "minute": 60.0, "hour": 3600.0}
+"""Units of time in OME-Zarr."""
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
@@ -35,7 +41,7 @@ def ordered(path: Path, array: npt.NDArray[Any], axes: str) -> Read:
     array = array.squeeze(single)
     axes = "".join(axis for i, axis in enumerate(axes) if i not in single)
     others = [axis for axis in axes if axis not in "YX"]
-    colour = "S" if "S" in others else "C" if "C" in others and array.shape[axes.index("C")] == 3 else ""
+    colour = next((a for a in "SC" if a in others and array.shape[axes.index(a)] in _COLOURS[a]), "")
     stack = [axis for axis in others if axis != colour]
     if len(stack) > 1:
         found = " x ".join(f"{array.shape[axes.index(axis)]} ({axis})" for axis in stack)
@@ -47,7 +53,7 @@ def ordered(path: Path, array: npt.NDArray[Any], axes: str) -> Read:
     if wanted != axes:
         array = array.transpose([axes.index(axis) for axis in wanted])
         notes.append(f"axes {axes} brought to {wanted}")
-    if stack == ["C"]:
+    if stack in (["C"], ["S"]):
         notes.append(f"its {len(array)} channels taken as the images of a stack")
     return array, tuple(notes)
 
@@ -55,7 +61,7 @@ def ordered(path: Path, array: npt.NDArray[Any], axes: str) -> Read:
 # Files of several arrays ---------------------------------------------------------------------------
 def is_hdf5(beginning: bytes) -> bool:
     """Whether a file that begins so is HDF5; MATLAB's, since 7.3, have a header of their own before."""
-    return beginning.startswith(_HDF5_MAGIC) or beginning[512:520] == _HDF5_MAGIC
+    return any(beginning[at : at + 8] == _HDF5_MAGIC for at in (0, 512, 1024, 2048, 4096))
 
 
 def is_matlab(beginning: bytes) -> bool:
@@ -80,7 +86,8 @@ def read_hdf5(path: Path, inside: str, *, of_matlab: bool = False) -> Read:
     found: dict[str, tuple[int, ...]] = {}
 
     def note(name: str, entry: Any) -> None:  # links are not followed: they may lead out of the file
-        if isinstance(entry, h5py.Dataset) and entry.dtype.kind in "biuf" and not name.startswith("#"):
+        is_array = isinstance(entry, h5py.Dataset) and entry.shape is not None
+        if is_array and entry.dtype.kind in "biuf" and not name.startswith("#"):
             found[name] = entry.shape
 
     def read(name: str) -> npt.NDArray[Any]:
@@ -95,11 +102,21 @@ def read_hdf5(path: Path, inside: str, *, of_matlab: bool = False) -> Read:
         with h5py.File(path, "r") as file:
             file.visititems(note)
             name, array = _chosen(path, found, inside, read)
+            labels = [str(axis.label) for axis in file[name].dims]
     except FileError:
         raise
     except Exception as error:  # noqa: BLE001 - a damaged file raises nearly anything
         raise FileError(path, f"is a damaged or unusual HDF5 file: {error!s:.200}.") from None
-    return _of_matlab(name, array.T) if of_matlab else (array, (f"the array {name} taken",))
+    if of_matlab:
+        return _of_matlab(name, array.T)
+    array, said = ordered(path, array, _letters(labels))
+    return array, (f"the array {name} taken", *said)
+
+
+def _letters(names: Sequence[Any]) -> str:
+    """Return names of axes as :func:`ordered` takes them; empty where they are not all known."""
+    known = all(str(name).lower() in _AXES for name in names)
+    return "".join(str(name) for name in names) if known else ""
 
 
 def read_matlab(path: Path, inside: str) -> Read:
@@ -173,18 +190,17 @@ def read_zarr(folder: Path) -> Read:
     try:
         group: Any = zarr.open(folder, mode="r")
         axes, notes = "", []
-        if not isinstance(group, zarr.Array):
-            if group.attrs.get("ome", group.attrs).get("bioformats2raw.layout") is not None:
+        if isinstance(group, zarr.Array):
+            names = getattr(group.metadata, "dimension_names", None) or group.attrs.get("_ARRAY_DIMENSIONS")
+            axes = _letters(names if isinstance(names, list | tuple) else ())
+        else:
+            if _said(group).get("bioformats2raw.layout") is not None:
                 group, taken = _only_series(folder, group)
                 notes.append(taken)
-            facts = group.attrs.get("ome", group.attrs)["multiscales"][0]
-            axes = "".join(str(a["name"] if isinstance(a, dict) else a) for a in facts.get("axes", "tczyx"))
-            scales = facts["datasets"][0].get("coordinateTransformations", [{}])[0].get("scale", [])
-            units = [a.get("unit", "") if isinstance(a, dict) else "" for a in facts.get("axes", ())]
-            if "z" in axes and len(scales) == len(units) == len(axes):
-                z = axes.index("z")
-                notes += [f"planes every {scales[z]:g} {units[z]} as it says"] if units[z] else []
-            group = group[facts["datasets"][0]["path"]]
+            image = _image_of(folder, group)
+            names = [axis["name"] if isinstance(axis, dict) else axis for axis in image.get("axes", "tczyx")]
+            axes = "".join(map(str, names))
+            group = group[image["datasets"][0]["path"]]
         reading.require_plausible(folder, group.nbytes, reading.folder_bytes(folder, group.nbytes))
         array = np.asarray(group[...])
     except FileError:
@@ -193,3 +209,64 @@ def read_zarr(folder: Path) -> Read:
         raise FileError(folder, f"is no OME-Zarr image, or a damaged one: {error!r:.200}.") from None
     array, said = ordered(folder, array, axes)
     return array, (*notes, *said)
+
+
+def zarr_facts(folder: Path) -> dict[str, Any]:
+    """Return what an OME-Zarr image says of its planes, frames and pixels, by the names of a photograph's.
+
+    ``depths_um``, ``frame_period_s`` and ``pixel_pitch_um``, as far as it tells them with units.
+    """
+    import zarr
+
+    try:
+        group: Any = zarr.open(folder, mode="r")
+        if isinstance(group, zarr.Array):
+            return {}
+        if _said(group).get("bioformats2raw.layout") is not None:
+            group, _ = _only_series(folder, group)
+        image = _image_of(folder, group)
+        places = _places(image, group[image["datasets"][0]["path"]].shape)
+    except Exception:  # noqa: BLE001 - what is wrong there is said by who reads its pixels
+        return {}
+    told: dict[str, Any] = {}
+    if "z" in places and len(places["z"]) > 1:
+        told["depths_um"] = places["z"].tolist()
+    for axis, name in (("t", "frame_period_s"), ("x", "pixel_pitch_um")):
+        if axis in places and len(places[axis]) > 1:
+            told[name] = float(np.diff(places[axis])[0])
+    return told
+
+
+def _places(image: Mapping[str, Any], shape: Sequence[int]) -> dict[str, npt.NDArray[np.float64]]:
+    """Return where an image's elements lie along each axis whose unit is known: micrometres, seconds."""
+    level = image["datasets"][0]
+    places = {}
+    for number, axis in enumerate(image["axes"]):
+        unit = (_SECONDS if axis["name"] == "t" else MICROMETRES).get(axis.get("unit", "?"))
+        at = np.arange(min(shape[number], MOST_PLANES), dtype=float)
+        for transformed in (level, image):  # what is said of all levels follows
+            for step in transformed.get("coordinateTransformations", ()):
+                if step["type"] == "scale":
+                    at = at * step["scale"][number]
+                elif step["type"] == "translation":
+                    at = at + step["translation"][number]
+        if unit is not None:
+            places[str(axis["name"])] = unit * at
+    return places
+
+
+def _said(group: Any) -> Any:
+    return group.attrs.get("ome", group.attrs)
+
+
+def _image_of(folder: Path, group: Any) -> Any:
+    """Return what OME-Zarr says of a group's image; raises FileError where it says nothing."""
+    if "multiscales" not in _said(group):
+        inside = sorted([*group.array_keys(), *group.group_keys()])
+        paths = ", ".join(str(folder / name) for name in inside[:4])
+        raise FileError(
+            folder,
+            "is a Zarr group, but no OME-Zarr image.",
+            f"Name what is meant of it: {paths}." if paths else "There is nothing in it.",
+        )
+    return _said(group)["multiscales"][0]

@@ -24,6 +24,7 @@ MOST_PLANES = 100_000
 MICROMETRES = {
     "": 1.0, "nm": 1e-3, "um": 1.0, "µm": 1.0, "μm": 1.0, "\\u00B5m": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6,
     "micron": 1.0, "microns": 1.0, "micrometer": 1.0, "nanometer": 1e-3, "millimeter": 1e3,
+    "centimeter": 1e4, "meter": 1e6,
 }  # fmt: skip
 """Units of length; none is a micrometre, which is what OME takes then."""
 

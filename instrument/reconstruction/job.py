@@ -291,7 +291,9 @@ def _matching_binning(image: ImageFile, shape: tuple[int, ...], folder: Path) ->
             image.path,
             f"is {image.describe()}, but the PSFs of {folder} are {shape[0]} x {shape[1]}: "
             "no whole binning brings one to the other.",
-            "Photograph with the region of interest and binning of the calibration.",
+            "Its axes are in another order: images first, then rows, then columns (numpy.moveaxis)."
+            if shape[0] == width != height
+            else "Photograph with the region of interest and binning of the calibration.",
         )
     return int(factor)
 
