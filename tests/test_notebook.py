@@ -13,7 +13,7 @@ import pytest
 
 import diffuserbench as db
 from instrument.files.errors import BenchError
-from instrument.files.images import write_image
+from instrument.files.images import ImageFile, write_image
 from instrument.notebook.words import in_python
 from recon.base.declare import options_of
 from recon.errors import InputError
@@ -55,6 +55,10 @@ def test_the_ten_lines_of_the_readme_run(
     with pytest.warns(UserWarning, match="no screen"):
         exec(compile(code_of(ROOT / "README.md"), "README.md", "exec"), names := {})
     assert (tmp_path / "scene.png").exists()
+    with pytest.warns(UserWarning, match="no screen"):
+        db.show("photo.tif")
+    with pytest.raises(db.BenchError, match="given together by `psf`"):
+        db.show(ImageFile(Path("films.tif"), np.zeros((5, 9, 9), np.uint8)))
     assert "counts from both" in names["tv"].job.notes["Dark"]
     assert names["tv"].image.shape == (48, 48)
     np.testing.assert_array_equal(np.asarray(names["tv"]), names["tv"].image)

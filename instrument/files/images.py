@@ -112,6 +112,8 @@ def read_image(path: Path | str | ImageFile, *, holes: bool = False) -> ImageFil
     holds values that are no finite numbers.
     """
     if isinstance(path, ImageFile):
+        if path.is_stack:
+            raise _several(path.path, len(path.pixels))
         _refuse_non_finite(path.path, path.pixels, holes=holes)
         return path
     path, array, notes = _decoded(_only_image(Path(path)))
@@ -330,6 +332,14 @@ def _decoded(path: Path) -> tuple[Path, npt.NDArray[Any], tuple[str, ...]]:
 
 
 # Shapes and dtypes ---------------------------------------------------------------------------------
+def _several(path: Path, count: int) -> FileError:
+    return FileError(
+        path,
+        f"holds {count} images; a single one is expected.",
+        "Give one of them, or their mean; PSFs, one a depth, are given together by --volume.",
+    )
+
+
 def _one_image(path: Path, array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
     notes: tuple[str, ...] = ()
     while array.ndim > 2 and array.shape[0] == 1:
@@ -341,11 +351,7 @@ def _one_image(path: Path, array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], t
         array = array[..., 0] if array.shape[-1] == 1 else array
         notes += dropped
     elif array.ndim == 3:
-        raise FileError(
-            path,
-            f"holds {array.shape[0]} images; a single one is expected.",
-            "Where a stack is expected, give the file itself instead of its folder.",
-        )
+        raise _several(path, len(array))
     elif array.ndim != 2:
         raise FileError(path, f"holds an array of shape {array.shape}; an image is expected.")
     if 0 in array.shape:

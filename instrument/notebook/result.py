@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
-from instrument.files.images import ImageFile, write_image
+from instrument.files.images import ImageFile, read_image, write_image
 from instrument.files.seen import as_seen, png_bytes
 from instrument.notebook.words import in_python, job_in_python, result_in_python, speaking
 from instrument.reconstruction.job import Job
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Shown = npt.NDArray[np.uint8]
+_FILES = (str, Path, ImageFile)
 
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
@@ -192,12 +193,13 @@ def _title(shown: object) -> str:
     return shown.path.name if isinstance(shown, ImageFile) else ""
 
 
+@speaking
 def show(*pictures: Any, **titled: Any) -> None:
-    """Show pictures beside one another: results, images, arrays, calibrations (the PSF nearest to the axis).
+    """Show pictures beside one another: results, files, arrays, calibrations (the PSF nearest to the axis).
 
     Below the cell of a notebook, else in a window: ``db.show(photo, tv=first, l1=second)``.
 
-    Raises BenchError when one of them is no picture.
+    Raises BenchError when one of them is no picture, FileError when one cannot be read.
     """
     show_figure(figure_of(*pictures, **titled))
 
@@ -207,6 +209,7 @@ def figure_of(*pictures: Any, **titled: Any) -> Figure:
     from matplotlib.figure import Figure
 
     panels = [*(("", picture) for picture in pictures), *titled.items()]
+    panels = [(name, read_image(p, holes=True) if isinstance(p, _FILES) else p) for name, p in panels]
     if not panels:
         raise BenchError("There is nothing to show: give results, images or arrays.")
     figure = Figure(figsize=(4.5 * len(panels), 4.2), layout="constrained")
