@@ -228,7 +228,7 @@ def explain_or_take(kind: str, seed: int, foretold: bool, by_course: bool, answe
     meter, began = MemoryMeter(), time.process_time()
     if foretold:
         if by_course:
-            module.SOLVED_S = 0.0
+            module.SOLVED_S = 1e-6
         told = forecast(Measurement(photograph), calibration, asked)
         cost_s, settles = time.process_time() - began, told.settles or np.nan
         answer.send((told.seconds, *told.between_s, told.memory_bytes, cost_s, settles))

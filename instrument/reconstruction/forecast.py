@@ -21,12 +21,12 @@ from recon.solvers.base import IterationRecord, StopReason
 from recon.solvers.memory import MemoryMeter, in_words
 from recon.types import Calibration
 
-TRIED, TRIED_S = 64, 60.0
-"""Iterations, and seconds of solving, that are run to tell what each takes and when they settle."""
-_LEAST, _UNCOUNTED = 16, 4
-"""Fewer tell nothing of when they settle; the first are slower, of varying PSFs twice, and do not count."""
 SOLVED_S = 5.0
 """What solving takes no longer than is carried out whole."""
+TRIED, TRIED_S = 64, 60.0
+"""Iterations of what takes longer, or seconds of them, whose course tells when it settles."""
+_LEAST, _UNCOUNTED = 16, 4
+"""Fewer tell nothing of when they settle; the first are slower, of varying PSFs twice, and do not count."""
 ASTRAY = 1.5
 """How many times as many, or as few, the iterations may turn out that were told by the first."""
 
@@ -105,25 +105,35 @@ def forecast(
     ``on_stage`` and errors as of :func:`~recon.reconstruction.reconstruct.reconstruct`.
     """
     tell = on_stage or (lambda *_: None)
-    limit = options.time_s
-    tried = replace(
-        options,
-        iterations=min(TRIED, options.iterations or TRIED),
-        time_s=TRIED_S if limit is None else min(limit, TRIED_S),
-    )
+    soon_s = SOLVED_S / (1 + REPEATS * options.uncertainty)
     one_step = options.solver != "auto" and SOLVERS.named(options.solver).one_step
-    first = Trial.of(measurement, calibration, options if one_step else tried, lambda s, w: tell(s / 2, w))
-    cut = first.cut_short(options)
-    if cut and first.longest_s(options) <= SOLVED_S:
-        whole = Trial.of(measurement, calibration, options, lambda s, w: tell((1 + s) / 2, w))
-        first, cut = replace(whole, memory_bytes=max(whole.memory_bytes, first.memory_bytes)), False
-    count = first.longest
+    tried = options if one_step else limited(options, None, soon_s)
+    trial = Trial.of(measurement, calibration, tried, lambda s, w: tell(s / 2, w))
+    cut = trial.cut_short(tried, options)
+    if cut and trial.longest < TRIED:
+        tried = limited(options, TRIED, TRIED_S)
+        further = Trial.of(measurement, calibration, tried, lambda s, w: tell((1 + s) / 2, w))
+        trial = replace(further, memory_bytes=max(trial.memory_bytes, further.memory_bytes))
+        cut = trial.cut_short(tried, options)
+    count = trial.longest
     if not cut:
-        return Forecast(first.beside_s(count), first.iteration_s, count, first.memory_bytes, count, True)
-    most = first.most(options)
-    settles = first.settles(options, _tolerance(first.found, measurement, calibration, options))
-    beside_s, counted = first.beside_s(settles or most), options.tolerance == 0 and settles is not None
-    return Forecast(beside_s, first.iteration_s, most, first.memory_bytes, settles, counted)
+        return Forecast(trial.beside_s(count), trial.iteration_s, count, trial.memory_bytes, count, True)
+    most = trial.most(options)
+    settles = trial.settles(options, _tolerance(trial.found, measurement, calibration, options))
+    beside_s, counted = trial.beside_s(settles or most), options.tolerance == 0 and settles is not None
+    return Forecast(beside_s, trial.iteration_s, most, trial.memory_bytes, settles, counted)
+
+
+def limited(options: ReconstructionOptions, iterations: int | None, time_s: float) -> ReconstructionOptions:
+    """Return options that end after so many iterations or seconds, where they do not end before."""
+    most = [n for n in (most_iterations(options), iterations) if n is not None]
+    time_s = time_s if options.time_s is None else min(time_s, options.time_s)
+    return replace(options, iterations=min(most, default=None), time_s=time_s)
+
+
+def most_iterations(options: ReconstructionOptions) -> int | None:
+    """Return how many iterations there may be by their number; None where the time alone ends them."""
+    return ITERATIONS if options.iterations is None and options.time_s is None else options.iterations
 
 
 @dataclass(frozen=True)
@@ -166,23 +176,17 @@ class Trial:
         runs = [history for history in self.found.histories if len(history) > _UNCOUNTED]
         return sum((r[-1].seconds - r[_UNCOUNTED - 1].seconds) / (len(r) - _UNCOUNTED) for r in runs)
 
-    def cut_short(self, options: ReconstructionOptions) -> bool:
-        """Whether it would have gone on without the limits of a trial."""
-        further = {
-            StopReason.ITERATIONS: options.iterations is None or options.iterations > TRIED,
-            StopReason.TIME: options.time_s is None or options.time_s > TRIED_S,
-        }
-        return any(further.get(why, False) for why in self.found.stop_reasons)
+    def cut_short(self, tried: ReconstructionOptions, options: ReconstructionOptions) -> bool:
+        """Whether it would have gone on by its options, without the limits of what was tried."""
+        reasons = self.found.stop_reasons
+        counted_out = StopReason.ITERATIONS in reasons and tried.iterations != most_iterations(options)
+        return counted_out or (StopReason.TIME in reasons and tried.time_s != options.time_s)
 
     def most(self, options: ReconstructionOptions) -> int:
-        """Return how many iterations there may be."""
-        count = options.iterations or (ITERATIONS if options.time_s is None else None)
+        """Return how many iterations there may be, by their number and time."""
+        count = most_iterations(options)
         in_time = None if options.time_s is None else int(options.time_s / max(self.iteration_s, 1e-9))
         return min(n for n in (count, in_time) if n is not None)
-
-    def longest_s(self, options: ReconstructionOptions) -> float:
-        """Return how long all iterations would take, those of an uncertainty too."""
-        return self.most(options) * self.iteration_s * (1 + REPEATS * options.uncertainty)
 
     def settles(self, options: ReconstructionOptions, tolerance: float) -> int | None:
         """Return after how many iterations all ends, by its first ones; None where they do not tell."""
