@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from calibration_routines.procedure import (
     Procedure,
     Routine,
 )
-from calibration_routines.scatter import NO_CHANGE, STEADY, Scatter, compare, scatter_of
+from calibration_routines.scatter import NO_CHANGE, STEADY, Scatter, compare, pooled, scatter_of
 from instrument.bench.bench import Bench
 from instrument.display.hologram import bench_display, load_alignment
 from instrument.files.atomic import require_new
@@ -38,9 +39,12 @@ from recon.holography.slm_response import MODES, flatness_jacobian, mode, phases
 Array = npt.NDArray[Any]
 SLM_FILE = "slm-calibration.json"
 """Where the command line writes it."""
-MAX_PHASE_ERROR_RAD = 0.004
-"""Standard deviation of a phase beyond which no table is made. What flickers with the phase's own cosine
-bends the whole table: its worst level is within five times this, 0.02, in 19 of 20 tables then."""
+MAX_PHASE_ERROR_RAD = 0.0027
+"""Standard deviation of a phase beyond which no table is made. What flickers with the phase's own cosine and
+sine bends the whole table, unseen: two independent parts of this size, the worst level off by twice their
+root sum of squares, beyond 0.02 rad in one table of a thousand (docs/decisions/0227)."""
+MOST_SERIES = 4
+"""Times that all pictures are taken where their mean over so many is steady enough and one series is not."""
 _REFERENCE_EVERY = 8  # levels between two pictures of level 0
 _FLATNESS_FRAMES = 22
 """Of a flatness measurement, at most."""
@@ -64,12 +68,19 @@ class SlmCalibration:
     """Of the picture of level 0, taken again and again in between."""
 
 
-def measure_look_up_table(io: DisplayBench, *, n_levels: int = 33, seed: int = 0) -> SlmCalibration:
+def measure_look_up_table(
+    io: DisplayBench,
+    *,
+    n_levels: int = 33,
+    seed: int = 0,
+    on_more: Callable[[int, float], object] | None = None,
+) -> SlmCalibration:
     """Let half of the SLM's pixels interfere with the other half at one level after the other.
 
     Needs no alignment and no model: see :func:`recon.holography.slm_response.phases_from_frames`. Level 0 is
     shown again after every few levels: a slow change of brightness is taken out where the pictures then lie
-    better on one ellipse.
+    better on one ellipse. Where they flicker too much for a table, and not more than the mean over a few
+    series makes up for, more series are taken; ``on_more`` gets how many in all, and the error so far.
 
     Raises InputError when the pictures do not change as interference does; CalibrationError when they lie so
     far off it that the table would be wrong, with what flickers or shakes.
@@ -91,13 +102,9 @@ def measure_look_up_table(io: DisplayBench, *, n_levels: int = 33, seed: int = 0
             order.append(int(level))
             reference.append(False)
     images = [np.where(varied, level, 0).astype(np.uint8) for level in order]
-    pictures, references = [], []
-    for picture, again in zip(io.photographs(images, exposure_ms), reference, strict=True):
-        if again:  # whole: a picture of every other pixel does not tell how far it moved
-            references.append(picture)
-        else:  # every fourth pixel has more than enough light
-            pictures.append(picture[::2, ::2])
-    phases, error, scatter = _phases(np.array(pictures), np.array(references, np.float32), np.array(before))
+    phases, error, scatter = steady_phases(
+        lambda: _taken(io, images, reference, exposure_ms), np.array(before), on_more
+    )
     if error > MAX_PHASE_ERROR_RAD:
         words = scatter.causes() or (
             "light, mask or camera are not steady, or the SLM flickers: look for saturation, loose mounts.",
@@ -112,16 +119,86 @@ def measure_look_up_table(io: DisplayBench, *, n_levels: int = 33, seed: int = 0
     return SlmCalibration(SlmCorrection(table), levels, phases, None, io.frames, error, scatter)
 
 
-def _phases(frames: Array, references: Array, before: Array) -> tuple[Array, float, Scatter]:
-    """Return the levels' phases, their error, and how the pictures of level 0 scatter.
+def _taken(
+    io: DisplayBench, images: Sequence[npt.NDArray[np.uint8]], reference: Sequence[bool], exposure_ms: float
+) -> tuple[Array, Array]:
+    """Take a series; returns the levels' pictures, and those of level 0 in between."""
+    pictures, references = [], []
+    for picture, again in zip(io.photographs(images, exposure_ms), reference, strict=True):
+        if again:  # whole: a picture of every other pixel does not tell how far it moved
+            references.append(picture)
+        else:  # every fourth pixel has more than enough light
+            pictures.append(picture[::2, ::2])
+    return np.array(pictures), np.array(references, np.float32)
+
+
+def steady_phases(
+    take: Callable[[], tuple[Array, Array]],
+    before: Array,
+    on_more: Callable[[int, float], object] | None = None,
+) -> tuple[Array, float, Scatter]:
+    """Return the levels' phases by as many series as needed, their error, and how light and place scatter.
+
+    Parameters
+    ----------
+    take : callable
+        Takes a series: the levels' pictures, (n_levels, ...), and of level 0, (n_references, height, width).
+    before : ndarray, (n_references,)
+        After which level each of these comes.
+    on_more : callable, optional
+        Gets how many series are needed in all, and the error so far, radians.
+    """
+    series = _Series(before)
+    phases, error = series.add(*take())
+    while MAX_PHASE_ERROR_RAD < error <= MAX_PHASE_ERROR_RAD * float(np.sqrt(MOST_SERIES / series.count)):
+        if on_more is not None:
+            on_more(int(np.ceil(series.count * (error / MAX_PHASE_ERROR_RAD) ** 2)), error)
+        phases, error = series.add(*take())
+    return phases, error, series.scatter
+
+
+class _Series:
+    """Series of the same pictures, averaged; ``before`` tells after which level each reference came."""
+
+    def __init__(self, before: Array) -> None:
+        self._before = before
+        self._frames: Array = np.zeros(0)
+        self._references: Array = np.zeros(0)
+        self._scatters: list[Scatter] = []
+
+    @property
+    def count(self) -> int:
+        """Series so far."""
+        return len(self._scatters)
+
+    @property
+    def scatter(self) -> Scatter:
+        """Of the pictures of level 0; a level has one picture a series."""
+        return replace(pooled(self._scatters), frames=self.count)
+
+    def add(self, frames: Array, references: Array) -> tuple[Array, float]:
+        """Average another series, (n_levels, ...) and (n_references, height, width), with those before it.
+
+        Returns the levels' phases and their error, radians.
+        """
+        self._scatters.append(scatter_of(references)[0])
+        many = self.count
+        self._frames = frames if many == 1 else self._frames + (frames - self._frames) / many
+        if many == 1:
+            self._references = references
+        else:
+            self._references = (self._references + (references - self._references) / many).astype(np.float32)
+        return _phases(self._frames, self._references, self._before, self.scatter)
+
+
+def _phases(frames: Array, references: Array, before: Array, scatter: Scatter) -> tuple[Array, float]:
+    """Return the levels' phases and their error.
 
     The pictures as they are, and divided by the brightness between two of the references: what is known
     better counts. Where references flicker they bend the table by it, as slowly as phases go.
     """
     changes = [NO_CHANGE, *(compare(picture, references[0]) for picture in references[1:])]
     levels = np.array([change.brightness for change in changes])
-    scatter, _ = scatter_of(references)
-    scatter = replace(scatter, frames=1)  # a level has one picture
     tries = [(frames, 0.0)]
     if np.isfinite(levels).all() and (levels > 0).all():
         at = np.interp(np.arange(len(frames)), before, levels)
@@ -135,8 +212,7 @@ def _phases(frames: Array, references: Array, before: Array) -> tuple[Array, flo
             if words := scatter.causes():
                 raise CalibrationError(f"The SLM's table cannot be measured: {' '.join(words)}") from None
             raise
-    phases, error = min(found, key=lambda one: one[1])
-    return phases, error, scatter
+    return min(found, key=lambda one: one[1])
 
 
 def _flicker(levels: npt.NDArray[np.float64], at: npt.NDArray[np.float64]) -> float:
@@ -234,10 +310,14 @@ class SlmProcedure(SeenAgain, Checked, Procedure):
     overwrite: bool = option(False, flags=("--force",), help="Overwrite a file that exists.")
 
     @property
+    def series_frames(self) -> int:
+        """Frames of a series of levels."""
+        return self.levels + 1 + -(-self.levels // _REFERENCE_EVERY)
+
+    @property
     def frames(self) -> int:
-        """Frames it takes at most."""
-        references = 1 + -(-self.levels // _REFERENCE_EVERY)
-        return self.levels + references + 2 + (_FLATNESS_FRAMES if self.alignment is not None else 0)
+        """Frames it takes at most, of one series."""
+        return self.series_frames + 2 + (_FLATNESS_FRAMES if self.alignment is not None else 0)
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse a bench without phase SLM, an alignment that cannot be read, a file that exists."""
@@ -246,23 +326,37 @@ class SlmProcedure(SeenAgain, Checked, Procedure):
             require_new(self.out, overwrite=self.overwrite)
         if self.alignment is not None:
             load_alignment(self.alignment)
-        words = f"{self.levels} grey levels, {self.frames} frames at most"
-        return Outlook((words, kept_words(bench, self.frames, self.again)))
+        most = self.frames + (MOST_SERIES - 1) * self.series_frames
+        words = (
+            f"{self.levels} grey levels, {self.frames} frames at most; where the light flickers the levels "
+            f"are taken up to {MOST_SERIES} times, {most} frames"
+        )
+        return Outlook((words, kept_words(bench, most, self.again)))
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Measure, and save what ``align mask`` and ``show`` take."""
         slm, out = require_slm(bench), writable(bench, folder, self.out, "slm calibration")
         place = load_alignment(self.alignment) if self.alignment is not None else None
+        total = self.frames
+
+        def more(series: int, error_rad: float) -> None:
+            nonlocal total
+            total = self.frames + (series - 1) * self.series_frames
+            listener.said(
+                f"The pictures are not steady: a level's phase is known to {error_rad:.4f} rad. All levels "
+                f"are taken {series} times in all, for their mean."
+            )
+
         with KeptFrames(bench, folder, "calibrate slm", self) as kept:
             io = DisplayBench(
                 bench,
                 bench.config.display.slm_binning,
                 check=control.check,
-                on_frame=lambda frames: listener.share(frames, self.frames),
+                on_frame=lambda frames: listener.share(frames, total),
                 kept=kept,
             )
             listener.step("measuring the look-up table")
-            found = measure_look_up_table(io, n_levels=self.levels)
+            found = measure_look_up_table(io, n_levels=self.levels, on_more=more)
             if place is not None:
                 listener.step("measuring flatness")
                 bring_mask(bench, place.stage_position)
@@ -291,6 +385,8 @@ def slm_lines(found: SlmCalibration, *, simulated: bool) -> list[str]:
         f"  up to {worst:.3f} rad from an ideal SLM's 256 levels a turn; a level is known to "
         f"{found.phase_error_rad:.4f} rad",
     ]
+    if (series := found.steadiness.frames) > 1:
+        lines.append(f"  as the light flickers: every level was taken {series} times, for its mean")
     if found.flatness_rms_rad is not None:
         lines.append(f"  flatness error {found.flatness_rms_rad:.3f} rad rms")
     return lines

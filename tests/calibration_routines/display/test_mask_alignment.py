@@ -15,9 +15,9 @@ from calibration_routines.display.mask_stage import PlacementCost
 from calibration_routines.display.slm_calibration import (
     MAX_PHASE_ERROR_RAD,
     SlmProcedure,
-    _phases,
     measure_flatness,
     measure_look_up_table,
+    steady_phases,
 )
 from calibration_routines.procedure import CalibrationError
 from drivers.simulated.display import DisplayWorld
@@ -266,24 +266,30 @@ def test_a_table_under_a_fault_of_the_bench_is_right_or_not_written(
     assert found.steadiness.flicker == pytest.approx(0.005, rel=0.7)
 
 
-@pytest.mark.parametrize(("flicker", "drift"), [(0.003, 0.0), (0.015, 0.0), (0.0, 0.3)])
-def test_tables_of_many_flickers_are_within_five_of_their_errors(flicker: float, drift: float) -> None:
-    """Pictures of level 0 that flicker bent every fourth table by up to ten, and it was written."""
+@pytest.mark.parametrize(("flicker", "drift", "most"), [(0.003, 0.0, 1), (0.015, 0.0, 4), (0.0, 0.3, 1)])
+def test_tables_of_flickering_pictures_are_within_0_02_rad(flicker: float, drift: float, most: int) -> None:
+    """What flickers with the phase's cosine bends a table unseen: more pictures, or none."""
     rng = np.random.default_rng(7)
     truth = np.linspace(0, 6.2, 33)
     parts = rng.normal(size=(3, 24, 24))
     turn = np.stack([np.ones(33), 0.4 * np.cos(truth), 0.4 * np.sin(truth)], axis=1)
     pictures = np.tensordot(turn, parts + 2 * np.ones((3, 1, 1)) * (np.arange(3) == 0)[:, None, None], 1)
     before = np.array([-0.5, 7.5, 15.5, 23.5, 31.5, 32.5])
-    within = []
-    for _ in range(20):
+
+    def take() -> tuple[np.ndarray, np.ndarray]:
         shown = (1 + flicker * rng.standard_normal(33)) * (1 + drift * np.arange(33) / 33)
         again = (1 + flicker * rng.standard_normal(6)) * (1 + drift * before / 33)
         references = (again[:, None, None] * pictures[0]).astype(np.float32)
-        phases, error, _ = _phases(shown[:, None, None] * pictures, references, before)
-        within.append(np.abs(phases - truth).max() / max(error, 1e-4))
-        assert error <= MAX_PHASE_ERROR_RAD + 0.002
-    assert np.sort(within)[-2] < 5  # the largest of twenty may be beyond
+        return shown[:, None, None] * pictures, references
+
+    series = []
+    for _ in range(5):
+        phases, error, scatter = steady_phases(take, before)
+        assert error <= MAX_PHASE_ERROR_RAD
+        assert np.abs(phases - truth).max() < 0.02
+        series.append(scatter.frames)
+    assert max(series) <= most
+    assert (max(series) > 1) == (most > 1)
 
 
 def test_too_little_phase_is_noticed() -> None:
