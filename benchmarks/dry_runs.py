@@ -3,8 +3,8 @@
     python benchmarks/dry_runs.py [--only axial angular beads stage]
 
 Each on the preset ``tiny`` in real time, told and then taken in two processes, in a folder of its own without
-what other runs took. The time that the program takes to start is in neither: taken is what goes by from its
-first words on.
+what other runs took, and without kernels that others compiled. The time that the program takes to start is in
+neither: taken is what goes by from its first words on.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ def carried_out(routine: str, words: list[str], folder: Path) -> tuple[float, st
         "PYTHONPATH": str(ROOT),
         "PYTHONUNBUFFERED": "1",
         "XDG_CACHE_HOME": str(folder / "cache"),
+        "NUMBA_CACHE_DIR": str(folder / "kernels"),
     }
     said, began_s = [], 0.0
     with subprocess.Popen(

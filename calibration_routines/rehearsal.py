@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -33,10 +33,11 @@ def rehearse_whole(
 ) -> tuple[str, ...]:
     """Say how long a routine takes on a simulated bench: homing, exposures, frames, analysis, files.
 
-    All of it is done on a bench like the open one that waits for nothing, and what waiting would take is
-    added. A long one is ended on the way, and told by how far it came. ``on_progress`` gets the seconds that
-    it has gone on and :data:`ENOUGH_S`. Nothing where a device is not simulated, where frames that were kept
-    are seen again, and where it cannot be done there.
+    All of it is done on a bench like the open one that waits for nothing; what waiting would take is added,
+    and what kernels took to compile, which are there from then on, is taken off. A long one is ended on the
+    way, and told by how far it came. ``on_progress`` gets the seconds that it has gone on and
+    :data:`ENOUGH_S`. Nothing where a device is not simulated, where frames that were kept are seen again, and
+    where it cannot be done there.
     """
     if getattr(options, "again", None) is not None:
         return ()
@@ -49,7 +50,7 @@ def rehearse_whole(
         procedure, control = routine.procedure(options), RunControl()
         watch = _Watch(control, lambda: time_scale(bench) * not_waited_s(twin), on_progress)
         try:
-            with control.procedure(twin):
+            with watch.compiling(), control.procedure(twin):
                 procedure.perform(twin, folder, control, watch)
         except BenchError:
             if control.ending is None:
@@ -73,9 +74,31 @@ class _Watch(Listener):
         self._done, self._total, self._at_most, self._several = 0.0, 0.0, False, False
         self._paces_s: list[float] = []
         self._seen_s = 0.0
+        self._compiled_s, self._compiling, self._compiles_since_s = 0.0, 0, 0.0
+
+    @contextmanager
+    def compiling(self) -> Iterator[None]:
+        """Note how long kernels are compiled in this context, those within others once."""
+        from numba.core import event
+
+        watch = self
+
+        class Compiles(event.Listener):
+            def on_start(self, event: object) -> None:
+                if watch._compiling == 0:
+                    watch._compiles_since_s = time.perf_counter()
+                watch._compiling += 1
+
+            def on_end(self, event: object) -> None:
+                watch._compiling -= 1
+                if watch._compiling == 0:
+                    watch._compiled_s += time.perf_counter() - watch._compiles_since_s
+
+        with event.install_listener("numba:compile", Compiles()):
+            yield
 
     def _now_s(self) -> float:
-        return time.perf_counter() - self._began_s + self._waiting_s()
+        return time.perf_counter() - self._began_s - self._compiled_s + self._waiting_s()
 
     def step(self, words: str) -> None:
         """Begin another step; of several alike, as slides are, they are counted and not their frames."""
