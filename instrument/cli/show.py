@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -160,7 +161,12 @@ def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -
             raise BenchError(f"{opened.label} has no [slm].")
         for path, (levels, facts) in zip(what, read, strict=True):
             if levels.shape != opened.slm.shape:
-                raise FileError(path, f"is {levels.shape} pixels, the SLM {opened.slm.shape}.")
+                sizes = (" x ".join(map(str, shape)) for shape in (levels.shape, opened.slm.shape))
+                raise FileError(
+                    path,
+                    "has {} pixels, the SLM {}.".format(*sizes),
+                    f"A picture becomes a hologram by: diffuserbench hologram {quote(str(path))}",
+                )
             if facts and (words := mismatch(opened.slm, mirrors=is_of_mirrors(facts))):
                 raise FileError(path, f"cannot be shown: {words}")
         bring_mask(opened, place.stage_position if place else {})
