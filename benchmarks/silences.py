@@ -32,7 +32,7 @@ sys.path.insert(0, str(ROOT))
 
 TIME = re.compile(
     r"left (about )?\d|about [\d.]+ ?\w+ (left|in all)|in all|"
-    r"longer than (last time|a first guess)|\d+ of \d+|at most"
+    r"longer than (last time|a first guess)|\d+ of \d+|at most|About ten seconds"
 )
 """Words that tell a time, or how much of how much is done."""
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
