@@ -167,6 +167,8 @@ def _image(
         count = (data[0] if isinstance(data, list) else data).shape[at]
         colours = ["red", "green", "blue"] if count == 3 else [str(n) for n in range(count)]
         arguments |= {"channel_axis": at, "name": [f"{name} {colour}" for colour in colours]}
+        if count == 3:  # napari's own choice is cyan, magenta, yellow
+            arguments["colormap"] = colours
     arguments["scale"] = [step.get(axis) or 1.0 for axis in shown]
     arguments["translate"] = [origin.get(axis, 0.0) for axis in shown]
     arguments["units"] = [("s" if axis == "t" else "um") if step.get(axis) else "pixel" for axis in shown]

@@ -119,12 +119,14 @@ def write_volume_zarr(
                 break
             height, width = height // 2, width // 2
             levels.append(2 * levels[-1])
+        white = 0.0
         for z, plane in enumerate(planes):
             pixels = np.moveaxis(plane, -1, 0) if colour else plane
+            white = max(white, float(np.nanmax(plane, initial=0.0)))
             for array in arrays:
                 array[..., z, :, :] = pixels
                 pixels = _halved(pixels)
-        group.attrs["ome"] = ome_attributes(
+        told = ome_attributes(
             path.name,
             names,
             voxel_um(grid),
@@ -132,6 +134,9 @@ def write_volume_zarr(
             origin=_origin_um(grid),
             more={"type": "local mean"},
         )
+        if channels == (3,):
+            told["omero"] = ome_channels(white or 1.0, colour=True)
+        group.attrs["ome"] = told
         group.attrs["diffuserbench"] = attributes | {"words": _of_voxels(grid)} | grid_facts(grid)
 
 
@@ -276,6 +281,16 @@ def known(values: npt.NDArray[np.float64]) -> list[float] | None:
 
 _KINDS = {"t": ("time", "second"), "c": ("channel", ""), "z": ("space", "micrometer")}
 _KINDS |= dict.fromkeys("yx", _KINDS["z"])
+
+
+_COLOURS = {"red": "FF0000", "green": "00FF00", "blue": "0000FF"}
+
+
+def ome_channels(white: float, *, colour: bool) -> dict[str, Any]:
+    """Return OME's ``omero``: in which colours channels are shown, black at zero and white at ``white``."""
+    window = {"min": 0, "max": white, "start": 0, "end": white}
+    seen = _COLOURS if colour else {"grey": "FFFFFF"}
+    return {"channels": [{"window": window, "color": c, "active": True, "label": n} for n, c in seen.items()]}
 
 
 def ome_attributes(

@@ -19,11 +19,11 @@ from instrument.files.orientation import AS_IT_IS, Kind, Orientation
 from instrument.files.volumes import grid_of, is_zarr_name
 from instrument.reconstruction.video_files import (
     DEFAULT_FPS,
-    SAMPLES,
     VideoPictures,
     create_output,
     levels_of,
     require_video,
+    samples_of,
 )
 from instrument.runs.run import Run
 
@@ -119,7 +119,7 @@ class Film:
 
     def levels(self) -> tuple[float, float]:
         """Return black and white for all pictures, from some of them."""
-        places = np.unique(np.linspace(0, len(self) - 1, SAMPLES).round().astype(int))
+        places = samples_of(range(len(self)))
         return levels_of([np.asarray(self.read(int(place)), np.float32) for place in places])
 
 
@@ -257,6 +257,7 @@ def _write_zarr(film: Film, target: Path, advance: Advance | None) -> None:
             made.write(index, np.asarray(film.whole(place), np.float32))
             if advance is not None:
                 advance(place + 1, len(film))
+        made.say_white(samples_of(film.indices))
     except BaseException:
         shutil.rmtree(target)
         raise

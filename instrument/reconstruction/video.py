@@ -25,11 +25,11 @@ from instrument.reconstruction.preparation import Crop
 from instrument.reconstruction.request import PictureRequest
 from instrument.reconstruction.video_files import (
     DEFAULT_FPS,
-    SAMPLES,
     VideoPictures,
     create_output,
     levels_of,
     require_video,
+    samples_of,
 )
 from instrument.reconstruction.video_job import VideoJob, VideoPlan
 from instrument.reconstruction.video_work import BlockReport, CancelledError, cluster, in_process, on_cluster
@@ -203,9 +203,10 @@ def finish_video(prepared: PreparedVideo) -> list[Path]:
     pictures = VideoPictures(request.out)
     pictures.remove_litter()
     written = [request.out]
+    chosen = samples_of(plan.frames)
+    pictures.say_white(chosen)
     if request.video.film:
-        chosen = np.unique(np.linspace(0, len(plan.frames) - 1, SAMPLES).round().astype(int))
-        black, white = levels_of(pictures.flat(plan.frames[i]) for i in chosen)
+        black, white = levels_of(pictures.flat(index) for index in chosen)
         fps = request.video.fps or (1 / pictures.period_s if pictures.period_s else DEFAULT_FPS)
         shown = (as_shown(pictures.flat(index), black, white) for index in plan.frames)
         write_mp4(request.film_path, shown, fps)

@@ -14,7 +14,7 @@ from drivers.frame import FrameMetadata
 from instrument.files.atomic import whole_folder
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import FileError
-from instrument.files.volumes import grid_facts, ome_attributes, voxel_um
+from instrument.files.volumes import grid_facts, ome_attributes, ome_channels, voxel_um
 from instrument.runs.run import Run
 
 STILL = {"um": 0.5, "mrad": 0.02}
@@ -187,6 +187,15 @@ class VideoPictures:
         with self._file(index).open("rb") as written:
             os.fsync(written.fileno())
 
+    def say_white(self, indices: Sequence[int]) -> None:
+        """Say in OME's own words how bright the pictures of these indices are, where they are in colour."""
+        import zarr
+
+        if "c" in self.axes:
+            _, white = levels_of(self.read(index) for index in indices)
+            self.attributes["ome"] = {**self.attributes["ome"], "omero": ome_channels(white, colour=True)}
+            zarr.open_group(self.path, mode="r+").attrs["ome"] = self.attributes["ome"]
+
     def remove(self, index: int) -> None:
         """Take a picture away, where there is one."""
         self._file(index).unlink(missing_ok=True)
@@ -203,6 +212,14 @@ class VideoPictures:
 DEFAULT_FPS = 25.0
 SAMPLES = 24
 """Pictures looked at to find black and white of all."""
+
+
+def samples_of(indices: Sequence[int]) -> list[int]:
+    """Return at most :data:`SAMPLES` of a video's pictures, spread over all of it."""
+    chosen = np.unique(np.linspace(0, len(indices) - 1, SAMPLES).round().astype(int))
+    return [indices[place] for place in chosen]
+
+
 BLACK_PERCENTILE, WHITE_PERCENTILE = 0.5, 99.8
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
-from instrument.files.volumes import EVEN
+from instrument.files.volumes import EVEN, ome_channels
 from instrument.runs.frame_array import description_of, group_of
 from instrument.runs.run import Run
 from instrument.runs.run_files import PROVENANCE, RunError
@@ -54,14 +54,7 @@ def descriptions(run: Run, n_frames: int) -> tuple[dict[str, Any], dict[str, Any
     more: dict[str, Any] = {"diffuserbench": facts}
     if array.dtype.kind == "u":
         top = (1 << first.significant_bits) - 1
-        window = {"min": 0, "max": top, "start": 0, "end": top}
-        seen = (
-            {"red": "FF0000", "green": "00FF00", "blue": "0000FF"} if array.is_colour else {"grey": "FFFFFF"}
-        )
-        channels = [
-            {"window": window, "color": c, "active": True, "label": label} for label, c in seen.items()
-        ]
-        more["omero"] = {"channels": channels}
+        more["omero"] = ome_channels(top, colour=array.is_colour)
     step, start = run.frame_period_s, None
     if steps.size:
         sizes = np.abs(steps)

@@ -67,6 +67,21 @@ def test_each_is_shown_with_its_scale(folder: Path, name: str) -> None:
         assert layer["translate"] == read(str(folder / "volume.ome.zarr"))[0][1]["translate"]
 
 
+def test_colours_are_shown_in_themselves(tmp_path: Path) -> None:
+    """Napari's own choice for three channels is cyan, magenta and yellow."""
+    pixels = np.random.default_rng(1).random((2, 8, 9, 3)).astype(np.float32)
+    create_output(tmp_path / "film.ome.zarr", 2, (8, 9, 3), period_s=0.5, grid=None, attributes={})
+    film = VideoPictures(tmp_path / "film.ome.zarr", write=True)
+    for t in range(2):
+        film.write(t, pixels[t])
+    film.say_white([0, 1])
+    shown = film.attributes["ome"]["omero"]["channels"]
+    assert [channel["color"] for channel in shown] == ["FF0000", "00FF00", "0000FF"]
+    assert shown[0]["window"]["end"] == pytest.approx(1, abs=0.02)
+    [(_, layer, _)] = read(str(tmp_path / "film.ome.zarr"))
+    assert (layer["channel_axis"], layer["colormap"]) == (1, ["red", "green", "blue"])
+
+
 def test_a_run_without_frames_is_refused_in_words(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no frames"):
         read(str(write_recording(tmp_path, {})))

@@ -66,6 +66,9 @@ def test_colour_goes_first_and_unknown_sizes_have_no_unit(tmp_path, volume):
     axes = Image.from_zarr(group).ome_attributes.multiscales[0].axes
     assert [a.name for a in axes] == ["c", "z", "y", "x"]
     assert axes[1].unit is None
+    shown = group.attrs["ome"]["omero"]["channels"]
+    assert [channel["color"] for channel in shown] == ["FF0000", "00FF00", "0000FF"]
+    assert shown[0]["window"]["end"] == pytest.approx(3 * volume.max())
     np.testing.assert_array_equal(group["0"][2], 3 * volume)
     assert group.attrs["diffuserbench"]["pitch_um"] is None
 
