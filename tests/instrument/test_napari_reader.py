@@ -77,7 +77,7 @@ def test_colours_are_shown_in_themselves(tmp_path: Path) -> None:
     film.say_white([0, 1])
     shown = film.attributes["ome"]["omero"]["channels"]
     assert [channel["color"] for channel in shown] == ["FF0000", "00FF00", "0000FF"]
-    assert shown[0]["window"]["end"] == pytest.approx(1, abs=0.02)
+    assert pixels.max() > shown[0]["window"]["end"] > 0.9  # a percentile of some of them
     [(_, layer, _)] = read(str(tmp_path / "film.ome.zarr"))
     assert (layer["channel_axis"], layer["colormap"]) == (1, ["red", "green", "blue"])
 
