@@ -28,6 +28,7 @@ from instrument.files.errors import BenchError, size
 from instrument.runs.acquire import record_of
 from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_control import EndedEarlyError
+from instrument.runs.run_files import BENCH_TOML
 from instrument.runs.writer import FrameToStore, RunWriter
 from recon.base.declare import RARE, option
 from recon.base.option_text import command_line
@@ -102,8 +103,7 @@ class KeptFrames:
     ) -> None:
         if error is not None and self.path is not None:
             error.add_note(
-                f"{self._next} frames are kept. To go on with them: {self._typed} --again "
-                f"{shlex.quote(str(self.path))}"
+                f"{self._next} frames are kept. To go on with them: {_typed_again(self._typed, self.path)}"
             )
         if self._writer is not None:
             reason = FinishReason.COMPLETED
@@ -206,7 +206,12 @@ def going_on(run: Run) -> str:
     typed = next(
         (str(event["typed"]) for event in run.events if "typed" in event), f"diffuserbench {command}"
     )
-    return f"{typed} --again {shlex.quote(str(run.path))} --bench {shlex.quote(str(run.path / 'bench.toml'))}"
+    return _typed_again(typed, run.path)
+
+
+def _typed_again(typed: str, run: Path) -> str:
+    """Return what is typed to have a run's frames seen again, on the bench that they were taken on."""
+    return f"{typed} --again {shlex.quote(str(run))} --bench {shlex.quote(str(run / BENCH_TOML))}"
 
 
 def _answered(run: Run) -> list[str]:
