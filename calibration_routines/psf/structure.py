@@ -40,7 +40,12 @@ class Structure:
     source_um: float
     """A source whose image is so wide; one that is much wider than the structure is larger, by up to 1.8."""
     depths: int
-    """How many told; one tells only what the source's image is at most."""
+    """How many there are."""
+    um_per_px: float
+    """Size of a source whose image is a pixel wide at the nearest depth."""
+    least_um: float | None
+    """A smaller source would not have been told from what the diffuser itself leaves; None: one depth, or few
+    that lie near one another, tell only how large it is at most."""
 
     def line(self, size_um: float | None, configured_px: float) -> str:
         """Return what is to be said of it; nothing where the configured size explains it.
@@ -50,22 +55,30 @@ class Structure:
         size_um, configured_px : float
             The source's size as configured, None where it is not, and its image's width at the nearest depth.
         """
-        if self.depths == 1:
+        half_um = _MATTERS_PX * self.um_per_px
+        if self.least_um is None:
             if size_um is not None:
                 return ""
+            told = "one depth does" if self.depths == 1 else "so few depths, so near one another, do"
             if self.near_px <= _WIDE_PX:
                 return (
-                    "Source: one depth does not tell how large it is, and [source] size_um does not say. A "
-                    f"pinhole of {_MATTERS_PX * self.source_um / self.near_px:.2g} um would be half a pixel "
-                    "wide: a larger one blurs the PSFs by more than 3 %. Measure it, or sweep over depths."
+                    f"Source: {told} not tell how large it is, and [source] size_um does not say. A "
+                    f"pinhole of {half_um:.2g} um would be half a pixel wide: a larger one blurs the PSFs by "
+                    "more than 3 %. Measure it, or sweep over more depths."
                 )
             return (
                 f"Source: the pattern's finest structure is {self.near_px:.1f} pixels wide. The image of a "
-                f"source of {self.source_um:.0f} um would be, too: one depth does not tell it from the "
+                f"source of {self.source_um:.0f} um would be, too: {told} not tell it from the "
                 "diffuser's own. Measure the pinhole, and set [source] size_um."
             )
         if self.widened_px <= max(_SEEN_PX, _SURE * self.error_px, _EXPLAINED * configured_px):
-            return ""
+            if size_um is not None:
+                return ""
+            return (
+                f"Source: one of {self.least_um:.2g} um or more would have been told by these depths. From "
+                f"{half_um:.2g} um on its image is half a pixel wide and blurs the PSFs by more than 3 %; "
+                "[source] size_um does not say how large it is: measure the pinhole."
+            )
         whose = "whose size is not configured" if size_um is None else f"not {size_um:g} as configured"
         return (
             f"Source: towards the diffuser the pattern's finest structure widens from {self.far_px:.1f} to "
@@ -92,11 +105,9 @@ def fit_structure(
     if d_mm is None or pitch_um is None or not len(z):
         return None
     um_per_px = pitch_um * float(z.min()) / (1e3 * d_mm)
-    if len(z) == 1:
-        width = float(widths[0])
-        return Structure(width, width, width, 0.0, width * um_per_px, 1)
     if len(z) < _LEAST_DEPTHS or z.max() < _LEAST_RANGE * z.min():
-        return None
+        width = float(widths.max())
+        return Structure(width, width, width, 0.0, width * um_per_px, len(z), um_per_px, None)
     # Widths of what is folded with one another add as squares.
     design = np.stack([np.ones_like(z), (z.min() / z) ** 2], axis=1)
     solution, *_ = np.linalg.lstsq(design, widths**2, rcond=None)
@@ -113,4 +124,6 @@ def fit_structure(
         error,
         widened * um_per_px,
         len(z),
+        um_per_px,
+        um_per_px * max(_SEEN_PX, float(np.sqrt(_SURE * of_square / 2))),
     )
