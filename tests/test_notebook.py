@@ -116,6 +116,9 @@ def test_a_files_image_is_no_array_and_says_where_its_array_is(
         (lambda: photo[:10], ".pixels is its array"),
         (lambda: db.reconstruct(photo, None), "not NoneType"),
         (lambda: db.read(3), "read by its name, not int"),
+        (lambda: db.reconstruct(photo, scene[1], scene[0]), r"options are db.Options\(...\), not ndarray"),
+        (lambda: db.reconstruct(scene[0][None], scene[1]), "1 of 48 x 48 pixels. Give one of them"),
+        (lambda: db.chart(photo), "ImageFile is neither a result nor a scene .* charted by its result"),
     ):
         with pytest.raises((AttributeError, TypeError, db.BenchError), match=said):
             used()
@@ -127,6 +130,7 @@ def test_how_files_are_read_is_said_by_arrays_and_numbers_as_well(
     for name, image in zip(("photo.tif", "psf.tif"), scene, strict=True):
         db.write_image(tmp_path / name, image)
     files = tmp_path / "photo.tif", tmp_path / "psf.tif"
+    assert db.reconstruct(*files, iterations=1, binning="auto").image.shape == (48, 48)
     dark = np.full((48, 48), OFFSET, np.uint16)
     found = db.reconstruct(*files, dark=dark, crop=(0, 0, 40, 44), noise=(2, 0.5), iterations=2)
     assert found.image.shape == (40, 44)

@@ -16,6 +16,7 @@ from instrument.files.atomic import write_json
 from instrument.files.errors import BenchError
 from instrument.notebook.result import Result, figure_png, show_figure
 from instrument.notebook.words import speaking
+from recon.evaluation.scene import FAMILIES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,6 +82,12 @@ def chart(
 
     Raises BenchError when there was no time for any setting; InputError when the subject cannot be charted.
     """
+    if not isinstance(subject, Result) and not (isinstance(subject, str) and subject in FAMILIES):
+        given = repr(subject) if isinstance(subject, str) else type(subject).__name__
+        raise BenchError(
+            f"{given} is neither a result nor a scene ({', '.join(FAMILIES)}). A photograph of your own "
+            "is charted by its result: db.chart(db.reconstruct(photo, psf))."
+        )
     if isinstance(subject, Result):
         asked = subject.provenance.get("options", {}).get("z_um")
         problem, about = problem_of_job(subject.job, asked, volume=not subject.is_picture)

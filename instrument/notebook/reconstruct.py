@@ -134,6 +134,11 @@ def reconstruct(
     """
     image, psf = getattr(image, "measurement", image), getattr(psf, "calibration", psf)
     require_known(overrides, ReconstructionOptions, InputOptions)
+    if not isinstance(options, ReconstructionOptions | None):
+        raise BenchError(
+            f"options are db.Options(...), not {type(options).__name__}; single ones are given by name: "
+            "prior='l1', warm=result."
+        )
     told = on_stage or _Told()
     further: dict[str, Any] = {"warm": warm, "on_progress": on_progress, "cancel": cancel, "on_stage": told}
     try:
@@ -148,11 +153,22 @@ def reconstruct(
                 f"{' and '.join(about)}: of files, and of images by db.read; arrays are taken as they are. "
                 "Leave it out, or do it to the arrays."
             )
+        _require_one(image, psf)
         found = one_door.reconstruct(image, psf, options, **further, **overrides)  # type: ignore[arg-type]
         return Result.of(found, _job_of_arrays(image, psf))
     finally:
         if isinstance(told, _Told):
             told.end()
+
+
+def _require_one(image: Any, psf: Any) -> None:
+    """Raise BenchError where an array has a photograph's size behind an axis that counts photographs."""
+    shape, psf_shape = np.shape(image), np.shape(psf)
+    if len(shape) == 3 and len(psf_shape) == 2 and shape[:2] != psf_shape == shape[1:]:
+        raise BenchError(
+            f"The photograph is an array {shape}: {shape[0]} of {shape[1]} x {shape[2]} pixels. Give one of "
+            "them: photograph[0]; colours are the last axis."
+        )
 
 
 def _is_file(given: object) -> bool:
@@ -182,15 +198,17 @@ def _opened(given: Any, name: str) -> ImageFile:
 
 def _inputs(given: Mapping[str, Any]) -> InputOptions:
     """Return options of files; words are read as the terminal reads them, and numbers in a row as words."""
-    parsers = {o.name: o.declaration.parse for o in options_of(InputOptions)}
+    declared = {o.name: o.declaration for o in options_of(InputOptions)}
     read: dict[str, Any] = {}
     for name, value in given.items():
+        if isinstance(value, str) and value == declared[name].none_word:
+            value = None
         if isinstance(value, tuple | list) and all(isinstance(one, Real) for one in value):
             value = ",".join(map(str, value))
         elif name == "dark" and np.ndim(value):
             opened = _opened(value, "dark frame")
             value = opened if value is opened else ImageFile(Path("an array"), opened.pixels)
-        parse = parsers[name] if isinstance(value, str) else None
+        parse = declared[name].parse if isinstance(value, str) else None
         try:
             read[name] = value if parse is None else parse(value)
         except InputError as error:
