@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import DOUBTFUL, whole_folder
 from instrument.files.errors import FileError
+from instrument.files.pieces import piece_bytes
 from instrument.files.reading import folder_bytes, require_plausible
 from instrument.files.record import RecordFormat
 from instrument.files.volumes import ome_attributes
@@ -171,7 +172,8 @@ def _read_array(folder: Path, name: str, checksums: Mapping[str, str]) -> npt.ND
 
     try:
         stored = zarr.open_array(folder / name / "0", mode="r")
-        require_plausible(folder / name, stored.nbytes, folder_bytes(folder / name, stored.nbytes))
+        held = folder_bytes(folder / name, stored.nbytes, piece_bytes(stored))
+        require_plausible(folder / name, stored.nbytes, held)
         array = np.ascontiguousarray(stored[...])
     except FileError:
         raise

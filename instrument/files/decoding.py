@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files import reading
-from instrument.files.errors import FileError, size
+from instrument.files.errors import FileError, os_reason, size
 from instrument.files.named_arrays import is_hdf5, is_matlab, read_hdf5, read_matlab
 from instrument.files.pictures import MAGIC, READABLE, Decoded, decode_picture
 from instrument.files.tiffs import RAW, decode_tiff
@@ -56,6 +56,8 @@ def decode(path: Path, inside: str = "") -> Decoded:
             beginning = file.read(_BEGINNING)
     except FileNotFoundError:
         raise FileError(path, "there is no such file.") from None
+    except OSError as failure:
+        raise FileError(path, f"cannot be read: {os_reason(failure)}") from None
     if not n_bytes:
         raise FileError(path, "is empty (0 bytes).")
     if is_hdf5(beginning):

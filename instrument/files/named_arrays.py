@@ -14,6 +14,7 @@ import numpy.typing as npt
 from instrument.files import matlab, reading
 from instrument.files.errors import FileError
 from instrument.files.ome_tiff import MICROMETRES, MOST_PLANES
+from instrument.files.pieces import hdf5_pieces, piece_bytes, require_pieces
 
 Read = tuple[npt.NDArray[Any], tuple[str, ...]]
 _AXES = ("t", "c", "z", "y", "x", "s")
@@ -96,6 +97,8 @@ def read_hdf5(path: Path, inside: str, *, of_matlab: bool = False) -> Read:
                 path, f"keeps the numbers of {name} in other files.", "Copy them into one file (h5repack)."
             )
         reading.require_plausible(path, file[name].nbytes, reading.stored_bytes(path))
+        if file[name].chunks is not None and file[name].id.get_create_plist().get_nfilters():
+            require_pieces(path, hdf5_pieces(file[name].id), piece_bytes(file[name]))
         return np.asarray(file[name][()])
 
     try:
@@ -201,7 +204,8 @@ def read_zarr(folder: Path) -> Read:
             names = [axis["name"] if isinstance(axis, dict) else axis for axis in image.get("axes", "tczyx")]
             axes = "".join(map(str, names))
             group = group[image["datasets"][0]["path"]]
-        reading.require_plausible(folder, group.nbytes, reading.folder_bytes(folder, group.nbytes))
+        held = reading.folder_bytes(folder, group.nbytes, piece_bytes(group))
+        reading.require_plausible(folder, group.nbytes, held)
         array = np.asarray(group[...])
     except FileError:
         raise

@@ -6,10 +6,12 @@ import json
 import re
 import stat
 import tomllib
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from instrument.files.errors import FileError, os_reason, size
+from instrument.files.pieces import require_pieces
 
 MOST_TEXT_BYTES = 48 << 20
 """Records, plans, configurations: a plan of 100,000 named positions has 20 MB."""
@@ -94,10 +96,21 @@ def stored_bytes(path: Path) -> int:
     return min(found.st_size, 512 * (getattr(found, "st_blocks", 0) or found.st_size))
 
 
-def folder_bytes(folder: Path, n_bytes: int | None = None, *, error: type[FileError] = FileError) -> int:
+def _opened(path: Path) -> IO[bytes]:
+    return path.open("rb")
+
+
+def folder_bytes(
+    folder: Path,
+    n_bytes: int | None = None,
+    piece_bytes: int | None = None,
+    *,
+    error: type[FileError] = FileError,
+) -> int:
     """Return the stored bytes of all files in a folder and below.
 
-    With ``n_bytes``, those of its array's numbers, a file that is larger than they could be is refused.
+    With ``n_bytes``, those of its array's numbers, a file that is larger than they could be is refused; with
+    ``piece_bytes`` one that inflates to more than that too, which is what a file of an array holds.
     """
     files = [file for file in folder.rglob("*") if file.is_file()]
     for file in files if n_bytes is not None else ():
@@ -105,6 +118,9 @@ def folder_bytes(folder: Path, n_bytes: int | None = None, *, error: type[FileEr
             raise error(
                 file, f"has {size(file.stat().st_size)}, for numbers of {size(n_bytes or 0)}: damaged."
             )
+    if piece_bytes is not None:
+        pieces = ((file.stat().st_size, partial(_opened, file)) for file in files if file.suffix != ".json")
+        require_pieces(folder, pieces, piece_bytes, error=error)
     return sum(map(stored_bytes, files))
 
 

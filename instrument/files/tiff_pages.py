@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from instrument.files.errors import FileError
+from instrument.files.pieces import bound_tiff_pieces
 
 if TYPE_CHECKING:
     import tifffile
@@ -33,6 +34,7 @@ def open_tiff(path: Path) -> tifffile.TiffFile:
                 path,
                 f"is a damaged TIFF: its pages follow one another in a circle, or are over {_MOST_PAGES}.",
             )
+    bound_tiff_pieces(tifffile)
     return tifffile.TiffFile(path)
 
 

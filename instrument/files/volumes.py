@@ -17,6 +17,7 @@ import numpy.typing as npt
 from instrument.files.atomic import whole_file, whole_folder
 from instrument.files.errors import FileError
 from instrument.files.ome_tiff import annotation, facts_of, resolution
+from instrument.files.pieces import piece_bytes
 from instrument.files.reading import folder_bytes, require_file, require_plausible, stored_bytes
 from instrument.files.tiff_pages import open_tiff
 
@@ -482,8 +483,8 @@ def _open_zarr(path: Path) -> VolumeSource:
         names = [axis["name"] for axis in multiscale["axes"]]
         facts = group.attrs.get("diffuserbench")
         arrays = [group[dataset["path"]] for dataset in multiscale["datasets"]]
+        stored = folder_bytes(path, arrays[0].nbytes, piece_bytes(*arrays))
         for array in arrays:
-            stored = folder_bytes(path, arrays[0].nbytes)
             require_plausible(path, array.nbytes, stored, small=_SPARSE_BYTES)
             if len(array.shape) != len(names) or 0 in array.shape:
                 raise FileError(path, f"holds an array of shape {array.shape} for {len(names)} axes.")

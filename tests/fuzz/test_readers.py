@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import io
+import lzma
 import os
 import struct
 import tracemalloc
 import zipfile
+import zlib
 from pathlib import Path
 
+import numcodecs
 import numpy as np
 import pytest
+import zarr
 
 from instrument.bench.config_file import load_config
 from instrument.files.errors import BenchError
@@ -69,6 +73,59 @@ def test_what_claims_more_than_it_holds_is_refused_before_memory_is_taken(tmp_pa
     (tmp_path / "a.png").write_bytes(png)
     with pytest.raises(BenchError, match="made to fill the memory"):
         read_image(tmp_path / "a.png")
+
+
+def untold(blocks: int) -> bytes:
+    """Return a Zstandard frame of so many blocks of 128 kB of zeros each, which does not tell its size."""
+    block = ((1 << 17) << 3 | 1 << 1).to_bytes(3, "little") + b"\0"
+    last = (1 << 1 | 1).to_bytes(3, "little") + b"\0"
+    return b"\x28\xb5\x2f\xfd\x00\x58" + blocks * block + last
+
+
+@pytest.mark.parametrize("kind", ["hdf5", "gzip", "zstd", "untold", "blosc"])
+def test_a_piece_that_inflates_beyond_what_its_array_holds_is_refused(tmp_path: Path, kind: str) -> None:
+    path, whole = tmp_path / kind, np.arange(6144, dtype=np.uint16).reshape(64, 96)
+    inflated = bytes(40 << 20)
+    if kind == "hdf5":
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w") as file:
+            file.create_dataset("image", data=whole, chunks=(64, 96), compression="gzip")
+    else:
+        codec = {"gzip": zarr.codecs.GzipCodec, "blosc": zarr.codecs.BloscCodec}.get(
+            kind, zarr.codecs.ZstdCodec
+        )
+        zarr.create_array(path, shape=(64, 96), dtype="u2", chunks=(64, 96), compressors=codec())[:] = whole
+    assert (read_image(path).pixels == whole).all()
+    if kind == "hdf5":
+        with h5py.File(path, "r+") as file:
+            file["image"].id.write_direct_chunk((0, 0), zlib.compress(inflated))
+    else:
+        packed = {"gzip": numcodecs.GZip(), "blosc": numcodecs.Blosc()}.get(kind, numcodecs.Zstd())
+        (path / "c/0/0").write_bytes(untold(2200) if kind == "untold" else packed.encode(inflated))
+    with pytest.raises(BenchError, match=r"inflates to over 1.07 MB, for 12.3 kB of numbers"):
+        read_image(path)
+
+
+@pytest.mark.parametrize("compression", [8, 34925])
+def test_a_tiffs_strip_is_inflated_as_far_as_it_holds(tmp_path: Path, compression: int) -> None:
+    whole, zeros = np.arange(6144, dtype=np.uint16).tobytes(), bytes(60 << 20)
+    pack = zlib.compress if compression == 8 else lzma.compress
+    facts = [(256, 96), (257, 64), (258, 16), (259, compression), (262, 1), (273, 8), (277, 1), (278, 64)]
+    for packed in (pack(whole), pack(whole + zeros)):
+        entries = [struct.pack("<HHII", tag, 4, 1, value) for tag, value in [*facts, (279, len(packed))]]
+        pages = struct.pack("<H", len(entries)) + b"".join(entries) + bytes(4)
+        (path := tmp_path / "a.tif").write_bytes(
+            b"II*\0" + struct.pack("<I", 8 + len(packed)) + packed + pages
+        )
+        tracemalloc.start()
+        try:
+            assert read_image(path).pixels.tobytes() == whole
+            assert tracemalloc.get_traced_memory()[1] < 16 << 20
+        finally:
+            tracemalloc.stop()
+    path.write_bytes(path.read_bytes().replace(packed, pack(whole)[:-4].ljust(len(packed), b"\0")))
+    with pytest.raises(BenchError, match="damaged or unusual TIFF"):
+        read_image(path)
 
 
 def hollow(path: Path, beginning: bytes, n_bytes: int = 20 << 30) -> Path:
