@@ -40,7 +40,7 @@ from instrument.bench.config_file import parse_config
 from instrument.evaluation.chart import ChartData
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
-from instrument.runs.finish import ctrl_c_remembered
+from instrument.runs.interrupts import ctrl_c_remembered
 from instrument.runs.runner import RunStatus
 from instrument.runs.writer import free_name
 from recon import Reconstruction, reconstruct

@@ -36,6 +36,7 @@ from instrument.files.record import plain
 from instrument.plan import Plan
 from instrument.runs.frame_array import FrameArray
 from instrument.runs.frame_facts import descriptions
+from instrument.runs.interrupts import interrupts_held
 from instrument.runs.log import AppendOnlyLog, FrameRecord, Gap, log_line
 from instrument.runs.repair import keep_beside, mend_files, settle_recording
 from instrument.runs.run import FinishReason, Run
@@ -255,11 +256,18 @@ class RunWriter:
     def write(self, frames: Sequence[FrameToStore]) -> None:
         """Store frames with their metadata, and return once all of it is on the disk.
 
+        Ctrl-C and SIGTERM wait until the frames have their lines.
+
         Raises RunError when the disk is full or not writable, or a frame does not fit the run. What was on
         the disk before stays.
         """
         if not frames:
             return
+        with interrupts_held() as held:
+            self._store(frames)
+        held.answer()
+
+    def _store(self, frames: Sequence[FrameToStore]) -> None:
         try:
             with _disk(self.path, f"frame {frames[0].index} could not be stored"):
                 array = self._array or self._make_array(frames)

@@ -72,6 +72,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "instrument/runs/run.py",
             "instrument/runs/repair.py",
             "instrument/runs/finish.py",
+            "instrument/runs/interrupts.py",
             "instrument/runs/frame_array.py",
             "instrument/runs/inspection.py",
             "instrument/files/atomic.py",

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from instrument.runs.finish import ctrl_c_remembered, interrupts_held
+from instrument.runs.interrupts import ctrl_c_remembered, interrupts_held
 
 
 def in_context(work: Callable[[Callable[[], None]], None]) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from ome_zarr_models.v05 import Image
 from drivers.frame import FrameMetadata
 from instrument.files.atomic import write_json
 from instrument.plan import Part, Plan
+from instrument.runs.frame_array import FrameArray
 from instrument.runs.inspection import run_paths, verify
 from instrument.runs.log import AppendOnlyLog, BadLine, FrameRecord, Gap, read_lines
 from instrument.runs.run import FinishReason, Run, RunCondition
@@ -175,6 +178,25 @@ def test_an_interrupted_append_leaves_nothing_and_loses_nothing_later(
     log.append([{"a": 3}])
     log.close()
     assert read_lines(path)[0] == [{"a": 1}, {"a": 3}]
+
+
+def test_ctrl_c_between_an_image_and_its_line_waits_for_the_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = FrameArray.write
+
+    def interrupted(self: FrameArray, *images: Any) -> Any:
+        stored = write(self, *images)
+        signal.raise_signal(signal.SIGINT)
+        return stored
+
+    monkeypatch.setattr(FrameArray, "write", interrupted)
+    writer = new_run(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        writer.write([frame(0)])
+    run = writer.finish(FinishReason.ABORTED)
+    assert set(run.records) == {0}
+    assert verify(run).is_sound
 
 
 def test_a_frame_of_another_shape_or_place_is_refused(tmp_path: Path) -> None:
