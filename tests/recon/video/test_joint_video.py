@@ -90,6 +90,10 @@ def test_the_value_of_low_rank_plus_sparse_is_that_of_the_parts_last_found() -> 
     assert prior.value(low) == pytest.approx(alone)
     prior.sparse = sparse
     assert prior.value(low + sparse) == pytest.approx(alone + 0.3 * np.abs(sparse).sum())
+    faint = LowRankPlusSparse(2.0, 0.3).value(0.1 * np.repeat(low[:1], 3, axis=0))  # of rank one, and below 1
+    assert faint == pytest.approx(0.2 * np.sqrt(3) * np.linalg.norm(low[0]))
+    fainter = LowRankPlusSparse(10.0, 100.0).prox(0.1 * low, 1.0)  # every singular value is below its step
+    np.testing.assert_allclose(fainter, 0, atol=1e-12)
 
 
 def problem(n_frames: int = 4) -> tuple[Convolution, np.ndarray]:
@@ -267,7 +271,8 @@ def test_weights_over_time_are_those_of_the_noise_that_valid_pixels_pass_on(
 def test_what_a_prior_over_time_has_no_way_for_is_refused() -> None:
     frames = np.random.default_rng(0).random((3, 20, 20)).astype(np.float32)
     asked = stream_problem(frames[0], frames[0] ** 4, solver="admm")
-    with pytest.raises(InputError, match="a solver of its own"):
-        require_joint(asked)
+    for refused in (lambda: require_joint(asked), lambda: solve_together(asked, frames, "tv")):
+        with pytest.raises(InputError, match="a solver of its own"):
+            refused()
     with pytest.raises(InputError, match="two frames"):
         solve_together(stream_problem(frames[0], frames[0] ** 4), frames[0], "tv")
