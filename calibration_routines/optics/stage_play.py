@@ -136,6 +136,9 @@ class StagePlay:
                 found.append(
                     f"{name} has a play of {axis.play_um:.4g} um and bench.toml says {kept:g}: put the line "
                     "below into its [stage] table, and sweeps come to every place from one side."
+                    if axis.name in self.play
+                    else f"{name} stayed behind by {axis.play_um:.3g} +- {axis.play_error_um:.2g} um, too "
+                    "unsteadily for a play: look for slips and a loose source, and measure again."
                 )
             if abs(axis.slip_um) > _SURE * max(axis.repeatability_um, axis.play_error_um) + 2.0:
                 found.append(

@@ -8,7 +8,16 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from calibration_routines.optics.stage_play import ROUTINES, StageCheck, StageProcedure, planned, stage_plan
+from calibration_routines.optics.stage_play import (
+    ROUTINES,
+    AxisPlay,
+    StageCheck,
+    StagePlay,
+    StageProcedure,
+    planned,
+    stage_plan,
+)
+from calibration_routines.scatter import STEADY
 from drivers.simulated.world import SimulatedWorld
 from drivers.stage import approached
 from instrument.bench.bench import Bench, open_bench
@@ -84,6 +93,17 @@ def test_a_check_that_goes_on_comes_to_its_places_from_where_it_came() -> None:
             restore(Mock(plan=plan), bench, step.index)
             bench.stage.move_to(step.stage)
             assert world.source_position_um == pytest.approx(place, abs=10), step.label
+
+
+def test_a_play_too_unsteady_for_the_line_is_not_told_to_be_put_there() -> None:
+    steady, unsteady = (
+        AxisPlay("x_um", 200.0, 0.3, 0.5, 0.0, 0.0),
+        AxisPlay("y_um", 200.0, 70.0, 0.5, 0.0, 0.0),
+    )
+    found = StagePlay((steady, unsteady), STEADY, 40e3, 1600.0, 10.0)
+    assert list(found.play) == ["x_um"]
+    assert "put the line" in found.findings[0]
+    assert "y stayed behind by 200 +- 70 um" in found.findings[1]
 
 
 def there_and_back(z_um: float) -> Plan:
