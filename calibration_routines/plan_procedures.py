@@ -8,6 +8,7 @@ from pathlib import Path
 
 from calibration_routines.display.kept_frames import going_on, kept_by
 from calibration_routines.procedure import (
+    REFUSED,
     Listener,
     Outcome,
     Outlook,
@@ -174,11 +175,21 @@ def goes_on_with_frames(run: Path) -> bool:
     return routine is not None and routine.finish_takes_frames and lacks_result(run)
 
 
+def why_no_result(run: Path) -> str:
+    """Return why the frames of a complete run give no result; empty where nobody found that they do not."""
+    file = run / REFUSED
+    try:
+        return file.read_text("utf-8").strip() if file.is_file() else ""
+    except (OSError, UnicodeDecodeError) as error:
+        return f"{file} cannot be read: {error}"
+
+
 def can_go_on(run: Run, looked: Verification) -> bool:
     """Whether resuming a run would do something: take frames, mend files, make its result."""
     left = bool(looked.remedy()) or run.condition is RunCondition.CRASHED
     whole = run.plan is None or run.condition is RunCondition.COMPLETED
-    return (left or not whole or lacks_result(run.path)) and run.condition is not RunCondition.RUNNING
+    lacks = lacks_result(run.path) and not why_no_result(run.path)
+    return (left or not whole or lacks) and run.condition is not RunCondition.RUNNING
 
 
 def unfinished(path: Path | None) -> Path | None:

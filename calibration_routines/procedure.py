@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from importlib import import_module
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from calibration_routines.times import took, took_before
 from instrument.bench.bench import Bench
-from instrument.files.atomic import DOUBTFUL, named_by_worth
+from instrument.files.atomic import DOUBTFUL, named_by_worth, write_text
 from instrument.files.errors import BenchError, FileError, SettingsError
 from instrument.files.record import RecordFormat, plain
 from instrument.plan import Plan, PlanEstimate, Step, estimate
@@ -32,6 +33,7 @@ from instrument.runs.writer import dated_name, free_name
 from recon.base.declare import options_of
 from recon.base.option_text import size
 from recon.base.registry import Registry
+from recon.errors import InputError
 
 if TYPE_CHECKING:
     from calibration_routines.display.spot_camera import SpotLook
@@ -39,6 +41,8 @@ if TYPE_CHECKING:
     from calibration_routines.psf.sweep_watch import SweepEvent
 
 T = TypeVar("T")
+REFUSED = "no_result.txt"
+"""In a run's folder: why its frames, all of them, give no result."""
 
 
 # Errors ------------------------------------------------------------------------------------------------
@@ -283,6 +287,20 @@ class Purpose(Generic[T]):
     def lacks_result(self, run: Path) -> bool:
         """Whether they are, and the result is not there yet."""
         return self.is_of(run) and not any(self.place(run, doubted=one).exists() for one in (False, True))
+
+    @contextmanager
+    def analysed(self, run: Path) -> Iterator[None]:
+        """Keep with a complete run why its frames give no result, when their analysis in the block says so.
+
+        The same frames would say it again, so that :func:`can_go_on` offers the run to nobody any more.
+        """
+        refused = run / REFUSED
+        try:
+            yield
+        except (CalibrationError, InputError) as error:
+            write_text(refused, f"{error}\n")
+            raise
+        refused.unlink(missing_ok=True)  # by a program before this one
 
     def read(self, run: Path) -> T:
         """Read the record of a run; CalibrationError when there is none, or it is damaged."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy.typing as npt
 
 from calibration_routines.optics.photograph import PHOTOGRAPH
-from calibration_routines.plan_procedures import can_go_on
+from calibration_routines.plan_procedures import can_go_on, why_no_result
 from calibration_routines.psf.sweep_plan import SWEEP
 from drivers.frame import FrameMetadata
 from gui.widgets.entry import quantity
@@ -135,6 +135,8 @@ def _about_run(run: Run, looked: Verification) -> list[str]:
     devices = run.provenance.get("devices")
     if isinstance(devices, Mapping):
         lines += [f"{kind}: {identity}" for kind, identity in devices.items()]
+    if refused := why_no_result(run.path):
+        lines.append(f"Its frames give no result: {refused}")
     if SWEEP.is_of(run.path):
         lines += _calibration_lines(run.path)
     return [*lines, str(run.path)]

@@ -49,6 +49,8 @@ from instrument.runs.run_control import RunControl
 from recon.base.declare import RARE, option
 from recon.types import Geometry
 
+LEAST_STEPS = 2
+"""To one side of an axis: of fewer angles no curve is made."""
 MOST_STEPS = 300
 """More angles to one side of an axis are a mistake."""
 _REACH_MARGIN = 0.98  # of the stage's travel
@@ -179,7 +181,7 @@ def check_angular(bench: Bench, sweep: AngularSweep, folder: Path | None = None)
     """Refuse what is out of the stage's reach or does not fit the disk, before anything moves; the plan.
 
     Raises BenchError when the stage does not reach so far (which angle it reaches is said); PlanError when
-    something else of the plan cannot be done.
+    something else of the plan cannot be done; SettingsError for too few angles to tell a response from.
     """
     reach, (low, high) = _reach(bench)
     z_um = sweep.distance_um
@@ -188,6 +190,13 @@ def check_angular(bench: Bench, sweep: AngularSweep, folder: Path | None = None)
             f"The source at z = {z_um / 1e3:.4g} mm is outside the stage's limits {low / 1e3:.4g} to "
             f"{high / 1e3:.4g} mm. Choose a distance between them, or leave --z out."
         )
+    for along, name in enumerate("xy"):
+        if len(sweep.angles_deg(along)) < LEAST_STEPS:
+            end_deg = min(sweep.largest_deg, np.inf if sweep.ends_deg is None else sweep.ends_deg[along])
+            seen = "" if end_deg == sweep.largest_deg else ", beyond which the pattern leaves the sensor,"
+            words = f"steps of {sweep.step_deg:g} degrees up to {end_deg:.3g} along {name}{seen} are fewer"
+            words += f" than {LEAST_STEPS}: choose steps of {end_deg / LEAST_STEPS:.2g} degrees at most"
+            raise SettingsError([("step_deg", words)])
     largest_deg = max(*sweep.angles_deg(0), *sweep.angles_deg(1))
     needed = z_um * float(np.tan(np.deg2rad(largest_deg)))
     if needed > reach:
@@ -247,16 +256,17 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     images, scatter = images_of(run, points, dark, drift)
     ambient = dark.brightening_per_ms * run.metadata(run.steps(PSF)[0]).exposure_ms / float(images[0].mean())
     findings = (*scatter.findings("picture"), *ambient_findings(ambient))
-    response = analyse_angular(
-        images,
-        points.points_um,
-        pitch_um=pitch_um,
-        distance_um=1e3 * distance_mm,
-        emission=record.sweep.emission,
-        findings=findings if drift is None else (*findings, *drift.findings),
-        bench=record.bench,
-        simulated=record.simulated,
-    )
+    with ANGULAR.analysed(run.path):
+        response = analyse_angular(
+            images,
+            points.points_um,
+            pitch_um=pitch_um,
+            distance_um=1e3 * distance_mm,
+            emission=record.sweep.emission,
+            findings=findings if drift is None else (*findings, *drift.findings),
+            bench=record.bench,
+            simulated=record.simulated,
+        )
     response = replace(response, scatter=scatter)
     file = save_response(response, ANGULAR.place(run.path, doubted=bool(response.findings)))
     picture = file.with_suffix(".png")

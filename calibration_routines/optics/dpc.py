@@ -188,7 +188,8 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     record = DPC.read(run.path)
     optics, index = record.optics, record.setup.index
     dark = dark_model(run)
-    halves, scatter = _halves(run, dark)
+    with DPC.analysed(run.path):
+        halves, scatter = _halves(run, dark)
     first, shaken = halves[SIDES[0]], scatter.motion_px > _SHAKEN_PX
     findings = (  # each half is brought to its own mean: flicker is none
         *replace(scatter, flicker=0.0, motion_px=shaken * scatter.motion_px).findings("half"),

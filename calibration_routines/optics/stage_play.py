@@ -259,7 +259,8 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
     """Judge the stage by a complete run; CalibrationError when the pattern or a play is not seen whole."""
     listener.step("analysing")
     record = STAGE.read(run.path)
-    found = judged(run, record)
+    with STAGE.analysed(run.path):
+        found = judged(run, record)
     file = STAGE.place(run.path, doubted=bool(found.scatter.findings()))
     _RESULT.write(file, plain(found) | {"play": found.play, "findings": list(found.findings)})
     return Outcome(

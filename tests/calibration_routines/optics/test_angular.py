@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibration_routines.optics import angular
 from calibration_routines.optics.angular import (
     AngularProcedure,
     AngularSweep,
@@ -15,6 +16,7 @@ from calibration_routines.optics.angular import (
     farthest_um,
 )
 from calibration_routines.optics.angular_response import AngularResponse, Curve, load_response
+from calibration_routines.plan_procedures import lacks_result, unfinished, why_no_result
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
@@ -116,6 +118,18 @@ def test_angles_from_which_no_light_meets_the_sensor_are_left_out(bench: Bench, 
         np.testing.assert_allclose(curve.response, truth, atol=0.05)
 
 
+def test_a_run_whose_frames_give_no_response_is_not_offered_to_go_on_with(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(angular, "pattern_ends_deg", lambda _: None)  # of an aperture that is not known
+    with pytest.raises(BenchError, match="Only 2 angles along x could be measured"):
+        AngularProcedure(AngularSweep(80e3, 34.0, 17.0, average=1)).carry_out(bench, tmp_path)
+    (run,) = tmp_path.iterdir()
+    assert lacks_result(run)
+    assert unfinished(run) is None
+    assert "Only 2 angles" in why_no_result(run)
+
+
 def test_an_angle_out_of_reach_is_refused_before_anything_moves(bench: Bench) -> None:
     assert farthest_um(bench, 45.0) == pytest.approx(0.98 * 60e3)
     assert farthest_um(bench, 5.0) == pytest.approx(300e3)
@@ -127,6 +141,8 @@ def test_an_angle_out_of_reach_is_refused_before_anything_moves(bench: Bench) ->
         check_angular(bench, AngularSweep(250e3))
     with pytest.raises(BenchError, match="outside the stage's limits 8 to 300 mm"):
         check_angular(bench, AngularSweep(400e3, 5.0))
+    with pytest.raises(BenchError, match=r"up to 12 along x are fewer than 2: .* of 6 degrees at most"):
+        check_angular(bench, AngularSweep(150e3, 12.0, 10.0))
 
 
 def test_curves_between_the_axes_follow_a_gaussian_of_two_widths() -> None:
