@@ -2,10 +2,11 @@
 
     python benchmarks/gui_contact_sheet.py --out sheet.jpg                  all of it; some minutes
     python benchmarks/gui_contact_sheet.py --out sheet.jpg --size 1350x690 --state empty --panel live
-    QT_SCALE_FACTOR=2 python benchmarks/gui_contact_sheet.py --out sheet.jpg --state empty
+    QT_SCALE_FACTOR=2 python benchmarks/gui_contact_sheet.py --out sheet.jpg --pictures sheet
 
-The last one is 3840 x 2160 at scale 2. Empty: a bench whose folder holds nothing. Failed: all of its devices
-unplugged. Filled: with what ``gui_screenshots.py`` makes and keeps (``--work``). Words cut off, places
+The last one is 3840 x 2160 at scale 2, every picture kept in its own size, too. Empty: a bench whose folder
+holds nothing. Failed: all of its devices unplugged, what is begun or opened refused. Filled: with what
+``gui_screenshots.py`` makes and keeps (``--work``). Words cut off, places
 scrolled twice or sideways, and parts without a name for screen readers are looked for in each
 (``tests/gui/looks.py``) and printed; exit status 1 where there are any. Needs no screen.
 """
@@ -19,6 +20,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 sys.path.append(str(Path(__file__).parents[1]))
@@ -30,6 +32,7 @@ from PySide6.QtTest import QTest
 
 from drivers.simulated.world import SimulatedWorld
 from gui.app import application
+from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.theme import THEMES, apply_theme
 from tests.gui.looks import faults
@@ -37,6 +40,7 @@ from tests.gui.looks import faults
 STATES = ("empty", "filled", "failed")
 HEADING_PX = 22
 RESTYLED_MS = 120
+DAMAGED = "damaged.tif"
 
 
 def main() -> int:
@@ -50,6 +54,7 @@ def main() -> int:
     parser.add_argument("--state", action="append", choices=STATES, help="only this one; repeatable")
     parser.add_argument("--theme", action="append", choices=list(THEMES), help="only this one; repeatable")
     parser.add_argument("--panel", action="append", choices=list(PANELS), help="only this one; repeatable")
+    parser.add_argument("--pictures", type=Path, help="folder that keeps every picture in its own size")
     parser.add_argument("--tile", type=int, default=400, help="width of a picture on the sheet, pixels")
     given = parser.parse_args()
     width, height = (int(part) for part in given.size.split("x"))
@@ -60,6 +65,9 @@ def main() -> int:
     found: list[str] = []
     for state in given.state or STATES:
         for name, theme, picture, wrong in _pictures(state, panels, themes, (width, height), given.work):
+            if given.pictures is not None:
+                given.pictures.mkdir(parents=True, exist_ok=True)
+                picture.save(str(given.pictures / f"{state}-{name}-{theme}.png"))
             tiles[name, state, theme] = picture.scaledToWidth(
                 given.tile, Qt.TransformationMode.SmoothTransformation
             )
@@ -75,40 +83,77 @@ def _pictures(
     state: str, panels: list[str], themes: list[str], size: tuple[int, int], work: Path
 ) -> Iterator[tuple[str, str, QImage, list[str]]]:
     """Yield every panel in every theme: name, theme, picture, faults."""
-    own = Path(tempfile.mkdtemp())
-    folder = work.resolve() / "camera" if state == "filled" else own / "camera"
+    benches = {"camera": [name for name in panels if state != "filled" or name not in shots.DISPLAY]}
+    benches["display"] = [name for name in panels if name not in benches["camera"]]
+    for bench, names in benches.items():
+        if not names:
+            continue
+        own = Path(tempfile.mkdtemp())
+        folder = (work.resolve() if state == "filled" else own) / bench
+        _prepare(folder, state)
+        apply_theme(application(), themes[0])  # the state before ended with the last
+        window = shots._open(folder, *size)
+        if state == "failed":
+            _unplug(window)
+        for name in names:
+            _come_to(window, name, state, own)
+            for theme in themes:
+                window.set_theme(theme)
+                shots._wait(lambda window=window: not window.is_restyling, "the theme")
+                QTest.qWait(RESTYLED_MS)
+                picture = window.grab().toImage()
+                picture.setDevicePixelRatio(1.0)  # in the screen's own pixels
+                yield name, theme, picture, faults(window)
+        shots._close(window)
+        shutil.rmtree(own, ignore_errors=True)
+
+
+def _prepare(folder: Path, state: str) -> None:
+    """Make a bench, and what its panels are filled with."""
     folder.mkdir(parents=True, exist_ok=True)
-    if state == "filled":
-        shots._prepare_camera(folder)
-    else:
+    if state != "filled":
         (folder / "bench.toml").write_text(shots.CAMERA)
-    apply_theme(application(), themes[0])  # the state before ended with the last
-    window = shots._open(folder, *size)
+        (folder / DAMAGED).write_text("neither a picture nor a film")
+    elif folder.name == "display":
+        shots._prepare_display(folder)
+    else:
+        shots._prepare_camera(folder)
+
+
+def _unplug(window: MainWindow) -> None:
+    """Take every device away, and wait until that is noticed."""
+    world = window.session.bench.shared["simulated"]
+    assert isinstance(world, SimulatedWorld)
+    for kind in window.session.kinds:
+        world.unplug(kind)
+        window.session.reconnect(kind)
+    shots._wait(
+        lambda: all(window.session.state(k).condition == "failed" for k in window.session.kinds),
+        "the devices to fail",
+    )
+
+
+def _come_to(window: MainWindow, name: str, state: str, out: Path) -> None:
+    """Bring a panel to the front in a state."""
+    if state == "filled" and name == "alignment":
+        shots._align(window)
+    elif state == "filled" and name == "holograms":
+        shots._hologram(window)
+    elif state == "filled":
+        shots._show(window, name, out)
+        return
+    panel: Any = window.show_panel(name)
     if state == "failed":
-        world = window.session.bench.shared["simulated"]
-        assert isinstance(world, SimulatedWorld)
-        for kind in window.session.kinds:
-            world.unplug(kind)
-            window.session.reconnect(kind)
-        shots._wait(
-            lambda: all(window.session.state(k).condition == "failed" for k in window.session.kinds),
-            "the devices to fail",
-        )
-    for name in panels:
-        if state == "filled" and name not in shots.DISPLAY:
-            shots._show(window, name, own)
-        else:
-            window.show_panel(name)
-            QTest.qWait(shots.SETTLE_MS)
-        for theme in themes:
-            window.set_theme(theme)
-            shots._wait(lambda: not window.is_restyling, "the theme")
-            QTest.qWait(RESTYLED_MS)
-            picture = window.grab().toImage()
-            picture.setDevicePixelRatio(1.0)  # in the screen's own pixels
-            yield name, theme, picture, faults(window)
-    shots._close(window)
-    shutil.rmtree(own, ignore_errors=True)
+        damaged = window.session.runs_folder.parent / DAMAGED
+        if name in ("films", "charts", "reconstructions"):
+            panel.open(damaged)
+        elif name == "tasks":
+            panel.take(("export", {"run": damaged}))
+            shots._wait(lambda: panel.run_bar.start_button.isEnabled(), "the form")
+            panel.options_form.set_values({"out": damaged.with_suffix(".npy")})
+            panel.start()
+            shots._wait(lambda: not panel.run.is_running, "the refusal")
+    QTest.qWait(shots.SETTLE_MS)
 
 
 def _sheet(tiles: dict[tuple[str, str, str], QImage]) -> QImage:

@@ -22,7 +22,18 @@ from typing import Any
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 
 import numpy as np
-from PySide6.QtCore import QSettings, QSize, Qt, QtMsgType, qInstallMessageHandler
+from PySide6.QtCore import (
+    QCoreApplication,
+    QEvent,
+    QPoint,
+    QPointF,
+    QSettings,
+    QSize,
+    Qt,
+    QtMsgType,
+    qInstallMessageHandler,
+)
+from PySide6.QtGui import QMouseEvent
 from PySide6.QtTest import QTest
 
 import instrument
@@ -67,6 +78,9 @@ bead_diameter_um = 300.0
 scene_distance_mm = 40.84
 scene_depth_mm = 50.0
 """
+FILM_FRAMES = 40
+FILM_REGIONS = ((0.4, 0.3), (0.5, 0.55))
+"""Corners, fractions of the view."""
 SWEEP = ["--z-min", "22", "--z-max", "80", "--planes", "12", "--average", "2"]
 EXPOSURES_MS = {"beads": 1.0, "bars": 60.0}
 PICTURE_Z_MM = "40.84"
@@ -128,6 +142,8 @@ def _prepare_camera(folder: Path) -> None:
         bench.write_text(fast.replace('scene = "beads"', f'scene = "{scene}"'))
         if not (folder / f"{scene}.tif").exists():
             _do("snap", "--bench", bench, "--exposure-ms", exposure_ms, "--out", folder / f"{scene}.tif")
+    if not list((folder / "runs").glob("*recording")):
+        _do("record", "--bench", bench, "--frames", FILM_FRAMES, "--exposure-ms", 1)
     if not (folder / "chart" / "chart.json").exists():
         _do("chart", "scene", "sparse-picture", "--size", 32, "--budget", 30, "--out", folder / "chart")
     bench.write_text(CAMERA)
@@ -194,6 +210,10 @@ def _show(window: MainWindow, name: str, out: Path) -> None:
         _half(window)
     if name == "slm":
         _lens(window)
+    if name == "films":
+        _film(window)
+    if name == "tasks":
+        _analysis(window)
     _grab(window, out / f"{name}.png")
     if name == "charts":
         _chart(window)
@@ -235,6 +255,53 @@ def _lens(window: MainWindow) -> None:
     panel.file.setText(str(picture))
     panel.load()
     _wait(lambda: slm.displayed.any(), "the SLM")
+
+
+def _film(window: MainWindow) -> None:
+    """Open a recording, and follow two regions in it."""
+    from gui.panels.films import FilmsPanel
+
+    panel = window.panel("films")
+    assert isinstance(panel, FilmsPanel)
+    panel.open(next(panel.session.runs_folder.glob("*recording")))
+    _wait(lambda: panel.film is not None, "the film")
+    panel.region_button.click()
+    for left, top in FILM_REGIONS:
+        _drag(panel.view, (left, top), (left + 0.12, top + 0.15))
+    _wait(lambda: len(panel.courses) == len(FILM_REGIONS), "the curves")
+
+
+def _drag(view: Any, start: tuple[float, float], end: tuple[float, float]) -> None:
+    """Drag the mouse over a picture, between places in fractions of the view."""
+    port = view.graphics.viewport()
+    places = [QPoint(round(x * port.width()), round(y * port.height())) for x, y in (start, end)]
+    QTest.mousePress(port, Qt.MouseButton.LeftButton, pos=places[0])
+    for share in np.linspace(0, 1, 6):
+        at = places[0] + (places[1] - places[0]) * float(share)
+        move = QMouseEvent(
+            QEvent.Type.MouseMove,
+            QPointF(at),
+            QPointF(port.mapToGlobal(at)),
+            Qt.MouseButton.NoButton,
+            Qt.MouseButton.LeftButton,
+            Qt.KeyboardModifier.NoModifier,
+        )  # QTest's own hold no button
+        QCoreApplication.sendEvent(port, move)
+        QTest.qWait(60)  # pyqtgraph thins out what comes sooner
+    QTest.mouseRelease(port, Qt.MouseButton.LeftButton, pos=places[1])
+
+
+def _analysis(window: MainWindow) -> None:
+    """Analyse the calibration in Files."""
+    from gui.panels.tasks import TasksPanel
+
+    panel = window.panel("tasks")
+    assert isinstance(panel, TasksPanel)
+    calibration = sorted(panel.session.runs_folder.glob("*/calibration"))[0]
+    panel.choose("analyze", calibration=calibration, points=False)
+    _wait(lambda: panel.name == "analyze" and panel.run_bar.start_button.isEnabled(), "the form")
+    panel.start()
+    _wait(lambda: not panel.run.is_running, "the analysis")
 
 
 def _sweep(window: MainWindow) -> None:

@@ -229,6 +229,7 @@ class MainWindow(QMainWindow):
 
     def _make_status_bar(self) -> None:
         self.job_label = label("Ready")
+        self.job_label.setContentsMargins(6, 0, 0, 0)
         self.job_progress = QProgressBar()
         self.job_progress.setRange(0, 0)
         self.job_progress.setFixedWidth(140)
@@ -258,7 +259,7 @@ class MainWindow(QMainWindow):
         ):
             self._add_action(camera, words, keys, partial(self._on_live_panel, what))
         bench = self.menus.addMenu("&Bench")
-        self._add_action(bench, "&Another bench …", "Ctrl+O", partial(self.bring, "start"))
+        self._add_action(bench, "&Another bench…", "Ctrl+O", partial(self.bring, "start"))
         for kind in self.session.kinds:
             reconnect = partial(self.session.reconnect, kind)
             self._add_action(bench, f"Reconnect the {name_of(kind)}", "", reconnect)

@@ -323,11 +323,15 @@ class RunBar(QWidget):
         On the start button.
     tips : (str, str)
         Of the buttons that pause and abort.
+    small : bool
+        Whether progress has no place before something is carried out.
     """
 
     start = Signal()
 
-    def __init__(self, run: Pausable, words: str, tips: tuple[str, str] = _TIPS) -> None:
+    def __init__(
+        self, run: Pausable, words: str, tips: tuple[str, str] = _TIPS, *, small: bool = False
+    ) -> None:
         super().__init__()
         self.start_button = button(words, clicked=self.start, shortcut="Ctrl+Return", primary=True)
         self.pause_button = button("Pause", tips[0], checkable=True)
@@ -343,7 +347,9 @@ class RunBar(QWidget):
         run.looked.connect(self.show_situation)
         self._why_not = ""
         self._when_paused = ", light off" if tips is _TIPS else ""
+        self._small = small
         self.set_running(False)
+        self._give_place()
 
     def _abort(self) -> None:
         self._ending = True
@@ -365,6 +371,7 @@ class RunBar(QWidget):
         if running:
             self.bar.setValue(0)
             self.words.setText("Beginning")
+            self._give_place()
 
     def show_situation(self, now: Situation) -> None:
         """Show how far it is."""
@@ -388,12 +395,19 @@ class RunBar(QWidget):
         """Show nothing of what was carried out before."""
         self.bar.reset()
         self.words.clear()
+        self._give_place()
+
+    def _give_place(self) -> None:
+        """Give progress and its words their place."""
+        for each in (self.bar, self.words):
+            each.setVisible(not self._small or bool(self.words.text()))
 
     def show_end(self, words: str, *, complete: bool) -> None:
         """Show how it ended."""
         self.bar.setRange(0, _STEPS)
         self.bar.setValue(_STEPS if complete else self.bar.value())
         self.words.setText(words)
+        self._give_place()
 
     def _show_start(self, *, running: bool) -> None:
         self.start_button.setEnabled(not running and not self._why_not)

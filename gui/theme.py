@@ -279,6 +279,8 @@ def _style(c: Colours) -> str:
     unused = faint.name(QColor.NameFormat.HexArgb)
     side = f"4px solid {c.field}"
     arrow = f"image: none; width: 0; height: 0; border-left: {side}; border-right: {side};"
+    places = ((0, c.window), (0.39, c.window), (0.4, c.line), (0.6, c.line), (0.61, c.window), (1, c.window))
+    rule = ", ".join(f"stop:{place} {colour}" for place, colour in places)
     return f"""
 QWidget {{ font-size: {BODY_PT}pt; }}
 QToolTip {{ background: {c.field}; color: {c.text}; border: 1px solid {c.border}; padding: 3px; }}
@@ -324,7 +326,7 @@ QToolButton#device {{ border: none; padding: 2px 4px; }}
 QToolButton#device[condition="open"] {{ color: {c.ok}; }}
 QToolButton#device[condition="failed"] {{ color: {c.error}; }}
 QToolButton#device[condition="opening"] {{ color: {c.warning}; }}
-QCommandLinkButton {{ border-radius: 6px; padding: 8px; text-align: left; }}
+QCommandLinkButton {{ border-radius: 6px; padding: 8px 12px 8px 8px; text-align: left; }}
 QCommandLinkButton:focus {{ padding: 7px; }}
 QPushButton#stop {{ background: {c.stop}; color: {c.stop_text}; border: 2px solid {c.stop};
   border-radius: 5px;
@@ -369,7 +371,8 @@ QTabBar::tab:selected:focus {{ color: palette(link); border: 2px solid palette(l
 QDockWidget {{ color: palette(placeholder-text); }}
 QDockWidget::title {{ background: palette(alternate-base); padding: 4px 8px; }}
 QMainWindow::separator {{ background: palette(midlight); width: 3px; height: 3px; }}
-QSplitter::handle {{ background: {c.line}; }}
+QSplitter::handle:horizontal {{ width: 5px; background: qlineargradient(x1:0, y1:0, x2:1, y2:0, {rule}); }}
+QSplitter::handle:vertical {{ height: 5px; background: qlineargradient(x1:0, y1:0, x2:0, y2:1, {rule}); }}
 QProgressBar {{ background: {c.field}; color: {c.text}; border: 1px solid {c.line}; border-radius: 4px;
   text-align: center; }}
 QProgressBar::chunk {{ background: {c.primary}; border-radius: 3px; }}
@@ -380,6 +383,7 @@ QScrollBar:horizontal {{ background: {c.window}; height: 10px; }}
 QScrollBar::handle {{ background: {c.border}; border-radius: 4px; min-height: 24px; min-width: 24px; }}
 QScrollBar::add-line, QScrollBar::sub-line {{ width: 0; height: 0; }}
 QStatusBar {{ background: {c.panel}; color: {c.dim}; }}
+QStatusBar::item {{ border: none; }}
 QWidget#header {{ background: {c.panel}; }}
 QMenuBar {{ border: none; }}
 QMenuBar, QMenu {{ background: {c.panel}; color: {c.text}; }}

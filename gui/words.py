@@ -29,11 +29,22 @@ _REST = r"(?:\s+(?:--[a-z][a-z-]*|[A-Z]{3,}|mask|slm|illumination|(?:/|[A-Za-z]:
 """Of a command: its sub-command, options, places and paths."""
 
 
+_SIGNS = ((re.compile(r"(?<=\d) um\b"), " µm"), (re.compile(r"\+-(?=[ \d])"), "±"))
+"""Units and signs as the window's own figures have them; a terminal may lack the letters."""
+
+
 def in_the_window(text: str) -> str:
-    """Return a message with the window's own ways in place of the terminal's commands."""
+    """Return a message with the window's own ways in place of the terminal's commands, and its signs."""
     ways, command = _ways()
     text = command.sub(lambda found: ways[found[1] or found[2]], text)
-    return _AGAIN.sub("“Start”", text)
+    return with_signs(_AGAIN.sub("“Start”", text))
+
+
+def with_signs(text: str) -> str:
+    """Return a text with units and signs as the window's own figures have them."""
+    for pattern, sign in _SIGNS:
+        text = pattern.sub(sign, text)
+    return text
 
 
 @functools.cache

@@ -111,7 +111,7 @@ class OptionsForm(QWidget):
         self.more.setToolTip(", ".join(field.bare_label for field in folded) or FOLDED[0])
         self.more.toggled.connect(self._fold)
         self._seldom.hide()
-        fill(self, usual, in_row(self.more, None), self._seldom, None, margins=(2, 6, 8, 2))
+        fill(self, usual, in_row(self.more, None), self._seldom, None, margins=(0, 6, 0, 2))
         self.more.setVisible(bool(folded))  # once it has its place
         yield from self._fill(usual, [field for field in self.fields.values() if field not in folded])
         yield from self._fill(self._seldom, folded)

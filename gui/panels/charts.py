@@ -145,6 +145,8 @@ def _read(path: Path) -> dict[str, Any] | ChartData:
 
 
 _NEAR_PX = 12.0
+_ROW_PX = 38
+"""Two lines: settings differ by their ends."""
 _SHORT = {"seconds": "seconds", "peak_mib": "MiB", "images": "photographs"}
 """Costs as a column's heading."""
 
@@ -170,11 +172,11 @@ class ChartView(QWidget):
         self.plot.scene().sigMouseMoved.connect(self._moved)
         yield
         tip = "Settings by their best score; one that is chosen is drawn bold"
-        self.table = table(["", "", ""], tip, wide=0, row_px=30)
+        self.table = table(["", "", ""], tip, wide=0, row_px=_ROW_PX)
         self.table.setTextElideMode(Qt.TextElideMode.ElideMiddle)  # settings differ by their ends
         self.table.verticalHeader().hide()
         self.table.itemSelectionChanged.connect(self._setting_chosen)
-        words = "The bold line is the front: no setting is both cheaper and better."
+        words = "The bold line is the front (●): no setting is both cheaper and better."
         self.place = label(words, "dim", selectable=True)
         self.front: list[Point] = []
         yield
@@ -247,7 +249,8 @@ class ChartView(QWidget):
                 value, spent = getattr(point, score.key), getattr(point, cost.key)
                 mark = "● " if name in on_front else ""
                 for place, text in enumerate((f"{mark}{name}", f"{value:.4g}", f"{spent:.3g}")):
-                    self.table.setItem(number, place, cell(text, data=name))
+                    self.table.setItem(number, place, cell(text, number=place > 0, data=name))
+                self.table.item(number, 0).setToolTip(f"{name}{', on the front' if mark else ''}")
         self.plot.setLabel("left", score.words)
         self.plot.setLabel("bottom", cost.words)
         self._draw_curves()

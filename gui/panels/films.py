@@ -87,7 +87,7 @@ class FilmsPanel(Panel):
         self.play_button = button(
             "Play", "Play, or hold (Ctrl+Space)", self._play, checkable=True, shortcut="Ctrl+Space"
         )
-        self.speed = choice(("0.25 x", "0.5 x", "1 x", "2 x", "4 x"), "Speed", lambda _: self._play())
+        self.speed = choice(("0.25 ×", "0.5 ×", "1 ×", "2 ×", "4 ×"), "Speed", lambda _: self._play())
         self.speed.setCurrentIndex(2)
         self.slider = QSlider(Qt.Orientation.Horizontal)
         self.slider.setToolTip("Picture of the film (arrow keys, Page up and down)")

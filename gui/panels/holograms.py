@@ -84,7 +84,7 @@ class HologramsPanel(Panel):
         fill(self.body, across)
         self.form = self._make_form()
         place = scrolled(self.form)
-        fill(left, (place, 1))
+        fill(left, (place, 1), margins=(0, 0, 6, 0))
         yield
         yield from self.form.parts()
         self._names = SuggestedName(self.jobs, self.form, session.runs_folder / "holograms", ".png")

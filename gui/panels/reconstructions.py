@@ -115,7 +115,8 @@ class ReconstructionsPanel(Panel):
         ends = (self.refine_button, self.keep_button, self.export_button)
         self.caption = label(role="dim", selectable=True, wraps=True, yields=True)
         self.caption.hide()
-        fill(top, in_row(self.heading, (self.place, 1), *ends), self.caption, (self.viewers, 1))
+        shown = in_row(self.heading, (self.place, 1), *ends)
+        fill(top, shown, self.caption, (self.viewers, 1), margins=(6, 0, 0, 0))
         yield
         self.picture = PictureView(session)
         self.viewers.addWidget(self.picture)

@@ -22,7 +22,6 @@ from gui.widgets.building import (
     button,
     cell,
     fill,
-    in_column,
     in_row,
     label,
     split,
@@ -71,13 +70,9 @@ class RunsPanel(Panel):
         yield
         fill(top, (self.view, 1), self.slider, self.frame_words, margins=(6, 0, 0, 0))
         yield
-        foot = in_row(
-            (self.bar, 1),
-            in_column(
-                self.use_button, self.play_button, self.export_button, self.verify_button, self.folder_button
-            ),
-        )
-        fill(below, (self.about, 1), foot, margins=(6, 0, 0, 0))
+        uses = in_row((self.use_button, 1), (self.play_button, 1))
+        others = in_row((self.export_button, 1), (self.verify_button, 1), (self.folder_button, 1))
+        fill(below, (self.about, 1), self.bar, uses, others, margins=(6, 0, 0, 0))
         yield
         self._rest = after_rest(self, _REST_MS, self.read_folder)
         self._watcher = QFileSystemWatcher(self)
@@ -198,7 +193,7 @@ class RunsPanel(Panel):
         self.frame_words = label(role="dim", yields=True)
         self.about = text_view(empty="What is in a run stands here, once it is clicked.")
         self.about.setAccessibleName("About the run")
-        self.bar = RunBar(self.run, "Resume")
+        self.bar = RunBar(self.run, "Resume", small=True)
         self.bar.set_startable("No run is open.")
         self.bar.start.connect(self.resume)
         tip = "Show the run's files in the file manager"
@@ -226,6 +221,7 @@ class RunsPanel(Panel):
         said += ", SIMULATED," if simulated else ""
         self.where.setText(f"{said} in {folder.name} of {folder.parent.name}")
         self.where.setToolTip(str(folder))
+        self.where.setVisible(bool(summaries))
         self.hint.setVisible(not summaries)
         self.table.setVisible(bool(summaries))
         paths = [listed.path for listed in summaries]

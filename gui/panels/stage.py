@@ -97,7 +97,7 @@ class StagePanel(DevicePanel):
         self.pad = JogPad(self)
         self.setFocusProxy(self.pad)
         tip = "Find the reference of every axis: the stage moves; asks first, and reconnects after a fault"
-        self.home_button = button("Home …", tip, self.ask_home)
+        self.home_button = button("Home…", tip, self.ask_home)
         self._here: dict[str, float] | None = None
         """Where the stage said that it is."""
         self.places = KeptBar(session, "places", "Places", lambda: self._here, self._go_to, "Go")
@@ -120,7 +120,7 @@ class StagePanel(DevicePanel):
             pad,
             None,
         )
-        self.watch_device(self.state, ("Home …", self.ask_home))
+        self.watch_device(self.state, ("Home…", self.ask_home))
 
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:

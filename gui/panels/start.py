@@ -60,6 +60,7 @@ class StartPanel(Panel):
         has_bench = bool(session.kinds)
         at = f"Open now: {session.config.label}." if has_bench else "No bench is open."
         self.place = label(f"{at} What is made goes to {session.runs_folder}.", "dim", wraps=True)
+        self.place.setContentsMargins(0, 0, 0, 6)
         parts: list[QWidget] = [label("What would you like to do?", "title"), self.place]
         tried = {
             name: (words, about, f"{tip}; {_WRITTEN}.", partial(self.try_bench, name))

@@ -37,7 +37,7 @@ from gui.widgets.building import (
 from gui.widgets.orientation import orientation_of, read_turned
 from gui.widgets.sweep_views import Picture
 from gui.widgets.tab_order import tab_in_order
-from gui.words import in_the_window
+from gui.words import in_the_window, with_signs
 from instrument.files.calibration_file import newest_calibration
 from instrument.files.orientation import Kind
 from instrument.tasks import CHARTS, TASKS, VIDEOS
@@ -282,6 +282,7 @@ class TasksPanel(Panel):
 
     def _clear(self) -> None:
         self.words.setPlainText("")
+        self.words.show()
         self.results.setCurrentIndex(0)  # a picture comes to the front once there is one
         mark(self.words, "refused", False)
         while (item := self._tables.takeAt(0)) is not None:
@@ -298,19 +299,21 @@ class TasksPanel(Panel):
     def _told(self, told: Told) -> None:
         text = self._pages[self._running].form.in_its_words(in_the_window(told.text))
         if told.kind == "table":
-            made = table(told.headings, text, row_px=_ROW_PX)
+            made = table([with_signs(heading) for heading in told.headings], text, row_px=_ROW_PX)
             made.setRowCount(len(told.rows))
             for row, texts in enumerate(told.rows):
                 for column, shown in enumerate(texts):
-                    made.setItem(row, column, cell(shown, number=True))
+                    made.setItem(row, column, cell(with_signs(shown), number=True))
             made.verticalHeader().hide()
             self._tables.addWidget(made)
             self.tables.show()
+            self.words.setVisible(bool(self.words.toPlainText()))
             return
         if told.kind == "warn":
             self.session.log("warning", text)
             text = f"⚠ {text}"
         self.words.appendPlainText(text)
+        self.words.show()
 
     def _succeeded(self, done: Done) -> None:
         self.files = done.files
@@ -349,6 +352,7 @@ class TasksPanel(Panel):
 
     def _ended(self, words: str) -> None:
         self.words.appendPlainText(words)
+        self.words.show()
         mark(self.words, "refused", True)
         self.run_bar.show_end(words.splitlines()[0], complete=False)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from PySide6.QtCore import QEvent, QObject, QSignalBlocker, QSize, Qt, QTimer, SignalInstance
-from PySide6.QtGui import QColor, QResizeEvent
+from PySide6.QtGui import QColor, QPaintEvent, QResizeEvent
 from PySide6.QtWidgets import (
     QBoxLayout,
     QComboBox,
@@ -266,12 +266,23 @@ def narrow(box: QComboBox, characters: int = 5) -> QComboBox:
     return box
 
 
+class ShareBar(QProgressBar):
+    """A bar without words; while there is no progress its place is empty."""
+
+    def __init__(self, most: int) -> None:
+        super().__init__()
+        self.setTextVisible(False)
+        self.setRange(0, most)
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: N802 - Qt's name
+        """Paint what has begun: an empty frame would look like a field."""
+        if self.value() > self.minimum() or self.maximum() == self.minimum():
+            super().paintEvent(event)
+
+
 def share_bar(most: int = 1000) -> QProgressBar:
     """Return a bar for a share of ``most``, without words on it."""
-    made = QProgressBar()
-    made.setRange(0, most)
-    made.setTextVisible(False)
-    return made
+    return ShareBar(most)
 
 
 def text_view(text: str = "", tip: str = "", *, empty: str = "") -> QPlainTextEdit:
@@ -345,8 +356,11 @@ def after_rest(parent: QObject, rest_ms: int, call: Callable[[], object]) -> QTi
 
 
 # Places that scroll ------------------------------------------------------------------------------------
+_GAP_PX = 6
+
+
 def scrolled(form: QWidget) -> QScrollArea:
-    """Return a frameless place for a form, which scrolls up and down.
+    """Return a frameless place for a form, which scrolls up and down; its bar keeps off.
 
     It takes the form only when it has its own place: else it measures all of the form at once.
     """
@@ -357,6 +371,10 @@ def scrolled(form: QWidget) -> QScrollArea:
     scroll.setFocusPolicy(Qt.FocusPolicy.NoFocus)  # it follows the keyboard's place in the form
     scroll.setWidget(holder)
     fill(holder, form)
+    bar = scroll.verticalScrollBar()
+    bar.rangeChanged.connect(
+        lambda _, most: holder.layout().setContentsMargins(0, 0, _GAP_PX * (most > 0), 0)
+    )
     return scroll
 
 

@@ -86,7 +86,7 @@ class CameraForm(QWidget):
         self._temperature_name = label("Temperature")
         tip = "Everything that the camera reports of itself; its own settings can be changed there"
         self.all_button = button(
-            "All settings …", tip, lambda: DeviceSettings(self._session, "camera", self).show()
+            "All settings…", tip, lambda: DeviceSettings(self._session, "camera", self).show()
         )
         self.presets = KeptBar(self._session, "camera", "Presets", self._preset, self._use_preset, "Use")
         self.buttons = in_row(self._temperature_name, (self.temperature, 1), self.all_button)

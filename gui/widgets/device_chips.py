@@ -15,7 +15,7 @@ from instrument.bench.config import Kind
 
 
 class DeviceChips(QWidget):
-    """One chip a device; a click shows all about it, "Reconnect" appears where one has failed."""
+    """One chip a device; a click shows all about it, "Reconnect" appears where only one has failed."""
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(parent)
@@ -43,6 +43,9 @@ class DeviceChips(QWidget):
         chip.setText(f"● {name_of(kind)}{word}")
         mark(chip, "condition", state.condition)
         chip.setToolTip(state.text or state.condition)
+        failed = [one for one in self.chips if self._session.state(one).condition == "failed"]
+        for one, again in self.reconnect_buttons.items():  # of several the strip has one button
+            again.setVisible(failed == [one])
 
     def _show_all(self, kind: Kind) -> None:
         DeviceSettings(self._session, kind, self).show()

@@ -84,9 +84,13 @@ def dots(colour: Any, size: int = 5) -> dict[str, Any]:
 
 
 def legend(names: Mapping[int, str]) -> str:
-    """Return the names of curves by their numbers, each with its line and colour, as rich text."""
+    """Return the names of curves by their numbers, each with its line and colour, as rich text.
+
+    No line ends within a name, nor between it and its curve.
+    """
     return " &nbsp; ".join(
-        f'<span style="color:{curve_colour(number)}"><b>{_SIGNS[number % len(_SIGNS)]}</b></span> {name}'
+        f'<span style="color:{curve_colour(number)}"><b>{_SIGNS[number % len(_SIGNS)]}</b></span>&nbsp;'
+        + name.replace(" ", "&nbsp;")
         for number, name in names.items()
     )
 
@@ -219,7 +223,7 @@ class RangeBar(QWidget):
         self.words = label("No frame yet.", wraps=True, selectable=True)
         self.words.setObjectName("figures")
         self.words.setToolTip("Of the raw data, all pixels; share: the largest count of the sensor's range")
-        fill(self, _BAR_PX, self.words)
+        fill(self, _BAR_PX + 3, self.words)
 
     def show_figures(self, figures: FrameFigures) -> None:
         """Show the figures of a frame."""

@@ -121,7 +121,7 @@ class StabilityView(QWidget):
             if np.isfinite(error):
                 ground = "#{:02x}{:02x}{:02x}".format(*cells[iy, ix])
                 patch = QGraphicsRectItem(figures)  # dims boundaries under the figure
-                text = QGraphicsSimpleTextItem(f"{error:.2g}", patch)
+                text = QGraphicsSimpleTextItem(f"{error:.2f}", patch)
                 text.setBrush(QColor(max((colours().window, colours().text), key=partial(contrast, ground))))
                 size = text.boundingRect()
                 patch.setRect(size)

@@ -56,6 +56,13 @@ class Film:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        if path.is_file():
+            raise FileError(
+                path,
+                "is no film that can be opened here: expected is the folder of a recording, or the .ome.zarr "
+                "folder of a reconstructed video.",
+                "Films of other programs become recordings by diffuserbench import.",
+            )
         self._video = open_video(path) if is_zarr_name(path) else None
         self._run = None if self._video is not None else Run.open(path)
         if self._video is not None:

@@ -56,7 +56,7 @@ def test_a_film_is_played_followed_and_written(
     assert panel.view.graphics.orientation == Orientation(1)
     panel.slider.setValue(20)
     qtbot.waitUntil(lambda: panel.words.text() == "1.050 s, picture 21 of 29", timeout=WAIT_MS)
-    panel.speed.setCurrentText("4 x")
+    panel.speed.setCurrentText("4 ×")
     panel.play_button.click()
     assert panel._step * 1000 / panel._timer.interval() == 80  # pictures a second
     qtbot.waitUntil(lambda: panel.slider.value() < 20, timeout=WAIT_MS)  # round at the end
