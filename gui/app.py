@@ -15,6 +15,7 @@ from PySide6.QtCore import QCoreApplication, QSettings, QSize, QTimer, qInstallM
 from PySide6.QtWidgets import QApplication
 
 from gui.main_window import MainWindow
+from gui.making import PICTURE_MS
 from gui.session import BenchSession
 from gui.theme import apply_theme, theme_of
 from gui.widgets.dialogues import TextWindow
@@ -22,6 +23,7 @@ from instrument.bench.config import BenchConfig
 from instrument.bench.config_file import no_bench
 from instrument.files import kept_times
 from instrument.files.errors import BenchError, in_words
+from recon.optics.jit import extensions_put_off
 
 _FRAME = QSize(16, 40)
 """What a window manager puts round a window, at most: the first window fits the screen with it."""
@@ -95,6 +97,14 @@ def show_and_open(window: MainWindow) -> None:
     """Show a window, and open its bench when it was seen: what takes long is done before there is light."""
     window.show()
     application().processEvents()
+    load = extensions_put_off()
+
+    def load_later() -> None:
+        if not window.session.is_closing:
+            window.session.jobs.watch("Loading extensions", lambda _: load())
+
+    window.session.pictured.connect(load_later)
+    QTimer.singleShot(PICTURE_MS, window, load_later)  # where no picture comes
     # What stays is not looked through for garbage again and again, 0.1 s during which nothing answers.
     window.session.opened.connect(gc.freeze)
     window.maker.made.connect(gc.freeze)
