@@ -60,6 +60,9 @@ class Panel(QWidget):
         self._said_of: QWidget | None = None
         """The field that the last line is about, where it is about one."""
         self._heeded: set[Refusing] = set()
+        self._busy: tuple[str, QWidget | None] | None = None
+        """What was refused last because something else went on, and at which field."""
+        session.jobs.job_ended.connect(self._forget_busy)
         self._fade = after_rest(self, _REFUSAL_MS, self.accepted)
         fill(self, (self.body, 1), in_row((self._note, 1), self.copy_button), margins=(8, 8, 8, 4), spacing=4)
 
@@ -184,7 +187,15 @@ class Panel(QWidget):
             return self.follow(start(), field)
         except BusyError as error:
             self.refused(field, str(error))
+            self._busy = self._note.toolTip(), field
             return None
+
+    def _forget_busy(self, job: Job) -> None:
+        """Take away that something was in the way, once it has ended."""
+        if self._busy is not None and (job.exclusive or job.endless):
+            (said, field), self._busy = self._busy, None
+            if self._note.toolTip() == said:
+                self.accepted(field)
 
 
 class _InParts(Protocol):

@@ -258,6 +258,8 @@ class FilmsPanel(Panel):
         for item in self.plot.listDataItems():
             self.plot.removeItem(item)
         none = self.film is None or not self.courses.size
+        for side in ("left", "bottom"):  # an empty plot's numbers would mean nothing
+            self.plot.getAxis(side).setStyle(showValues=not none)
         self.plot.setTitle(_NO_REGION if none else None, color=colours().dim, size="9pt")
         if self.film is None or none:
             return

@@ -171,6 +171,7 @@ class TasksPanel(Panel):
     def _show_form(self, name: str, task: Task) -> None:
         if name not in self._pages:
             self._pages[name] = self._made(name, task)
+            self._look_for_calibration(name)
             self.stack.addWidget(scrolled(self._pages[name].form))
             tab_in_order(self)
         if name != self.name:
@@ -180,6 +181,7 @@ class TasksPanel(Panel):
         if self._given:
             page.form.set_values(self._given)
             self._given = {}
+            self._look_for_calibration(name)
         if not self.run.is_running:
             if name != self._running:  # what another task found is not this one's
                 self._clear()
@@ -206,14 +208,22 @@ class TasksPanel(Panel):
             names = SuggestedName(self.jobs, form, self.session.runs_folder / "results", suffix)
             form.set_values({"out": None})
             names.suggest(place.name.partition(".")[0])
-        if (field := form.fields.get(_CALIBRATION)) is not None and (
-            field.option.is_required or _CALIBRATION in task.needed
-        ):
-            folder = self.session.runs_folder
+        return _Page(task, form, names)
+
+    def _look_for_calibration(self, name: str) -> None:
+        """Begin with the newest calibration where one is needed: to see a recording's scene, too."""
+        page, folder = self._pages[name], self.session.runs_folder
+        fields = page.form.fields
+        if (field := fields.get(_CALIBRATION)) is None:
+            return
+        film = fields.get("run") or fields.get("video")
+        recording = "" if film is None else str(film.raw()).rstrip("/\\")
+        takes_one = "run" in fields or (bool(recording) and not recording.endswith(".zarr"))
+        other = "psf" in fields and str(fields["psf"].raw()).strip()
+        if field.option.is_required or _CALIBRATION in page.task.needed or (takes_one and not other):
             self._newest.ask(
                 lambda: newest_calibration(folder), lambda newest: self._offer_calibration(name, newest), name
             )
-        return _Page(task, form, names)
 
     def _offer_calibration(self, name: str, newest: Path | None) -> None:
         """Begin with the newest calibration where none was named."""

@@ -37,7 +37,10 @@ def end_run(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseEx
 
 
 def _end(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseException | None) -> Run:
-    text = "" if error is None else str(error) or type(error).__name__
+    wordless = error is None or (
+        isinstance(error, KeyboardInterrupt) and not str(error)
+    )  # the reason says it
+    text = "" if wordless else str(error) or type(error).__name__
     ended: list[Run] = []
     try:
         try_all(

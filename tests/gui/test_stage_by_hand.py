@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
@@ -28,6 +30,18 @@ def _type(qtbot: QtBot, field: object, text: str) -> None:
     field.setFocus()  # type: ignore[attr-defined]
     field.selectAll()  # type: ignore[attr-defined]
     qtbot.keyClicks(field, text)
+
+
+def test_what_stood_in_the_way_is_told_until_it_has_ended(
+    qtbot: QtBot, window: MainWindow, stage: StagePanel
+) -> None:
+    gate = threading.Event()
+    sweep = window.session.jobs.exclusive("Sweep", lambda _: gate.wait(WAIT_MS / 1000))
+    assert stage.command("Move", lambda _: None, stage.home_button) is None
+    assert "Sweep is running" in stage._note.toolTip()
+    gate.set()
+    qtbot.waitUntil(lambda: sweep.is_over and not stage._note.text(), timeout=WAIT_MS)
+    assert not stage.home_button.property("refused")
 
 
 def test_a_step_that_makes_no_sense_moves_nothing(

@@ -118,6 +118,15 @@ def test_forms_begin_with_the_newest_calibration_and_a_place_for_the_result(
     shown(qtbot, panel, "analyze", calibration=runs.parent / "mine")
     qtbot.waitUntil(lambda: panel._newest._job is None, timeout=WAIT_MS)
     assert panel._pages["analyze"].form.fields["calibration"].raw() == str(runs.parent / "mine")
+    shown(qtbot, panel, "video", run=runs / "2026-11-25_21-40-00_recording")  # by a PSF or a calibration
+    video = panel._pages["video"].form.fields["calibration"]
+    qtbot.waitUntil(lambda: video.raw() == str(newest), timeout=WAIT_MS)
+    shown(qtbot, panel, "activity", video=runs / "results" / "video.ome.zarr")  # reconstructed already
+    activity = panel._pages["activity"].form.fields["calibration"]
+    qtbot.waitUntil(lambda: panel._newest._job is None, timeout=WAIT_MS)
+    assert not activity.raw()
+    panel.choose("activity", video=runs / "2026-11-25_21-40-00_recording")
+    qtbot.waitUntil(lambda: activity.raw() == str(newest), timeout=WAIT_MS)
 
 
 def test_a_hologram_of_spots_is_previewed_and_goes_on_to_the_slm(qtbot: QtBot, panel: TasksPanel) -> None:
