@@ -95,6 +95,7 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
 
 def show_and_open(window: MainWindow) -> None:
     """Show a window, and open its bench when it was seen: what takes long is done before there is light."""
+    application().processEvents()  # to be made and to be shown are turns of their own
     window.show()
     application().processEvents()
     load = extensions_put_off()

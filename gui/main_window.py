@@ -228,7 +228,7 @@ class MainWindow(QMainWindow):
         self.setMenuWidget(self._header)
 
     def _make_status_bar(self) -> None:
-        self.job_label = label("Ready")
+        self.job_label = label("Ready", yields=True)
         self.job_label.setContentsMargins(6, 0, 0, 0)
         self.job_progress = QProgressBar()
         self.job_progress.setRange(0, 0)
@@ -372,8 +372,9 @@ class MainWindow(QMainWindow):
         if running:
             self.job_label.setText(f"{running[0].title} …")
         # What was told meanwhile stays.
-        elif job.state.value == "succeeded" and self.job_label.text() == f"{job.title} …":
-            self.job_label.setText(f"{job.title}: {job.became}")
+        elif self.job_label.text() == f"{job.title} …":
+            became = {"succeeded": job.became, "cancelled": "ended early"}.get(job.state.value, "failed")
+            self.job_label.setText(f"{job.title}: {became}")
 
     def _shown_jobs(self) -> list[Job]:
         """Return what runs and would be missed: runs, moves, photographs, computations."""

@@ -460,6 +460,7 @@ class ProcedurePanel(Panel):
         self._said_at_end = words
 
     def _over(self) -> None:
+        self.accepted()  # what ended it stands below the form
         words = self.run_bar.words.text()
         self.run_bar.set_running(False)
         self.run_bar.words.setText(words)

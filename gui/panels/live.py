@@ -97,13 +97,17 @@ class LivePanel(Panel):
         yield
         fill(pictures, (self.picture, 1), in_row((self.status, 1), self.under_mouse))
         yield
+        heading = label("HISTOGRAM, RAW DATA", "heading")
+        self._of_frames = (heading, self.picture.histogram)
+        """What there is room for while the camera is open."""
         fill(
             side,
             label("CAMERA", "heading"),
             self.form,
             6,
-            label("HISTOGRAM, RAW DATA", "heading"),
-            (self.picture.histogram, 1),
+            heading,
+            (self.picture.histogram, 100),
+            None,
             margins=(8, 0, 0, 0),
         )
         yield
@@ -375,6 +379,8 @@ class LivePanel(Panel):
         if kind != "camera":
             return
         self._came_s = time.monotonic()
+        for part in self._of_frames:
+            part.setVisible(self.session.state("camera").condition != "failed")
         if self.session.is_open("camera"):
             self.status.setText("Waiting for the first frame …")
         else:

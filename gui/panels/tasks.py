@@ -358,12 +358,12 @@ class TasksPanel(Panel):
             self._show([*previews, *pictures][0])
 
     def _failed(self, why: str) -> None:
-        self._ended(self._pages[self._running].form.in_its_words(in_the_window(why)))
+        self._ended(self._pages[self._running].form.in_its_words(in_the_window(why)), wrong=True)
 
-    def _ended(self, words: str) -> None:
+    def _ended(self, words: str, *, wrong: bool = False) -> None:
         self.words.appendPlainText(words)
         self.words.show()
-        mark(self.words, "refused", True)
+        mark(self.words, "refused", wrong)  # a deliberate end is no error
         self.run_bar.show_end(words.splitlines()[0], complete=False)
 
     def _over(self) -> None:

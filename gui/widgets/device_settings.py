@@ -44,6 +44,7 @@ class DeviceSettings(TextWindow):
         assert isinstance(layout, QVBoxLayout)
         self._layout = layout
         layout.insertWidget(1, self.note)
+        self.note.hide()
         session.device_changed.connect(self._changed)
         if session.is_open(kind):
             read = partial(_read, session.bench.devices[kind])
@@ -72,6 +73,7 @@ class DeviceSettings(TextWindow):
 
     def _say(self, words: str) -> None:
         elided(self.note, words)
+        self.note.show()
 
     def _fill(self, read: _Read) -> None:
         """Show what was read, and make the fields."""

@@ -179,5 +179,9 @@ class TextWindow(QDialog):
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         copy = buttons.addButton("Copy all", QDialogButtonBox.ButtonRole.ActionRole)
         copy.clicked.connect(lambda: QGuiApplication.clipboard().setText(self.view.toPlainText()))
+        copy.setToolTip("Put all of the text on the clipboard")
+        buttons.button(QDialogButtonBox.StandardButton.Close).setToolTip(
+            "Close this window (Esc, which stops, too)"
+        )
         buttons.rejected.connect(self.reject)
-        fill(self, self.view, buttons)
+        fill(self, (self.view, 1), buttons, margins=(8, 8, 8, 8))

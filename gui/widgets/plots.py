@@ -86,10 +86,11 @@ def dots(colour: Any, size: int = 5) -> dict[str, Any]:
 def legend(names: Mapping[int, str]) -> str:
     """Return the names of curves by their numbers, each with its line and colour, as rich text.
 
-    No line ends within a name, nor between it and its curve.
+    No line ends within a name, nor between it and its curve: word joiners hold dashes together.
     """
+    signs = ["&#8288;".join(sign).replace(" ", "&nbsp;") for sign in _SIGNS]
     return " &nbsp; ".join(
-        f'<span style="color:{curve_colour(number)}"><b>{_SIGNS[number % len(_SIGNS)]}</b></span>&nbsp;'
+        f'<span style="color:{curve_colour(number)}"><b>{signs[number % len(signs)]}</b></span>&#8288;&nbsp;'
         + name.replace(" ", "&nbsp;")
         for number, name in names.items()
     )

@@ -52,8 +52,12 @@ def test_every_panel_opens_and_copies_python(qtbot: QtBot, window: MainWindow) -
 
 
 def test_panels_at_the_side_come_after_the_first_picture(
-    qtbot: QtBot, make_session: Callable[[], BenchSession], settings: QSettings
+    qtbot: QtBot,
+    make_session: Callable[[], BenchSession],
+    settings: QSettings,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("gui.making.PICTURE_MS", WAIT_MS)  # a busy machine takes longer than they wait
     window = MainWindow(make_session(), settings)
     qtbot.addWidget(window)
     window.show()

@@ -250,4 +250,5 @@ def test_a_task_waits_ends_and_keeps_what_it_can(qtbot: QtBot, panel: TasksPanel
         assert "ENDING" in panel.run_bar.words.text()
         run.abort()
         run.pause()  # of what is ended: it does not wait
+    assert not panel.words.property("refused"), "a deliberate end is no error"
     assert issubclass(JobCancelledError, KeyboardInterrupt)  # what a task in the terminal sees
