@@ -248,9 +248,9 @@ class ChartView(QWidget):
             for number, (name, point) in enumerate(best.items()):
                 value, spent = getattr(point, score.key), getattr(point, cost.key)
                 mark = "● " if name in on_front else ""
+                tip = f"{name}, on the front" if mark else name
                 for place, text in enumerate((f"{mark}{name}", f"{value:.4g}", f"{spent:.3g}")):
-                    self.table.setItem(number, place, cell(text, number=place > 0, data=name))
-                self.table.item(number, 0).setToolTip(f"{name}{', on the front' if mark else ''}")
+                    self.table.setItem(number, place, cell(text, tip, number=place > 0, data=name))
         self.plot.setLabel("left", score.words)
         self.plot.setLabel("bottom", cost.words)
         self._draw_curves()

@@ -370,11 +370,10 @@ def scrolled(form: QWidget) -> QScrollArea:
     scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
     scroll.setFocusPolicy(Qt.FocusPolicy.NoFocus)  # it follows the keyboard's place in the form
     scroll.setWidget(holder)
-    fill(holder, form)
+    inside = in_column(form)
+    holder.setLayout(inside)
     bar = scroll.verticalScrollBar()
-    bar.rangeChanged.connect(
-        lambda _, most: holder.layout().setContentsMargins(0, 0, _GAP_PX * (most > 0), 0)
-    )
+    bar.rangeChanged.connect(lambda _, most: inside.setContentsMargins(0, 0, _GAP_PX * (most > 0), 0))
     return scroll
 
 

@@ -35,7 +35,7 @@ def extensions_put_off() -> Callable[[], None]:
         if not loaded:
             loaded.append(True)
             entrypoints._already_initialized = False
-            entrypoints.init_all()
+            entrypoints.init_all()  # type: ignore[no-untyped-call]
 
     loaded: list[bool] = []
     return load
