@@ -12,6 +12,9 @@ else the machine does.
 The overhead of a Dask worker: the same recording in this process with one thread, and with one worker of a
 local cluster once that stands, alternating; wall seconds, least of three.
 
+What ``auto`` costs (``--only choice``): nine PSFs, beside films of several lengths; processor seconds of one
+thread.
+
 Offline rates (``--only offline``): the same on all cores, two blocks, at three sizes; wall seconds of the
 second of two runs, with reading and writing.
 """
@@ -31,6 +34,7 @@ from pathlib import Path
 
 import numpy as np
 from dense_2d import FINE, binned, caustic, dense_scene
+from live import FULL, near
 from scipy import fft
 from scipy.ndimage import gaussian_filter
 
@@ -209,6 +213,37 @@ def offline(psf, frames) -> float:
     return len(frames) / (time.perf_counter() - began_s)
 
 
+def choice(height: int, width: int) -> None:
+    """Print what ``auto`` costs beside a film, through nine PSFs: of one frame, a block and longer films."""
+    for kind in ("local", "background"):
+        seen, calibration = near(height, width, kind)
+        frames = [frame.astype(np.float32) for frame in seen[:5]]
+        known = {"noise": float(np.sqrt(np.mean(frames[0]) * 0.2 * FULL / PHOTONS)), "prior": "tv"}
+        for _ in range(2):  # the first compiles
+            began_s = time.process_time()
+            problem = stream_problem(frames[0], calibration, others=frames[1:], **known)
+            took = time.process_time() - began_s
+        settled = {"model": problem.model, "estimate_background": problem.options.estimate_background}
+        began_s = time.process_time()
+        stream_problem(frames[0], calibration, **settled, **known)
+        choosing = took - (time.process_time() - began_s)
+        solver, times = VideoSolver(problem), []
+        for number in range(9):
+            began_s = time.process_time()
+            solver.next(frames[number % len(frames)])
+            times.append(time.process_time() - began_s)
+        cold, warm_s = times[0], float(np.median(times[1:]))
+        print(f"{width} x {height}, {kind}: {problem.reason}")
+        print(
+            f"  choosing {choosing:.1f} CPU s, cold {cold:.2f}, warm {warm_s:.3f} s a frame; of a film of",
+            end="",
+        )
+        for count in (32, 100, 200, 500):
+            film = count * warm_s + -(-count // 32) * (cold - warm_s)
+            print(f" {count}: {choosing / (film + took):.1%}", end="")
+        print(flush=True)
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -218,7 +253,7 @@ def main() -> None:
     parser.add_argument("--planes", type=int, default=1, help="beads in so many depths instead of a picture")
     parser.add_argument("--prior", default="tv")
     parser.add_argument("--pans", nargs="+", choices=list(PANS), default=list(PANS))
-    parser.add_argument("--only", choices=("warm", "overhead", "offline"))
+    parser.add_argument("--only", choices=("warm", "overhead", "offline", "choice"))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     if options.only != "offline":
@@ -232,6 +267,9 @@ def main() -> None:
             print(f"{width} x {height}: {offline(psf, frames):.1f} frames/s", flush=True)
         return
     height, width = options.height, options.width
+    if options.only == "choice":
+        choice(height, width)
+        return
     known = {"prior": options.prior, "estimate_background": False, "model": "convolution"}
     several = options.planes > 1
     light, scene, psf = volume_scenes(height, width, options.planes) if several else scenes(height, width)
