@@ -80,6 +80,8 @@ DRIVERS = {
     SimulatedSlm: Slm,
 }
 """Each with the interface whose methods are called."""
+AT_ONCE = ("pattern", "displayed")
+"""They do not hang: a driver tells them without asking its device (docs/reference/safety.md)."""
 FAULTS = ("exception", "hang", "nan", "garbage", "unplugged")
 _ALIGN = ["align", "mask", "--reach", "8", "--depth-um", "100", "--spots", "25", "--moves", "1"]
 WORK = {
@@ -186,7 +188,7 @@ class Faulty:
             return method(device, *args, **named)
         if self.fault == "exception":
             raise ZeroDivisionError("a mistake of the driver's")
-        if self.fault == "hang":
+        if self.fault == "hang" and name not in AT_ONCE:
             threading.Event().wait()
         return changed(method(device, *args, **named), math.nan if self.fault == "nan" else 9.9e9)
 
@@ -346,8 +348,9 @@ def table(work: str, faults: list[str], every: int, seed: int, folder: Path) -> 
             counts[found.judged] += 1
             words = [line for line in found.said.splitlines() if "SIMULATED" not in line and line.strip()]
             sentence = next((line.strip() for line in words if "(simulated):" in line), "".join(words[:1]))
+            call = found.call or calls[number]  # what comes when is up to threads
             print(
-                f"{work:<7}{number:>4} {calls[number]:<28}{fault:<10}{found.judged:<12}light {found.light:<5}"
+                f"{work:<7}{number:>4} {call:<28}{fault:<10}{found.judged:<12}light {found.light:<5}"
                 f"motion {found.motion:<8}run {found.run:<11}exit {found.code!s:<5}{sentence}",
                 flush=True,
             )
