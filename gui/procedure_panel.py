@@ -126,7 +126,7 @@ class ProcedurePanel(Panel):
         self.about = label(role="dim", wraps=True)
         tip = "What will be done and why, or what stands against it; can be copied"
         self.verdict = text_view(tip=tip)
-        self.verdict.setMaximumHeight(150)
+        self.verdict.setMaximumHeight(320)
         self.run_bar = RunBar(self.run, self._start_words)
         tip = "Take what was measured to where it is used"
         self.use_button = button(self.use_words, tip, self._use)
@@ -150,8 +150,8 @@ class ProcedurePanel(Panel):
             left,
             self.choice,
             self.about,
-            (self.views, 1),
-            self.verdict,
+            (self.views, 3),
+            (self.verdict, 2),
             self.run_bar,
             self.use_button,
             self.way_on,

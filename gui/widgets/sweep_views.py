@@ -214,7 +214,7 @@ class PsfTable(QWidget):
         self._qualities += [None] * (row + 1 - len(self._qualities))
         self._qualities[row] = quality
         verdict = note or ("good" if not quality.findings else " ".join(quality.findings))
-        cells = [f"{value / 1e3:.4g}" for value in quality.source_um]
+        cells = [f"{value / 1e3:.3f}" for value in quality.source_um]
         cells += [f"{quality.snr:.0f}", f"{quality.saturated_pixels}", f"{quality.step_px:.2f}", verdict]
         tip, warns = "\n".join(quality.findings), bool(quality.findings)
         for place, text in enumerate(cells):
