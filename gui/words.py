@@ -29,6 +29,8 @@ _REST = r"(?:\s+(?:--[a-z][a-z-]*|[A-Z]{3,}|mask|slm|illumination|(?:/|[A-Za-z]:
 """Of a command: its sub-command, options, places and paths."""
 
 
+_FORCE = re.compile(r"--force\b")
+"""The same field in every form that has it."""
 _SIGNS = ((re.compile(r"(?<=\d) um\b"), " µm"), (re.compile(r"\+-(?=[ \d])"), "±"))
 """Units and signs as the window's own figures have them; a terminal may lack the letters."""
 
@@ -36,7 +38,7 @@ _SIGNS = ((re.compile(r"(?<=\d) um\b"), " µm"), (re.compile(r"\+-(?=[ \d])"), "
 def in_the_window(text: str) -> str:
     """Return a message with the window's own ways in place of the terminal's commands, and its signs."""
     ways, command = _ways()
-    text = command.sub(lambda found: ways[found[1] or found[2]], text)
+    text = _FORCE.sub("“Overwrite”", command.sub(lambda found: ways[found[1] or found[2]], text))
     return with_signs(_AGAIN.sub("“Start”", text))
 
 

@@ -238,7 +238,7 @@ class FilmsPanel(Panel):
             return
         if self._curves_job is not None:
             self._curves_job.cancel()
-        self.measure.set_colours([curve_colour(number) for number in range(len(regions))])
+        self._colour_regions()
 
         def work(context: JobContext) -> npt.NDArray[np.float64]:
             return curves(film, regions, lambda done, total: context.report(done / total))
@@ -248,6 +248,10 @@ class FilmsPanel(Panel):
         job.progressed.connect(lambda share: self.progress.setValue(round(1000 * share)))
         job.succeeded.connect(lambda courses: self._take_curves(job, courses))
         job.ended.connect(lambda: self.progress.hide() if job is self._curves_job else None)
+
+    def _colour_regions(self) -> None:
+        """Draw each region in its curve's colour."""
+        self.measure.set_colours([curve_colour(number) for number in range(len(self.measure.regions))])
 
     def _take_curves(self, job: Job, courses: npt.NDArray[np.float64]) -> None:
         if job is self._curves_job:
@@ -317,6 +321,7 @@ class FilmsPanel(Panel):
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""
         self._now.setPen(colours().dim)
+        self._colour_regions()
         self._draw_curves()
 
     def as_python(self) -> str:

@@ -33,6 +33,10 @@ _IN_WINDOW = ("recon", "instrument", "calibration_routines")
         ("install diffuserbench again", "install diffuserbench again"),
         ("3 settings: run the same command again to go on.", "3 settings: “Start” again to go on."),
         ("The same command goes on with the rest.", "“Start” goes on with the rest."),
+        (
+            "Choose another name, or overwrite with --force.",
+            "Choose another name, or overwrite with “Overwrite”.",
+        ),
         ("d 8.82 +- 0.14 mm, off by 1.7 um (--reach-um).", "d 8.82 ± 0.14 mm, off by 1.7 µm (--reach-um)."),
     ],
 )
