@@ -60,7 +60,7 @@ def in_python(text: str) -> str:
 def _options() -> tuple[Option, ...]:
     """Return the options that a notebook meets; where two have the same flag, reconstructions' counts."""
     from instrument.reconstruction.options import InputOptions
-    from recon.analysis.report import AnalysisSettings
+    from recon.analysis.settings import AnalysisSettings
     from recon.holography.options import HologramOptions
     from recon.reconstruction.options import ReconstructionOptions
 

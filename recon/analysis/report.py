@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -28,7 +27,6 @@ from recon.analysis.middle import RIM_PX, Middle
 from recon.analysis.points import (
     AT_NEARER,
     PLANES,
-    AskedNoise,
     InVolumes,
     Noise,
     PointTests,
@@ -43,20 +41,16 @@ from recon.analysis.resolution import (
     VoxelGrid,
     across_depth,
     axial_resolutions,
-    axial_spacing_per_um,
-    gaussian_response,
-    lateral_spacing_um,
     support_extent_px,
     voxel_grid,
 )
+from recon.analysis.settings import AnalysisSettings, axial_spacing, lateral_spacing, response_of
 from recon.base.brief import brief
 from recon.base.checks import require_calibration
-from recon.base.declare import option
 from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.camera_model import choose_model, sort_by_depth
 from recon.camera.refocus import central_psfs
 from recon.errors import InputError
-from recon.optics.fall_off import FallOff
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
@@ -71,82 +65,6 @@ CONDITION_COUNTS: Mapping[Direction, tuple[int, ...]] = {"x": (2, 4, 9, 16), "z"
 SEPARATIONS = (1, 2, 3, 4, 5, 6, 8)
 CONDITION_PLANES = 13
 """Planes for groups in depth: four sources four planes apart."""
-STEEPEST = math.atan(40.0)
-"""Angle at which a response is taken to have ended."""
-
-
-def _cutoff(typed: str) -> tuple[float, float]:
-    """Read ``X,Y``, or one angle for both, as ``(y, x)``."""
-    try:
-        values = [float(part) for part in typed.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in (1, 2) or not all(0 < v < 90 for v in values):
-        raise ValueError("one or two angles between 0 and 90, as 41.5,30 for x and y.")
-    return values[-1], values[0]
-
-
-@dataclass(frozen=True, slots=True)
-class AnalysisSettings:
-    """What the calibration itself does not tell.
-
-    Resolution is stated and tested at ``z_um``: without it in the middle of the calibrated range in 1/z, or
-    nearer where the tests along the axis, which take most of the time, would not fit. ``deflection_deg`` is
-    the ``beta`` of Kuo 2020; ``cutoff_deg`` is along y and x. The lateral sampling follows from ``fall_off``,
-    the sensor's response as a function of the tangents along y and x, else from a Gaussian of
-    ``fall_off_deg``; the axial one (Eq. 5.10) from a microlens diffuser's ``lenslet_um`` and the wavelength.
-    """
-
-    z_um: float | None = option(
-        None,
-        help="Depth to analyse.",
-        label="Depth",
-        default_words="the middle in 1/z",
-        unit="um",
-        shown_unit="mm",
-        shown_factor=1000.0,
-        above=0,
-        group="Optics",
-    )
-    deflection_deg: float = option(
-        0.5, help="The diffuser's largest deflection.", unit="deg", above=0, below=90, group="Optics"
-    )
-    cutoff_deg: tuple[float | None, float | None] | None = option(
-        None,
-        help="Angles at which the sensor's response is down to 20 %, along x and y (calibrate angular).",
-        default_words="not known",
-        unit="deg",
-        metavar="X,Y",
-        parse=_cutoff,
-        group="Optics",
-    )
-    fall_off: FallOff | None = None
-    fall_off_deg: float | None = option(
-        None,
-        help="Sigma of the sensor's angular response.",
-        default_words="from --cutoff-deg",
-        unit="deg",
-        above=0,
-        group="Optics",
-    )
-    lenslet_um: float | None = option(
-        None, help="Diameter of a microlens diffuser's lenses.", unit="um", above=0, group="Optics"
-    )
-    wavelength_nm: float | None = option(
-        None,
-        help="Of the light.",
-        default_words="the calibration's",
-        unit="nm",
-        above=0,
-        group="Optics",
-    )
-    points: bool = option(True, help="Two- and 16-point tests by reconstructions.", group="Point tests")
-    volumes: bool = option(
-        False,
-        help="Two points along the axis and 16 points in default volumes, too: minutes.",
-        group="Point tests",
-    )
-    noise: AskedNoise = field(default_factory=AskedNoise)
 
 
 @dataclass(frozen=True)
@@ -357,9 +275,9 @@ def analyse(
         points=tests,
         reached=found,
         in_volumes=volumes,
-        half_light_deg=half_light_deg(psf, sensor_shape, pitch_um / distance_um, _fall_off(settings)),
-        lateral_spacing_um=_lateral_spacing(settings, float(depths[0]), notes),
-        axial_spacing_per_um=_axial_spacing(settings, calibration, notes),
+        half_light_deg=half_light_deg(psf, sensor_shape, pitch_um / distance_um, response_of(settings)),
+        lateral_spacing_um=lateral_spacing(settings, float(depths[0]), notes),
+        axial_spacing_per_um=axial_spacing(settings, calibration, notes),
         grid=voxel_grid(
             resolution_px=resolution_px,
             step_per_um=step,
@@ -473,48 +391,3 @@ def _in_volumes(
         f"them ({found.planes} planes for 16 points), each group alone in the dark, with the noise above."
     )
     return found
-
-
-def _fall_off(settings: AnalysisSettings) -> Callable[[Array, Array], Array]:
-    """Return the pixels' response by the tangents along y and x: 1 where it is not known."""
-    if settings.fall_off is not None:
-        return settings.fall_off
-    given = settings.cutoff_deg or (None, None)
-    sigmas = [
-        settings.fall_off_deg if angle is None else angle / math.sqrt(2 * math.log(5)) for angle in given
-    ]
-
-    def response(y: Array, x: Array) -> Array:
-        total: Array = np.ones(np.broadcast(y, x).shape)
-        for tangent, sigma in zip((y, x), sigmas, strict=True):
-            if sigma is not None:
-                total = total * gaussian_response(sigma)(np.arctan(np.abs(tangent)))
-        return total
-
-    return response
-
-
-def _lateral_spacing(settings: AnalysisSettings, nearest_um: float, notes: list[str]) -> float | None:
-    if (fall_off := settings.fall_off) is not None:
-
-        def along(y: float, x: float) -> Callable[[Floats], Floats]:
-            return lambda angles: fall_off(*(n * np.tan(np.minimum(angles, STEEPEST)) for n in (y, x)))
-
-        return min(lateral_spacing_um(f, nearest_um) for f in (along(1, 0), along(0, 1)))
-    sigma = settings.fall_off_deg
-    if sigma is None and settings.cutoff_deg is not None:
-        known = [angle for angle in settings.cutoff_deg if angle is not None]
-        if known:
-            sigma = min(known) / math.sqrt(2 * math.log(5))  # a Gaussian that falls to 20 % there
-    if sigma is None:
-        notes.append("The sensor's angular fall-off is not known: no lateral calibration spacing follows.")
-        return None
-    return lateral_spacing_um(gaussian_response(sigma), nearest_um)
-
-
-def _axial_spacing(settings: AnalysisSettings, calibration: Calibration, notes: list[str]) -> float | None:
-    wavelength_nm = settings.wavelength_nm or calibration.geometry.wavelength_nm
-    if settings.lenslet_um is None or wavelength_nm is None:
-        notes.append("Eq. 5.10 (axial calibration spacing) needs the lenslet's diameter and the wavelength.")
-        return None
-    return axial_spacing_per_um(settings.lenslet_um, 1e-3 * wavelength_nm)
