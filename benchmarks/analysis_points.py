@@ -6,10 +6,11 @@
 
 Benches of :data:`BENCHES`, calibrated at two depths with noise. Then points alone, at places
 between pixels and planes that the analysis has not seen, by wave optics: pairs across in a picture as the
-default reconstruction makes it; pairs along the axis and sixteen in x and z in the window that states them.
-Printed is how many are told apart at the stated distance and at 0.8 of it. ``volume``: pairs along the axis
-and sixteens, each in a cell of its own with the noise that it would have alone, in one default volume, at
-the distances that ``analyze --volumes`` states.
+default reconstruction makes it, at the depth analysed (``--between``: in the middle of the two); pairs along
+the axis and sixteen in x and z in the window that states them. Printed is how many are told apart at the
+stated distance and at 0.8 of it. ``volume``: pairs along the axis and sixteens, each in a cell of its own
+with the noise that it would have alone, in one default volume, at the distances that ``analyze --volumes``
+states.
 """
 
 from __future__ import annotations
@@ -210,8 +211,9 @@ def _volumes(
             )
 
 
-def held(bench: str, wanted: Sequence[str], count: int, shares: Sequence[float], together: int = 1) -> None:
+def held(bench: str, wanted: Sequence[str], asked: argparse.Namespace) -> None:
     """Analyse a bench's calibration, then count."""
+    count, shares, together = asked.pairs, asked.shares, asked.together
     camera = Camera.of(bench)
     calibration = calibrated(camera, BENCHES[bench][2])
     began = time.process_time()
@@ -222,6 +224,8 @@ def held(bench: str, wanted: Sequence[str], count: int, shares: Sequence[float],
         flush=True,
     )
     truth, points = Truth(camera, found), found.points
+    if asked.between:
+        truth.z_um = float(2 / np.sum(1 / np.array(BENCHES[bench][2])))
     assert points is not None
     if found.reached is not None:
         for axis, px in enumerate(found.reached.across_px):
@@ -277,10 +281,11 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=["across", "along", "sixteen", "volume"], default=None)
     parser.add_argument("--bench", nargs="+", choices=list(BENCHES), default=["tiny"])
     parser.add_argument("--shares", nargs="+", type=float, default=SHARES, help="Of a volume's points.")
+    parser.add_argument("--between", action="store_true", help="Pairs across between the two depths.")
     parser.add_argument("--together", type=int, default=1, help="Pairs across in one picture, far apart.")
     asked = parser.parse_args()
     for bench in asked.bench:
-        held(bench, asked.only or ["across", "along", "sixteen"], asked.pairs, asked.shares, asked.together)
+        held(bench, asked.only or ["across", "along", "sixteen"], asked)
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ PLANES = 17
 """Planes of the window in depth, half an axial step (inner product 0.8) apart: the spacing of Sec. 4.4."""
 HALF_WINDOW = (4, 24)
 """Rows and columns that the window reaches from the axis, voxels."""
-_PARTS = 4  # of a plane, at which points' PSFs are made
+_PARTS = 2  # of a plane, at which points' PSFs are made: between two of them 0.3 % of the light is blurred
 FARTHEST = 12.0
 """Pixels, or planes, between two points at most."""
 

@@ -294,24 +294,26 @@ def analyse(
 
 
 def _depth_to_analyse(depths: Floats, step_per_um: Callable[[int], float], notes: list[str]) -> float:
-    """Return the middle of the range in 1/z, or the nearest to it about which depth can be tested at all.
+    """Return the calibrated depth nearest to the middle in 1/z, or a nearer one where depth can be tested.
 
-    Far away the planes of the tests along the axis, evenly spaced in 1/z, would reach beyond infinity:
-    ``step_per_um(k)`` apart at the ``k``-th depth.
+    What lies between two depths is a blend of their PSFs, which is a little blurred. Far away the planes of
+    the tests along the axis, evenly spaced in 1/z, would reach beyond infinity: ``step_per_um(k)`` apart at
+    the ``k``-th depth.
     """
-    middle = float(2 / (1 / depths[0] + 1 / depths[-1]))
+    middle = (1 / depths[0] + 1 / depths[-1]) / 2
+    away = np.abs(1 / depths - middle)
+    first = int(np.flatnonzero(away <= away.min() + 1e-9 * middle)[0])  # of two as near the nearer
     reach = max(CONDITION_PLANES, PLANES) // 2
-    for z_um in (middle, *sorted((float(z) for z in depths if z < middle), reverse=True)):
-        nearest = int(np.argmin(np.abs(1 / depths - 1 / z_um)))
-        if 1 / z_um > reach * step_per_um(nearest) / 2:
-            if z_um != middle:
+    for k in range(first, -1, -1):
+        if 1 / depths[k] > reach * step_per_um(k) / 2:
+            if k != first:
                 notes.append(
-                    f"Analysed at {z_um / 1e3:.3g} mm, not in the middle of the range "
-                    f"({middle / 1e3:.3g} mm in 1/z): from there tests along the axis would reach beyond "
+                    f"Analysed at {depths[k] / 1e3:.3g} mm, not at {depths[first] / 1e3:.3g} mm, nearest to "
+                    "the middle of the range in 1/z: from there tests along the axis would reach beyond "
                     "infinity. --z-mm chooses another depth."
                 )
-            return z_um
-    return middle
+            return float(depths[k])
+    return float(depths[first])
 
 
 def _geometry(calibration: Calibration) -> tuple[float, float]:
@@ -341,6 +343,7 @@ def _cut_to_light(calibration: Calibration) -> tuple[Calibration, tuple[int, int
 
 
 def _condition(planes: Array, *, with_depth: bool) -> tuple[ConditionCurve, ...]:
+    planes = planes.astype(np.float64)  # once, not for every product
     middle = planes[len(planes) // 2][None]
     curves = (
         condition_curve(middle if direction == "x" else planes, direction, count, SEPARATIONS)

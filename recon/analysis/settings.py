@@ -38,18 +38,19 @@ def _cutoff(typed: str) -> tuple[float, float]:
 class AnalysisSettings:
     """What the calibration itself does not tell.
 
-    Resolution is stated and tested at ``z_um``: without it in the middle of the calibrated range in 1/z, or
-    nearer where the tests along the axis, which take most of the time, would not fit. ``deflection_deg`` is
-    the ``beta`` of Kuo 2020; ``cutoff_deg`` is along y and x. The lateral sampling follows from ``fall_off``,
-    the sensor's response as a function of the tangents along y and x, else from a Gaussian of
-    ``fall_off_deg``; the axial one (Eq. 5.10) from a microlens diffuser's ``lenslet_um`` and the wavelength.
+    Resolution is stated and tested at ``z_um``: without it at the calibrated depth nearest to the middle of
+    the range in 1/z, or at a nearer one where the tests along the axis would reach beyond infinity.
+    ``deflection_deg`` is the ``beta`` of Kuo 2020; ``cutoff_deg`` is along y and x. The lateral sampling
+    follows from ``fall_off``, the sensor's response as a function of the tangents along y and x, else from
+    a Gaussian of ``fall_off_deg``; the axial one (Eq. 5.10) from a microlens diffuser's ``lenslet_um`` and
+    the wavelength.
     """
 
     z_um: float | None = option(
         None,
         help="Depth to analyse.",
         label="Depth",
-        default_words="the middle in 1/z",
+        default_words="the calibrated one nearest to the middle in 1/z",
         unit="um",
         shown_unit="mm",
         shown_factor=1000.0,

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 from typing import Any
 
@@ -30,11 +31,11 @@ from recon.types import Calibration
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
 
-PICTURES, PAIRS = 10, 12
+PICTURES, PAIRS = 5, 24
 """Pictures that are reconstructed, and pairs in each, half of them along each axis.
 
-Where there is no room for so many, up to three times as many pictures. More in a picture cost resolution, of
-which a pair alone knows nothing: with 22 in cells of 20 pixels the stated distance is 3 % more.
+Where there is no room for so many, up to three times as many pictures. Nearer together they cost resolution,
+of which a pair alone knows nothing: with 22 in cells of 20 pixels the stated distance is 3 % more.
 """
 _RANGE = 3.0  # of the first distances, largest over smallest
 _BELOW = 1.12  # the stated distance over the middle of an axis' later ones: there the share rises
@@ -43,6 +44,7 @@ _MORE = 1.6  # times as many pairs, before the next ones' distances are chosen a
 _ABOUT = 1.2  # of these, to both sides
 _CELL_PX = 30  # for a pair, at least; more where its points lie farther apart
 _FIELD = 0.25  # of the sensor to both sides of its middle, where pairs stand
+_CERTAIN = 0.22  # of it, whatever of the pattern falls beyond its edges: 25 cells of the middle
 _BESIDE = 2  # rows to both sides of a pair's line that the picture is summed over
 _WIDER = 1.5  # times the stated distance: pairs that tell the depth of field
 _DEPTHS = 8  # tried to each side of the focus, to _FARTHEST times the optics' step
@@ -83,7 +85,7 @@ class _Tests:
         self.z_um, self.rng = z_um, np.random.default_rng(seed)
         # As people have pictures of this depth made, who name it: between calibrated ones of what is between.
         self.calibration, _ = at_depth(_on_axis(middle.calibration), z_um)
-        self.psf = middle.psf_at
+        self.psf = cache(middle.psf_at)
         self.noise = middle.noise(noise)
         self.method = ""
         # The default looks for stray light where no part of the sensor is dark, as the middle may be.
@@ -220,7 +222,9 @@ def _focus_um(
     told: list[list[bool]] = [[], []]
     while True:
         asked = [
-            (side, place) for side in (0, 1) if all(told[side]) for place in sides[side][len(told[side]) :]
+            (side, sides[side][n])
+            for n, side in product(range(_DEPTHS), (0, 1))
+            if all(told[side]) and len(told[side]) <= n < len(sides[side])
         ]
         if not asked:
             break
@@ -248,12 +252,12 @@ def _focus_um(
 def cells(psf: Array, px: float, least_px: float = _CELL_PX) -> Floats:
     """Return the middles of the cells that pairs stand in, (n, 2): where all of the pattern is seen.
 
-    At least within a fifth of the sensor, where its pattern leaves no rim.
+    At least within :data:`_CERTAIN` of the sensor, where its pattern leaves no rim.
     """
     cell = max(least_px, 5 * px)
     sides = []
     for size, (first, last) in zip(psf.shape, lit_extent(psf), strict=True):
-        half = max(min(first, size - 1 - last, _FIELD * size), size / 5)
+        half = max(min(first, size - 1 - last, _FIELD * size), _CERTAIN * size)
         steps = int(half // cell)
         sides.append(cell * np.arange(-steps, steps + 1))
     return np.array(list(product(*sides)))

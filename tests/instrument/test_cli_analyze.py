@@ -68,7 +68,7 @@ def test_the_depth_is_one_about_which_depth_can_be_tested(
     out = tmp_path / "page.png"
     assert main(["analyze", str(made), "--out", str(out), "--no-points"]) == 0
     said = capsys.readouterr()
-    assert "Analysed at 60 mm, not in the middle of the range" in said.err
+    assert "Analysed at 60 mm, not at 92 mm, nearest to the middle of the range" in said.err
     found = json.loads((tmp_path / "page.json").read_text())["analysis"]
     assert found["z_um"] == 60e3
     assert {curve["direction"] for curve in found["condition"]} == {"x", "z", "xz"}
