@@ -22,8 +22,8 @@ from instrument.notebook.result import show as show
 from instrument.notebook.result import show_figure as show_figure
 from instrument.notebook.words import open_result as open_result
 from recon.analysis.compare import compare as compare
-from recon.analysis.report import AnalysisSettings as AnalysisSettings
 from recon.analysis.report import analyse as analyse
+from recon.analysis.settings import AnalysisSettings as AnalysisSettings
 from recon.base import metrics as metrics
 from recon.base.noise import NoiseModel as NoiseModel
 from recon.camera.base import LinearOperator as LinearOperator
