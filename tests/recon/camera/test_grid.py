@@ -88,6 +88,34 @@ def test_the_pixel_on_the_axis_looks_along_it():
     assert GRID.place_um(3, 40, 60) == (*GRID.axis_um[3], Z_UM[3])
 
 
+@pytest.mark.parametrize("upright", [False, True])
+def test_a_metric_grid_reaches_as_far_as_the_volume_about_its_middle(upright):
+    grid = Grid(
+        (4, 90, 110), (20, 30), 1e3 * np.array([10.0, 11.0, 13.0, 17.0]), np.full(4, 25.0), 6.5, None, upright
+    )
+    made = metric_grid(grid, 800.0)
+    assert made.z_um.mean() == pytest.approx((9500 + 19000) / 2)  # 11 voxels of 800 um in 9500
+    fine = metric_grid(replace(grid, z_um=1e3 * np.arange(10.0, 14.0)), 25.0)
+    for axis, number in ((0, 2), (1, 1)):
+        ends, reached = (
+            sorted(
+                of.place_um(0, *((at, 0) if axis else (0, at)))[axis]
+                for at in (least, of.shape[number] - 1 - least)
+            )
+            for of, least in ((grid, -0.5), (fine, 0))
+        )
+        assert reached == pytest.approx(ends, abs=25.0)
+
+
+@pytest.mark.parametrize("plane", range(4))
+def test_the_light_of_a_plane_stays_where_steps_differ(plane):
+    grid = Grid((4, 40, 40), (20, 20), 1e3 * np.array([10.0, 12.0, 13.0, 17.0]), np.full(4, 25.0))
+    volume = np.zeros(grid.shape, np.float32)
+    volume[plane, 10:30, 10:30] = 1
+    made, _ = metric_volume(volume, grid, 25.0)
+    assert made.sum(dtype=float) == pytest.approx(volume.sum(), rel=0.02)
+
+
 def test_a_deep_voxel_is_the_mean_of_what_lies_about_it():
     """Light that grows evenly with depth does so on voxels five planes deep, too, and is centred on them."""
     z = np.arange(40) * 10.0 + 1e5
