@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import stat
 import tomllib
@@ -32,15 +33,22 @@ def read_bytes(path: Path, most: int = MOST_TEXT_BYTES, *, error: type[FileError
     """
     said = require_file(path, most, error=error)
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=_at_once) as file:
             data = file.read(said + _GROWTH_BYTES)
     except FileNotFoundError:
         raise
     except OSError as failure:
         raise error(path, f"cannot be read: {os_reason(failure)}") from failure
+    if data is None:  # /proc/kmsg: a plain file by its kind
+        raise error(path, "is a device, which might never end; a file is expected.", "Name a file.")
     if len(data) > most:
         raise error(path, _too_large(len(data), most))
     return data
+
+
+def _at_once(path: str, flags: int) -> int:
+    """Open a file so that reading it does not wait for what is not there yet."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def require_file(path: Path, most: int | None = None, *, error: type[FileError] = FileError) -> int:

@@ -340,10 +340,12 @@ def load_plan(path: Path | str) -> Plan:
     """
     path = Path(path)
     reader = _reader(path)
-    if not path.is_file():
-        raise FileError(path, "is a folder; a plan is a file." if path.is_dir() else "no such plan file.")
+    if path.is_dir():
+        raise FileError(path, "is a folder; a plan is a file.")
     try:
         data = reader(read_bytes(path).decode())
+    except FileNotFoundError:
+        raise FileError(path, "no such plan file.") from None
     except UnicodeDecodeError:
         raise FileError(path, "is no text file.", "A plan is a TOML or JSON file.") from None
     except ValueError as error:  # of tomllib and json alike; both name the line

@@ -17,6 +17,7 @@ import pytest
 import zarr
 
 from instrument.bench.config_file import load_config
+from instrument.files import reading
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image, write_image
 from instrument.files.volumes import ome_attributes, open_volume
@@ -41,8 +42,20 @@ def test_a_pipe_and_an_endless_device_are_refused_at_once(tmp_path: Path, read: 
     os.mkfifo(pipe)
     endless.symlink_to("/dev/zero")
     for path in (pipe, endless):
-        with pytest.raises(BenchError):
+        with pytest.raises(BenchError) as caught:
             read(path)  # type: ignore[operator]
+        assert (
+            read is not load_plan or suffix not in (".toml", ".json") or "pipe or device" in str(caught.value)
+        )
+
+
+def test_what_is_not_there_yet_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.mkfifo(pipe := tmp_path / "plan.toml")  # like /proc/kmsg, which says that it is a plain file
+    monkeypatch.setattr(reading, "require_file", lambda *_, **__: 0)
+    writer = os.open(pipe, os.O_RDWR)
+    with pytest.raises(BenchError, match="might never end"):
+        load_plan(pipe)
+    os.close(writer)
 
 
 def test_what_claims_more_than_it_holds_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
