@@ -7,6 +7,7 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 
 from recon.camera.transformed import Transformation, geometric_centre, resampled, transformed
 from recon.errors import InputError
@@ -80,3 +81,9 @@ def test_words() -> None:
         "turned by -0.8 degrees, 2 % larger, moved by +0 rows and -2.5 columns"
     )
     assert str(Transformation(mirrored=True)) == "mirrored"
+
+
+def test_a_shift_by_a_part_of_a_pixel_goes_by_cubic_splines() -> None:
+    image = np.random.default_rng(0).random((12, 14)).astype(np.float32)
+    expected = np.maximum(ndimage.shift(image, (-0.3, -0.4), order=3), 0)
+    np.testing.assert_allclose(resampled(image, np.ones(2), np.array([0.3, 0.4])), expected, atol=1e-6)
