@@ -27,7 +27,8 @@ Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]
 
-_GRID_SHARE = 0.6  # of the work, on the grid; the rest with points
+_GRID_SHARE = 0.45
+"""Of the time, on the grid; the rest with points. Nine slides binned 4 x 4: 0.45, five binned 8 x 8: 0.51."""
 
 
 @dataclass(frozen=True, slots=True)
