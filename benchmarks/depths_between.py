@@ -33,7 +33,8 @@ from drivers.simulated.world import SimulatedWorld
 from recon import reconstruct
 from recon.analysis.correlation import similarity
 from recon.base import metrics
-from recon.camera.refocus import refocus, refocus_field
+from recon.camera.refocus import refocus
+from recon.camera.refocus_field import refocus_field
 from recon.camera.two_part import two_part
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.fall_off import gaussian_fall_off, response_on

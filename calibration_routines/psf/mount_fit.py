@@ -20,7 +20,7 @@ from calibration_routines.psf.psf_quality import MAX_CLIPPED, PsfQuality
 from calibration_routines.psf.stage_fit import StageFit
 from calibration_routines.scatter import compare, growth, reduction
 from recon.base.blocks import block_mean
-from recon.camera.refocus import paraxial_scale
+from recon.camera.depth_mixture import paraxial_scale
 from recon.camera.registration import moved, rescaled
 from recon.types import Geometry
 

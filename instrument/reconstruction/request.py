@@ -26,7 +26,7 @@ from instrument.runs.run_files import STATE
 from recon.base.checks import require_noise, select_psf
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.camera.grid import depth_in_words
-from recon.camera.refocus import at_depth
+from recon.camera.refocus_field import at_depth
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
@@ -229,7 +229,9 @@ def refocused(job: Job, z_um: float, *, beside: bool = False) -> Job:
     """Return the job with a PSF for a depth that its calibration does not contain, and a note that says so.
 
     With ``beside`` the calibrated depths stay beside it, for a fit of the depth. What could not be brought
-    there stays as it is, and a note says so. Raises InputError as :func:`recon.camera.refocus.at_depth`.
+    there stays as it is, and a note says so.
+
+    Raises InputError as :func:`recon.camera.refocus_field.at_depth`.
     """
     calibration, made = at_depth(job.calibration, z_um)
     if made is None:

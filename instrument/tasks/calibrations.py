@@ -276,7 +276,7 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
     from instrument.files.calibration_file import load_calibration, save_calibration
     from instrument.reconstruction.job import find_calibration
     from recon.camera.refocus import refocus as refocused
-    from recon.camera.refocus import refocus_field
+    from recon.camera.refocus_field import refocus_field
     from recon.camera.two_part import two_part
 
     if len(set(options.z_um)) < len(options.z_um):

@@ -19,7 +19,8 @@ from recon.analysis.correlation import correlate, cut_to_light, lit_extent, simi
 from recon.analysis.what_moved import Explanation, Seen, moved_across, moved_along
 from recon.base.blocks import block_mean
 from recon.base.checks import require_calibration
-from recon.camera.refocus import central_psfs, psf_at
+from recon.camera.depth_mixture import central_psfs
+from recon.camera.refocus import psf_at
 from recon.camera.registration import register
 from recon.camera.transformed import geometric_centre, resampled
 from recon.errors import InputError

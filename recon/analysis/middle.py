@@ -16,7 +16,8 @@ import numpy.typing as npt
 
 from recon.analysis.points import Noise
 from recon.analysis.resolution import axial_resolution
-from recon.camera.refocus import central_psfs, psf_at
+from recon.camera.depth_mixture import central_psfs
+from recon.camera.refocus import psf_at
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]

@@ -49,7 +49,7 @@ from recon.base.brief import brief
 from recon.base.checks import require_calibration
 from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.camera_model import choose_model, sort_by_depth
-from recon.camera.refocus import central_psfs
+from recon.camera.depth_mixture import central_psfs
 from recon.errors import InputError
 from recon.types import Calibration
 

@@ -30,7 +30,7 @@ import numpy.typing as npt
 from recon.analysis.correlation import RESOLUTION_LEVEL
 from recon.analysis.resolution import axial_resolution, lateral_resolution
 from recon.camera.camera_model import ModelName
-from recon.camera.refocus import central_psfs
+from recon.camera.depth_mixture import central_psfs
 from recon.errors import InputError
 from recon.evaluation.scene import SceneSpec, TestScene, make_scene
 from recon.evaluation.trial import Setting

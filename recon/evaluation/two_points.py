@@ -24,7 +24,8 @@ from recon.analysis.middle import Middle
 from recon.analysis.points import DIP, NEARER, Noise, Reached, TriedPair, smallest_dip
 from recon.analysis.told_apart import Told, stated_apart
 from recon.base import fft
-from recon.camera.refocus import at_depth, central_psfs
+from recon.camera.depth_mixture import central_psfs
+from recon.camera.refocus_field import at_depth
 from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration
 

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from recon.analysis.correlation import similarity
 from recon.camera.camera_model import Depths, members_of_depths
-from recon.camera.refocus import refocus, refocus_field
+from recon.camera.refocus import refocus
+from recon.camera.refocus_field import refocus_field
 from recon.camera.registration import rescaled
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation

@@ -14,7 +14,7 @@ from recon.base.checks import as_channels, check_psf
 from recon.base.declare import settled
 from recon.camera.camera_model import Depths, Extent, ModelName, choose_model, energies, levelled
 from recon.camera.grid import Grid
-from recon.camera.refocus import at_depth
+from recon.camera.refocus_field import at_depth
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (
@@ -117,7 +117,7 @@ class Problem:
             one convolution of everything. One channel serves all.
         options : ReconstructionOptions, optional
             With ``z_um`` the picture of one depth, which PSFs are brought to where the calibration does not
-            have it (:func:`recon.camera.refocus.at_depth`). Else all depths.
+            have it (:func:`recon.camera.refocus_field.at_depth`). Else all depths.
         extent : Extent, optional
             How much of the PSFs and of the field to model; default all.
 

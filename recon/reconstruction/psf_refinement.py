@@ -33,8 +33,8 @@ import numpy.typing as npt
 from recon.base.blocks import block_sum
 from recon.base.declare import settled
 from recon.camera.camera_model import CAMERAS, Depths, choose_model, one_depth
+from recon.camera.depth_mixture import central_psfs, paraxial_scale
 from recon.camera.grid import FAR_UM
-from recon.camera.refocus import central_psfs, paraxial_scale
 from recon.camera.transformed import Transformation, transformed
 from recon.camera.varying_psfs import FieldOfPsfs
 from recon.errors import InputError

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.camera_model import Extent, choose_model
-from recon.camera.refocus import at_depth
+from recon.camera.refocus_field import at_depth
 from recon.errors import InputError
 from recon.reconstruction.first_look import look_at
 from recon.reconstruction.measurement import Floats, Measurement, depths_of

@@ -17,7 +17,7 @@ from calibration_routines.psf.structure import fit_structure
 from calibration_routines.psf.sweep_plan import size_findings
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
-from recon.camera.refocus import paraxial_scale
+from recon.camera.depth_mixture import paraxial_scale
 from recon.camera.registration import moved, rescaled
 from recon.types import Geometry
 

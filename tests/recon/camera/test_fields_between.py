@@ -8,7 +8,7 @@ import pytest
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.correlation import similarity
-from recon.camera.refocus import at_depth, refocus_field
+from recon.camera.refocus_field import at_depth, refocus_field
 from recon.camera.two_part import two_part
 from recon.errors import InputError
 from recon.optics.fall_off import gaussian_fall_off

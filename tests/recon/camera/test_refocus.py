@@ -12,8 +12,10 @@ from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.correlation import across_field, similarity
 from recon.camera.depth_likeness import likeness_range
+from recon.camera.depth_mixture import central_psfs, paraxial_scale
 from recon.camera.grid import FAR_UM
-from recon.camera.refocus import at_depth, central_psfs, paraxial_scale, refocus, refocus_psf
+from recon.camera.refocus import refocus, refocus_psf
+from recon.camera.refocus_field import at_depth
 from recon.camera.registration import register, rescaled
 from recon.errors import InputError
 from recon.reconstruction.reconstruct import reconstruct

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.camera.refocus import paraxial_scale
+from recon.camera.depth_mixture import paraxial_scale
 from recon.camera.registration import aligned, displacement, expected_shift, register, rescaled
 from recon.errors import InputError
 from recon.optics.diffuser import microlens_diffuser, smooth_diffuser
