@@ -150,13 +150,25 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise ValueError("it is nested too deeply") from None
 
 
-def parse_json(text: str | bytes) -> Any:
-    """Return what JSON text says; raises ValueError for all that is none, nested without end or huge too."""
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    made = dict(pairs)
+    if len(made) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice!r:.60} stands there twice")
+    return made
+
+
+def parse_json(text: str | bytes, *, by_hand: bool = False) -> Any:
+    """Return what JSON text says; raises ValueError for all that is none, nested without end or huge too.
+
+    ``by_hand``: people write it, and a key that stands twice is a mistake of theirs (of two the last counts).
+    """
     if len(text) > _MOST_JSON_VALUES:
         marks = text.count if isinstance(text, str) else lambda mark: text.count(mark.encode())
         if sum(map(marks, ",[{")) > _MOST_JSON_VALUES:
             raise ValueError(f"it has more than {_MOST_JSON_VALUES} values")
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_each_once if by_hand else None)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -375,7 +376,7 @@ def plan_toml(plan: Plan) -> str:
 
 
 def _reader(path: Path) -> Any:
-    readers: Mapping[str, Any] = {".toml": parse_toml, ".json": parse_json}
+    readers: Mapping[str, Any] = {".toml": parse_toml, ".json": partial(parse_json, by_hand=True)}
     if path.suffix.lower() not in readers:
         raise FileError(path, f"a plan's name ends in {' or '.join(readers)}.")
     return readers[path.suffix.lower()]

@@ -27,6 +27,7 @@ from instrument.plan import (
     estimate,
 )
 from instrument.plan.abilities import BYTES_A_FRAME_BESIDE_THE_IMAGE as BESIDE
+from instrument.plan.model import load_plan
 
 AXES = (
     StageAxis("x_um", -100.0, 100.0, 1000.0, 0.1),
@@ -225,3 +226,10 @@ def test_the_estimate_counts_frames_bytes_moves_and_seconds() -> None:
     assert found.total_bytes == 3 * (10 * 20 * 4 + BESIDE)
     assert found.exposures == 30
     assert found.seconds == pytest.approx(120 + 0.1)
+
+
+def test_a_key_that_stands_twice_in_a_plan_is_a_mistake(tmp_path: Path) -> None:
+    part = '{"label": "a", "exposures_ms": [1], "exposures_ms": [2]}'
+    (path := tmp_path / "plan.json").write_text(f'{{"label": "x", "parts": [{part}]}}')
+    with pytest.raises(PlanError, match="the key 'exposures_ms' stands there twice"):
+        load_plan(path)
