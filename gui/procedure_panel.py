@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from PySide6.QtCore import Qt, QTimer
+from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QScrollArea, QStackedWidget, QWidget
 
 from calibration_routines.plan_procedures import ResumeProcedure, left_unfinished, routine_of
@@ -168,6 +168,7 @@ class ProcedurePanel(Panel):
         self._again = False
         self._unchecked = False
         """Whether the bench was busy when the form was to be checked."""
+        self._making = after_rest(self, REST_MS, self._make_form)
         self._rest = after_rest(self, _CHECK_MS, self.check)
         self._slow = after_rest(self, _SLOW_MS, lambda: self._say("This is being checked …", wrong=False))
         self.choice.currentIndexChanged.connect(self._chosen)
@@ -335,16 +336,21 @@ class ProcedurePanel(Panel):
         self.views.show_page(self.routine.name)
         self.about.setText(f"{self.routine.help.removesuffix('.')}.")
         self.run_bar.set_startable("Its form is being made.")
-        self._make_form()
+        self._making.start()  # not at once: keys that go through the list pass over most of them
 
     def _make_form(self) -> None:
         """Make the form that is shown, a slice at a time, then have it checked."""
         try:
             take_slice(self.views.parts(self.routine.name))
-            QTimer.singleShot(REST_MS, self, self._make_form)
+            self._making.start()
         except StopIteration:
             tab_in_order(self)
             self._typed()
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the form that is shown is made, and checked as it stands."""
+        return not (self._making.isActive() or self._rest.isActive()) and self._check_job is None
 
     @property
     def _with_files(self) -> bool:

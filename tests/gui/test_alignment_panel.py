@@ -59,7 +59,7 @@ def begin(qtbot: QtBot, panel: AlignmentPanel, **numbers: str) -> None:
         field.selectAll()
         qtbot.keyClicks(field, text)
     qtbot.wait(1)
-    qtbot.waitUntil(lambda: not panel._rest.isActive() and panel._check_job is None, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: panel.is_settled, timeout=WAIT_MS)
     qtbot.mouseClick(panel.run_bar.start_button, LEFT)
     assert panel.run.is_running
 

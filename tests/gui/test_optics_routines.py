@@ -57,7 +57,7 @@ def carry_out(qtbot: QtBot, window: MainWindow, name: str, **numbers: str) -> Sw
         field.selectAll()
         qtbot.keyClicks(field, text)
     qtbot.wait(1)
-    qtbot.waitUntil(lambda: not panel._rest.isActive() and panel._check_job is None, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: panel.is_settled, timeout=WAIT_MS)
     assert panel.run_bar.start_button.isEnabled(), panel.verdict.toPlainText()
     with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
         qtbot.mouseClick(panel.run_bar.start_button, LEFT)
@@ -67,7 +67,7 @@ def carry_out(qtbot: QtBot, window: MainWindow, name: str, **numbers: str) -> Sw
 @pytest.mark.parametrize("bench_text", [MICROSCOPE], indirect=True, ids=["microscope"])
 def test_the_diffusers_surface(qtbot: QtBot, window: MainWindow) -> None:
     panel = carry_out(qtbot, window, "dpc", average="1", dark_frames="1")
-    assert "um rms" in panel.verdict.toPlainText()
+    assert "µm rms" in panel.verdict.toPlainText()
     (picture,) = window.session.runs_folder.glob("*/*.png")
     assert picture.stat().st_size > 1000
     assert window.session.bench.led_array is not None

@@ -72,7 +72,7 @@ def enter(qtbot: QtBot, panel: SweepsPanel, **numbers: str) -> None:
 
 def wait_for_check(qtbot: QtBot, panel: SweepsPanel) -> None:
     qtbot.wait(1)
-    qtbot.waitUntil(lambda: not panel._rest.isActive() and panel._check_job is None, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: panel.is_settled, timeout=WAIT_MS)
 
 
 def press(qtbot: QtBot, button: Any) -> None:
