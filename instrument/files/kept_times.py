@@ -30,11 +30,11 @@ _TRANSFORMS_PER_MEGAPIXEL = {
     "Frames": (110.0, 0.0),
     "finding exposures": (48.0, 48.0),
     "photographing bead slides": (120.0, 120.0),
-    "Rehearsing all of it on a simulated bench of its own": (170.0, 170.0),
+    "Rehearsing all of it on a simulated bench of its own": (110.0, 110.0),
 }
 """Steps that compute light on a simulated bench: their time of the processor, in that of a picture of
 1024 x 1024 which is transformed and back; where light has to be computed first, and where it is there."""
-_TRANSFORMS = {"drawing": 140.0, "optics": 4200.0}
+_TRANSFORMS = {"drawing": 140.0, "optics": 3300.0}
 """Transforms that steps take the first time, of any sensor: drawing a page with its library and the list of
 fonts; all optics by default options."""
 _ALONE_IN_IT = "drawing"
