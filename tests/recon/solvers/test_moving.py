@@ -40,7 +40,7 @@ def test_every_pixel_is_the_weighted_mean_of_those_that_came_there(rows: float, 
     move(nothing, rows, columns)
 
 
-@pytest.mark.parametrize("shape", [(6, 8), (7, 9), (6, 9), (7, 8)])
+@pytest.mark.parametrize("shape", [(8, 8), (7, 9), (6, 9), (7, 8)])
 def test_spectra_move_as_their_images_by_whole_pixels_and_stay_those_of_real_ones(
     shape: tuple[int, int],
 ) -> None:
