@@ -99,6 +99,11 @@ class SimulatedWorld(Surroundings):
         """Light the point source; each band relative to one LED at its brightest right behind it."""
         self._emission = self._glow(rgb)
 
+    @property
+    def leds_light_scene(self) -> bool:
+        """Whether the LED array lights the scene, and nothing the point source."""
+        return self.options.led_light == "scene"
+
     def light_scene(self, light: SceneLight | None) -> None:
         """Light the scene by LEDs (None: by none); besides, it glows while ``scene_lit``."""
         self._scene_light = light

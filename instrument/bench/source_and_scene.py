@@ -25,6 +25,13 @@ class SceneSwitch(Protocol):
     scene_lit: bool
 
 
+@runtime_checkable
+class LedsOnScene(Protocol):
+    """A shared part that says whether the LED array lights the scene, and no point source: the same world."""
+
+    leds_light_scene: bool
+
+
 class Lights:
     """Switches point source and scene, asking the operator where no device can do it."""
 
@@ -78,7 +85,17 @@ class Lights:
         return LedPattern(words, tuple((led, rgb) for led in leds))
 
     def switch_source(self, *, lit: bool) -> None:
-        """Light or darken the point source; confirmed when this returns."""
+        """Light or darken the point source; confirmed when this returns.
+
+        Raises BenchError where the simulated world's LED array lights the scene instead: what is taken for a
+        PSF would be the scene. OperatorNeededError when nobody can be asked.
+        """
+        world: object = self.scene_switch
+        if lit and isinstance(world, LedsOnScene) and world.leds_light_scene:
+            raise BenchError(
+                'The LED array lights the scene here, and no point source (led_light = "scene" in '
+                '[simulated]). Calibrate with led_light = "source", which is the same camera.'
+            )
         if self._led_array is None:
             self._ask_once("the point source", lit=lit)
         elif lit:

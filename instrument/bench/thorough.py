@@ -118,7 +118,7 @@ def _exposures(bench: Bench) -> str:
     """Say what becomes of exposures asked for, and of the counts; the exposure is put back."""
     camera, before = bench.camera, bench.camera.exposure_ms
     if bench.led_array is not None:
-        bench.source_on()
+        bench.led_array.set_pattern(bench.source_pattern)
     low, high = camera.exposure_limits_ms
     found = []
     try:
@@ -136,7 +136,7 @@ def _light(bench: Bench) -> str:
     assert leds is not None
     leds.off()
     before = bench.camera.snap().image.astype(np.float32)
-    bench.source_on()
+    leds.set_pattern(bench.source_pattern)
     change = bench.camera.snap().image - before
     dark, lit = float(before.mean()), float((before + change).mean())
     if not lit - dark > _BRIGHTER * float(change.std()) / change.size**0.5:

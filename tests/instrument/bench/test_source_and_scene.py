@@ -43,6 +43,16 @@ def test_the_source_is_switched_by_its_leds_or_else_by_who_can_be_asked(*, leds:
     assert asked == ([] if leds else ["Please light the point source.", "Please darken the point source."])
 
 
+def test_no_source_is_lit_by_leds_that_light_the_scene() -> None:
+    """A sweep took the scene for the PSF, and called it good."""
+    found, done = lights("simulated", leds=True, switch=True, asked=None)
+    found.scene_switch = SimpleNamespace(scene_lit=False, leds_light_scene=True)
+    with pytest.raises(BenchError, match="lights the scene here, and no point source"):
+        found.switch_source(lit=True)
+    found.switch_source(lit=False)
+    assert done == ["off"]
+
+
 @pytest.mark.parametrize("switch", [True, False])
 @pytest.mark.parametrize("can_ask", [True, False])
 @pytest.mark.parametrize("control", ["operator", "simulated"])

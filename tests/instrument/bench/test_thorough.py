@@ -38,7 +38,7 @@ def test_a_report_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 def test_light_that_does_not_reach_the_camera_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     with Bench(parse_config(MICROSCOPE, None)) as bench:
         bench.open()
-        monkeypatch.setattr(bench, "source_on", lambda: None)
+        monkeypatch.setattr(bench.led_array, "set_pattern", lambda _: None)
         light = next(found for found in thorough(bench) if found.device == "led_array")
     assert light.failed
     assert "gives no more light" in light.words
