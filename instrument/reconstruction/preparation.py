@@ -256,7 +256,24 @@ def dark_from_file(dark: ImageFile, image: ImageFile) -> Dark:
             "Give a frame taken in the dark (diffuserbench snap --dark), or leave --dark out.",
         )
     frame = dark.pixels.astype(np.float32)
-    return Dark(frame, frame, f"the frame {dark.path} (mean {float(frame.mean()):.1f} counts)")
+    words = f"the frame {dark.path} (mean {float(frame.mean()):.1f} counts)"
+    if (brighter := _brighter_share(frame, image.pixels)) > _MOST_BRIGHTER:
+        words += f"; in {brighter:.0%} of the picture it is BRIGHTER than the photograph: was there light?"
+    return Dark(frame, frame, words)
+
+
+_MOST_BRIGHTER, _BRIGHTER_BY, _SIDE = 0.1, 0.05, 8
+"""In what share of its blocks, and by what share of the mean, a photograph may lie below its dark frame."""
+
+
+def _brighter_share(dark: npt.NDArray[Any], image: npt.NDArray[Any]) -> float:
+    """Return in what share of the picture a dark frame is clearly brighter than a photograph."""
+    greys = [np.nan_to_num(pixels.astype(np.float32)) for pixels in (dark, image)]
+    greys = [grey.mean(axis=-1) if grey.ndim == 3 else grey for grey in greys]
+    if min(greys[0].shape) < _SIDE:
+        return 0.0
+    dark_means, means = (block_mean(grey, _SIDE) for grey in greys)
+    return float((dark_means > means + _BRIGHTER_BY * means.mean()).mean())
 
 
 def dark_from_corners(psf: ImageFile, image: ImageFile) -> Dark:

@@ -23,6 +23,7 @@ from instrument.reconstruction.preparation import (
     check_pair,
     check_psf,
     dark_from_corners,
+    dark_from_file,
     defective_pixels,
     erasures_of,
     reduce,
@@ -315,3 +316,15 @@ def test_a_binned_pixel_is_valid_where_all_of_its_pixels_are() -> None:
     valid[1, 2] = False
     assert reduce_valid(valid, None, 2).tolist() == [[True, False, True], [True, True, True]]
     assert reduce_valid(valid, Crop(2, 0, 2, 4), 2).all()
+
+
+def test_a_dark_frame_with_light_is_told() -> None:
+    rng = np.random.default_rng(0)
+    light = rng.poisson(100 + 400 * rng.random((1, 64)) * np.ones((48, 1))).astype(np.uint16)
+    image = ImageFile(Path("photo.tif"), light)
+    dark = ImageFile(Path("dark.tif"), rng.poisson(100, (48, 64)).astype(np.uint16))
+    unlit = ImageFile(Path("unlit.tif"), rng.poisson(100, (48, 64)).astype(np.uint16))
+    lit = ImageFile(Path("lit.tif"), np.roll(light, 32, axis=1))
+    for photograph in (image, unlit):
+        assert "BRIGHTER" not in dark_from_file(dark, photograph).reason
+    assert "BRIGHTER than the photograph: was there light?" in dark_from_file(lit, image).reason
