@@ -33,7 +33,7 @@ from recon.holography import (
     hologram_limit,
     random_mask,
 )
-from recon.holography.judge import low_pass, seen_image
+from recon.holography.scores import low_pass, seen_image
 
 PICTURES = ("portrait", "relief", "leaves", "head")
 LIFTS = (0.0, 0.1, 0.2, 0.3, 0.5)

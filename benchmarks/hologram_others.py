@@ -30,7 +30,7 @@ from recon.base.metrics import psnr
 from recon.base.threads import set_threads
 from recon.holography import Display, HologramModel, Target, compute_hologram
 from recon.holography.display import no_mask
-from recon.holography.judge import judge
+from recon.holography.scores import judge
 
 COUNTS = (10, 30, 100, 300)
 Row = dict[str, object]

@@ -25,7 +25,7 @@ from instrument.display.hologram_files import CHANNELS
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, write_image
 from recon.holography import Scores
-from recon.holography.judge import compare
+from recon.holography.scores import compare
 
 Array = npt.NDArray[Any]
 

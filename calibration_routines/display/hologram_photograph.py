@@ -29,7 +29,7 @@ from instrument.files.images import Pixels, write_image
 from instrument.files.slm_image import field_levels, is_of_mirrors, write_slm_image
 from recon.holography import Display, HologramModel, HologramOptions, Scores, Target, compute_hologram
 from recon.holography.camera_map import CameraMap
-from recon.holography.judge import compare, low_pass
+from recon.holography.scores import compare, low_pass
 from recon.holography.target import Band, make_band
 
 Array = npt.NDArray[Any]

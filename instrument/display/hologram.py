@@ -33,11 +33,11 @@ from recon.holography import (
     random_mask,
 )
 from recon.holography.display import greatest_defocus_mm, no_mask
-from recon.holography.judge import compare
 from recon.holography.learned import Learned
 from recon.holography.limit import limited_by
 from recon.holography.options import Fit
 from recon.holography.pose import NODES, Pose
+from recon.holography.scores import compare
 from recon.holography.target import EVERYWHERE, FIRST_ORDER, Window, band_of, near_window
 
 if TYPE_CHECKING:

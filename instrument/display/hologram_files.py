@@ -20,8 +20,8 @@ from instrument.files.figures import Convergence, Panel, Summary, save_figure, s
 from instrument.files.images import side_car, write_image
 from instrument.files.slm_image import field_levels, write_slm_image
 from recon.holography import Display, HologramOptions, Scores
-from recon.holography.judge import DISSERTATION, GRIDS, METHODS, Cell, average
 from recon.holography.losses import loss_of
+from recon.holography.scores import DISSERTATION, GRIDS, METHODS, Cell, average
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

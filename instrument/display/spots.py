@@ -115,7 +115,7 @@ class SpotFiles:
 
 
 def _draw(path: Path, spots: SpotList, display: Display, hologram: Hologram, scores: SpotScores) -> None:
-    from recon.holography.judge import intensity
+    from recon.holography.scores import intensity
     from recon.holography.target import near_window
 
     phase = np.mod(np.angle(hologram.slm[0]), 2 * np.pi)

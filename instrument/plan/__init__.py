@@ -1,25 +1,10 @@
 """Plans: what an acquisition will do, as data that counts, checks and iterates itself into steps."""
 
-from instrument.plan.abilities import BenchAbilities, PlanEstimate, check, estimate
-from instrument.plan.model import Part, Plan, PlanError, Step
-from instrument.plan.patterns import OFF, SOURCE, Light
-from instrument.plan.positions import SourceGrid, SourcePoints, SourcePosition, Span, StagePoints
+from recon.base.handed_on import handed_on
 
-__all__ = [
-    "OFF",
-    "SOURCE",
-    "BenchAbilities",
-    "Light",
-    "Part",
-    "Plan",
-    "PlanError",
-    "PlanEstimate",
-    "SourceGrid",
-    "SourcePoints",
-    "SourcePosition",
-    "Span",
-    "StagePoints",
-    "Step",
-    "check",
-    "estimate",
-]
+_HOMES, __getattr__ = handed_on(globals())
+__all__ = sorted(_HOMES)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -22,7 +22,7 @@ from recon.holography import (
     pixels_for,
     pixels_per_degree,
 )
-from recon.holography.judge import GRIDS, METHODS, Cell, run_table
+from recon.holography.scores import GRIDS, METHODS, Cell, run_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

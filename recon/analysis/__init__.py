@@ -1,7 +1,10 @@
 """Analysis: what the optics of a calibration can do (Kuo 2020, secs. 3.2, 4.4, 5.3)."""
 
-from recon.analysis.points import AskedNoise, Noise
-from recon.analysis.report import Analysis, analyse
-from recon.analysis.settings import AnalysisSettings
+from recon.base.handed_on import handed_on
 
-__all__ = ["Analysis", "AnalysisSettings", "AskedNoise", "Noise", "analyse"]
+_HOMES, __getattr__ = handed_on(globals())
+__all__ = sorted(_HOMES)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,15 +1,10 @@
 """Calibration without a point source: from beads at unknown places (Kuo 2020, sec. 5.4), known pictures."""
 
-from recon.blind.alternate import BlindResult, BlindSettings, calibrate_from_beads
-from recon.blind.known_pictures import PicturePsf, PictureSettings, psf_from_pictures
-from recon.camera.points import Points
+from recon.base.handed_on import handed_on
 
-__all__ = [
-    "BlindResult",
-    "BlindSettings",
-    "PicturePsf",
-    "PictureSettings",
-    "Points",
-    "calibrate_from_beads",
-    "psf_from_pictures",
-]
+_HOMES, __getattr__ = handed_on(globals())
+__all__ = sorted(_HOMES)
+
+
+def __dir__() -> list[str]:
+    return __all__

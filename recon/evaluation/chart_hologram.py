@@ -19,11 +19,11 @@ from recon.errors import InputError
 from recon.evaluation.scored import Aside, Curve, Point
 from recon.evaluation.trial import Subject
 from recon.holography.display import Display, random_mask
-from recon.holography.judge import compare
 from recon.holography.losses import LOSSES
 from recon.holography.model import HologramModel
 from recon.holography.optimise import HologramRecord, HologramStop, compute_hologram
 from recon.holography.options import HologramOptions, Method
+from recon.holography.scores import compare
 from recon.holography.target import Target, foveal_weights
 
 Array = npt.NDArray[Any]

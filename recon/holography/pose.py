@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from recon.base.metrics import psnr
 from recon.holography.display import Display
-from recon.holography.judge import low_pass
 from recon.holography.model import HologramModel
 from recon.holography.optimise import compute_hologram
+from recon.holography.scores import low_pass
 from recon.holography.target import Target, make_band
 
 

@@ -1,20 +1,10 @@
 """Priors: what is known about an object before the measurement, as value and proximal map."""
 
-from recon.priors.base import L1, Box, NonNegativity, Prior, Separable, Sum, Zero
-from recon.priors.named import PRIORS, NamedPrior
-from recon.priors.total_variation import Differences, HaarTotalVariation, TotalVariation
+from recon.base.handed_on import handed_on
 
-__all__ = [
-    "L1",
-    "PRIORS",
-    "Box",
-    "Differences",
-    "HaarTotalVariation",
-    "NamedPrior",
-    "NonNegativity",
-    "Prior",
-    "Separable",
-    "Sum",
-    "TotalVariation",
-    "Zero",
-]
+_HOMES, __getattr__ = handed_on(globals())
+__all__ = sorted(_HOMES)
+
+
+def __dir__() -> list[str]:
+    return __all__

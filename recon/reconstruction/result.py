@@ -50,7 +50,7 @@ class Reconstruction:
     solver, prior : str
     tau : float or None
         Regularisation that was solved with, relative to ``max |A^H b|`` (for ``"wiener"`` as
-        :func:`recon.solvers.wiener`); None where nothing is weighted. The largest of all channels.
+        :func:`recon.solvers.wiener_filter`); None where nothing is weighted. The largest of all channels.
     noise_norm : float
         Expected norm of the noise, in the units of the histories' residuals.
     residuals : tuple of float

@@ -207,7 +207,7 @@ class OneStep(Solver):
 def _wiener(part: Part, _: Array | None) -> Solver:
     """Wiener's penalty takes the place of a prior; bounds are kept by clipping."""
     from recon.priors.base import Separable
-    from recon.solvers.wiener import wiener
+    from recon.solvers.wiener_filter import wiener
 
     def solve() -> Outcome:
         outcome = wiener(part.picture_operator, part.data, part.problem.options.tau)

@@ -17,7 +17,7 @@ from recon.reconstruction.measurement import Floats
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
-from recon.solvers.wiener import WienerFilter, cross_validated
+from recon.solvers.wiener_filter import WienerFilter, cross_validated
 from recon.streams.detail import Detail
 from recon.streams.stillness import SceneState, has_light
 from recon.streams.video import VideoSolver

@@ -37,7 +37,7 @@ from recon.solvers.operator_admm import OperatorAdmm
 from recon.solvers.splitting import SensorData, Tuning
 from recon.solvers.tv_admm_volume import LeanTotalVariation, volume_solver
 from recon.solvers.volume_admm import VolumeAdmm
-from recon.solvers.wiener import WienerFilter, cross_validated, wiener
+from recon.solvers.wiener_filter import WienerFilter, cross_validated, wiener
 from recon.types import Calibration, Geometry
 
 Result = dict[str, Any]

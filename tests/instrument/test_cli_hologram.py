@@ -27,9 +27,9 @@ from instrument.files.sample_images import SAMPLES, load_sample
 from instrument.files.slm_image import levels_phase, phase_levels, read_slm_image
 from recon.holography import Display, HologramModel, HologramOptions, HologramStop, Limit, spot_array
 from recon.holography.display import no_mask
-from recon.holography.judge import compare
 from recon.holography.learned import Learned
 from recon.holography.pose import Pose
+from recon.holography.scores import compare
 from recon.holography.spot_list import SpotField
 from recon.holography.target import EVERYWHERE
 

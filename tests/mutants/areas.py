@@ -162,7 +162,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "recon/solvers/splitting.py",
             "recon/solvers/tv_admm_volume.py",
             "recon/solvers/volume_admm.py",
-            "recon/solvers/wiener.py",
+            "recon/solvers/wiener_filter.py",
             "recon/priors/base.py",
             "recon/priors/total_variation.py",
         ),

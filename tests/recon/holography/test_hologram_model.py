@@ -17,7 +17,7 @@ from recon.holography import (
     painted_weights,
     random_mask,
 )
-from recon.holography.judge import intensity, judge, low_pass, seen_image
+from recon.holography.scores import intensity, judge, low_pass, seen_image
 
 RNG = np.random.default_rng(7)
 

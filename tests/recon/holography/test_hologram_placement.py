@@ -10,8 +10,8 @@ import pytest
 
 from recon.errors import InputError
 from recon.holography import DcTerm, Display, HologramModel, Target, random_mask
-from recon.holography.judge import compare, low_pass
 from recon.holography.pose import PlacedHologram, Pose
+from recon.holography.scores import compare, low_pass
 from recon.optics.scattering_display import DisplaySpec, MaskPose, ScatteringDisplay
 
 SHAPE, K = (48, 64), 4

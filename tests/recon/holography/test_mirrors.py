@@ -18,8 +18,8 @@ from recon.holography import (
     random_mask,
 )
 from recon.holography.display import no_mask
-from recon.holography.judge import seen_image
 from recon.holography.learned import Learned
+from recon.holography.scores import seen_image
 from recon.holography.target import FIRST_ORDER, Window
 from recon.holography.variables import Mirrors, coded
 

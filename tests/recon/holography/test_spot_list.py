@@ -16,7 +16,7 @@ from recon.holography import (
     spot_array,
 )
 from recon.holography.display import no_mask
-from recon.holography.judge import intensity
+from recon.holography.scores import intensity
 from recon.holography.spot_list import SpotField, brighter_where_dim
 
 SHAPE = (48, 64)

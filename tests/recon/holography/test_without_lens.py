@@ -22,7 +22,7 @@ from recon.holography import (
     hologram_limit,
 )
 from recon.holography.display import no_mask
-from recon.holography.judge import intensity
+from recon.holography.scores import intensity
 from recon.holography.target import near_window
 
 NM, PITCH_UM, SIDE, FINE = 532.0, 16.0, 48, 4

@@ -6,7 +6,7 @@ import pytest
 from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.solvers.base import StopReason
-from recon.solvers.wiener import FLATNESS, WienerFilter, cross_validated, wiener
+from recon.solvers.wiener_filter import FLATNESS, WienerFilter, cross_validated, wiener
 
 
 def camera_and_data(sensor=(11, 14), noise=0.02):

@@ -1,0 +1,33 @@
+# What `import recon.holography` offers: each name with its home, from which `__init__.py` imports it.
+
+from recon.holography.display import DcTerm as DcTerm
+from recon.holography.display import Display as Display
+from recon.holography.display import Etendue as Etendue
+from recon.holography.display import ScatteringMask as ScatteringMask
+from recon.holography.display import eyebox_for_field_of_view as eyebox_for_field_of_view
+from recon.holography.display import field_of_view_for_eyebox as field_of_view_for_eyebox
+from recon.holography.display import pixels_for as pixels_for
+from recon.holography.display import pixels_per_degree as pixels_per_degree
+from recon.holography.display import random_mask as random_mask
+from recon.holography.limit import Limit as Limit
+from recon.holography.limit import hologram_limit as hologram_limit
+from recon.holography.losses import LOSSES as LOSSES
+from recon.holography.losses import Loss as Loss
+from recon.holography.model import Evaluation as Evaluation
+from recon.holography.model import HologramModel as HologramModel
+from recon.holography.optimise import Hologram as Hologram
+from recon.holography.optimise import HologramRecord as HologramRecord
+from recon.holography.optimise import HologramStop as HologramStop
+from recon.holography.optimise import compute_hologram as compute_hologram
+from recon.holography.optimise import one_step as one_step
+from recon.holography.options import HologramOptions as HologramOptions
+from recon.holography.scores import Scores as Scores
+from recon.holography.scores import judge as judge
+from recon.holography.spot_list import SpotList as SpotList
+from recon.holography.spot_list import SpotScores as SpotScores
+from recon.holography.spot_list import compute_spots as compute_spots
+from recon.holography.spot_list import spot_array as spot_array
+from recon.holography.target import Grid as Grid
+from recon.holography.target import Target as Target
+from recon.holography.target import foveal_weights as foveal_weights
+from recon.holography.target import painted_weights as painted_weights
