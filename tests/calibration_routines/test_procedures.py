@@ -375,10 +375,12 @@ def test_a_plan_is_carried_out_with_the_stage_homed(bench: Bench, tmp_path: Path
 
 
 def test_the_angular_procedure_fills_in_the_distance(bench: Bench, tmp_path: Path) -> None:
-    procedure = AngularProcedure(AngularSweep(largest_deg=20.0, step_deg=10.0))
+    with pytest.raises(SettingsError, match="fewer than 2"):
+        AngularProcedure(AngularSweep(largest_deg=20.0, step_deg=10.0)).outlook(bench, tmp_path)
+    procedure = AngularProcedure(AngularSweep(largest_deg=20.0, step_deg=7.0))
     outlook = procedure.outlook(bench, tmp_path)
     assert "the farthest from which the stage spans the angles" in outlook.reasons[0]
-    assert "5 places" in outlook.reasons[0]  # at 20 degrees nothing is left of the pattern
+    assert "9 places" in outlook.reasons[0]  # at 20 degrees nothing is left of the pattern
     assert "leaves the sensor" in outlook.reasons[0]
     with pytest.raises(SettingsError):
         AngularSweep(average=0)
