@@ -76,7 +76,8 @@ class GroupedCommand(TyperCommand):
                 meant.append(f"--{file}")
                 continue
             named = [flag for flag in flags if flag[2:] in file.name.lower() and flag != "--out"]
-            if (file / "calibration.json").exists() and "--calibration" in flags:
+            kept = (file / "calibration.json", file / "calibration" / "calibration.json")  # of a run, too
+            if "--calibration" in flags and any(one.exists() for one in kept):
                 named = ["--calibration"]
             if file.suffix == ".toml" and "--bench" in flags:
                 named = ["--bench"]

@@ -55,6 +55,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["reconstruct", *PAIR[3:], "--out", "absent/o.tif"], "Make it first"),
     (["reconstruct", "psf.tif", "photo.tif"], "Did you mean --psf psf.tif --image photo.tif?"),
     (["reconstruct", "cal", "photo.tif"], "Did you mean --calibration cal --image photo.tif?"),
+    (["reconstruct", "photo.tif", "sweep"], "Did you mean --image photo.tif --calibration sweep?"),
     (["reconstruct", "photo.tif"], "by --image photo.tif"),
     ([*RECONSTRUCT, "--calibration", "plain", "--image", "photo.tif"], "--volume FOLDER"),
     ([*RECONSTRUCT, "--volume", "plain", "--image", "photo.tif", "--z-mm", "30"], "do not apply: --z-mm"),
@@ -103,6 +104,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for z in range(2):
         write_image(folder / "plain" / f"psf{z}.tif", psf)
     save_calibration(scene.calibration, folder / "cal")
+    shutil.copytree(folder / "cal", folder / "sweep" / "calibration")
     save_calibration(Calibration(scene.calibration.psfs[:1], np.array([[0, 0, 2e4]])), folder / "near")
     (folder / "text.tif").write_text("psf")
     (folder / "empty.tif").touch()
