@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 from calibration_routines.display.kept_frames import going_on, kept_by
@@ -21,14 +23,15 @@ from calibration_routines.procedure import (
 )
 from calibration_routines.psf.exposure import expose_patterns
 from instrument.bench.bench import Bench
+from instrument.bench.photograph import Snapshot
 from instrument.files.errors import BenchError
-from instrument.plan import Plan, check, estimate
+from instrument.plan import Plan, Step, check, estimate
 from instrument.plan.illumination import IlluminationOptions
 from instrument.runs.acquire import abilities_of, acquire, look, prepare_resume, settle
 from instrument.runs.inspection import Verification, run_paths, verify
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import discarded
+from instrument.runs.runner import Runner, discarded
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,11 +123,14 @@ class ResumeProcedure(Procedure):
             routine.restore(run, bench, looked.todo[0])
         runner = prepare_resume(bench, self.run, looked, on_progress=listener.frame)
         with discarded(runner):
+            (self.run / REFUSED).unlink(missing_ok=True)  # of other frames than these will be
             listener.said(f"Found {looked}")
             for words in runner.mended:
                 listener.said(words)
             if routine is not None and routine.watch is not None:
                 routine.watch(bench, runner, listener)
+            if routine is not None and routine.restore is not None:
+                _restore_after_gaps(runner, partial(routine.restore, run, bench), looked.todo)
             listener.step(run.label)
             control.follow(runner)
         run = runner.execute()
@@ -133,6 +139,20 @@ class ResumeProcedure(Procedure):
             for words in frames.verdict:
                 listener.said(words)
         return finished(run, bench, control, listener) or frames
+
+
+def _restore_after_gaps(runner: Runner, restore: Callable[[int], None], todo: Sequence[int]) -> None:
+    """Have what no plan tells brought back also where steps that are there lie between two that are not."""
+    following, seen = dict(pairwise(todo)), runner.on_frame
+
+    def watch(step: Step, snapshot: Snapshot) -> bool:
+        anew = seen is not None and seen(step, snapshot)
+        if (after := following.get(step.index, 0)) <= step.index + 1:
+            return anew
+        restore(after)
+        return True
+
+    runner.on_frame = watch
 
 
 def settled(

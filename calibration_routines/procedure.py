@@ -298,7 +298,10 @@ class Purpose(Generic[T]):
         try:
             yield
         except (CalibrationError, InputError) as error:
-            write_text(refused, f"{error}\n")
+            try:
+                write_text(refused, f"{error}\n")
+            except FileError as unwritten:  # why there is no result counts, not that it cannot be kept
+                error.add_note(str(unwritten))
             raise
         refused.unlink(missing_ok=True)  # by a program before this one
 
@@ -379,8 +382,8 @@ class Routine:
     finish_takes_frames: bool = False
     """Whether that needs the bench, to take the frames of further runs."""
     restore: Callable[[Run, Bench, int], None] | None = None
-    """Brings back what no plan tells, before such a run takes the frames that it lacks; takes the first step
-    of these, too."""
+    """Brings back what no plan tells, before such a run takes a step that it lacks and has not come to by the
+    one before; takes that step's number, too."""
     watch: Callable[[Bench, Runner, Listener], None] | None = None
     """Makes the runner of such a run that goes on look at its frames as from its beginning."""
     files: FromFiles | None = None

@@ -165,6 +165,7 @@ class _Series:
         self._frames: Array = np.zeros(0)
         self._references: Array = np.zeros(0)
         self._scatters: list[Scatter] = []
+        self._errors: list[float] = []
 
     @property
     def count(self) -> int:
@@ -179,16 +180,19 @@ class _Series:
     def add(self, frames: Array, references: Array) -> tuple[Array, float]:
         """Average another series, (n_levels, ...) and (n_references, height, width), with those before it.
 
-        Returns the levels' phases and their error, radians.
+        Returns the levels' phases and their error, radians: at least what the series' own errors leave of
+        themselves in a mean, as the mean's looks small by chance.
         """
         self._scatters.append(scatter_of(references)[0])
+        self._errors.append(_phases(frames, references, self._before, self._scatters[-1])[1])
         many = self.count
         self._frames = frames if many == 1 else self._frames + (frames - self._frames) / many
         if many == 1:
             self._references = references
         else:
             self._references = (self._references + (references - self._references) / many).astype(np.float32)
-        return _phases(self._frames, self._references, self._before, self.scatter)
+        phases, error = _phases(self._frames, self._references, self._before, self.scatter)
+        return phases, max(error, float(np.linalg.norm(self._errors)) / many)
 
 
 def _phases(frames: Array, references: Array, before: Array, scatter: Scatter) -> tuple[Array, float]:

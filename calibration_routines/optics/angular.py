@@ -195,7 +195,8 @@ def check_angular(bench: Bench, sweep: AngularSweep, folder: Path | None = None)
             end_deg = min(sweep.largest_deg, np.inf if sweep.ends_deg is None else sweep.ends_deg[along])
             seen = "" if end_deg == sweep.largest_deg else ", beyond which the pattern leaves the sensor,"
             words = f"steps of {sweep.step_deg:g} degrees up to {end_deg:.3g} along {name}{seen} are fewer"
-            words += f" than {LEAST_STEPS}: choose steps of {end_deg / LEAST_STEPS:.2g} degrees at most"
+            most_deg = np.floor(100 * end_deg / LEAST_STEPS) / 100  # rounded up it would be refused again
+            words += f" than {LEAST_STEPS}: choose steps of {most_deg:g} degrees at most"
             raise SettingsError([("step_deg", words)])
     largest_deg = max(*sweep.angles_deg(0), *sweep.angles_deg(1))
     needed = z_um * float(np.tan(np.deg2rad(largest_deg)))

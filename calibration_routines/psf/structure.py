@@ -24,6 +24,16 @@ _WIDE_PX = 4.0  # structure of one depth that a source may be the reason of: twi
 _MATTERS_PX = 0.5
 """Width of the source's image from which on PSFs change: by 3.5 % at 0.64 pixels, 8.7 % at 1.3 (noise alone
 1.5 %; ``tiny``)."""
+_UNTOLD = {
+    1: ("one depth does", "sweep over more depths"),
+    2: ("two depths do", "sweep over more depths"),
+    3: ("depths so near one another do", "sweep over a wider range of them"),
+}
+"""By how many depths there are: what does not tell the source's size, and what would."""
+
+
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,16 +65,16 @@ class Structure:
         size_um, configured_px : float
             The source's size as configured, None where it is not, and its image's width at the nearest depth.
         """
-        half_um = _MATTERS_PX * self.um_per_px
+        half = f"{_two_digits(_MATTERS_PX * self.um_per_px)} um"
         if self.least_um is None:
             if size_um is not None:
                 return ""
-            told = "one depth does" if self.depths == 1 else "so few depths, so near one another, do"
+            told, better = _UNTOLD[min(self.depths, 3)]
             if self.near_px <= _WIDE_PX:
                 return (
                     f"Source: {told} not tell how large it is, and [source] size_um does not say. A "
-                    f"pinhole of {half_um:.2g} um would be half a pixel wide: a larger one blurs the PSFs by "
-                    "more than 3 %. Measure it, or sweep over more depths."
+                    f"pinhole of {half} would be half a pixel wide: a larger one blurs the PSFs by more than "
+                    f"3 %. Measure it, or {better}."
                 )
             return (
                 f"Source: the pattern's finest structure is {self.near_px:.1f} pixels wide. The image of a "
@@ -75,8 +85,8 @@ class Structure:
             if size_um is not None:
                 return ""
             return (
-                f"Source: one of {self.least_um:.2g} um or more would have been told by these depths. From "
-                f"{half_um:.2g} um on its image is half a pixel wide and blurs the PSFs by more than 3 %; "
+                f"Source: one of {_two_digits(self.least_um)} um or more would have been told by these "
+                f"depths. From {half} on its image is half a pixel wide and blurs the PSFs by more than 3 %; "
                 "[source] size_um does not say how large it is: measure the pinhole."
             )
         whose = "whose size is not configured" if size_um is None else f"not {size_um:g} as configured"

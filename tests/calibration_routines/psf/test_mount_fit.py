@@ -193,14 +193,16 @@ def test_a_pinhole_of_unknown_size_is_told_by_structure_that_widens_as_its_image
         assert plain is not None
         assert plain.line(30.0, 0.3) == ""
         assert plain.least_um is not None
-        assert f"one of {plain.least_um:.2g} um or more would have been told" in plain.line(None, 0.0)
+        said = plain.line(None, 0.0)
+        assert "or more would have been told" in said
+        assert "e+" not in said
         larger = np.hypot(np.linspace(near, far, len(DEPTHS)), 1.2 * plain.least_um * 8.9e3 / DEPTHS / 13.0)
         told = fit_structure(DEPTHS, larger, GEOMETRY)
         assert told is not None
         assert "widens from" in told.line(None, 0.0)
     two = fit_structure(DEPTHS[:2], widths[:2], GEOMETRY)
     assert two is not None
-    assert "so few depths" in two.line(None, 0.0)
+    assert "two depths do not tell" in two.line(None, 0.0)
     assert two.line(30.0, 0.3) == ""
     matters = f"A pinhole of {0.5 * 13.0 * DEPTHS[0] / 8.9e3:.2g} um would be half a pixel wide"
     for width, size_um, said in ((4.9, None, "one depth does not tell it from"), (2.3, None, matters)):
