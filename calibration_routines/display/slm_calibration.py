@@ -42,7 +42,7 @@ SLM_FILE = "slm-calibration.json"
 MAX_PHASE_ERROR_RAD = 0.0027
 """Standard deviation of a phase beyond which no table is made. What flickers with the phase's own cosine and
 sine bends the whole table, unseen: two independent parts of this size, the worst level off by twice their
-root sum of squares, beyond 0.02 rad in one table of a thousand (docs/decisions/0227)."""
+root sum of squares, beyond 0.02 rad in some tables of a thousand (docs/decisions/0227)."""
 MOST_SERIES = 4
 """Times that all pictures are taken where their mean over so many is steady enough and one series is not."""
 _REFERENCE_EVERY = 8  # levels between two pictures of level 0

@@ -16,6 +16,8 @@ from typing import Any
 def handed_on(names: MutableMapping[str, Any]) -> tuple[dict[str, tuple[str, str]], Callable[[str], Any]]:
     """Return module and name there of everything that a package's stub hands on, and its ``__getattr__``.
 
+    The package's own modules come when asked for, too.
+
     Parameters
     ----------
     names : mutable mapping
@@ -32,6 +34,11 @@ def handed_on(names: MutableMapping[str, Any]) -> tuple[dict[str, tuple[str, str
     def found(name: str) -> Any:
         if name not in homes:
             import difflib
+            from importlib.util import find_spec
+
+            own = f"{names['__name__']}.{name}"
+            if not name.startswith("_") and find_spec(own) is not None:
+                return import_module(own)
 
             near = difflib.get_close_matches(name, homes, 1)
             hint = f" Did you mean {near[0]!r}?" if near else ""

@@ -35,9 +35,10 @@ Floats = npt.NDArray[np.float64]
 PICTURES, PAIRS = 5, 24
 """Pictures that are reconstructed, and pairs in each, half of them along each axis.
 
-Where there is no room for so many, up to three times as many pictures. Nearer together they cost resolution,
+Where there is no room for so many, up to :data:`MOST_PICTURES`. Nearer together they cost resolution,
 of which a pair alone knows nothing: with 22 in cells of 20 pixels the stated distance is 3 % more.
 """
+MOST_PICTURES = 30
 _RANGE = 3.0  # of the first distances, largest over smallest
 _BELOW = 1.12  # the stated distance over the middle of an axis' later ones: there the share rises
 _ON = np.array((0.754878, 0.569840))  # of a pixel, to the next pair: places between pixels come evenly
@@ -159,18 +160,18 @@ def reached(
     about, wide = np.full(2, low * np.sqrt(_RANGE)), np.sqrt(_RANGE)
     tried: list[TriedPair] = []
     fitted, last = 0, False
-    for number in range(3 * PICTURES):
+    for number in range(MOST_PICTURES):
         if last:
             break
         if on_progress is not None:
-            on_progress(max(len(tried) / PAIRS, number / 3) / (PICTURES + 1))
+            on_progress(max(len(tried) / PAIRS / (PICTURES + 1), number / (MOST_PICTURES + 1)))
         share = (tests.rng.permutation(PAIRS // 2).repeat(2) + tests.rng.uniform(0, 1)) / (PAIRS / 2)
         axes = (len(tried) + np.arange(PAIRS)) % 2
         pairs = tests.pairs([float(v) for v in about[axes] * wide ** (2 * share - 1)], len(tried))
         light = shifted(psf, np.concatenate([pair.points for pair in pairs]))
         told = tests.told_apart(pairs, light)
         tried += [TriedPair(p.px, p.axis, t, p.place) for p, t in zip(pairs, told, strict=True)]
-        last = len(tried) > (PICTURES - 1) * PAIRS or number == 3 * PICTURES - 1
+        last = len(tried) > (PICTURES - 1) * PAIRS or number == MOST_PICTURES - 1
         if not last and len(tried) < _MORE * fitted:
             continue
         fitted, laws = len(tried), stated_apart(tried)

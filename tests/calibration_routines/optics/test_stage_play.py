@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -17,6 +18,7 @@ from calibration_routines.optics.stage_play import (
     planned,
     stage_plan,
 )
+from calibration_routines.plan_procedures import _restore_after_gaps
 from calibration_routines.scatter import STEADY
 from drivers.simulated.world import SimulatedWorld
 from drivers.stage import approached
@@ -93,6 +95,15 @@ def test_a_check_that_goes_on_comes_to_its_places_from_where_it_came() -> None:
             restore(Mock(plan=plan), bench, step.index)
             bench.stage.move_to(step.stage)
             assert world.source_position_um == pytest.approx(place, abs=10), step.label
+        runner, seen = Mock(on_frame=None), dict(zip((step.index for step in steps), came, strict=True))
+        todo = [steps[2].index, steps[5].index, steps[6].index, steps[11].index]
+        _restore_after_gaps(runner, partial(restore, Mock(plan=plan), bench), todo)
+        bench.stage.home()
+        restore(Mock(plan=plan), bench, todo[0])
+        for step in (step for step in steps if step.index in todo):
+            bench.stage.move_to(step.stage)
+            assert world.source_position_um == pytest.approx(seen[step.index], abs=10), step.label
+            runner.on_frame(step, Mock())
 
 
 def test_a_play_too_unsteady_for_the_line_is_not_told_to_be_put_there() -> None:

@@ -192,7 +192,7 @@ def test_a_pattern_that_is_dark_in_the_middle_is_seen_farther_out(monkeypatch: p
 
 
 def test_a_small_colour_sensor_has_room_for_one_pair_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(two_points, "PICTURES", 2)
+    monkeypatch.setattr(two_points, "MOST_PICTURES", 6)
     calibration = _calibration((40, 44), colours=3)
     assert [pair.axis for pair in reached(calibration, 50e3, 1.2, 2e-6).pairs] == [0, 1] * 3
     assert (
