@@ -29,9 +29,9 @@ _REST = r"(?:\s+(?:--[a-z][a-z-]*|[A-Z]{3,}|mask|slm|illumination|(?:/|[A-Za-z]:
 """Of a command: its sub-command, options, places and paths."""
 
 
-_FORCE = re.compile(r"--force\b")
+_FORCE = re.compile(r"--force(?![\w-])")
 """The same field in every form that has it."""
-_SIGNS = ((re.compile(r"(?<=\d) um\b"), " µm"), (re.compile(r"\+-(?=[ \d])"), "±"))
+_SIGNS = ((re.compile(r"(?<=\d) um\b(?![/\\])"), " µm"), (re.compile(r"\+-(?=[ \d])"), "±"))
 """Units and signs as the window's own figures have them; a terminal may lack the letters."""
 
 

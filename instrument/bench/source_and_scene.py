@@ -91,7 +91,7 @@ class Lights:
         PSF would be the scene. OperatorNeededError when nobody can be asked.
         """
         world: object = self.scene_switch
-        if lit and isinstance(world, LedsOnScene) and world.leds_light_scene:
+        if lit and self._led_array is not None and isinstance(world, LedsOnScene) and world.leds_light_scene:
             raise BenchError(
                 'The LED array lights the scene here, and no point source (led_light = "scene" in '
                 '[simulated]). Calibrate with led_light = "source", which is the same camera.'

@@ -172,7 +172,7 @@ def _read_array(folder: Path, name: str, checksums: Mapping[str, str]) -> npt.ND
 
     try:
         stored = zarr.open_array(folder / name / "0", mode="r")
-        held = folder_bytes(folder / name, stored.nbytes, piece_bytes(stored))
+        held = folder_bytes(folder / name, stored.nbytes, [(folder / name, piece_bytes(stored))])
         require_plausible(folder / name, stored.nbytes, held)
         array = np.ascontiguousarray(stored[...])
     except FileError:

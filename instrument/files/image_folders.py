@@ -13,9 +13,10 @@ from instrument.files.errors import FileError
 SUFFIXES = {".tif", ".tiff", ".png", ".bmp", ".npy", ".jpg", ".jpeg"}
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _DEPTH = re.compile(
-    r"(?<!\de)(?<!\de-)(?:(?<=[a-zA-Z_=])-)?\d+(?:[.,p]\d+)?(?= ?_?(nm|um|µm|μm|mm|cm)(?![a-zA-Z]))"
+    r"(?<!\de)(?<!\de[-+])(?<!\d)(?:(?<=[a-zA-Z_=])-)?"
+    r"(?:\d+(?:\.\d+)?|(?<![\d.,p])\d+[,p]\d{1,2})(?= ?_?(nm|um|µm|μm|mm|cm)(?![a-zA-Z]))"
 )
-"""A length in a name; 1.5, 1,5 and 1p5 are the same."""
+"""A length in a name; 1.5, 1,5 and 1p5 are the same. Three digits behind a comma or p are another number."""
 _UM = {"nm": 1e-3, "um": 1.0, "µm": 1.0, "μm": 1.0, "mm": 1e3, "cm": 1e4}
 MICRO_MANAGER = "metadata.txt"
 _MICRO_MANAGERS = (

@@ -204,7 +204,7 @@ def read_zarr(folder: Path) -> Read:
             names = [axis["name"] if isinstance(axis, dict) else axis for axis in image.get("axes", "tczyx")]
             axes = "".join(map(str, names))
             group = group[image["datasets"][0]["path"]]
-        held = reading.folder_bytes(folder, group.nbytes, piece_bytes(group))
+        held = reading.folder_bytes(folder, group.nbytes, [(folder / group.path, piece_bytes(group))])
         reading.require_plausible(folder, group.nbytes, held)
         array = np.asarray(group[...])
     except FileError:

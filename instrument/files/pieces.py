@@ -21,6 +21,8 @@ from instrument.files.errors import FileError, size
 _SLACK_BYTES = 1 << 20
 _HARMLESS_BYTES = 512
 """A piece so small inflates to some megabytes at most, whatever it is."""
+_DEFLATES = 1040
+"""By how much deflate shrinks zeros, at most (1032)."""
 _BLOCK_BYTES = 1 << 16
 _ZSTD_BLOCK_BYTES = 1 << 17
 _UNTOLD_BYTES = 1 << 28
@@ -69,8 +71,9 @@ def require_pieces(
 
 def hdf5_pieces(stored: Any) -> Iterator[tuple[int, Callable[[], IO[bytes]]]]:
     """Yield the chunks of an HDF5 dataset, ``h5py.h5d.DatasetID``, as they are stored."""
-    for number in range(stored.get_num_chunks()):
-        chunk = stored.get_chunk_info(number)
+    chunks: list[Any] = []
+    stored.chunk_iter(chunks.append)  # asked one by one the index is walked for each
+    for chunk in chunks:
         yield chunk.size, lambda: io.BytesIO(stored.read_direct_chunk(chunk.chunk_offset)[1])  # noqa: B023
 
 
@@ -85,7 +88,7 @@ def inflates_beyond(piece: IO[bytes], stored: int, most: int) -> bool:
     if head.startswith(_ZSTD):
         return _zstd_beyond(piece, most)
     if head.startswith(_GZIP) or (head[:1] == b"\x78" and int.from_bytes(head[:2]) % 31 == 0):
-        return _deflated_beyond(piece, most)
+        return stored * _DEFLATES > most and _deflated_beyond(piece, most)
     if len(head) == 16 and head[0] in _BLOSC_VERSIONS:
         n_bytes, _, with_head = struct.unpack("<III", head[4:])
         return bool(with_head == stored and n_bytes > most)

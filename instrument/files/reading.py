@@ -7,6 +7,7 @@ import os
 import re
 import stat
 import tomllib
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import IO, Any
@@ -111,14 +112,14 @@ def _opened(path: Path) -> IO[bytes]:
 def folder_bytes(
     folder: Path,
     n_bytes: int | None = None,
-    piece_bytes: int | None = None,
+    pieces: Sequence[tuple[Path, int]] = (),
     *,
     error: type[FileError] = FileError,
 ) -> int:
     """Return the stored bytes of all files in a folder and below.
 
-    With ``n_bytes``, those of its array's numbers, a file that is larger than they could be is refused; with
-    ``piece_bytes`` one that inflates to more than that too, which is what a file of an array holds.
+    With ``n_bytes``, those of its array's numbers, a file that is larger than they could be is refused; of
+    ``pieces``, folders of arrays that are read and what a file of each holds, one that inflates to more.
     """
     files = [file for file in folder.rglob("*") if file.is_file()]
     for file in files if n_bytes is not None else ():
@@ -126,9 +127,13 @@ def folder_bytes(
             raise error(
                 file, f"has {size(file.stat().st_size)}, for numbers of {size(n_bytes or 0)}: damaged."
             )
-    if piece_bytes is not None:
-        pieces = ((file.stat().st_size, partial(_opened, file)) for file in files if file.suffix != ".json")
-        require_pieces(folder, pieces, piece_bytes, error=error)
+    for below, piece_bytes in pieces:
+        stored = (
+            (file.stat().st_size, partial(_opened, file))
+            for file in files
+            if file.suffix != ".json" and file.is_relative_to(below)
+        )
+        require_pieces(folder, stored, piece_bytes, error=error)
     return sum(map(stored_bytes, files))
 
 

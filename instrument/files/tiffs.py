@@ -174,7 +174,8 @@ def _with_opencv(path: Path, tiff: tifffile.TiffFile, series: Any) -> Decoded:
     is_palette = page.photometric == _PHOTOMETRIC.PALETTE
     separate = page.samplesperpixel > 1 and page.planarconfig != 1
     differences = page.predictor != 1 and kind is tifffile.COMPRESSION.PACKBITS  # which it takes for pixels
-    if separate or differences or page.samplesperpixel not in (1, 3, 4):  # two it cuts to 8 bits
+    elsewhere = any(one.parent is not tiff for one in series.pages)  # images of an OME-TIFF in several files
+    if elsewhere or separate or differences or page.samplesperpixel not in (1, 3, 4):  # two it cuts to 8 bits
         raise odd
     data = reading.read_bytes(path, MOST_BYTES)
     with quiet_opencv():

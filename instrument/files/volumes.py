@@ -483,7 +483,7 @@ def _open_zarr(path: Path) -> VolumeSource:
         names = [axis["name"] for axis in multiscale["axes"]]
         facts = group.attrs.get("diffuserbench")
         arrays = [group[dataset["path"]] for dataset in multiscale["datasets"]]
-        stored = folder_bytes(path, arrays[0].nbytes, piece_bytes(*arrays))
+        stored = folder_bytes(path, arrays[0].nbytes, [(path / one.path, piece_bytes(one)) for one in arrays])
         for array in arrays:
             require_plausible(path, array.nbytes, stored, small=_SPARSE_BYTES)
             if len(array.shape) != len(names) or 0 in array.shape:

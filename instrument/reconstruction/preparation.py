@@ -262,18 +262,23 @@ def dark_from_file(dark: ImageFile, image: ImageFile) -> Dark:
     return Dark(frame, frame, words)
 
 
-_MOST_BRIGHTER, _BRIGHTER_BY, _SIDE = 0.1, 0.05, 8
-"""In what share of its blocks, and by what share of the mean, a photograph may lie below its dark frame."""
+_MOST_BRIGHTER, _BRIGHTER_BY, _SURE, _SIDE = 0.1, 0.05, 4.0, 8
+"""In what share of its blocks a photograph may lie below its dark frame, by more than what share of the mean
+and how many standard deviations of noise."""
 
 
 def _brighter_share(dark: npt.NDArray[Any], image: npt.NDArray[Any]) -> float:
     """Return in what share of the picture a dark frame is clearly brighter than a photograph."""
-    greys = [np.nan_to_num(pixels.astype(np.float32)) for pixels in (dark, image)]
+    greys = [np.nan_to_num(pixels.astype(np.float64)) for pixels in (dark, image)]
     greys = [grey.mean(axis=-1) if grey.ndim == 3 else grey for grey in greys]
     if min(greys[0].shape) < _SIDE:
         return 0.0
     dark_means, means = (block_mean(grey, _SIDE) for grey in greys)
-    return float((dark_means > means + _BRIGHTER_BY * means.mean()).mean())
+    # Noise of a block's mean: what the dark frame, which has no picture, varies by within blocks.
+    variance = float(np.median(block_mean(greys[0] ** 2, _SIDE) - dark_means**2))
+    noise = np.sqrt(2 * max(variance, 0.0)) / _SIDE
+    least = max(_BRIGHTER_BY * abs(float(means.mean())), _SURE * noise)
+    return float((dark_means > means + least).mean())
 
 
 def dark_from_corners(psf: ImageFile, image: ImageFile) -> Dark:

@@ -76,15 +76,16 @@ def interrupts_held() -> Iterator[Held]:
         if len(held.signals) > HELD_SIGNALS:
             held.before[number](number, frame)
 
-    if threading.current_thread() is threading.main_thread():
-        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+    in_main = threading.current_thread() is threading.main_thread()
+    try:
+        for name in ("SIGINT", "SIGTERM", "SIGHUP") if in_main else ():
             number = getattr(signal, name, None)
             # What kills the process or is ignored stays as it is.
             if number is not None and callable(handler := signal.getsignal(number)):
                 held.before[number] = handler
                 signal.signal(number, hold)
-    try:
         yield held
     finally:
-        for number, handler in held.before.items():
+        # Ctrl-C last: from then on it breaks off what follows, and the others would stay held.
+        for number, handler in reversed(held.before.items()):
             signal.signal(number, handler)

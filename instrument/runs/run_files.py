@@ -218,9 +218,13 @@ def refuse_within(folder: Path) -> None:
 
     Raises RunError naming the folder that it may go to instead.
     """
-    for place in (folder.resolve(), *folder.resolve().parents):
+    try:
+        whole = folder.resolve()
+    except (OSError, RuntimeError) as error:  # links in a circle
+        raise RunError(folder, f"leads nowhere: {error}.", "Choose another folder.") from None
+    for place in (whole, *whole.parents):
         if is_run(place) and (place / LOG).is_file():
-            where = "is a run" if place == folder.resolve() else f"is within the run {place.name}"
+            where = "is a run" if place == whole else f"is within the run {place.name}"
             raise RunError(
                 folder,
                 f"{where}; no other run is kept there.",

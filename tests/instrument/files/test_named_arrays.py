@@ -124,3 +124,16 @@ def test_axes_and_steps_that_zarr_tells(tmp_path: Path) -> None:
         zarr.create_array(store, shape=STACK.shape, dtype=STACK.dtype)[...] = STACK
     with pytest.raises(FileError, match=r"zipped Zarr, which is not read\. Unpack it"):
         read_stack(tmp_path / "a.zarr.zip")
+
+
+def test_labels_beside_an_image_may_have_larger_chunks(tmp_path: Path) -> None:
+    image = np.arange(64 * 96, dtype=np.uint8).reshape(64, 96)
+    group = zarr.open_group(tmp_path / "a.zarr", mode="w")
+    group.create_array("0", data=image, chunks=(16, 16))
+    axes = [{"name": "y", "type": "space"}, {"name": "x", "type": "space"}]
+    scales = [{"type": "scale", "scale": [1.0, 1.0]}]
+    datasets = [{"path": "0", "coordinateTransformations": scales}]
+    group.attrs["ome"] = {"version": "0.5", "multiscales": [{"axes": axes, "datasets": datasets}]}
+    cells = RNG.integers(0, 1 << 31, (1024, 1024)).astype(np.uint32) // (1 << 24)
+    group.create_array("labels/cells", data=cells, chunks=(1024, 1024), compressors=zarr.codecs.GzipCodec())
+    np.testing.assert_array_equal(read_image(tmp_path / "a.zarr").pixels, image)

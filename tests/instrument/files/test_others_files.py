@@ -36,6 +36,9 @@ PICTURE = STACK[0]
         (["psf_0p9mm.tif", "psf_1p10mm.tif", "psf_1p2mm.tif"], (900.0, 1100.0, 1200.0)),
         (["9,8mm.tif", "10,2mm.tif"], (9800.0, 10200.0)),
         (["1e2um.tif", "3e1um.tif"], ()),
+        (["1e+06nm.tif", "1e-35um.tif"], ()),
+        (["t=5,100um.tif", "t=4,300um.tif"], (100.0, 300.0)),
+        (["pos1,2,5um.tif", "pos1,2,50um.tif", "step1p200um.tif"], (5.0, 50.0, 200.0)),
         (["10x_1mm.tif", "10x_2mm.tif", "10x_10mm.tif"], (1e3, 2e3, 1e4)),
     ],
 )  # fmt: skip

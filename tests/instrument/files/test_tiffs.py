@@ -162,3 +162,24 @@ def test_axes_of_imagej_and_ome(tmp_path: Path) -> None:
         read_stack(path)
     tifffile.imwrite(path, STACK[:2], ome=True, metadata={"axes": "CYX"})
     assert "its 2 channels taken as the images of a stack" in read_stack(path).notes
+
+
+def test_compressed_images_in_several_files_are_not_taken_from_one(tmp_path: Path) -> None:
+    """OpenCV reads the named file alone: the first image came three times."""
+    pieces = "".join(
+        f'<TiffData FirstZ="{z}" PlaneCount="1"><UUID FileName="a{z}.ome.tif">urn:uuid:{z}</UUID></TiffData>'
+        for z in range(3)
+    )
+    for z in range(3):
+        words = (
+            f'<OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06" UUID="urn:uuid:{z}">'
+            '<Image ID="Image:0"><Pixels ID="Pixels:0" DimensionOrder="XYZCT" Type="uint8" '
+            'SizeX="40" SizeY="32" SizeZ="3" SizeC="1" SizeT="1">'
+            f"{pieces}</Pixels></Image></OME>"
+        )
+        image = Image.fromarray(np.full((32, 40), 10 * (z + 1), np.uint8))
+        image.save(tmp_path / f"a{z}.ome.tif", compression="tiff_lzw", tiffinfo={270: words})
+    with tifffile.TiffFile(tmp_path / "a0.ome.tif") as tiff:
+        assert tiff.series[0].shape == (3, 32, 40)
+    with pytest.raises(FileError, match="compressed as LZW, which are not read"):
+        read_stack(tmp_path / "a0.ome.tif")
