@@ -209,7 +209,7 @@ log: AppendOnlyLog.__init__|run_files: note_damage|screen_bench: _written
 stability_file: CellLog.add|video_files: VideoPictures.__init__|video_files: VideoPictures.remove
 video_files: VideoPictures.remove_litter|video_job: VideoJob.go_on_without|video_job: VideoJob.mark_done
 video_job: VideoJob.remove|writer: lock_run|serve: _token|video_files: VideoPictures.say_white
-procedure: Purpose.analysed"""
+procedure: Purpose.analysed|plan_procedures: ResumeProcedure.perform"""
 _REFUSED_BEFORE = """
 film: _write_zarr|result_file: _take_away_others|video: _job"""
 _NOWHERE = "__init__: main"  # the null device
