@@ -3,6 +3,7 @@
     python -m tests.mutants                       a sample of every area, within 30 minutes
     python -m tests.mutants solvers --sample 50   so many of each area that is named
     python -m tests.mutants --list                what can be changed, and do nothing
+    python -m tests.mutants solvers --by-module   so many of each module, counted by module
     python -m tests.mutants safety --sample 999 --only checked.py --tests tests/drivers/test_checked.py
                                                   every mutant of one module, soon: what those tests notice
 
@@ -46,34 +47,42 @@ def known_equal() -> dict[str, str]:
     return {mutant["name"]: mutant["why"] for mutant in listed}
 
 
-def drawn(areas: list[str], sample: int, seed: int) -> list[tuple[str, Mutant]]:
-    """Return a sample of each area's mutants, the areas in turn."""
+def drawn(groups: dict[str, tuple[str, ...]], sample: int, seed: int, only: str) -> list[tuple[str, Mutant]]:
+    """Return a sample of each group of modules, of those mutants in whose name ``only`` stands, in turn."""
     found: list[tuple[float, str, Mutant]] = []
     equal = known_equal()
-    for area in areas:
-        rng = random.Random(f"{seed} {area}")
-        every = [mutant for path in AREAS[area][0] for mutant in mutants_of(Path(path), ROOT)]
-        those = [mutant for mutant in every if mutant.name not in equal]
+    for group, paths in groups.items():
+        rng = random.Random(f"{seed} {group}")
+        every = [mutant for path in paths for mutant in mutants_of(Path(path), ROOT)]
+        those = [mutant for mutant in every if mutant.name not in equal and only in mutant.name]
         some = rng.sample(those, min(sample, len(those)))
-        found += [(number / len(some), area, mutant) for number, mutant in enumerate(some)]
-    return [(area, mutant) for _, area, mutant in sorted(found, key=lambda one: one[0])]
+        found += [(number / len(some), group, mutant) for number, mutant in enumerate(some)]
+    return [(group, mutant) for _, group, mutant in sorted(found, key=lambda one: one[0])]
+
+
+def grouped(areas: list[str], *, by_module: bool) -> dict[str, tuple[str, ...]]:
+    """Return the modules of areas by area, or each by itself."""
+    if by_module:
+        return {path: (path,) for area in areas for path in AREAS[area][0]}
+    return {area: AREAS[area][0] for area in areas}
 
 
 def table(fates: list[tuple[str, Mutant, Fate]]) -> float:
     """Print what became of the mutants, and those that lived; return the share that was noticed."""
-    for area, mutant, fate in fates:
+    for _, mutant, fate in fates:
         if fate != "noticed":
-            print(f"{area}: {fate}: {mutant.path}:{mutant.lines[1]} {mutant.function}: {mutant.what}")
-    print(f"{'area':<12}{'tried':>7}{'noticed':>9}{'lived':>7}{'no test':>9}{'share':>8}")
-    counts = Counter((area, fate) for area, _, fate in fates)
-    areas = list(dict.fromkeys(area for area, _, _ in fates))
+            print(f"{fate}: {mutant.path}:{mutant.lines[1]} {mutant.function}: {mutant.what}")
+    counts = Counter((group, fate) for group, _, fate in fates)
+    groups = list(dict.fromkeys(group for group, _, _ in fates))
+    wide = max(map(len, groups), default=0) + 2
+    print(f"{'':<{wide}}{'tried':>7}{'noticed':>9}{'lived':>7}{'no test':>9}{'share':>8}")
     sums: Counter[str] = Counter()
-    for area in [*sorted(areas, key=list(AREAS).index), "all"]:
-        n = sums if area == "all" else Counter({fate: counts[area, fate] for fate in get_args(Fate)})
-        sums += n if area != "all" else Counter()
+    for group in [*groups, "all"]:
+        n = sums if group == "all" else Counter({fate: counts[group, fate] for fate in get_args(Fate)})
+        sums += n if group != "all" else Counter()
         tried = sum(n.values())
         share = n["noticed"] / max(tried, 1)
-        print(f"{area:<12}{tried:>7}{n['noticed']:>9}{n['lived']:>7}{n['no test']:>9}{share:>8.0%}")
+        print(f"{group:<{wide}}{tried:>7}{n['noticed']:>9}{n['lived']:>7}{n['no test']:>9}{share:>8.0%}")
     return share
 
 
@@ -81,7 +90,8 @@ def main() -> int:
     """Try mutants as the command line says; 1 when too few were noticed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("area", nargs="*", choices=[*AREAS, []], help="what is changed [default: all]")
-    parser.add_argument("--sample", type=int, default=40, help="mutants of each area")
+    parser.add_argument("--sample", type=int, default=40, help="mutants of each area (--by-module: module)")
+    parser.add_argument("--by-module", action="store_true", help="draw from each module, and count by module")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=25.0, help="no mutant is begun after so long")
     parser.add_argument("--most", type=float, default=30.0, help="seconds of tests of a mutant, as watched")
@@ -91,10 +101,10 @@ def main() -> int:
     parser.add_argument("--list", action="store_true", help="print the sample and end")
     options = parser.parse_args()
     areas = options.area or list(AREAS)
-    chosen = [one for one in drawn(areas, options.sample, options.seed) if options.only in one[1].name]
+    chosen = drawn(grouped(areas, by_module=options.by_module), options.sample, options.seed, options.only)
     if options.list:
-        for area, mutant in chosen:
-            print(f"{area}: {mutant.name}")
+        for _, mutant in chosen:
+            print(mutant.name)
         return 0
     tests = options.tests or sorted({test for area in areas for test in AREAS[area][1]})
     modules = sorted({path for area in areas for path in AREAS[area][0]})
