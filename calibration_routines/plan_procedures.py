@@ -31,6 +31,7 @@ from instrument.runs.acquire import abilities_of, acquire, look, prepare_resume,
 from instrument.runs.inspection import Verification, run_paths, verify
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
+from instrument.runs.run_files import RunError, is_run, refuse_within
 from instrument.runs.runner import Runner, discarded
 
 
@@ -97,6 +98,7 @@ class ResumeProcedure(Procedure):
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Say what is left to do, by the run's log and files; its frames are read when it goes on."""
+        _refuse_nested(self.run)
         found = Run.open(self.run)
         abilities = replace(abilities_of(bench, self.run), stage_homed=True)
         looked = verify(found, read=False)
@@ -112,6 +114,7 @@ class ResumeProcedure(Procedure):
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Verify what is stored, take the rest, and make the calibration, response or surface."""
+        _refuse_nested(self.run)
         if self.found is None:
             listener.step("verifying the frames")
         looked = self.found or look(self.run, listener.share)
@@ -176,6 +179,27 @@ def settled(
     return finished(run, bench, control, listener) or Outcome(
         verdict=(*done, words), good=True, runs=(path,), result=run
     )
+
+
+def _refuse_nested(run: Path) -> None:
+    """Refuse to go on with a run within another (earlier versions made such) where frames may be taken again.
+
+    They are kept in a run beside it, which would be refused when everything else is done.
+
+    Raises RunError.
+    """
+    routine = routine_of(run)
+    if routine is None or not (routine.finish_takes_frames or routine.watch) or not lacks_result(run):
+        return
+    try:
+        refuse_within(run.parent)
+    except RunError as error:
+        where = [place.parent for place in run.resolve().parents if is_run(place)][-1]
+        raise RunError(
+            run,
+            "lies within another run, where none is kept that takes frames again.",
+            f"Move it to {where}.",
+        ) from error
 
 
 def routine_of(run: Path) -> Routine | None:

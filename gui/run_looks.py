@@ -121,7 +121,7 @@ def _about_photograph(path: Path) -> list[str]:
 
 def _about_run(run: Run, looked: Verification) -> list[str]:
     """Return what is known of a run, a line each."""
-    lines = [f"{run.condition}: {len(run.records)} of {run.n_frames} frames"]
+    lines = [f"{looked.became}: {len(run.records)} of {run.n_frames} frames"]
     lines[0] += "  SIMULATED" if run.is_simulated else ""
     if run.error:
         lines.append(run.error)

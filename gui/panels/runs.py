@@ -312,7 +312,11 @@ class RunsPanel(Panel):
             if self.session.is_closing or self.opened is None or self.opened.path != path:
                 raise InterruptedError
 
-        self._verifier.ask(lambda: look_into(path, read=True, on_progress=watch), self._show_run)
+        def show(opened: Opened | str) -> None:
+            self._show_run(opened)
+            self.read_folder()  # which marks what was found damaged
+
+        self._verifier.ask(lambda: look_into(path, read=True, on_progress=watch), show)
 
     def _open_folder(self) -> None:
         if self.opened is not None:

@@ -327,6 +327,11 @@ class Bench:
         """Whether the point source can be lit and darkened: by the LED array, or by asking the operator."""
         return self._lights.can_switch_source
 
+    @property
+    def no_source(self) -> str:
+        """Why the LED array lights no point source here; empty where it does, or there is no array."""
+        return self._lights.no_source
+
     # The scene ---------------------------------------------------------------------------------
     def scene_on(self) -> None:
         """Light the scene: the simulated world does it, or the operator is asked."""

@@ -115,15 +115,21 @@ class StepsFailedError(BenchError):
 
 
 def note_failures(error: BaseException, failure: BaseException) -> None:
-    """Note on an error what failed on its way out, less what it or its notes say already."""
+    """Note on an error what failed on its way out, less what it or its notes say already.
+
+    A step that failed with the error's own words is named without them.
+    """
     if isinstance(failure, StepsFailedError):
         told = "\n".join([str(error), *getattr(error, "__notes__", ())])
-        new = [(step, why) for step, why in failure.failures if _line(step, why) not in told]
-        new = [(step, why) for step, why in new if str(why) != str(error)]
+        brief = [(step, _SAME if str(why) == str(error) else why) for step, why in failure.failures]
+        new = [(step, why) for step, why in brief if _line(step, why) not in told]
         if new:
             error.add_note(str(StepsFailedError(new)))
     elif str(failure) not in (str(error), *getattr(error, "__notes__", ())):
         error.add_note(str(failure))
+
+
+_SAME = BenchError("as above.")
 
 
 def _line(step: str, error: BaseException) -> str:

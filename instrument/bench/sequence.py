@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import OFF, LedArray, LedPattern
 from drivers.slm import Slm
+from instrument.bench.safety import SafeStep, StepsFailedError, note_failures, try_all
 from instrument.files.errors import BenchError
 
 if TYPE_CHECKING:
@@ -158,20 +160,34 @@ def take_sequence(
 
 @contextmanager
 def _triggered(wire: Wire, count: int) -> Iterator[Camera]:
-    """Have the camera wait for pulses, and be as before at the end."""
+    """Have the camera wait for pulses, and be as before at the end; what fails then hides no error before."""
     camera = wire.bench.camera
     mode, line, edge = camera.trigger_mode, camera.trigger_line, camera.trigger_edge
+
+    def trigger_as_before() -> None:
+        camera.set_trigger_mode(mode)
+
+    as_before: list[SafeStep] = [
+        ("sequence ended", camera.stop_sequence),
+        ("trigger as before", trigger_as_before),
+        ("trigger's input as before", partial(_listen, camera, line, edge)),
+    ]
     try:
         _listen(camera, wire.line or line, wire.edge or edge)
         camera.set_trigger_mode("hardware")
         camera.start_sequence(count + 8)
+        yield camera
+    except BaseException as error:
         try:
-            yield camera
-        finally:
-            camera.stop_sequence()
-    finally:
-        camera.set_trigger_mode(mode)
-        _listen(camera, line, edge)
+            try_all(as_before)
+        except StepsFailedError as failure:
+            for _, problem in failure.failures:
+                note_failures(error, problem)
+        raise
+    try:
+        try_all(as_before)
+    except StepsFailedError as failure:
+        raise failure.failures[0][1] from None
 
 
 def _listen(camera: Camera, line: str, edge: TriggerEdge) -> None:

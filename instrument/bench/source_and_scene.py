@@ -56,6 +56,17 @@ class Lights:
         return self._led_array is not None or self.ask is not None
 
     @property
+    def no_source(self) -> str:
+        """Why the LED array lights no point source here; empty where it does, or there is no array."""
+        world: object = self.scene_switch
+        if self._led_array is None or not (isinstance(world, LedsOnScene) and world.leds_light_scene):
+            return ""
+        return (
+            'The LED array lights the scene here, and no point source (led_light = "scene" in '
+            '[simulated]). Calibrate with led_light = "source", which is the same camera.'
+        )
+
+    @property
     def can_switch_scene(self) -> bool:
         """Whether the scene can be lit and darkened: by the simulated world, or by asking the operator."""
         return self.ask is not None if self._by_operator else self.scene_switch is not None
@@ -90,12 +101,8 @@ class Lights:
         Raises BenchError where the simulated world's LED array lights the scene instead: what is taken for a
         PSF would be the scene. OperatorNeededError when nobody can be asked.
         """
-        world: object = self.scene_switch
-        if lit and self._led_array is not None and isinstance(world, LedsOnScene) and world.leds_light_scene:
-            raise BenchError(
-                'The LED array lights the scene here, and no point source (led_light = "scene" in '
-                '[simulated]). Calibrate with led_light = "source", which is the same camera.'
-            )
+        if lit and self.no_source:
+            raise BenchError(self.no_source)
         if self._led_array is None:
             self._ask_once("the point source", lit=lit)
         elif lit:

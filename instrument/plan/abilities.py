@@ -47,6 +47,8 @@ class BenchAbilities:
     can_switch_source: bool = True
     can_switch_scene: bool = True
     """Whether source and scene can be lit and darkened, by a device or by asking the operator."""
+    no_source: str = ""
+    """Why the LEDs light no point source; empty where they do."""
     n_leds: int = 0
     """0 without an LED array."""
     led_array: LedPlaces | None = None
@@ -197,6 +199,8 @@ def _step_problems(step: Step, abilities: BenchAbilities) -> Iterable[str]:
             yield f'light "{step.light}" lights no LED of this array.'
     if not is_pattern and not abilities.can_switch_source:
         yield f'light "{step.light}", but the bench has no LED array and nobody can be asked to see to it.'
+    elif step.light.kind == "source" and abilities.no_source:
+        yield f'light "{step.light}": {abilities.no_source}'
     if not abilities.can_switch_scene:
         yield (
             f"the scene must be {'lit' if step.scene_lit else 'dark'}, but nothing switches it and nobody "

@@ -82,6 +82,7 @@ def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
         stage_target=(lambda source: bench.source_mount.target(*source)) if stage is not None else None,
         play=bench.play,
         can_switch_source=bench.can_switch_source,
+        no_source=bench.no_source,
         can_switch_scene=bench.can_switch_scene,
         n_leds=len(bench.led_array.led_positions_mm) if bench.led_array is not None else 0,
         led_array=bench.led_array,

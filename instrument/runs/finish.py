@@ -28,11 +28,7 @@ def end_run(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseEx
     with interrupts_held() as held:
         run = _end(bench, writer, reason, error)
     if error is None:
-        try:
-            held.answer()
-        except BaseException as interruption:
-            interruption.add_note(_where(writer))
-            raise
+        held.answer(_where(writer))
     return run
 
 

@@ -46,6 +46,11 @@ class Verification:
         """Whether nothing is wrong. A run that ended early is sound, only not complete."""
         return not (self.damaged or self.without_a_line or self.files or self.problems)
 
+    @property
+    def became(self) -> str:
+        """What became of the run, with a mark when it is damaged."""
+        return _became(self.condition, is_damaged=not self.is_sound)
+
     def lines(self) -> list[str]:
         """Return what is wrong, a line each."""
         found = [f"frame {frame.index}: {frame.problem}" for frame in self.damaged]
@@ -220,7 +225,11 @@ class RunSummary:
         """What became of it, with a mark when it is damaged."""
         if self.condition is None:
             return "UNREADABLE"
-        return f"{self.condition}, DAMAGED" if self.is_damaged else str(self.condition)
+        return _became(self.condition, is_damaged=self.is_damaged)
+
+
+def _became(condition: RunCondition, *, is_damaged: bool) -> str:
+    return f"{condition}, DAMAGED" if is_damaged else str(condition)
 
 
 def run_paths(folder: Path) -> list[Path]:

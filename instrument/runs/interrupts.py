@@ -53,11 +53,20 @@ class Held:
         self.before: dict[int, Callable[[int, FrameType | None], Any]] = {}
         self.signals: list[tuple[int, FrameType | None]] = []
 
-    def answer(self) -> None:
-        """Answer the first signal that was held, as it would have been: with an exception."""
-        if self.signals:
-            number, frame = self.signals[0]
+    def answer(self, *said: str) -> None:
+        """Answer the first signal that was held, as it would have been: with an exception.
+
+        What is to be ``said`` becomes notes of it.
+        """
+        if not self.signals:
+            return
+        number, frame = self.signals[0]
+        try:
             self.before[number](number, frame)
+        except BaseException as interruption:
+            for words in said:
+                interruption.add_note(words)
+            raise
 
 
 @contextlib.contextmanager

@@ -286,8 +286,8 @@ class Runner:
             raise RuntimeError("A runner executes its plan once; make a new one (or resume the run).")
         self._thread = threading.current_thread()
         self._started_s = time.monotonic()
-        self._report(state=RunState.RUNNING)
         try:
+            self._report(state=RunState.RUNNING)
             self._writer.start(steps=len(self._todo))
             self._do_steps()
         except _EndedEarlyError as early:

@@ -256,15 +256,19 @@ class RunWriter:
     def write(self, frames: Sequence[FrameToStore]) -> None:
         """Store frames with their metadata, and return once all of it is on the disk.
 
-        Ctrl-C and SIGTERM wait until the frames have their lines.
+        Ctrl-C and SIGTERM wait until the frames have their lines, or cannot have them.
 
         Raises RunError when the disk is full or not writable, or a frame does not fit the run. What was on
         the disk before stays.
         """
         if not frames:
             return
-        with interrupts_held() as held:
-            self._store(frames)
+        try:
+            with interrupts_held() as held:
+                self._store(frames)
+        except RunError as error:
+            held.answer(str(error))
+            raise
         held.answer()
 
     def _store(self, frames: Sequence[FrameToStore]) -> None:

@@ -31,6 +31,7 @@ from instrument.runs import acquire
 from instrument.runs.acquire import abilities_of
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_control import EndedEarlyError, RunControl
+from instrument.runs.run_files import RunError
 from instrument.runs.runner import RunState, RunStatus
 from tests.mocks.listeners import Following
 
@@ -289,6 +290,18 @@ def test_a_resume_that_fails_before_its_first_frame_gives_the_run_up_again(
         ResumeProcedure(run.path).carry_out(bench)
     record.write_text(whole)
     assert ResumeProcedure(run.path).carry_out(bench).good
+
+
+def test_a_sweep_within_another_run_is_to_be_moved_out_before_anything_moves(
+    bench: Bench, tmp_path: Path
+) -> None:
+    outer, run = (_aborted(bench, tmp_path).path for _ in range(2))
+    nested = run.rename(outer / run.name)
+    for step in (ResumeProcedure(nested).outlook, ResumeProcedure(nested).carry_out):
+        with pytest.raises(RunError, match=f"lies within another run.*Move it to {tmp_path}"):
+            step(bench)
+    assert len(Run.open(nested).records) == 5
+    assert ResumeProcedure(nested.rename(run)).carry_out(bench).good
 
 
 def test_a_damaged_record_comes_from_its_copy(bench: Bench, tmp_path: Path) -> None:

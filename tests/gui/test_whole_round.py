@@ -126,3 +126,14 @@ def test_calibrate_photograph_and_reconstruct_by_mouse_alone(qtbot: QtBot, windo
     session.handed_on.connect(lambda *what: handed.extend(what))
     qtbot.mouseClick(runs.use_button, LEFT)
     assert handed == ["reconstructions", file]
+    # One bit of a frame flips: Verify finds it, and both the list and the run itself say so.
+    assert runs.opened is not None
+    assert runs.opened.run is not None
+    chunk = runs.opened.run.array.chunk_path(0)
+    image = bytearray(chunk.read_bytes())
+    image[len(image) // 2] ^= 1
+    chunk.write_bytes(image)
+    assert runs.about.toPlainText().startswith("completed: ")
+    qtbot.mouseClick(runs.verify_button, LEFT)
+    qtbot.waitUntil(lambda: runs.table.item(0, 1).text() == "completed, DAMAGED", timeout=WAIT_MS)
+    assert runs.about.toPlainText().startswith("completed, DAMAGED: ")

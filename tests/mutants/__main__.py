@@ -47,14 +47,16 @@ def known_equal() -> dict[str, str]:
     return {mutant["name"]: mutant["why"] for mutant in listed}
 
 
-def drawn(groups: dict[str, tuple[str, ...]], sample: int, seed: int, only: str) -> list[tuple[str, Mutant]]:
-    """Return a sample of each group of modules, of those mutants in whose name ``only`` stands, in turn."""
+def drawn(
+    groups: dict[str, tuple[str, ...]], sample: int, seed: int, only: list[str]
+) -> list[tuple[str, Mutant]]:
+    """Return a sample of each group of modules, of those mutants in whose name one of ``only`` stands."""
     found: list[tuple[float, str, Mutant]] = []
     equal = known_equal()
     for group, paths in groups.items():
         rng = random.Random(f"{seed} {group}")
         every = [mutant for path in paths for mutant in mutants_of(Path(path), ROOT)]
-        those = [mutant for mutant in every if mutant.name not in equal and only in mutant.name]
+        those = [one for one in every if one.name not in equal and any(part in one.name for part in only)]
         some = rng.sample(those, min(sample, len(those)))
         found += [(number / len(some), group, mutant) for number, mutant in enumerate(some)]
     return [(group, mutant) for _, group, mutant in sorted(found, key=lambda one: one[0])]
@@ -96,7 +98,9 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=25.0, help="no mutant is begun after so long")
     parser.add_argument("--most", type=float, default=30.0, help="seconds of tests of a mutant, as watched")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
-    parser.add_argument("--only", default="", help="only mutants in whose name this stands")
+    parser.add_argument(
+        "--only", nargs="+", default=[""], help="only mutants in whose name one of these stands"
+    )
     parser.add_argument("--tests", nargs="+", default=[], help="only these [default: those of the areas]")
     parser.add_argument("--list", action="store_true", help="print the sample and end")
     options = parser.parse_args()

@@ -133,7 +133,8 @@ def test_what_fails_twice_on_the_way_out_is_told_once(caplog: pytest.LogCaptureF
     for again in (DeviceError("stage", "was unplugged."), ValueError("by zero")):
         note_failures(caught.value, again)
         note_failures(caught.value, StepsFailedError([("close stage", ValueError("by zero"))]))
-    assert caught.value.__notes__ == said
+    assert caught.value.__notes__[:-1] == said
+    assert caught.value.__notes__[-1].endswith(":\n  close stage: as above.")  # named, its words not repeated
 
 
 @pytest.mark.parametrize(

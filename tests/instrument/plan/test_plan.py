@@ -188,6 +188,9 @@ def test_a_bench_without_stage_leds_or_slm_refuses_what_needs_them() -> None:
     with pytest.raises(PlanError) as caught:
         check(plan, bare)
     assert [problem[:6] for problem in caught.value.problems] == ["step 0", "step 1", "step 2"]
+    with pytest.raises(PlanError) as caught:
+        check(sweep(), abilities(no_source="The LEDs light the scene."))
+    assert caught.value.problems == ('steps 1-6: light "source": The LEDs light the scene.',)
 
 
 def test_slm_images_are_looked_at_before_anything_moves(tmp_path: Path) -> None:

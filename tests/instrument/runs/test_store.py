@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -197,6 +198,20 @@ def test_ctrl_c_between_an_image_and_its_line_waits_for_the_line(
     run = writer.finish(FinishReason.ABORTED)
     assert set(run.records) == {0}
     assert verify(run).is_sound
+
+
+def test_ctrl_c_while_a_frame_cannot_be_stored_is_answered_and_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with new_run(tmp_path) as writer:
+        monkeypatch.setattr(FrameArray, "write", full)
+        with pytest.raises(KeyboardInterrupt) as caught:
+            writer.write([frame(0)])
+    assert "frame 0 could not be stored: No space left on device" in caught.value.__notes__[0]
 
 
 def test_a_frame_of_another_shape_or_place_is_refused(tmp_path: Path) -> None:

@@ -138,6 +138,28 @@ def test_a_sequence_that_is_never_whole_is_refused(
         take_sequence(Wire(bench), patterns)
 
 
+def test_what_fails_while_the_camera_is_put_back_hides_no_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    def pressed(_: object) -> None:
+        raise KeyboardInterrupt
+
+    put_back: list[str] = []
+
+    def lost(_: object, mode: str) -> str:
+        if mode == "free_run":
+            put_back.append(mode)
+            raise DeviceError("camera", "was unplugged.")
+        return mode
+
+    patterns = [LedPattern("lit", ((0, (200, 200, 200)),))] * 2
+    with open_bench() as bench:
+        monkeypatch.setattr(type(bench.camera), "set_trigger_mode", lost)
+        with pytest.raises(KeyboardInterrupt) as caught:
+            take_sequence(Wire(bench), patterns, on_frame=pressed)
+        monkeypatch.undo()
+    assert put_back == ["free_run"]
+    assert caught.value.__notes__ == ["camera: was unplugged."]
+
+
 def test_times_are_put_to_places() -> None:
     rng = np.random.default_rng(1)
     times = 5.003 * np.arange(400.0) + rng.normal(0, 0.05, 400)  # clocks that differ: two periods in all
