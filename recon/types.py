@@ -16,7 +16,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.errors import InputError
+
 FloatArray = npt.NDArray[np.float32] | npt.NDArray[np.float64]
+_DTYPES: Mapping[str, type[np.floating]] = {
+    "psfs": np.float32,
+    "source_positions_um": np.float64,
+    "background": np.float32,
+}
+
+
+def _real(given: Any, name: str, dtype: type[np.floating]) -> npt.NDArray[Any]:
+    """Return an array of real numbers of any kind as one of ``dtype``; InputError where it is none."""
+    array = np.asarray(given)
+    if array.dtype.kind not in "uifb":
+        raise InputError(f"{name} must be real numbers, not {array.dtype}.")
+    return array.astype(dtype)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +57,8 @@ class Calibration:
     Attributes
     ----------
     psfs : ndarray, float32, (n_sources, n_channels, height, width)
-        Background removed, non-negative. ``n_channels`` is 1 for a grey camera. Not normalised: relative
-        brightness between sources is kept.
+        Background removed, non-negative; other real numbers are converted. ``n_channels`` is 1 for a grey
+        camera. Not normalised: relative brightness between sources is kept.
     source_positions_um : ndarray, float64, (n_sources, 3)
         ``x, y, z`` of the source for each PSF, micrometres; NaN where unknown.
     background : ndarray, float32, (n_channels, height, width), or None
@@ -63,18 +78,22 @@ class Calibration:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.psfs.ndim != 4 or self.psfs.dtype != np.float32:
-            raise ValueError(
-                "psfs must be float32 (n_sources, n_channels, height, width), "
-                f"not {self.psfs.dtype} {self.psfs.shape}."
+        for name, dtype in _DTYPES.items():
+            if (given := getattr(self, name)) is not None and getattr(given, "dtype", None) != dtype:
+                object.__setattr__(self, name, _real(given, name, dtype))
+        if self.psfs.ndim != 4:
+            hint = {2: ": psf[None, None] of a grey one", 3: ": psfs[:, None] of grey ones"}
+            raise InputError(
+                "psfs must be (n_sources, n_channels, height, width), not "
+                f"{self.psfs.shape}{hint.get(self.psfs.ndim, '')}."
             )
         if self.source_positions_um.shape != (len(self.psfs), 3):
-            raise ValueError(
+            raise InputError(
                 f"source_positions_um must be ({len(self.psfs)}, 3) for {len(self.psfs)} PSFs, "
                 f"not {self.source_positions_um.shape}."
             )
         if self.background is not None and self.background.shape != self.psfs.shape[1:]:
-            raise ValueError(
+            raise InputError(
                 f"background must have the shape of one PSF {self.psfs.shape[1:]}, "
                 f"not {self.background.shape}."
             )

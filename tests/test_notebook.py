@@ -100,6 +100,9 @@ def test_options_are_completed_and_nothing_is_ignored(scene: tuple[np.ndarray, n
         ({"dark": 30}, "arrays are taken as they are"),
         ({"iteration": 3}, "Did you mean 'iterations'"),
         ({"bin": 2}, "It is called 'binning'"),
+        ({"z_mm": 2}, "It is called 'z_um', in um"),
+        ({"prior": db.L1}, r"an object, not its class: L1\(\.\.\.\)"),
+        ({"warm": psf}, "a result to start from, not ndarray: warm=result"),
     ):
         with pytest.raises((ValueError, db.BenchError), match=said):
             db.reconstruct(photo, psf, **given)
@@ -109,7 +112,8 @@ def test_a_files_image_is_no_array_and_says_where_its_array_is(
     scene: tuple[np.ndarray, np.ndarray], tmp_path: Path
 ) -> None:
     db.write_image(tmp_path / "photo.tif", scene[0])
-    photo = db.read(tmp_path / "photo.tif")
+    photo, psf = db.read(tmp_path / "photo.tif"), plain(scene)[1]
+    assert db.Calibration(psf[None, None].astype(float), [[0, 0, 3]]).psfs.dtype == np.float32
     np.testing.assert_array_equal(np.asarray(photo), scene[0])
     for used, said in (
         (lambda: photo.astype(float), "take .pixels.astype"),
@@ -118,9 +122,17 @@ def test_a_files_image_is_no_array_and_says_where_its_array_is(
         (lambda: db.read(3), "read by its name, not int"),
         (lambda: db.reconstruct(photo, scene[1], scene[0]), r"options are db.Options\(...\), not ndarray"),
         (lambda: db.reconstruct(scene[0][None], scene[1]), "1 of 48 x 48 pixels. Give one of them"),
+        (lambda: db.reconstruct(np.dstack([scene[0]] * 3 + [0 * psf + 255]), psf), "fourth channel is 255"),
+        (
+            lambda: db.reconstruct(np.where(psf > 0, psf, np.inf), psf),
+            r"first at \(\d+, \d+\) \(of shape \(48, 48",
+        ),
+        (lambda: db.hologram(psf[0]), r"A picture is .* not ndarray .* \(48,\)"),
+        (lambda: db.calibration(psf), "read by its folder, not ndarray. .* db.Calibration"),
+        (lambda: db.Calibration(psf, [[0, 0, 3e3]]), r"not \(48, 48\): psf\[None, None\]"),
         (lambda: db.chart(photo), "ImageFile is neither a result nor a scene .* charted by its result"),
     ):
-        with pytest.raises((AttributeError, TypeError, db.BenchError), match=said):
+        with pytest.raises((AttributeError, TypeError, db.BenchError, InputError), match=said):
             used()
 
 

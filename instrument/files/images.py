@@ -269,7 +269,12 @@ def _read_folder(folder: Path, leave_out: Path | None) -> ImageFile:
     for path in paths[1:]:
         image = read_image(path)
         if image.pixels.shape != first.pixels.shape or image.pixels.dtype != first.pixels.dtype:
-            raise FileError(path, f"is {image.describe()}, but {first.path.name} is {first.describe()}.")
+            raise FileError(
+                path,
+                f"is {image.describe()}, but {first.path.name} is {first.describe()}: the images of a folder "
+                "that is taken as one stack must be alike.",
+                "Give a folder with nothing else in it, or a file by its name.",
+            )
         images.append(image.pixels)
     stack: Pixels = np.stack(images)  # type: ignore[assignment]
     metadata = {"files": [path.name for path in paths], "depths_um": list(depths)}

@@ -23,11 +23,13 @@ from instrument.display.hologram import (
     slm_size,
 )
 from instrument.display.hologram_files import HologramFiles, hologram_figure
+from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, read_image
 from instrument.files.sample_images import SAMPLES
 from instrument.notebook.reconstruct import bench_config
 from instrument.notebook.result import figure_png, show_figure
 from instrument.notebook.words import in_python, speaking
+from recon.base.checks import plain_array
 from recon.base.declare import with_overrides
 from recon.holography import HologramOptions, HologramRecord
 
@@ -144,4 +146,10 @@ def _pixels(picture: Any) -> npt.NDArray[Any]:
         return np.asarray(SAMPLES[picture].load())
     if isinstance(picture, Path | str | ImageFile):
         return read_image(picture).pixels
-    return np.asarray(picture)
+    pixels = plain_array(picture)
+    if pixels.dtype.kind not in "uifb" or pixels.ndim not in (2, 3) or not pixels.size:
+        raise BenchError(
+            "A picture is a file, the name of a sample, or an array (height, width) or (height, width, 3) of "
+            f"real numbers, not {type(picture).__name__} {pixels.dtype} {pixels.shape}."
+        )
+    return pixels

@@ -53,6 +53,11 @@ def calibration(folder: Path | str) -> Calibration:
 
     Raises FileError when there is none, more than one, or it is damaged.
     """
+    if not isinstance(folder, Path | str):
+        raise BenchError(
+            f"A calibration is read by its folder, not {type(folder).__name__}. PSFs in an array make one: "
+            "db.Calibration(psfs, source_positions_um); a single one goes to db.reconstruct as it is."
+        )
     return load_calibration(find_calibration(Path(folder)))
 
 
@@ -134,6 +139,8 @@ def reconstruct(
     """
     image, psf = getattr(image, "measurement", image), getattr(psf, "calibration", psf)
     require_known(overrides, ReconstructionOptions, InputOptions)
+    if not isinstance(warm, Reconstruction | None):
+        raise BenchError(f"warm is a result to start from, not {type(warm).__name__}: warm=result.")
     if not isinstance(options, ReconstructionOptions | None):
         raise BenchError(
             f"options are db.Options(...), not {type(options).__name__}; single ones are given by name: "
@@ -150,10 +157,12 @@ def reconstruct(
             return Result.of(one_door.reconstruct(measurement, job.calibration, options, **further), job)
         if about := sorted(_FILES_ONLY & set(overrides)):
             raise BenchError(
-                f"{' and '.join(about)}: of files, and of images by db.read; arrays are taken as they are. "
-                "Leave it out, or do it to the arrays."
+                f"{' and '.join(about)}: for files and images of db.read; arrays are taken as they are. "
+                "Leave it out, and do it to the arrays yourself (a dark frame: photograph - dark)."
             )
         _require_one(image, psf)
+        for name, given in (("photograph", image), ("PSF", psf)):
+            _require_no_alpha(given, name)
         found = one_door.reconstruct(image, psf, options, **further, **overrides)  # type: ignore[arg-type]
         return Result.of(found, _job_of_arrays(image, psf))
     finally:
@@ -167,7 +176,19 @@ def _require_one(image: Any, psf: Any) -> None:
     if len(shape) == 3 and len(psf_shape) == 2 and shape[:2] != psf_shape == shape[1:]:
         raise BenchError(
             f"The photograph is an array {shape}: {shape[0]} of {shape[1]} x {shape[2]} pixels. Give one of "
-            "them: photograph[0]; colours are the last axis."
+            "them: photograph[0]; colours are the last axis: np.moveaxis(photograph, 0, -1)."
+        )
+
+
+def _require_no_alpha(given: Any, name: str) -> None:
+    """Raise BenchError where the fourth channel of an array is the same everywhere, as transparency is."""
+    if isinstance(given, Measurement | Calibration):
+        return
+    pixels = plain_array(given)
+    if pixels.ndim == 3 and pixels.shape[-1] == 4 and pixels.size and np.ptp(pixels[..., 3]) == 0:
+        raise BenchError(
+            f"The {name}'s fourth channel is {pixels[0, 0, 3]:g} everywhere: transparency (RGBA), no light. "
+            f"Give the colours alone: [..., :3]."
         )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.atomic import require_new
-from instrument.files.errors import BenchError
+from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, read_image, write_image
 from instrument.files.seen import as_seen, png_bytes
 from instrument.notebook.words import in_python, job_in_python, result_in_python, speaking
@@ -148,6 +148,13 @@ class Result(Reconstruction):
             written: tuple[Path, ...] = (out,)
         else:
             volume = not self.is_picture
+            zarr = volume and out.suffix.lower() == ".zarr"
+            if out.suffix.lower() not in (".tif", ".tiff") and not zarr:
+                raise FileError(
+                    out,
+                    f"is not written: the name must end in .tif{' or .ome.zarr' * volume} (the numbers, with "
+                    "preview and record), .npy (the numbers alone) or .png (the picture as it is seen).",
+                )
             outputs = Outputs.named(
                 out, volume=volume, uncertainty=self.uncertainty is not None and not volume
             )

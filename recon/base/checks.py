@@ -60,10 +60,9 @@ def as_channels(image: npt.ArrayLike, name: str) -> npt.NDArray[np.float32]:
         )
     if min(array.shape) == 0:
         raise InputError(f"The {name} is empty: its shape is {array.shape}.")
-    channels = array[None] if array.ndim == 2 else np.moveaxis(array, 2, 0)
-    result = np.ascontiguousarray(channels, np.float32)
-    require_finite(result, name)
-    return result
+    single = np.asarray(array, np.float32)
+    require_finite(single, name)  # where the caller has them; beyond float32 there is infinity
+    return np.ascontiguousarray(single[None] if array.ndim == 2 else np.moveaxis(single, 2, 0))
 
 
 def require_finite(array: npt.NDArray[Any], name: str) -> None:
@@ -72,9 +71,12 @@ def require_finite(array: npt.NDArray[Any], name: str) -> None:
     count = int(np.count_nonzero(wrong))
     if count:
         first = tuple(int(i) for i in np.argwhere(wrong)[0])
+        remedy = (
+            "Put the mean of their neighbours there." if name == "PSF" else "Make bad pixels NaN: erased."
+        )
         raise InputError(
             f"The {name} holds {count} values that are not finite numbers, the first at {first} "
-            f"(of shape {array.shape}). Mark bad pixels with erasures and set them to 0."
+            f"(of shape {array.shape}). {remedy}"
         )
 
 

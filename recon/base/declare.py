@@ -198,6 +198,8 @@ class Option:
             return f"{name} must be True or False, not {value!r}."
         if any(_fits(kind, value) for kind in self.kinds):
             return None
+        if isinstance(value, type) and any(issubclass(value, k) for k in self.kinds if isinstance(k, type)):
+            return f"{name} must be an object, not its class: {value.__name__}(...)."
         if not {int, float} & set(self.kinds):
             return f"{name} must be {self.expected(typed=typed)}, not {_shown(value)}."
         said = self.declaration
@@ -353,9 +355,10 @@ def require_known(names: Iterable[str], *classes: type) -> None:
             near = difflib.get_close_matches(name, known, 1)
             hint = f" Did you mean {near[0]!r}?" if near else f" There are {', '.join(known)}."
             flag = f"--{name.replace('_', '-')}"  # an old name goes on working on the command line
-            if new := next((o.name for cls in classes for o in options_of(cls) if flag in o.flags), ""):
-                hint = f" It is called {new!r}."
-            raise InputError(f"{classes[0].__name__} has no option {name!r}.{hint}")
+            if new := next((o for cls in classes for o in options_of(cls) if flag in o.flags), None):
+                unit = new.declaration.unit
+                hint = f" It is called {new.name!r}{f', in {unit}' if unit else ''}."
+            raise InputError(f"There is no option {name!r}.{hint}")
 
 
 def settled(options: _T, **values: Any) -> _T:

@@ -157,7 +157,7 @@ def test_messages_name_the_flag_that_was_typed() -> None:
 
 
 def test_an_old_name_is_answered_in_python_with_the_new_one() -> None:
-    with pytest.raises(InputError, match=r"has no option 'sort'\. It is called 'kind'"):
+    with pytest.raises(InputError, match=r"no option 'sort'\. It is called 'kind'"):
         with_overrides(Main(), {"sort": "fancy"})
 
 

@@ -227,7 +227,7 @@ BAD = np.where(np.arange(12 * 14).reshape(12, 14) == 30, np.nan, GOOD)
     [
         (GOOD, 0 * GOOD, {}, "zero everywhere: the point source was not seen"),
         (GOOD, 0 * GOOD + 3, {}, "constant .3 everywhere."),
-        (GOOD, BAD, {}, r"PSF holds 1 values that are not finite numbers, the first at .0, 2, 2."),
+        (GOOD, BAD, {}, r"PSF holds 1 values that are not finite numbers, the first at .2, 2."),
         (np.nan_to_num(BAD, nan=np.inf), GOOD, {}, r"measurement holds 1 values that are not finite"),
         (GOOD, GOOD - 2, {}, "sums to a negative number"),
         (GOOD[1:], GOOD, {}, "PSF has 12 x 14 pixels and the measurement 11 x 14"),

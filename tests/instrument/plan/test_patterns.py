@@ -118,7 +118,7 @@ def test_text_and_back(text: str) -> None:
         ("half-circle", "not known. Choose one of bright-field"),
         ("half side=front", "side must be one of left, right"),
         ("half na=2", "na must be a number, above 0, 1 or less"),
-        ("half nan=0.1", "has no option 'nan'. Did you mean 'na'"),
+        ("half nan=0.1", "no option 'nan'. Did you mean 'na'"),
         ("half 0.3", "'0.3' in 'half 0.3' is no option"),
         ("grid side=0", "side must be a whole number, 1 or more"),
     ],
@@ -157,7 +157,7 @@ def test_lights_of_before_are_written_as_before() -> None:
     [
         ('"sorce"', "light 'sorce' is not known; there are off, source, pattern, bright-field"),
         ('"half side=front"', "side must be one of"),
-        ('{ kind = "half", size = 3 }', "has no option 'size'"),
+        ('{ kind = "half", size = 3 }', "no option 'size'"),
         ('{ kind = "source", na = 0.3 }', "Extra inputs are not permitted"),
         ('{ kind = "half", leds = [[0, 1, 1, 1]] }', "leds belong to"),
     ],

@@ -54,6 +54,6 @@ def test_labels_have_the_unit_that_people_read() -> None:
 
 
 def test_an_unknown_override_is_refused_with_the_nearest_name() -> None:
-    with pytest.raises(InputError, match=r"has no option .cuont.\. Did you mean .count."):
+    with pytest.raises(InputError, match=r"no option .cuont.\. Did you mean .count."):
         with_overrides(Some(), {"cuont": 1})
     assert with_overrides(Some(), {"count": 1}) == Some(count=1)

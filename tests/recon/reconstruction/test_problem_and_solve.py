@@ -112,7 +112,7 @@ def test_a_prior_over_time_subtracts_the_background_and_keeps_to_its_solver(phot
         ({"prior": 3}, "a Prior, not 3"),
         ({"iterations": "5"}, "iterations must be a whole number"),
         ({"scratch": 5}, "scratch must be the name of a file"),
-        ({"method": "admm"}, "has no option 'method'. It is called 'solver'"),
+        ({"method": "admm"}, "no option 'method'. It is called 'solver'"),
     ],
 )
 def test_an_option_of_another_type_is_refused_in_words(photograph, wrong, said) -> None:
