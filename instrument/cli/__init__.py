@@ -71,7 +71,7 @@ COMMANDS: Mapping[str, Command] = {
     ),
     "serve": Command(BENCH, "offer the devices to another computer, and a page in the browser", "serve"),
     "test": Command(BENCH, "test this installation: files, cameras, solvers, simulated bench", "selftest"),
-    "completion": Command(BENCH, "print completions for bash and zsh", "completion"),
+    "completion": Command(BENCH, "print completions for bash, zsh and fish", "completion"),
     "calibrate": Command(BENCH, "measure PSFs, the sensor, the diffuser, or an SLM", "calibrate"),
     "snap": Command(BENCH, "take a photograph", "capture:snap_app"),
     "plan": Command(ACQUISITION, "look at a plan before anything moves, or write one", "plan"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -12,7 +12,7 @@ from instrument.files.errors import BenchError
 
 app = App()
 
-SHELLS = ("bash", "zsh")
+SHELLS = ("bash", "zsh", "fish")
 
 _SCRIPT = """\
 # Completions of diffuserbench for bash and zsh.
@@ -36,47 +36,83 @@ _diffuserbench() {{
 }}
 complete -o filenames -F _diffuserbench diffuserbench
 """
+_FISH = """\
+# Completions of diffuserbench for fish.
+set -g __diffuserbench_keys {keys}
+function __diffuserbench_at
+  set -l key all
+  for word in (commandline -opc)[2..-1]
+    set -l below $key-$word
+    test $key = all; and set below $word
+    contains -- $below $__diffuserbench_keys; and set key $below
+  end
+  test $key = $argv[1]
+end
+{lines}
+"""
 
 
 @app.command(
     epilog=examples(
         "diffuserbench completion > ~/.local/share/bash-completion/completions/diffuserbench",
-        'eval "$(diffuserbench completion)"          for this shell',
+        'eval "$(diffuserbench completion)"          for this shell, bash or zsh',
+        "diffuserbench completion fish > ~/.config/fish/completions/diffuserbench.fish",
     )
 )
 def completion(
     shell: Annotated[
-        str, typer.Argument(help="bash or zsh: both take the same lines.", show_default=False)
-    ] = "",
+        str, typer.Argument(help="bash, zsh (both take the same lines) or fish.", show_default=False)
+    ] = "bash",
 ) -> None:
-    """Print completions of commands, options and their words for bash and zsh, plug-ins' among them."""
-    if shell not in ("", *SHELLS):
-        raise BenchError(f"There are no completions for {shell}; there are for {' and '.join(SHELLS)}.")
-    typer.echo(script(), nl=False)
+    """Print completions of commands, options and their words for a shell, plug-ins' among them."""
+    if shell not in SHELLS:
+        raise BenchError(f"There are no completions for {shell}; there are for {', '.join(SHELLS)}.")
+    typer.echo(script(shell), nl=False)
 
 
-def script() -> str:
+def script(shell: str = "bash") -> str:
     """Return the shell's lines."""
     from instrument.cli import COMMANDS
 
-    words = {"all": " ".join(COMMANDS)}
-    values: dict[str, str] = {}
+    below = {"all": list(COMMANDS)}
+    options: dict[str, dict[str, Sequence[str] | None]] = {}
+    """Of each command its options, with the words that one takes, none for a switch."""
     for name, command in COMMANDS.items():
         for key, parser in _parsers(name, typer.main.get_command(command.load())):
             declared: Mapping[str, Any] = getattr(parser.callback, "declared", {})
-            flags = [
-                (flag, param) for param in parser.params for flag in (*param.opts, *param.secondary_opts)
-            ]
-            words[key] = " ".join(
-                [*getattr(parser, "commands", ()), *(f for f, _ in flags if f[:2] == "--"), "--help"]
-            )
-            for flag, param in flags:
-                if param.name in declared and (said := declared[param.name].words):
-                    values[key + flag] = " ".join(said)
-    tables = [f"_diffuserbench_words[{key}]='{text}'" for key, text in words.items()]
-    return _SCRIPT.format(
-        tables="\n".join(tables + [f"_diffuserbench_values[{key}]='{text}'" for key, text in values.items()])
-    )
+            below[key] = list(getattr(parser, "commands", ()))
+            options[key] = {
+                flag: None if getattr(param, "is_flag", False) else _words(declared, param.name)
+                for param in parser.params
+                for flag in (*param.opts, *param.secondary_opts)
+                if flag[0] == "-"
+            } | {"--help": None}
+    if shell == "fish":
+        return _FISH.format(keys=" ".join(options), lines="\n".join(_fish_lines(below, options)))
+    tables = []
+    for key, commands in below.items():
+        words = [*commands, *(flag for flag in options.get(key, ()) if flag[:2] == "--")]
+        tables.append(f"_diffuserbench_words[{key}]='{' '.join(words)}'")
+    for key, flags in options.items():
+        given = [(flag, " ".join(words)) for flag, words in flags.items() if words]
+        tables += [f"_diffuserbench_values[{key}{flag}]='{words}'" for flag, words in given]
+    return _SCRIPT.format(tables="\n".join(tables))
+
+
+def _words(declared: Mapping[str, Any], name: str) -> Sequence[str]:
+    return declared[name].words if name in declared else ()
+
+
+def _fish_lines(
+    below: Mapping[str, Sequence[str]], options: Mapping[str, Mapping[str, Sequence[str] | None]]
+) -> Iterator[str]:
+    for key, commands in below.items():
+        line = f"complete -c diffuserbench -n '__diffuserbench_at {key}'"
+        if commands:
+            yield f"{line} -f -a '{' '.join(commands)}'"
+        for flag, words in options.get(key, {}).items():
+            taken = "" if words is None else f" -x -a '{' '.join(words)}'" if words else " -r"
+            yield f"{line} {'-l' if flag[1] == '-' else '-s'} {flag.lstrip('-')}{taken}"
 
 
 def _parsers(name: str, parser: Any) -> Iterator[tuple[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -458,6 +459,24 @@ def test_bash_completes_commands_options_and_their_words(tmp_path: Path) -> None
         ["bash", "-c", "\n".join(lines)], capture_output=True, text=True, cwd=tmp_path, check=True
     )
     assert said.stdout.splitlines() == list(asked.values())
+
+
+def test_fish_completes_the_same(tmp_path: Path) -> None:
+    lines = completion.script("fish").splitlines()
+    at = "complete -c diffuserbench -n '__diffuserbench_at"
+    assert f"{at} reconstruct' -l image -r" in lines
+    assert f"{at} reconstruct' -l solver -x -a 'auto admm admm-sensor fista wiener'" in lines
+    assert f"{at} new' -l camera" in lines, "a switch takes nothing"
+    assert any(line.startswith(f"{at} calibrate' -f -a 'axial lateral") for line in lines)
+    if (fish := shutil.which("fish")) is None:
+        return  # what it makes of them was tried where it is
+    (tmp_path / "lines.fish").write_text("\n".join(lines))
+    asked = "source lines.fish; complete -C 'diffuserbench reconstruct --prior tv-'"
+    home = {**os.environ, "HOME": str(tmp_path)}
+    said = subprocess.run(
+        [fish, "-c", asked], capture_output=True, text=True, cwd=tmp_path, check=True, env=home
+    )
+    assert said.stdout.split() == ["tv-haar", "tv-isotropic"]
 
 
 def test_a_thread_that_still_computes_does_not_abort_the_end_of_the_program() -> None:

@@ -72,7 +72,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     ([*PAIR, "--dark", "photo.tif"], "nothing would be left of it"),
     ([*RECONSTRUCT, "--psf", "psf.tif", "--image", "huge.tif"], "no light has more"),
     (["calibrate", "axial", "--z-min", "100", "--z-max", "200", "--planes", "100000000"], "10000 or less"),
-    (["completion", "fish"], "there are for bash and zsh"),
+    (["completion", "tcsh"], "there are for bash, zsh, fish"),
     (["chart", "calibrations", "--out", "photo.tif"], "a folder is expected"),
     (["reconstruct", "cal"], "by --calibration cal"),
     (["show", "plain"], "plain"),
