@@ -205,7 +205,7 @@ def _unknown(name: str) -> str:
     if name.startswith("-"):
         problem = f"diffuserbench: there is no option {name!r} before a command."
     else:
-        close = difflib.get_close_matches(name, COMMANDS, n=1)
+        close = [one for one in COMMANDS if one.startswith(name)] or difflib.get_close_matches(name, COMMANDS)
         hint = f" Did you mean {close[0]!r}?" if close else ""
         problem = f"diffuserbench: there is no command {name!r}.{hint}"
     return f"{problem}\n{USAGE}\nCommands: {', '.join(COMMANDS)}\n"

@@ -11,6 +11,7 @@ it needs::
 from __future__ import annotations
 
 import inspect
+import shlex
 import typing
 from collections.abc import Callable, Container, Mapping
 from dataclasses import replace
@@ -87,7 +88,7 @@ class GroupedCommand(TyperCommand):
             if flag not in flags:
                 return ""
             meant += [flag, str(file)]
-        return " ".join(meant)
+        return shlex.join(meant)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write arguments and options, a definition list a group; close together where there are many."""

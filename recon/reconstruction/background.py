@@ -196,9 +196,8 @@ def beyond_of(
         return Decision("beyond", value, why, overruled=asked, open=False)
     helps = trial.without**2 - again.without**2 > GAIN
     why = (
-        f"on pixels held out a coarse pass misses by {trial.without:.1f} times noise and usual error of the "
-        f"model, with planes beyond the farthest depth by {again.without:.1f} times (the square must fall by "
-        f"{GAIN:g})"
+        f"held-out pixels are missed by {trial.without:.1f} times the error to expect, with planes beyond "
+        f"the farthest depth by {again.without:.1f} times{'' if helps else ': too little for them'}"
     )
     numbers = {"held_out_without": trial.without, "held_out_with": again.without}
     up, down = (None, "none") if helps else ("planes", None)
@@ -213,18 +212,13 @@ def background_of(trial: Trial | None, overrides: Overrides, *, given: bool) -> 
         why = "a background was given" if given else "the darkest tenth leaves no room for stray light"
         return Decision("background", value, "" if asked else why, overruled=asked, open=False)
     why = (
-        f"on pixels held out a coarse pass misses by {trial.without:.1f} times noise and usual error of the "
-        f"model, with a background by {trial.lit:.1f} times, {trial.light:.0%} of the light (the square must "
-        f"fall by {GAIN:g} and by {MOST:.0%}"
+        f"held-out pixels are missed by {trial.without:.1f} times the error to expect, with a background of "
+        f"{trial.light:.0%} of the light by {trial.lit:.1f} times"
     )
-    if not trial.dim:
-        why += f", or by {trial.taken.fall:.0%} where it is {LIGHT:.0%} of the light"
-    if trial.taken.light:
-        why += (
-            f", or the picture be dark for {trial.taken.dark:.0%}, found {trial.dark:.0%}, where it is "
-            f"{trial.taken.light:.0%}"
-        )
-    why += ")"
+    if not trial.helps:
+        why += ": too little for one"
+    elif not trial.asks():
+        why += f", and {trial.dark:.0%} of the picture would be dark under it"
     numbers = {
         "held_out_without": trial.without,
         "held_out_with": trial.lit,

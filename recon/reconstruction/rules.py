@@ -194,9 +194,8 @@ def field_of(
     modelled = extent[0] * extent[1] if reach is None else min(np.pi * reach**2, extent[0] * extent[1])
     if within is not None:
         why += (
-            f"; on pixels held out a coarse pass misses by {within.anywhere:.2f} times noise and usual error "
-            f"of the model, with light only where PSFs were measured ({MARGIN:.0%} beyond) by "
-            f"{within.spanned:.2f} times (the square must fall by {FALL:.0%})"
+            f"; held-out pixels are missed by {within.anywhere:.2f} times the error to expect, with light "
+            f"only where PSFs were measured ({MARGIN:.0%} beyond) by {within.spanned:.2f} times"
         )
     share = modelled / ((2 * height - 1) * (2 * width - 1))
     up = None if share > 0.99 else largest

@@ -125,6 +125,7 @@ def test_the_module_is_the_program() -> None:
     ("arguments", "told"),
     [
         (["snpa"], "no command 'snpa'. Did you mean 'snap'?"),
+        (["recon"], "Did you mean 'reconstruct'?"),
         (["--colour"], "no option '--colour'"),
         (["help", "snpa"], "no command 'snpa'"),
         (["snap", "--averge", "3"], "--average"),
