@@ -123,7 +123,14 @@ def processor_s(process: int) -> float:
     return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
-def typed(words: list[str], folder: Path, most_s: float) -> Heard:
+BY_PROCESSOR = (
+    "from types import SimpleNamespace as N; from instrument.files import kept_times as k; "
+    "k.time = N(monotonic=k.time.process_time, process_time=k.time.process_time); "
+)
+"""Code by which a program keeps what its steps took of the processor: what a first guess goes by."""
+
+
+def typed(words: list[str], folder: Path, most_s: float, before: str = "") -> Heard:
     """Type a command in a terminal and listen to it; after so long press Ctrl-C."""
     heard = Heard(time.monotonic())
     process, terminal = pty.fork()
@@ -131,7 +138,7 @@ def typed(words: list[str], folder: Path, most_s: float) -> Heard:
         os.chdir(folder)
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # ignored in the background
         os.environ.update(PYTHONPATH=str(ROOT), TERM="xterm-256color", XDG_CACHE_HOME=str(folder / "cache"))
-        code = f"import sys; from instrument.cli import main; sys.exit(main({words!r}))"
+        code = f"import sys; {before}from instrument.cli import main; sys.exit(main({words!r}))"
         os.execv(sys.executable, [sys.executable, "-c", code])
     ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 80, 200, 0, 0))
     cpu_s, pressed = 0.0, False
@@ -163,6 +170,7 @@ def main() -> None:
     parser.add_argument("--once", action="store_true", help="not a second time")
     parser.add_argument("--most", type=float, default=300.0, help="seconds by the clock, then Ctrl-C")
     parser.add_argument("--folder", type=Path, help="kept")
+    parser.add_argument("--steps", action="store_true", help="once, and what each step took, in transforms")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     rows = []
@@ -179,10 +187,9 @@ def main() -> None:
             words = STEPS[name].replace("SWEEP", str(runs[-1]) if runs else "none").split()
             records = sorted(folder.glob("records/*"))
             words = [str(records[-1]) if word == "RECORD" and records else word for word in words]
-            for again in range(1 if options.once else 2):
-                heard = typed(
-                    [*words, "--force"] if again and needs_force(words) else words, folder, options.most
-                )
+            for again in range(1 if options.once or options.steps else 2):
+                forced = [*words, "--force"] if again and needs_force(words) else words
+                heard = typed(forced, folder, options.most, BY_PROCESSOR if options.steps else "")
                 silent, untold = heard.stretch(None), heard.stretch(TIME)
                 took = heard.said[-1]
                 rows.append({"name": name, "again": again, "said": heard.said, "status": heard.status})
@@ -192,8 +199,21 @@ def main() -> None:
                     f"| {untold[0]:.1f} ({untold[1]:.1f}) | {untold[2][-60:]} |",
                     flush=True,
                 )
+        if options.steps:
+            print_steps(folder / "cache")
     if options.out:
         options.out.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+def print_steps(cache: Path) -> None:
+    """Print what was kept of steps: seconds of the processor, and how many transforms that is."""
+    from instrument.files.kept_times import transform_s
+
+    one_s = transform_s()
+    for times in cache.rglob("times.json"):
+        for step, took_s in json.loads(times.read_text()).items():
+            if isinstance(took_s, float):
+                print(f"{took_s:8.2f} s {took_s / one_s:8.0f} transforms   {step}")
 
 
 def needs_force(words: list[str]) -> bool:

@@ -327,9 +327,10 @@ class AngularProcedure(Procedure):
         sweep = self.sweep.planned(bench)
         points = sweep.points()
         home_if_needed(bench, listener)
-        listener.step("moving the source")
+        listener.step("finding exposures")
         exposures = expose_sweep(bench, points, control=control)
         listener.exposures(exposures)
+        listener.step("moving the source")
         record = AngularRecord(
             sweep, bench.geometry, bench.label, bool(bench.simulated_kinds), bench.config.source.size_um
         )

@@ -194,10 +194,13 @@ def open_and_say(bench: BenchConfig | Path | None, *, as_is: bool = False) -> Be
     kept_times.about(of)
     with one_task("Opening the bench"):
         opened = open_bench(config, ask=_taken_for_done if as_is else operator())
-    if "camera" in opened.simulated_kinds:
-        height, width = opened.camera.sensor_shape
-        awaits_light = getattr(opened.camera, "awaits_light", bool)
-        kept_times.about(of, simulated_megapixels=1e-6 * height * width, awaits_light=awaits_light)
+    height, width = opened.camera.sensor_shape
+    kept_times.about(
+        of,
+        megapixels=1e-6 * height * width,
+        simulated="camera" in opened.simulated_kinds,
+        awaits_light=getattr(opened.camera, "awaits_light", bool),
+    )
     typer.echo(f"Bench: {opened.label}", err=True)
     return opened
 

@@ -253,8 +253,12 @@ def record(
         capture.set_camera(opened)
         switch_light(opened, light)
         recorder = prepare_recording(opened, files.out, options)
-        with one_task("Frames", options.n_frames, note="q ends") as advance:
-            recorder.on_progress = lambda status: advance(status.numbered, note=_note(status))
+        seconds = options.seconds if options.n_frames is None else None
+        what = "Frames" if seconds is None else "Seconds"
+        with one_task(what, options.n_frames if seconds is None else seconds, note="q ends") as advance:
+            recorder.on_progress = lambda status: advance(
+                status.numbered if seconds is None else min(status.seconds, seconds), note=_note(status)
+            )
             with keys({"q": recorder.stop}):
                 run = recorder.execute()
     _last_words(run)

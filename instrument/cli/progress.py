@@ -149,7 +149,7 @@ def one_task(
     """
     whole = description if total is None else f"{description} of {total:g}"
     with progress_bar() as bar, nullcontext() if done else kept_times.kept(whole):
-        expected = kept_times.expected(whole) or kept_times.expected(description)
+        expected = kept_times.expected(whole) or kept_times.expected(description, total or 1.0)
         task = bar.add_task(description, total=total, completed=done, note=note, expected=expected)
 
         def advance(done: float, total: float | None = None, *, note: str | None = None) -> None:

@@ -1,7 +1,7 @@
 """How long steps took on this machine: what tells of no progress is expected to take as long as last time.
 
-Steps of a simulated bench that compute light, and drawing, say something the first time, too: by how quick
-transforms are.
+What takes over two seconds on the default bench says something the first time, too, by how quick transforms
+are here: the tables below, measured by ``benchmarks/silences.py --steps``.
 Light that is kept from then on is not waited for again: with it a step is another one.
 """
 
@@ -24,19 +24,33 @@ WORTH_S = 0.5
 """Shorter ones need not be foretold."""
 _LARGEST = 1e9  # thirty years; frames, too
 _TRANSFORMS_PER_MEGAPIXEL = {
-    "Looking for hot pixels": (10.0, 10.0),
-    "Finding the scene's exposure": (120.0, 10.0),
+    "looking for hot pixels": (10.0, 10.0),
     "finding the scene's exposure": (120.0, 10.0),
-    "Frames": (110.0, 0.0),
+    "finding the source's exposure": (20.0, 20.0),
+    "frames": (110.0, 0.0),
+    "seconds": (110.0, 0.0),
     "finding exposures": (48.0, 48.0),
     "photographing bead slides": (120.0, 120.0),
-    "Rehearsing all of it on a simulated bench of its own": (110.0, 110.0),
+    "rehearsing all of it on a simulated bench of its own": (110.0, 110.0),
 }
 """Steps that compute light on a simulated bench: their time of the processor, in that of a picture of
 1024 x 1024 which is transformed and back; where light has to be computed first, and where it is there."""
-_TRANSFORMS = {"drawing": 140.0, "optics": 3300.0}
-"""Transforms that steps take the first time, of any sensor: drawing a page with its library and the list of
-fonts; all optics by default options."""
+_ANALYSED = {"analysing": 45.0}
+"""The same of steps that look at pictures of any bench, simulated or not."""
+_TRANSFORMS = {
+    "drawing": 140.0,
+    "optics": 3300.0,
+    "analyze": 950.0,
+    "comparing": 19.0,
+    "table 7.1": 75.0,
+    "hologram": 23.0,
+    "stability": 36.0,
+    "testing cameras": 950.0,
+    "testing solvers": 160.0,
+    "testing bench": 250.0,
+}
+"""Transforms that steps take the first time, of any sensor; each of those that they count. Drawing is a page
+with its library and the list of fonts; the others are by default options."""
 _ALONE_IN_IT = "drawing"
 """Keeps to one thread."""
 _FEW, _TRIED_S = 50.0, 0.05
@@ -44,7 +58,8 @@ _FEW, _TRIED_S = 50.0, 0.05
 _ALONE = 1.2
 """Times as long as if all of it were shared among the threads."""
 _of = ""
-_simulated_megapixels = 0.0
+_megapixels = 0.0
+_is_simulated = False
 _awaits_light: Callable[[], bool] = bool
 _window = False
 
@@ -56,13 +71,19 @@ class Expected(NamedTuple):
     by: str
 
 
-def about(what: str, *, simulated_megapixels: float = 0.0, awaits_light: Callable[[], bool] = bool) -> None:
-    """Say what the following steps belong to: a command, and then its bench, with its sensor if simulated.
+def about(
+    what: str,
+    *,
+    megapixels: float = 0.0,
+    simulated: bool = False,
+    awaits_light: Callable[[], bool] = bool,
+) -> None:
+    """Say what the following steps belong to: a command, and then its bench, with its sensor.
 
     ``awaits_light`` says whether a simulated frame would have its light computed first.
     """
-    global _of, _simulated_megapixels, _awaits_light
-    _of, _simulated_megapixels, _awaits_light = what, simulated_megapixels, awaits_light
+    global _of, _megapixels, _is_simulated, _awaits_light
+    _of, _megapixels, _is_simulated, _awaits_light = what, megapixels, simulated, awaits_light
 
 
 def place() -> Path:
@@ -81,15 +102,20 @@ def in_a_window() -> None:
     _window = True
 
 
-def expected(what: str) -> Expected | None:
-    """Return how long a step took last time, or takes elsewhere the first time; None: not known, or quick."""
+def expected(what: str, count: float = 1.0) -> Expected | None:
+    """Return how long a step took last time, or takes elsewhere the first time; None: not known, or quick.
+
+    ``count``: of how many it is, where it counts them.
+    """
     try:
         return Expected(sane(recall(_key(what))), "last time")
     except (LookupError, TypeError, ValueError):
-        awaited, here = _TRANSFORMS_PER_MEGAPIXEL.get(what, (0.0, 0.0))
-        transforms = (awaited if _computes_light() else here) * _simulated_megapixels
-        transforms = _TRANSFORMS.get(what.casefold(), transforms)
-        shared = what.casefold() != _ALONE_IN_IT
+        step = what.casefold()
+        transforms = _TRANSFORMS.get(step, 0.0) * count + _ANALYSED.get(step, 0.0) * _megapixels
+        if _is_simulated:
+            awaited, here = _TRANSFORMS_PER_MEGAPIXEL.get(step, (0.0, 0.0))
+            transforms += (awaited if _computes_light() else here) * _megapixels
+        shared = step != _ALONE_IN_IT
         if transforms < _FEW or not seen():
             return None
         return Expected(transforms * transform_s() * _waiting(shared=shared), "a first guess")
@@ -167,7 +193,7 @@ def _computes_light() -> bool:
 
 
 def _key(what: str) -> str:
-    computed = " with its light" if what in _TRANSFORMS_PER_MEGAPIXEL and _computes_light() else ""
+    computed = " with its light" if what.casefold() in _TRANSFORMS_PER_MEGAPIXEL and _computes_light() else ""
     return f"{_of}: {what}{computed}"
 
 

@@ -92,7 +92,7 @@ def stability(desk: Desk, options: StabilityOptions) -> Done:
 
     with (
         saying_what_is_left(out / RESULT, *pictures, kept=kept),
-        desk.step("stability", total) as advance,
+        desk.step("stability" if size == "quick" else "stability, full", total) as advance,
     ):
         for stress, picture in zip(chosen, pictures, strict=True):
             asked = set(jobs[stress.name])

@@ -63,9 +63,9 @@ def test_the_first_time_a_simulated_scene_is_exposed_goes_by_how_quick_this_mach
     monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
     kept_times.about("real bench")
     assert kept_times.expected(step) is None
-    kept_times.about("small", simulated_megapixels=0.08)
+    kept_times.about("small", megapixels=0.08, simulated=True)
     assert kept_times.expected(step) is None, "not worth a word"
-    kept_times.about("large", simulated_megapixels=5.5, awaits_light=lambda: True)
+    kept_times.about("large", megapixels=5.5, simulated=True, awaits_light=lambda: True)
     told = kept_times.expected(step)
     assert told is not None
     assert 1 < told.seconds < 20
@@ -86,7 +86,7 @@ def test_light_that_was_kept_is_not_waited_for_again(monkeypatch: pytest.MonkeyP
     step, awaited = "Finding the scene's exposure", [True]
     monkeypatch.setattr(kept_times, "transform_s", lambda: 0.01)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
-    kept_times.about("large", simulated_megapixels=5.5, awaits_light=lambda: awaited[0])
+    kept_times.about("large", megapixels=5.5, simulated=True, awaits_light=lambda: awaited[0])
     first = kept_times.expected(step)
     with kept_times.kept(step):
         awaited.clear()
@@ -111,6 +111,26 @@ def test_the_first_page_is_drawn_in_about_so_long_on_any_bench(monkeypatch: pyte
         told = kept_times.expected(what)
         assert told is not None
         assert 0.5 < told.seconds < 3
+
+
+def test_what_takes_long_is_told_the_first_time_too_each_of_what_it_counts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(kept_times, "transform_s", lambda: 0.01)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
+    kept_times.about("table7.1")
+    with one_task("table 7.1", 8):
+        few = kept_times.expected("table 7.1", 8)
+        assert few is not None
+        many = kept_times.expected("table 7.1", 96)
+        assert many is not None
+        assert many.seconds == pytest.approx(12 * few.seconds)
+    kept_times.about("real bench", megapixels=5.5)
+    analysing = kept_times.expected("analysing")
+    assert analysing is not None
+    assert analysing.by == "a first guess"
+    kept_times.about("small bench", megapixels=0.3)
+    assert kept_times.expected("analysing") is None, "a moment"
 
 
 def test_a_step_of_several_parts_is_expected_to_take_as_long_until_the_first_is_done() -> None:
