@@ -240,7 +240,15 @@ def _read(declared: Mapping[str, Option], given: Mapping[str, Any]) -> dict[str,
         values[key] = value
         if mistake := o.mistake(value, typed=True):
             wrong.append(mistake)
-    wrong += [f"{o.flag} must be given." for key, o in declared.items() if o.is_required and key not in given]
+    wrong += [_missing(o) for key, o in declared.items() if o.is_required and key not in given]
     if wrong:
         raise BenchError("\n".join(wrong))
     return values
+
+
+def _missing(o: Option) -> str:
+    """Say that an option must be given, and what it is: who lacks it may not know."""
+    said = o.declaration
+    words, unit = said.help.partition(". ")[0].rstrip("."), said.shown_unit or said.unit
+    in_unit = f", in {unit}" if unit else ""
+    return f"{o.flag} must be given" + (f": {words[0].lower()}{words[1:]}{in_unit}." if words else ".")

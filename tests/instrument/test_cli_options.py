@@ -134,7 +134,7 @@ def test_all_mistakes_are_told_at_once_with_their_flags_and_the_units_that_peopl
         "--z-mm must be a number, above 0, below 1000 (mm), not -2.",
         "--binning must be auto or a whole number, 1 or more, not 'few'.",
         "--depths must be a number, above 0, not 0.",
-        "--out must be given.",
+        "--out must be given: where to.",
     ]
     with pytest.raises(BenchError, match="--centre 'middle': could not convert"):
         run("in.tif", "-o", "x", "--centre", "middle")
