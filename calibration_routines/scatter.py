@@ -180,8 +180,11 @@ class Scatter:
         """Frames of an average whose brightness is known well enough."""
         return int(np.ceil((self.flicker / TOLERATED) ** 2))
 
-    def findings(self, what: str = "PSF") -> tuple[str, ...]:
-        """Return what is wrong with the light and the place of what was averaged, with the remedy."""
+    def findings(self, what: str = "PSF", *, put_back: bool = True) -> tuple[str, ...]:
+        """Return what is wrong with the light and the place of what was averaged, with the remedy.
+
+        ``put_back`` says that frames were put onto one another before they were averaged.
+        """
         found = []
         if self.brightness_error > TOLERATED:
             many = "one frame" if self.frames == 1 else f"{self.frames} frames"
@@ -193,10 +196,10 @@ class Scatter:
         if self.ambient > TOLERATED:
             found.append(self._other_light(what))
         if self.blur > TOLERATED:
+            how = "frames were put" if put_back else "too smooth for its frames to be put"
             found.append(
-                f"the picture shakes by {self.motion_px:.2f} pixels from frame to frame (frames were put "
-                f"onto one another; the place of a {what} is known to {self.place_error_px:.2f} pixels): "
-                f"{_STILL}."
+                f"the picture shakes by {self.motion_px:.2f} pixels from frame to frame ({how} onto one "
+                f"another; the place of a {what} is known to {self.place_error_px:.2f} pixels): {_STILL}."
             )
         return tuple(found)
 
