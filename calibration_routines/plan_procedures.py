@@ -173,6 +173,8 @@ def settled(
             words = f"a recording, {run.condition}, with {len(run.records)} of {run.n_frames} frames."
     else:
         words = f"complete already, {run.n_frames} frames read back, all as they were written."
+        if result := result_of(path):
+            words += f" To have them analysed again, move {result} away first."
     if lacks_result(path):
         for line in (*done, words):
             listener.said(line)
@@ -205,6 +207,15 @@ def _refuse_nested(run: Path) -> None:
 def routine_of(run: Path) -> Routine | None:
     """Return the routine whose results are made of such runs; None for every other run."""
     return next((one for one in routines.values() if one.purpose and one.purpose.is_of(run)), None)
+
+
+def result_of(run: Path) -> Path | None:
+    """Return where the result of a routine's run is; None where it has none, or goes on with other frames."""
+    routine = routine_of(run)
+    if routine is None or routine.purpose is None or routine.finish_takes_frames:
+        return None
+    result = routine.purpose.kept(run)
+    return result if result.exists() else None
 
 
 def lacks_result(run: Path) -> bool:

@@ -81,7 +81,12 @@ def test_a_run_that_was_cut_off_is_resumed_to_its_surface(
     assert json.loads((run / "dpc.json").read_text())["simulated"] is True
     assert (run / "dpc.png").is_file()
     assert main(["resume", str(run)]) == 0  # nothing is left to do
-    assert "Height" not in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "Height" not in said
+    assert f"To have them analysed again, move {run / 'dpc.json'} away first." in said
+    (run / "dpc.json").rename(tmp_path / "before.json")
+    assert main(["resume", str(run)]) == 0
+    assert "Height" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("creep", [0.0, 600.0])
