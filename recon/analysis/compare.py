@@ -1,7 +1,7 @@
 """Two calibrations of one camera compared: what moved, and whether to calibrate again.
 
-The new PSF is laid on the old one in blocks; from the blocks' displacements follow shift, scale and rotation
-by least squares. What is left then is a change of the pattern itself.
+What became of each PSF is in :mod:`recon.analysis.pattern_change`, which part moved in
+:mod:`recon.analysis.what_moved`; here it becomes a verdict, in sentences.
 """
 
 from __future__ import annotations
@@ -9,31 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from recon.analysis.correlation import correlate, cut_to_light, lit_extent, similarity, spot_px
-from recon.analysis.what_moved import Explanation, Seen, moved_across, moved_along
+from recon.analysis.pattern_change import PARTS, Change, compare_psfs
+from recon.analysis.what_moved import Explanation, Seen, moved_across, moved_along, seen_px, unseen
 from recon.base.blocks import block_mean
 from recon.base.checks import require_calibration
 from recon.camera.depth_mixture import central_psfs
 from recon.camera.refocus import psf_at
-from recon.camera.registration import register
-from recon.camera.transformed import geometric_centre, resampled
 from recon.errors import InputError
 from recon.types import Calibration, Geometry
 
 Array = npt.NDArray[Any]
 
-BLOCKS = 4
-"""Blocks along each side of the pattern."""
-ROUNDS = 3
-"""Times the blocks are measured, each time on what the last fit left."""
-PARTS = ROUNDS + 3
-"""Of comparing two PSFs: the whole of them, the rounds, their likeness as they lie, and turned about."""
 WIDER = 1.1
 """Spot that the old PSF makes of the new camera's light, over the sharpest: above this, calibrate again."""
 EDGE_PX = 0.5
@@ -53,40 +44,6 @@ ALIKE = 0.7
 """Inner product from which patterns are one whatever the turned one has: regular lenslets, or a spot, are
 their own half turn. Measured diffusers have 0.5 in common with theirs."""
 _SAME_PITCH = 1e-3  # relative: pitches of one camera are equal but for how they were written
-
-
-@dataclass(frozen=True, slots=True)
-class Change:
-    """What became of one PSF."""
-
-    z_um: float
-    rows: float
-    columns: float
-    """``rows`` and ``columns``: by how much the pattern moved, pixels."""
-    scale: float
-    """Size of the new pattern over that of the old one."""
-    rotation_deg: float | None
-    """From the image's right towards its bottom; None where too few parts of the pattern were recognised."""
-    as_is: float
-    aligned: float
-    """``as_is`` and ``aligned``: inner product at the best whole-pixel shift, and after shift, scale and
-    rotation are undone."""
-    spot: float
-    """Spot size of the new camera with the old PSF over that with its own."""
-    edge_px: float
-    """How far scale and rotation move the pattern's edge."""
-    decoy: float
-    """Inner product of the old PSF with the new one turned by 180 degrees, at the best whole-pixel shift.
-
-    Patterns of different diffusers have as much in common."""
-    brightness: float
-    """Light of the new PSF over the old, at equal exposure where both calibrations know theirs."""
-    place_error_px: float = 0.0
-    scale_error: float = 0.0
-    """``place_error_px`` and ``scale_error``: standard deviations of either shift, and of the size, by how
-    the blocks of the pattern agree."""
-    extent_px: float = 1.0
-    """From the pattern's middle to its corner."""
 
 
 @dataclass(frozen=True)
@@ -181,97 +138,6 @@ def compare(
     return Comparison(tuple(changes), due, (*binning, *reasons))
 
 
-def compare_psfs(
-    new: Array,
-    old: Array,
-    z_um: float = float("nan"),
-    exposure: float = 1.0,
-    on_part: Callable[[int], object] = lambda _: None,
-) -> Change:
-    """Compare two PSFs (height, width); ``exposure`` is the new one's over the old one's.
-
-    ``on_part`` gets how many of ``PARTS`` are done.
-    """
-    whole = register(new, old)
-    on_part(1)
-    light = cut_to_light(old)
-    extent = 0.5 * float(np.hypot(*light.shape))
-    factor, shift, errors = _fit(new, old, complex(whole.rows, whole.columns), lambda n: on_part(1 + n))
-    moved = _undone(new, factor, shift)
-    correlation = correlate(old, new)
-    on_part(PARTS - 1)
-    turned = correlate(old, np.ascontiguousarray(new[::-1, ::-1]))
-    on_part(PARTS)
-    return Change(
-        z_um=z_um,
-        rows=shift.real,
-        columns=shift.imag,
-        scale=abs(factor),
-        rotation_deg=float(-np.rad2deg(np.angle(factor))) if errors is not None else None,
-        as_is=correlation.maximum,
-        aligned=similarity(moved, old),
-        spot=correlation.spot_px / spot_px(new),
-        edge_px=abs(factor - 1) * extent,
-        decoy=turned.maximum,
-        brightness=float(new.sum(dtype=np.float64) / old.sum(dtype=np.float64)) / exposure,
-        place_error_px=math.inf if errors is None else errors[0],
-        scale_error=math.inf if errors is None else errors[1],
-        extent_px=extent,
-    )
-
-
-def _fit(
-    new: Array, old: Array, shift: complex, on_round: Callable[[int], object]
-) -> tuple[complex, complex, tuple[float, float] | None]:
-    """Fit ``p_new = factor p_old + shift``, positions being ``row + i column`` from the image's centre.
-
-    Returns standard deviations of a shift and of the factor, too; None where blocks were not recognised.
-    """
-    factor, errors = 1.0 + 0j, None
-    for number in range(ROUNDS):
-        places, displacements = _block_displacements(_undone(new, factor, shift), old)
-        on_round(number + 1)
-        if len(places) < 4:
-            break
-        # On the undone image: q = c p + t; q in the new image is factor q + shift.
-        matrix = np.stack([places, np.ones_like(places)], axis=1)
-        (c, t), *_ = np.linalg.lstsq(matrix, places + displacements, rcond=None)
-        shift, factor = shift + factor * t, factor * c
-        rest = displacements - (c - 1) * places - t
-        variance = float((np.abs(rest) ** 2).sum()) / (2 * len(places) - 4)  # of a row or a column
-        apart = float((np.abs(places - places.mean()) ** 2).sum())
-        errors = math.sqrt(variance / len(places)), math.sqrt(variance / max(apart, 1e-12))
-    return complex(factor), complex(shift), errors
-
-
-def _block_displacements(
-    moved: Array, old: Array
-) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.complex128]]:
-    places, displacements = [], []
-    height, width = old.shape
-    edges_y, edges_x = (
-        np.linspace(first, last + 1, BLOCKS + 1).astype(int) for first, last in lit_extent(old)
-    )
-    for top, bottom in pairwise(edges_y):
-        for left, right in pairwise(edges_x):
-            one, two = (image[top:bottom, left:right] for image in (moved, old))
-            if min(one.shape) < 8 or not (np.ptp(one) > 0 and np.ptp(two) > 0):
-                continue
-            found = register(one, two)
-            if found.reliable and max(abs(found.rows), abs(found.columns)) < 0.25 * min(one.shape):
-                places.append(complex((top + bottom - height) / 2, (left + right - width) / 2))
-                displacements.append(complex(found.rows, found.columns))
-    return np.array(places, np.complex128), np.array(displacements, np.complex128)
-
-
-def _undone(image: Array, factor: complex, shift: complex) -> npt.NDArray[np.float32]:
-    """Return ``image(factor p + shift)``: cubic splines, zero beyond the border."""
-    # (r + i c)(a + i b) = (a r - b c) + i (b r + a c)
-    matrix = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
-    centre = geometric_centre(image)
-    return resampled(image, matrix, centre + np.array([shift.real, shift.imag]) - matrix @ centre)
-
-
 def _at(old: Calibration, z_um: float) -> Array:
     depths, planes = central_psfs(old)
     nearest = int(np.argmin(np.abs(1 / depths - 1 / z_um)))
@@ -317,16 +183,20 @@ def _source_instead(change: Change, distance_um: float) -> str:
     return f"{words}; {change.brightness:.2f} is seen, which tells neither."
 
 
+def _seen(changes: list[Change]) -> list[Seen]:
+    return [
+        Seen(c.z_um, c.rows, c.columns, c.scale - 1, c.place_error_px, c.scale_error, c.extent_px)
+        for c in changes
+    ]
+
+
 def _what_moved(changes: list[Change], geometry: Geometry) -> tuple[Explanation | None, Explanation | None]:
     """Return what moved across and along, where there are several depths and the geometry is known."""
     known = geometry.diffuser_distance_mm, geometry.pixel_pitch_um
     if None in known or len(changes) < 2 or not all(math.isfinite(c.place_error_px) for c in changes):
         return None, None
     distance_um, pitch_um = 1e3 * (known[0] or 0.0), known[1] or 0.0
-    seen = [
-        Seen(c.z_um, c.rows, c.columns, c.scale - 1, c.place_error_px, c.scale_error, c.extent_px)
-        for c in changes
-    ]
+    seen = _seen(changes)
     return moved_across(seen, distance_um, pitch_um), moved_along(seen, distance_um)
 
 
@@ -347,14 +217,16 @@ def _verdict(changes: list[Change], geometry: Geometry) -> tuple[bool, tuple[str
     if spot > WIDER:
         due = True
         reasons.append(f"With the old PSFs, spots come out {spot:.2f} times as wide as they could be.")
-    if edge.edge_px > EDGE_PX:
-        due = True
-        turned = "" if not edge.rotation_deg else f" and turned by {edge.rotation_deg:+.2f} degrees"
-        cause = ""
-        if along is not None:
-            cause = f" {along.sentence}"
-        if (along is None or len(along.parts) != 1) and distance_um is not None:
+    least_px = seen_px(edge.scale_error * edge.extent_px)
+    if edge.edge_px > min(EDGE_PX, least_px):
+        due = due or edge.edge_px > EDGE_PX
+        turn_px = abs(math.radians(edge.rotation_deg or 0.0)) * edge.extent_px
+        turned = f" and turned by {edge.rotation_deg:+.2f} degrees" if turn_px > least_px else ""
+        cause = "" if along is None else f" {along.sentence}"
+        if along is None and distance_um is not None:
             cause += _either(edge, distance_um)
+        elif along is not None and len(along.parts) > 1 and distance_um is not None:
+            cause += _source_instead(edge, distance_um)
         reasons.append(
             f"The pattern is {edge.scale - 1:+.2%} in size{turned}, {edge.edge_px:.2g} pixels at its "
             f"edge.{cause}"
@@ -380,11 +252,10 @@ def _verdict(changes: list[Change], geometry: Geometry) -> tuple[bool, tuple[str
             f"The pattern moved by {largest:.3g} pixels: pictures move by as much, and stay as sharp."
             + _said(across, len(changes))
         )
-    elif across is not None:
+    elif across is not None or largest > seen_px(min(c.place_error_px for c in changes)):
         reasons.append(f"The pattern moved by {largest:.2g} pixels.{_said(across, len(changes))}")
-    if along is not None and edge.edge_px <= EDGE_PX:
-        reasons.append(f"The pattern is {edge.scale - 1:+.2%} in size. {along.sentence}")
     reasons += _light(changes)
+    reasons.append(unseen(_seen(changes), distance_um, geometry.pixel_pitch_um, DRIFTED))
     if not due:
         reasons.insert(0, "The old calibration still serves.")
     return due, tuple(reasons)

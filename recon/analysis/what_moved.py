@@ -9,6 +9,7 @@ several do where the differences exceed what the shifts are known to.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,8 +24,10 @@ _PARAXIAL = 0.01
 """Part of a shift or of a change of size to which straight rays tell it."""
 _LEAST_PX = 0.02
 """To which blocks of a pattern are registered at best."""
-_WORTH_PX = 0.25
-"""Smaller changes are not explained."""
+_WORTH_PX = 0.05
+"""Smaller changes are not told of: what stages and rooms do between any two sweeps."""
+_SEEN = 5.0
+"""Standard deviations from which a change is one: of 40 pairs of sweeps between which nothing moved, none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +45,11 @@ class Seen:
     growth_error: float
     extent_px: float
     """From its middle to its corner: what a change of size moves."""
+
+    @property
+    def edge_error_px(self) -> float:
+        """Standard deviation of how far a change of size moves the pattern's edge."""
+        return self.growth_error * self.extent_px
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +69,51 @@ class Explanation:
         return f"Which part moved cannot be told from these depths: {', or '.join(self.parts)}."
 
 
+def seen_px(error_px: float) -> float:
+    """Return from which size on a displacement is seen that is known to a standard deviation."""
+    return max(_WORTH_PX, _SEEN * error_px)
+
+
+def unseen(seen: Sequence[Seen], distance_um: float | None, pitch_um: float | None, drifted: float) -> str:
+    """Return in a sentence what may have changed without being seen.
+
+    ``drifted`` is the relative difference of light between depths that is told.
+    """
+    across = min(seen, key=lambda each: seen_px(each.place_error_px) * each.z_um)
+    along = min(seen, key=lambda each: seen_px(each.edge_error_px) / each.extent_px * each.z_um)
+    shift_px, edge_px = seen_px(across.place_error_px), seen_px(along.edge_error_px)
+    if not math.isfinite(shift_px):
+        moved = "what moved along the axis or turned, as too few parts of the pattern were recognised"
+    elif distance_um is None or pitch_um is None:
+        moved = (
+            f"what moves the pattern by less than {shift_px:.2g} pixels, its edge by less than {edge_px:.2g}"
+        )
+    else:
+        by_um, ratio = shift_px * pitch_um, distance_um / across.z_um
+        apart_um = edge_px / along.extent_px * (along.z_um + distance_um)
+        moved = (
+            f"a source that moved across by less than {_length(by_um / ratio)}, along the axis by less than "
+            f"{_length(apart_um * along.z_um / distance_um)}; a diffuser that did by less than "
+            f"{_length(by_um / (1 + ratio))} and {_length(apart_um)}"
+        )
+    if len(seen) == 1:
+        lamp = "any drift of the lamp during a sweep (one depth does not show it; several do)"
+    else:
+        lamp = f"a drift of the lamp during a sweep by less than {drifted:.0%}"
+    return f"This comparison does not see {moved}; {lamp}."
+
+
+def _length(um: float) -> str:
+    if um >= 1e3:
+        return f"{um / 1e3:.2g} mm"
+    return f"{um:.0f} um" if um >= 10 else f"{um:.1f} um"
+
+
 def moved_across(seen: Sequence[Seen], distance_um: float, pitch_um: float) -> Explanation | None:
     """Return what moved sideways; None where nothing did by :data:`_WORTH_PX`, or there is one depth."""
     shifts = np.array([complex(each.columns, each.rows) for each in seen])
-    if len(seen) < 2 or not np.abs(shifts).max() > _WORTH_PX:
+    worth = [abs(shift) > seen_px(e.place_error_px) for shift, e in zip(shifts, seen, strict=True)]
+    if len(seen) < 2 or not any(worth):
         return None
     ratio = np.array([distance_um / each.z_um for each in seen])
     errors = np.array([each.place_error_px for each in seen])
@@ -86,7 +135,8 @@ def moved_along(seen: Sequence[Seen], distance_um: float) -> Explanation | None:
     """Return what moved along the axis; None where it is not worth it, or there is one depth."""
     growth = np.array([each.growth for each in seen])
     extent = np.array([each.extent_px for each in seen])
-    if len(seen) < 2 or not np.abs(growth * extent).max() > _WORTH_PX:
+    worth = [abs(e.growth) * e.extent_px > seen_px(e.edge_error_px) for e in seen]
+    if len(seen) < 2 or not any(worth):
         return None
     z = np.array([each.z_um for each in seen])
     errors = np.array([each.growth_error for each in seen])

@@ -94,6 +94,26 @@ def test_a_diffuser_that_moved_away_is_named_with_its_distance() -> None:
     assert "One depth does not tell" in " ".join(alone.reasons)
 
 
+def test_one_depth_says_what_may_have_moved_and_what_it_does_not_see() -> None:
+    """A diffuser 0.05 mm farther moves the edge by a tenth of a pixel; a lamp that drifts, nothing."""
+    old = _first(calibration(world()))
+    found = compare(old, _first(calibration(world(diffuser_distance_mm=8.95), seed=1)))
+    assert not found.due
+    (size,) = (words for words in found.reasons if "in size" in words)
+    assert float(size.split("diffuser moved, it is ")[1].split(" um")[0]) == pytest.approx(50, rel=0.25)
+    assert "the light does not tell" in size
+    assert "turned" not in size
+    same = compare(old, _first(calibration(world(), seed=5)))
+    assert len(same.reasons) == 2
+    assert "any drift of the lamp" in same.reasons[1]
+    source_mm = float(same.reasons[1].split("along the axis by less than ")[1].split(" um")[0]) / 1e3
+    assert 0.1 < source_mm < 0.3  # at 60 mm 0.18 mm move the edge by a twentieth of a pixel
+    several = compare(calibration(world()), calibration(world(), seed=5))
+    assert "drift of the lamp during a sweep by less than 3%" in several.reasons[-1]
+    unknown = replace(old, geometry=replace(old.geometry, diffuser_distance_mm=None))
+    assert "by less than 0.05 pixels" in compare(unknown, unknown).reasons[-1]
+
+
 def _first(made: Calibration) -> Calibration:
     return made.part([0])
 
