@@ -17,7 +17,7 @@ from instrument.display.hologram import (
     HologramResult,
     bench_display,
     compute_and_judge,
-    crop_words,
+    field_words,
     load_alignment,
     prepare_target,
     read_weights,
@@ -82,7 +82,8 @@ def hologram(
     if inputs.weights is not None:
         options = replace(options, weights=read_weights(inputs.weights))
     pictures = _frames(target, video=inputs.video)
-    if said := next(filter(None, (crop_words(p, options.fit) for planes in pictures for p in planes)), ""):
+    told = (field_words(p, options.fit, in_colour=inputs.color) for planes in pictures for p in planes)
+    if said := next(filter(None, told), ""):
         typer.echo(said, err=True)
     depths = inputs.depths(1 if inputs.video else len(target))
     lasers = inputs.wavelengths if inputs.color else (None,)

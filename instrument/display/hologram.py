@@ -222,8 +222,15 @@ def field_picture(
 
     Stretched, it keeps its own number of pixels. Its greatest value is 1: phases dim nothing, a dark picture
     is shown as a bright one.
+
+    Raises BenchError for a picture with values below 0, which are no intensities.
     """
     image = np.asarray(pixels, np.float64)
+    if (least := float(image.min())) < 0:
+        raise BenchError(
+            f"The picture has values below 0 (the least is {least:.4g}), and light has none. Add an offset, "
+            "or set them to 0."
+        )
     height, width = image.shape[:2]
     side = min(height, width) if fit == "cover" else max(height, width)
     if fit == "cover":
@@ -239,20 +246,28 @@ def field_picture(
     return _to_white(image.mean(axis=2) if image.ndim == 3 else image)
 
 
-def crop_words(
+def field_words(
     pixels: npt.NDArray[Any],
     fit: Fit,
     otherwise: str = "--fit contain shows all of it, --fit stretch stretches it",
+    *,
+    in_colour: bool = False,
 ) -> str:
-    """Say what of a picture is not shown, and what shows it; empty where all of it is shown."""
+    """Say what of a picture is not shown, and what shows it; empty where all of it is shown.
+
+    ``in_colour``: its channels are shown one after the other.
+    """
     height, width = pixels.shape[:2]
-    if fit != "cover" or height == width:
-        return ""
-    side = min(height, width)
-    return (
-        f"The field is square: the middle {side} x {side} of the picture's {height} x {width} pixels are "
-        f"shown ({otherwise})."
-    )
+    said = []
+    if fit == "cover" and height != width:
+        side = min(height, width)
+        said.append(
+            f"The field is square: the middle {side} x {side} of the picture's {height} x {width} pixels are "
+            f"shown ({otherwise})."
+        )
+    if not in_colour and pixels.ndim == 3 and np.ptp(pixels, axis=2).any():
+        said.append("The picture is in colour: the mean of its channels is shown, in one colour.")
+    return " ".join(said)
 
 
 def _full_scale(pixels: npt.NDArray[Any]) -> float:

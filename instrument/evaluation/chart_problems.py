@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import bench_display, crop_words, prepare_target, slm_size
+from instrument.display.hologram import bench_display, field_words, prepare_target, slm_size
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.files.sample_images import SAMPLES
@@ -156,7 +156,7 @@ def problem_of_pictures(
         "z_mm": depths,
         "bench": config.label,
         "expansions": factors,
-        "cropped": next(filter(None, (crop_words(pixels, "cover", _SQUARE) for pixels in read)), None),
+        "cropped": next(filter(None, (field_words(pixels, "cover", _SQUARE) for pixels in read)), None),
         "simulated": True,
     }
     return HologramProblem(displays, targets, tuple(sorted(set(frames)))), about

@@ -17,7 +17,7 @@ from instrument.display.hologram import (
     HologramResult,
     bench_display,
     compute_and_judge,
-    crop_words,
+    field_words,
     load_alignment,
     prepare_target,
     slm_size,
@@ -133,7 +133,7 @@ def hologram(
     pictures = list(picture) if isinstance(picture, list | tuple) else [picture]
     depths = [float(z) for z in np.broadcast_to(np.asarray(z_mm, float), (len(pictures),))]
     pixels = [_pixels(one) for one in pictures]
-    if said := next(filter(None, (crop_words(p, options.fit) for p in pixels)), ""):
+    if said := next(filter(None, (field_words(p, options.fit) for p in pixels)), ""):
         warnings.warn(in_python(said), stacklevel=3)
     targets = [prepare_target(p, display, options, z_mm=z) for p, z in zip(pixels, depths, strict=True)]
     found = compute_and_judge(display, targets, options, callback=on_progress, cancel=cancel)

@@ -10,7 +10,7 @@ from typing import Annotated
 from instrument.bench.config import BenchConfig
 from instrument.display.hologram import (
     bench_display,
-    crop_words,
+    field_words,
     load_alignment,
     prepare_target,
     slm_size,
@@ -130,7 +130,7 @@ def limit(
     if inputs.alignment is not None:
         display = load_alignment(inputs.alignment).of(display)
     pixels = read_image(picture.target).pixels
-    if said := crop_words(pixels, options.fit):
+    if said := field_words(pixels, options.fit):
         desk.warn(said)
     return tell_limit(desk, pixels, display, options, inputs.depths(1)[0])
 

@@ -19,7 +19,7 @@ from calibration_routines.display.hologram_photograph import (
 )
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
-from instrument.display.hologram import Alignment, bench_display, field_picture, prepare_target
+from instrument.display.hologram import Alignment, bench_display, field_picture, field_words, prepare_target
 from instrument.display.limit import coarser_mask, limit_lines
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image, write_image
@@ -90,6 +90,19 @@ def test_a_dark_picture_is_judged_by_its_own_white_and_alpha_is_told(capsys):
     capsys.readouterr()
     assert main(["hologram", "clear.png", "-n", "1", "--out", "clear-slm.png"]) == 0
     assert "clear.png: alpha channel left out." in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("here")
+def test_colours_that_are_averaged_are_told_and_light_below_zero_is_refused(capsys):
+    grey = read_image("picture.png").pixels[:, :80]
+    colour = np.stack([grey, 255 - grey, grey], axis=-1)
+    assert field_words(grey, "cover") == field_words(colour, "cover", in_colour=True) == ""
+    assert field_words(np.stack([grey] * 3, axis=-1), "cover") == ""
+    assert "the mean of its channels is shown" in field_words(colour, "cover")
+    for side in (40, 1200):  # enlarged, and finer than the field
+        np.save("below.npy", np.linspace(-1, 1, side * side, dtype=np.float32).reshape(side, side))
+        assert main(["hologram", "below.npy"]) == 2
+        assert "values below 0 (the least is -1)" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("here")
