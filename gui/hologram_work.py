@@ -131,7 +131,7 @@ class Progress:
 class Computed:
     """A hologram with what it was computed for, and its patterns' files (none of a preview).
 
-    ``target`` is that of the first plane, on which the camera looks.
+    ``target`` is that of the plane in focus, on which the camera looks; where there is none, of the first.
     """
 
     order: HologramOrder
@@ -172,7 +172,8 @@ def compute(
     result = compute_and_judge(display, targets, options, callback=watch, cancel=context.cancel)
     if write:
         files.write(0, 0, result)
-    return Computed(order, display, targets[0], result, tuple(files.patterns(0, 0)) if write else ())
+    seen = next((target for target in targets if target.z_mm == 0), targets[0])
+    return Computed(order, display, seen, result, tuple(files.patterns(0, 0)) if write else ())
 
 
 def show_on_slm(bench: Bench, computed: Computed, correction: Path | None, context: JobContext) -> None:

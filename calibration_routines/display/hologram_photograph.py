@@ -208,6 +208,24 @@ def _require_lens(distance_mm: float | None) -> None:
         )
 
 
+def require_focus(depths_mm: Sequence[float], *, refined: bool = False) -> None:
+    """Refuse to photograph planes of which none is where the camera looks, or to refine one of several.
+
+    Raises BenchError.
+    """
+    told = ", ".join(f"{z_mm:g}" for z_mm in depths_mm)
+    if 0.0 not in depths_mm:
+        raise BenchError(
+            f"The picture is in focus {told} mm behind the focal plane, where the camera does not look: show "
+            "it without a photograph, or compute it without --z-mm."
+        )
+    if refined and len(depths_mm) > 1:
+        raise BenchError(
+            f"The pattern has planes {told} mm behind the focal plane: --refine would compute it anew for "
+            "the one that the camera sees, and lose the others. Photograph it without."
+        )
+
+
 def options_of_pattern(facts: Mapping[str, Any]) -> HologramOptions:
     """Return how a pattern was computed, by the facts beside it: fit, tone, envelope, fovea, mirrors' light.
 
@@ -226,8 +244,10 @@ def options_of_pattern(facts: Mapping[str, Any]) -> HologramOptions:
 def target_of_pattern(picture: Pixels, display: Display, facts: Mapping[str, Any]) -> Target:
     """Return a picture as a pattern shows it: colour, size and :func:`options_of_pattern`.
 
-    Raises BenchError where the pattern is one colour of several and the picture has none.
+    Raises BenchError where the pattern is one colour of several and the picture has none, and where none of
+    its planes is in focus on the camera.
     """
+    require_focus(facts.get("z_mm", [0.0]))
     if (colour := facts.get("colour")) in CHANNELS:
         if picture.ndim != 3 or picture.shape[2] != len(CHANNELS):
             raise BenchError(f"The pattern is the {colour} of a picture in colour; the one wanted is grey.")
@@ -252,9 +272,10 @@ def photograph_hologram(
     refining.
 
     Raises InputError when the speckle is not recognised; DeviceError when a device fails; BenchError for a
-    display without its lens.
+    display without its lens, and a target that is not in focus on the camera.
     """
     _require_lens(display.distance_mm)
+    require_focus([target.z_mm])
     options = options or CaptureOptions()
     seen = HologramCamera.registered(io, display, computed)
     refined = None

@@ -69,8 +69,14 @@ def photograph_spots(
     ``slm`` is complex (n_frames, height, width), ``computed`` how it was computed; ``progress(round,
     deviation)``. The most even pattern by photograph is kept.
 
-    Raises InputError when the camera does not see the spots; DeviceError when a device fails.
+    Raises InputError when the camera does not see the spots, or some are in focus elsewhere; DeviceError when
+    a device fails.
     """
+    if deep := int(np.count_nonzero(spots.z_mm)):
+        raise InputError(
+            f"{deep} of {len(spots)} spots are in focus before or behind the focal plane, where the camera "
+            "does not look: it would call them dim. Show them without a photograph."
+        )
     camera, _ = registered_camera(io, display)
     seen = _Spots(io, display, spots, camera, options.average)
     frame, relative = seen.measure(slm)

@@ -263,6 +263,7 @@ def _capture(
         display_of_pattern,
         options_of_pattern,
         photograph_hologram,
+        require_focus,
         target_of_pattern,
         write_capture,
         write_refined,
@@ -276,6 +277,7 @@ def _capture(
     assert opened.slm is not None
     slm = opened.slm.shape, opened.slm.pixel_pitch_um
     display = display_of_pattern(opened.config, slm, facts, place)
+    require_focus(facts.get("z_mm", [0.0]), refined=options.refine > 0)
     computed = options_of_pattern(facts)
     found = photograph_hologram(
         io,

@@ -81,12 +81,15 @@ class HologramResult:
     that reaches the picture."""
     limited_by: tuple[str, ...] = ()
     """What keeps it from being better, in words."""
+    depths_mm: tuple[float, ...] = (0.0,)
+    """Of its planes."""
 
     def facts(self, options: HologramOptions) -> dict[str, Any]:
         """Return metrics and options, JSON-compatible."""
         last = self.hologram.history[-1]
         return {
             "computed": True,
+            "z_mm": list(self.depths_mm),
             "metrics": [asdict(score) for score in self.scores],
             "efficiency": round(self.efficiency, 6),
             "limited_by": list(self.limited_by),
@@ -135,7 +138,8 @@ def compute_and_judge(
     if targets[0].window is not None:
         efficiency *= float(within(targets[0].window, whole[0]).sum() / whole[0].sum())
     why = limited_by(display, targets, hologram, model.options, efficiency) if initial is None else ()
-    return HologramResult(hologram, wanted, seen, raw, scores, efficiency, why)
+    depths_mm = tuple(float(target.z_mm) for target in targets)
+    return HologramResult(hologram, wanted, seen, raw, scores, efficiency, why, depths_mm)
 
 
 def within(window: Window | None, image: npt.NDArray[Any]) -> Image:

@@ -16,15 +16,26 @@ from calibration_routines.display.hologram_photograph import (
     display_of_pattern,
     options_of_pattern,
     photograph_hologram,
+    require_focus,
+    target_of_pattern,
 )
+from calibration_routines.display.spot_photograph import photograph_spots
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
-from instrument.display.hologram import Alignment, bench_display, field_picture, field_words, prepare_target
+from instrument.display.hologram import (
+    Alignment,
+    CaptureOptions,
+    bench_display,
+    field_picture,
+    field_words,
+    prepare_target,
+)
 from instrument.display.limit import coarser_mask, limit_lines
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image, write_image
 from instrument.files.sample_images import SAMPLES, load_sample
 from instrument.files.slm_image import levels_phase, phase_levels, read_slm_image
+from recon.errors import InputError
 from recon.holography import Display, HologramModel, HologramOptions, HologramStop, Limit, spot_array
 from recon.holography.display import no_mask
 from recon.holography.learned import Learned
@@ -139,6 +150,26 @@ def test_without_a_lens_the_fields_size_is_said_and_photographs_are_refused(caps
     with pytest.raises(FileError, match="learned behind the display's Fourier lens"):
         learned.of(display)
     assert HologramOptions().display_of(display).distance_mm == 80.0
+
+
+@pytest.mark.usefixtures("here")
+def test_only_what_is_in_focus_on_the_camera_is_photographed():
+    planes = ["picture.png", "picture.png", "--z-mm", "3", "--z-mm", "-3"]
+    assert main(["hologram", *planes, "--iterations", "1"]) == 0
+    picture, (_, facts) = read_image("picture.png").pixels, read_slm_image("slm.png")
+    assert facts["z_mm"] == [3.0, -3.0]
+    elsewhere = r"in focus 3, -3 mm behind the focal plane, where the camera does not look"
+    with pytest.raises(BenchError, match=elsewhere):
+        target_of_pattern(picture, bench(), facts)
+    with pytest.raises(BenchError, match="in focus 3 mm"):  # as the window asks for it
+        photograph_hologram(None, [], bench(), prepare_target(picture, bench(), z_mm=3.0))
+    some = facts | {"z_mm": [0.0, 3.0]}
+    assert target_of_pattern(picture, bench(), some).z_mm == 0
+    with pytest.raises(BenchError, match="and lose the others"):
+        require_focus(some["z_mm"], refined=True)
+    deep = spot_array(2, 2, z_mm=3.0)
+    with pytest.raises(InputError, match="4 of 4 spots are in focus before or behind"):
+        photograph_spots(None, np.ones((1, 96, 128)), bench(), deep, CaptureOptions(), HologramOptions())
 
 
 def test_eight_bits_and_binning_survive_the_file():
