@@ -227,12 +227,14 @@ def require_focus(depths_mm: Sequence[float], *, refined: bool = False) -> None:
 
 
 def options_of_pattern(facts: Mapping[str, Any]) -> HologramOptions:
-    """Return how a pattern was computed, by the facts beside it: fit, tone, envelope, fovea, mirrors' light.
+    """Return how a pattern was computed, by the facts beside it: tone, fovea, phase levels, mirrors' light.
 
     Weights from a file are not kept with a pattern: the whole field counts then.
     """
     said = facts.get("options", {})
-    names = ("fit", "srgb", "lift", "envelope", *(("mirrors", "light") if is_of_mirrors(facts) else ()))
+    names = ("fit", "srgb", "lift", "envelope", "phase_levels")
+    if is_of_mirrors(facts):
+        names = (*names, "mirrors", "light")
     if said.get("loss") == "spatial" and facts.get("own_weights") is False:
         names = (*names, "loss", "centre", "radius", "periphery")
     given: dict[str, Any] = {name: said[name] for name in names if name in said}

@@ -36,7 +36,15 @@ from instrument.files.images import read_image, write_image
 from instrument.files.sample_images import SAMPLES, load_sample
 from instrument.files.slm_image import levels_phase, phase_levels, read_slm_image
 from recon.errors import InputError
-from recon.holography import Display, HologramModel, HologramOptions, HologramStop, Limit, spot_array
+from recon.holography import (
+    Display,
+    HologramModel,
+    HologramOptions,
+    HologramStop,
+    Limit,
+    compute_hologram,
+    spot_array,
+)
 from recon.holography.display import no_mask
 from recon.holography.learned import Learned
 from recon.holography.pose import Pose
@@ -254,6 +262,16 @@ def test_an_slm_of_few_levels_gets_a_pattern_on_them(capsys):
     slm = np.exp(1j * levels_phase(levels, facts["binning"]))[None]
     found = seen_db(slm, bench(), read_image("picture.png").pixels)
     assert found == pytest.approx(facts["metrics"][0]["psnr_db"], abs=0.05)
+    again = HologramModel(bench(), [target_of_pattern(read_image("picture.png").pixels, bench(), facts)])
+    refined = compute_hologram(
+        again, initial=slm, iterations=5, phase_levels=options_of_pattern(facts).phase_levels
+    )
+    assert set(np.unique(phase_levels(refined.phase_rad))) <= {
+        0,
+        64,
+        128,
+        192,
+    }  # by the camera in the loop too
     assert main(["hologram", "picture.png", "--levels", "5", "--out", "five.png"]) == 2
     assert "5 phase levels" in capsys.readouterr().err
 
