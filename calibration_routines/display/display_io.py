@@ -173,6 +173,14 @@ class DisplayBench:
         """The camera's largest count."""
         return (1 << self.bench.camera.significant_bits) - 1
 
+    def saturated(self, photograph: Array) -> npt.NDArray[np.bool_]:
+        """Return which pixels of the photograph taken last, counts a millisecond, are at full scale."""
+        dark = 0.0 if self._dark is None else self._dark[1]
+        found: npt.NDArray[np.bool_] = (
+            photograph * self.bench.camera.exposure_ms + dark >= self.full_scale - 0.5
+        )
+        return found
+
     def exposure_ms(self, mean_per_ms: float) -> float:
         """Return the exposure at which the mean, so many counts a millisecond, is a twelfth of full scale."""
         return self.full_scale / (12 * mean_per_ms)

@@ -48,7 +48,7 @@ class Capture:
     """The target on the same grid, low-passed."""
     scores: Scores
     saturated_fraction: float
-    """Of the photograph's pixels."""
+    """Of the camera's pixels, at full scale in any of the photographs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +93,13 @@ class HologramCamera:
         io, display = self.io, self.display
         exposure_ms = io.exposure_ms(self.mean_per_ms)
         total = np.zeros(io.bench.camera.image_shape)
+        saturated = np.zeros(total.shape, bool)
         for shown in fields:
             io.show(shown)
             for _ in range(average):
-                total += io.photograph(exposure_ms)
-        ceiling = 0.98 * io.full_scale / io.bench.camera.exposure_ms * len(fields) * average
+                frame = io.photograph(exposure_ms)
+                saturated |= io.saturated(frame)
+                total += frame
         band = make_band(display.slm_shape, display.factor, "alias-free")
         seen = low_passed_picture(self.camera.lags(total, band), band, display.slm_shape)
         wanted, peak = wanted_picture(target, display)
@@ -105,7 +107,7 @@ class HologramCamera:
         scaled = seen * (wanted.mean() / seen.mean())
         weights = self.computed.field_weights() if target.window is None else None
         scores = compare(scaled, wanted, peak, weights)
-        return Capture(scaled / peak, wanted / peak, scores, float((total >= ceiling).mean()))
+        return Capture(scaled / peak, wanted / peak, scores, float(saturated.mean()))
 
     def refine(
         self,

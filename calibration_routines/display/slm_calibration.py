@@ -285,7 +285,8 @@ def _exposure_ms(io: DisplayBench) -> float:
     camera = io.bench.camera
     io.show_levels(np.zeros(io.slm.shape, np.uint8))
     first = io.photograph(camera.exposure_ms)
-    lit = float(np.mean(first[first > np.median(first) / 4]))
+    bright = first[first > np.median(first) / 4]
+    lit = float(bright.mean()) if bright.size else 0.0
     if lit <= 0:
         raise BenchError(f"{camera.name}: it is dark. Check that the laser shines and the exposure.")
     return io.exposure_ms(lit)
