@@ -327,7 +327,7 @@ class AlignmentProcedure(Procedure):
     settings: AlignmentSettings = field(default_factory=AlignmentSettings)
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
-        """Refuse a bench without phase SLM, a display that does not fit, files that exist or are wrong."""
+        """Refuse a bench without phase SLM or mask, an endless search, files that exist or are wrong."""
         slm = require_slm(bench, "a mask is aligned by the spots of a phase SLM in their place")
         if (out := self.settings.out) is not None:
             for file in (out, out.with_suffix(".png")):
@@ -335,6 +335,7 @@ class AlignmentProcedure(Procedure):
         if self.settings.slm_calibration is not None:
             load_slm_correction(self.settings.slm_calibration)
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
+        self.settings.require(display)
         moves = self.settings.moves
         return Outlook(
             (

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,27 @@ class AlignmentSettings(SeenAgain, Checked):
     def last_frames(self) -> int:
         """Frames of the last measurements, sections and pose; kept in reserve by what comes before."""
         return self.section_pictures + self.refinements + 2 + STEADY_FRAMES
+
+    def search_grid(self, display: Display) -> tuple[int, int]:
+        """Return how many depths the search for the shift has, and steps of an SLM pixel to each side."""
+        return max(1, ceil(self.depth_um / depth_um(display))), ceil(self.reach / display.factor)
+
+    def require(self, display: Display) -> None:
+        """Refuse before anything moves what could only fail: no mask, sections, a search without end.
+
+        Raises BenchError or InputError.
+        """
+        if len(np.unique(display.mask.levels)) == 1:
+            raise BenchError("The bench's [display] has no mask (its expansion is 1): none can be aligned.")
+        Sections(display.slm_shape, self.division.shape)
+        layers, steps = self.search_grid(display)
+        pictures = ceil(layers * (2 * steps + 1) ** 2 / self.spots)
+        if pictures + self.last_frames > self.max_frames:
+            raise BenchError(
+                f"To search ±{self.reach:g} mask pixels and ±{self.depth_um:g} um takes {pictures} pictures "
+                f"of {self.spots} spots, and what follows {self.last_frames} or more; {self.max_frames} may "
+                "be taken. Search less (--reach, --depth-um), or allow more (--max-frames)."
+            )
 
 
 class AlignmentSession:
@@ -343,8 +365,7 @@ def search_pose(session: AlignmentSession) -> Pose:
 def _shifts(session: AlignmentSession) -> list[Pose]:
     """Search the whole reach in steps of one SLM pixel, at as many depths as spots need."""
     settings, k = session.settings, session.display.factor
-    steps = int(np.ceil(settings.reach / k))
-    layers = max(1, int(np.ceil(settings.depth_um / depth_um(session.display))))
+    layers, steps = settings.search_grid(session.display)
     depths = np.linspace(-1, 1, 2 * layers + 1)[1::2] * settings.depth_um if layers > 1 else np.zeros(1)
     grid = [(i, j) for i in range(-steps, steps + 1) for j in range(-steps, steps + 1)]
     hypotheses = [Pose(shift_x=k * j, shift_y=k * i, z_um=z) for z in depths for i, j in grid]

@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 
 from calibration_routines.display.display_io import DisplayBench
-from calibration_routines.display.mask_alignment import AlignmentFailedError, AlignmentSettings, MaskAlignment
+from calibration_routines.display.mask_alignment import (
+    AlignmentFailedError,
+    AlignmentProcedure,
+    AlignmentSettings,
+    MaskAlignment,
+)
 from calibration_routines.display.mask_stage import PlacementCost
 from calibration_routines.display.slm_calibration import (
     MAX_PHASE_ERROR_RAD,
@@ -19,12 +24,13 @@ from calibration_routines.display.slm_calibration import (
     measure_look_up_table,
     steady_phases,
 )
-from calibration_routines.procedure import CalibrationError
+from calibration_routines.procedure import CalibrationError, Size
 from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
 from instrument.display.hologram import bench_display, load_alignment
+from instrument.files.errors import BenchError
 from instrument.files.images import write_image
 from instrument.files.slm_image import SlmCorrection, load_slm_correction, phase_levels
 from recon.errors import InputError
@@ -70,6 +76,23 @@ def test_it_says_so_when_it_fails_and_puts_the_stage_back() -> None:
         with pytest.raises(AlignmentFailedError, match="failed: spots reach"):
             aligned(bench)
         assert bench.stage.commanded_position() == {axis.name: 0.0 for axis in bench.stage.axes}
+
+
+@pytest.mark.parametrize(
+    ("changes", "settings", "words"),
+    [
+        ({"expansion": "1"}, {}, "has no mask"),
+        ({}, {"division": Size(60, 5)}, "cannot be divided into"),
+        ({}, {"reach": 1e6}, "may be taken. Search less"),
+        ({}, {"depth_um": 1e9}, "may be taken. Search less"),
+    ],
+)
+def test_what_can_only_fail_is_refused_before_anything_moves(changes, settings, words) -> None:
+    with Bench(parse_config(small(**changes), None)).open() as bench:
+        with pytest.raises((BenchError, InputError), match=words):
+            AlignmentProcedure(AlignmentSettings(**settings)).outlook(bench)
+        if not changes:
+            assert AlignmentProcedure().outlook(bench)
 
 
 def test_another_mask_is_noticed_at_once() -> None:
