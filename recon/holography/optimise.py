@@ -334,11 +334,15 @@ def _on_levels(variable: Phase, x: Array, levels: int, watch: _Watch, stages: St
                 away[variable.held] = -1
             variable.held = away <= np.quantile(away, held)
             x[variable.held] = np.rint(x[variable.held] / step) * step
-        if reason is HologramStop.CANCELLED or reason is HologramStop.TIME:
+        if reason in (HologramStop.CANCELLED, HologramStop.TIME, HologramStop.QUALITY):
             continue
         search = _Lbfgs(variable, x)
+
+        def rounded_db(search: _Lbfgs = search) -> float:
+            return variable.evaluate(np.rint(search.x / step) * step)[0].psnr_db
+
         iterations = round(watch.options.iterations * done)
-        history, reason = watch.run(search, iterations, None, history)
+        history, reason = watch.run(search, iterations, watch.options.psnr_db, history, rounded_db)
         x = search.x
     variable.held = None
     return _rounded(variable, np.rint(x / step) * step, history, reason)
@@ -374,7 +378,11 @@ def _on_mirrors(
     variable = kind(model, FIRST_ORDER)
     start = _start(None, model, options) if initial is None else decoded(initial)
     search = _Lbfgs(variable, variable.pack(start))
-    history, reason = watch.run(search, options.iterations, options.psnr_db)
+
+    def coded_db() -> float:
+        return model.evaluate(coded(search.slm)).seen_psnr_db
+
+    history, reason = watch.run(search, options.iterations, options.psnr_db, shown_db=coded_db)
     last, shown = history[-1], coded(search.slm)
     found = model.evaluate(shown)
     record = HologramRecord(last.iteration, last.seconds, found.loss, found.seen_psnr_db)
@@ -429,16 +437,22 @@ class _Watch:
         iterations: int,
         psnr_db: float | None,
         before: tuple[HologramRecord, ...] = (),
+        shown_db: Callable[[], float] | None = None,
     ) -> tuple[tuple[HologramRecord, ...], HologramStop]:
-        """Step on; ``before`` is the history so far, whose iterations count."""
+        """Step on; ``before`` is the history so far, whose iterations count.
+
+        ``shown_db`` is the PSNR of what would be shown, where that is not what the search moves.
+        """
         history = [*before] or [HologramRecord(0, 0.0, *search.point)]
         seconds, calm = history[-1].seconds, 0
         tolerance = TOLERANCE if self.options.tolerance is None else self.options.tolerance
         while True:
-            last = history[-1]
-            if (reason := self._ended(last, seconds, iterations, psnr_db)) is not None:
+            last, began = history[-1], time.perf_counter()
+            reason = self._ended(last, seconds, iterations, psnr_db)
+            if reason is HologramStop.QUALITY and shown_db is not None and shown_db() < (psnr_db or 0.0):
+                reason = self._ended(last, seconds, iterations, None)
+            if reason is not None:
                 return tuple(history), reason
-            began = time.perf_counter()
             found = search.step()
             seconds += time.perf_counter() - began
             if found is None:

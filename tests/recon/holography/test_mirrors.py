@@ -12,6 +12,7 @@ from recon.holography import (
     Display,
     HologramModel,
     HologramOptions,
+    HologramStop,
     Target,
     compute_hologram,
     judge,
@@ -67,6 +68,22 @@ def test_mirrors_show_a_picture_in_two_states(display: Display) -> None:
         assert 10 < judge(found.slm, display, wanted).psnr_db < optimised - gain
         warm = compute_hologram(HologramModel(display, [wanted], options), initial=found.slm, iterations=1)
         assert warm.history[0].loss < 0.2 * found.history[0].loss
+
+
+@pytest.mark.parametrize(("mirrors", "levels"), [("optimised", None), ("off-axis", None), (None, 4)])
+def test_the_quality_asked_for_is_that_of_what_is_shown(mirrors: str | None, levels: int | None) -> None:
+    wanted = target(BARE.mask.shape) if mirrors else Target(target(BARE.mask.shape).image + 0.2)
+    options = HologramOptions(mirrors=mirrors, phase_levels=levels, iterations=40)
+    model = HologramModel(BARE, [wanted], options)
+    whole = compute_hologram(model)
+    asked = whole.history[-1].psnr_db - 1.5
+    found = compute_hologram(model, psnr_db=asked)
+    assert found.stop_reason is HologramStop.QUALITY
+    assert found.history[-1].psnr_db >= asked
+    assert found.history[-1].iteration < whole.history[-1].iteration
+    beyond = compute_hologram(model, psnr_db=whole.history[-1].psnr_db + 0.5)  # less than unrounded, or coded
+    assert beyond.stop_reason is not HologramStop.QUALITY
+    np.testing.assert_array_equal(beyond.slm, whole.slm)
 
 
 def test_the_first_order_of_fringes_is_the_field_over_pi() -> None:
