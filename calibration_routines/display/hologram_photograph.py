@@ -234,7 +234,7 @@ def options_of_pattern(facts: Mapping[str, Any]) -> HologramOptions:
     Weights from a file are not kept with a pattern: the whole field counts then.
     """
     said = facts.get("options", {})
-    names = ("fit", "srgb", "lift", "envelope", "phase_levels")
+    names: tuple[str, ...] = ("fit", "srgb", "lift", "envelope", "phase_levels")
     if is_of_mirrors(facts):
         names = (*names, "mirrors", "light")
     if said.get("loss") == "spatial" and facts.get("own_weights") is False:
