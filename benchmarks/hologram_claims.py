@@ -46,9 +46,10 @@ MOVES = 6
 
 
 def display_of(slm: tuple[int, int], q: int) -> Display:
-    """Return a display with a random mask."""
+    """Return a display with a random mask, or with none where it expands nothing."""
     k = round(q**0.5)
-    return Display(slm, random_mask((slm[0] * k, slm[1] * k), seed=q))
+    mask = no_mask(slm) if q == 1 else random_mask((slm[0] * k, slm[1] * k), seed=q)
+    return Display(slm, mask)
 
 
 def solve(
@@ -64,10 +65,10 @@ def psnr(slm: np.ndarray, display: Display, target: Target) -> float:
     return judge(slm, display, target).psnr_db
 
 
-def dc_term(slm: tuple[int, int], iterations: int) -> list[tuple[str, float]]:
+def dc_term(slm: tuple[int, int], iterations: int, expansions: list[int]) -> list[tuple[str, float]]:
     """No DC term; one that is modelled; one that is ignored."""
     lines = []
-    for q in (4, 16):
+    for q in expansions:
         plain = display_of(slm, q)
         with_dc = replace(plain, dc=DC)
         sums = np.zeros(3)
@@ -136,7 +137,7 @@ def windowed(name: str, shape: tuple[int, int]) -> Target:
 def mirrors(slm: tuple[int, int], iterations: int) -> Iterator[tuple[str, float]]:
     """Patterns of mirrors beside a phase SLM's, 8 and 24 frames too: quality, and light in the picture."""
     for q in (1, 4, 16):
-        display = Display(slm, no_mask(slm)) if q == 1 else display_of(slm, q)
+        display = display_of(slm, q)
         ways: list[dict[str, Any]] = [{"mirrors": "optimised", "frames": n} for n in FRAMES[q]]
         ways.insert(0, {})
         if q == 1:
@@ -197,6 +198,7 @@ def main() -> None:
     parser.add_argument("--slm", default="135x240")
     parser.add_argument("--iterations", type=int, default=100)
     parser.add_argument("--only", choices=["dc", "complex", "frames", "warm", "mirrors"], help="one")
+    parser.add_argument("--expansions", type=int, nargs="+", default=[1, 4, 16], help="for --only dc")
     parser.add_argument("--picture", type=Path, help="a file for --only frames, instead of the samples")
     parser.add_argument("--out", type=Path, default=Path("hologram-claims.csv"))
     options = parser.parse_args()
@@ -206,7 +208,7 @@ def main() -> None:
         writer = csv.writer(file)
         writer.writerow(["case", "psnr_db"])
         parts = {
-            "dc": lambda: dc_term((rows, columns), options.iterations),
+            "dc": lambda: dc_term((rows, columns), options.iterations, options.expansions),
             "complex": lambda: complex_slm((rows, columns), options.iterations),
             "frames": lambda: frames((rows, columns), options.iterations, options.picture),
             "warm": lambda: warm_start((rows, columns)),

@@ -276,6 +276,25 @@ class Display:
         y, x = (np.sinc(fill * np.fft.fftfreq(n)) ** 2 for n in shape)
         return y, x
 
+    def dimmed(self, z_mm: float = 0.0) -> float:
+        """Return the part of its light that a picture costs which leaves no spot of DC light, 0 to 0.8.
+
+        DC light that passes the mask undiffracted and is in focus is a spot on the axis. The modulated light
+        takes it away by an opposite mean, and with ``s`` of modulus 1 that leaves ``1 - 2 p`` of all light
+        (``p``: the DC term's power). Through a mask, whose mean over an SLM pixel is ``M``, the smallest such
+        change of ``s`` goes with ``conj(M)`` and costs ``2 p |mean M|^2 / mean |M|^2``; the mask's pixels are
+        taken for independent of each other. Less than a hundredth is none.
+        """
+        if self.dc.power == 0 or self.near:
+            return 0.0
+        count = np.bincount(self.mask.levels.ravel(), minlength=len(self.mask.phases_rad))
+        straight = abs(count @ self.mask.response(self.wavelength_nm) / self.mask.levels.size) ** 2
+        focused = np.prod([abs(h.mean()) ** 2 for h in self.defocus(z_mm)])
+        if self.learned is not None:
+            focused *= abs(self.learned.illumination(self.slm_shape).mean()) ** 2
+        lost = 2 * self.dc.power * straight * focused / (straight + (1 - straight) / self.expansion)
+        return float(min(lost, 0.8)) if lost > 0.01 else 0.0
+
     def taught(self, learned: Learned) -> Display:
         """Return the display with what was learned of it."""
         light = complex(*learned.dc)

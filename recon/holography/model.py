@@ -339,6 +339,8 @@ class HologramModel:
         share = self.options.share
         if self.display.near:  # the light beside its square goes nowhere else
             share *= min(self.display.mask.shape) / max(self.display.mask.shape)
+        if not self.options.complex_slm and self.window is None:  # else there is light to spare
+            share *= 1 - max(self.display.dimmed(target.z_mm) for target in self.targets)
         spectrum *= share
         return spectrum.astype(self.dtype), peak * share
 

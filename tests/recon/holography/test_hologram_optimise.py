@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from recon.holography import (
     judge,
     random_mask,
 )
+from recon.holography.display import no_mask
 from recon.holography.variables import Bounded
 
 SHAPE, K = (48, 64), 2
@@ -108,6 +110,26 @@ def test_a_modelled_dc_term_costs_little_and_an_ignored_one_much():
     ignored = judge(ideal.slm, dirty, Target(picture())).psnr_db
     assert modelled.history[-1].psnr_db > ideal.history[-1].psnr_db - 0.7
     assert modelled.history[-1].psnr_db > ignored + 3
+
+
+def test_dc_light_that_no_mask_scatters_costs_light_and_hardly_a_picture():
+    """Its spot is taken away by an opposite mean, which leaves 1 - 2 p of all light."""
+    clean = Display(SHAPE, no_mask(SHAPE))
+    dirty = replace(clean, dc=DcTerm(0.1, 0.5))
+    shown = [make_model(display=d, image=picture(SHAPE)) for d in (clean, dirty)]
+    found = [compute_hologram(model, iterations=80) for model in shown]
+    target = Target(picture(SHAPE))
+    seen = [judge(f.slm, d, target).psnr_db for f, d in zip(found, (clean, dirty), strict=True)]
+    assert seen[1] > seen[0] - 1  # 5 dB less where all of the light was asked for
+    assert shown[1].efficiency(found[1].slm) == pytest.approx(0.8, abs=0.01)
+    assert dirty.dimmed() == pytest.approx(0.2)
+    assert dirty.dimmed(100.0) < 0.02  # out of focus there is no spot
+    assert clean.dimmed() == 0
+    mask = random_mask((SHAPE[0] * K, SHAPE[1] * K), design_wavelength_nm=660.0)
+    scattering = Display(SHAPE, mask, dc=DcTerm(0.1, 0.5))
+    assert scattering.dimmed() == 0
+    blue = replace(scattering, wavelength_nm=450.0)  # of which 0.45 passes undiffracted
+    assert blue.dimmed() == pytest.approx(0.2 * 0.45 / (0.45 + 0.55 / K**2), rel=0.05)
 
 
 def test_a_complex_slm_beats_a_phase_slm_beside_a_dc_term_at_the_light_that_was_asked_for():
