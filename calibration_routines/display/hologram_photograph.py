@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -303,8 +304,10 @@ def write_refined(pattern: Path, refined: Refinement, facts: Mapping[str, Any], 
 
 
 def write_capture(path: Path, found: Photographed) -> None:
-    """Write what was seen as an 8-bit image, white at 255, and its metrics beside it."""
-    pixels = np.clip(np.rint(found.capture.seen * 255), 0, 255).astype(np.uint8)
+    """Write what was seen as an 8-bit image, square as the field, white at 255, and its metrics beside it."""
+    side = max(found.capture.seen.shape)
+    square = cv2.resize(found.capture.seen, (side, side), interpolation=cv2.INTER_CUBIC)
+    pixels = np.clip(np.rint(square * 255), 0, 255).astype(np.uint8)
     facts = {
         "simulated": found.simulated,
         "background": "estimated" if found.background_estimated else "measured",

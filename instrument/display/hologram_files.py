@@ -162,7 +162,7 @@ def light_words(result: HologramResult, options: HologramOptions) -> str:
     return f"{result.efficiency:.1%} of what falls on the SLM reaches the {where}"
 
 
-_DETAIL = "middle sixteenth of the field, raw intensity, half as bright"
+_DETAIL = "its middle, raw, half as bright"
 
 
 def hologram_figure(result: HologramResult, *, title: str, facts: list[tuple[str, str]]) -> Figure:
