@@ -90,7 +90,11 @@ def twin_of(bench: Bench) -> Iterator[tuple[Bench, Path] | None]:
         yield None
         return
     with TemporaryDirectory(prefix="diffuserbench-rehearsal-") as folder, open_bench(config) as twin:
-        yield twin, Path(folder)
+        try:
+            yield twin, Path(folder)
+        except BaseException as error:  # its notes tell of frames that are kept: these go with the folder
+            error.__notes__ = [note for note in getattr(error, "__notes__", ()) if folder not in note]
+            raise
 
 
 def time_scale(bench: Bench) -> float:

@@ -16,6 +16,7 @@ from calibration_routines.rehearsal import ENOUGH_S, rehearse_whole
 from drivers.errors import DeviceError
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
+from instrument.runs.rehearsal import twin_of
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import RunState, RunStatus
 
@@ -157,6 +158,19 @@ def test_slides_are_counted_and_not_their_frames(bench: Bench, hands: Hands) -> 
     (words,) = told(deed, bench)
     assert f"about {9 * ENOUGH_S / 60:.0f} min" in words
     assert '"photographing slide"' in words
+
+
+def test_ctrl_c_in_a_rehearsal_tells_of_no_frames_that_went_with_it(bench: Bench) -> None:
+    interruption = KeyboardInterrupt()
+    interruption.add_note("led_array: was unplugged.")
+
+    def interrupted(folder: Path) -> None:
+        interruption.add_note(f"To go on: diffuserbench resume {folder}/run")
+        raise interruption
+
+    with pytest.raises(KeyboardInterrupt), twin_of(bench) as made:
+        interrupted(made[1] if made is not None else Path())
+    assert interruption.__notes__ == ["led_array: was unplugged."]
 
 
 def test_what_cannot_be_rehearsed_is_not_told(bench: Bench, tmp_path: Path) -> None:
