@@ -13,6 +13,7 @@ from drivers.camera import Camera
 from drivers.common.stream import FrameStream
 from drivers.errors import DeviceError
 from drivers.frame import Frame
+from instrument.bench.safety import note_failures
 from instrument.live.frame_view import Counts
 
 _BUFFERS = 8
@@ -78,15 +79,24 @@ class LiveCamera:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Keep the camera idle for a block (a photograph, a change of its region), then go on as before."""
+        """Keep the camera idle for a block (a photograph, a change of its region), then go on as before.
+
+        Where the block failed, that stays the error, whatever keeps the camera from going on.
+        """
         with self._changing:
             was_running = self.is_running
             self.stop()
             try:
                 yield
-            finally:
-                if was_running:
-                    self.start()
+            except BaseException as error:
+                try:
+                    if was_running:
+                        self.start()
+                except DeviceError as failure:
+                    note_failures(error, failure)
+                raise
+            if was_running:
+                self.start()
 
     @property
     def is_running(self) -> bool:

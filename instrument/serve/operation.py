@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
@@ -63,7 +64,7 @@ class Operation:
 
     def __init__(self, config: BenchConfig, say: Callable[[str], None]) -> None:
         self.config = config
-        self._say = say
+        self._tell = say
         self._taking, self._dropping = threading.RLock(), threading.Lock()
         self._bench: Bench | None = None
         self._dropped: Bench | None = None
@@ -157,11 +158,13 @@ class Operation:
             failure = error
         with self._taking:
             if self._bench is bench:
-                for hold in self._holds.values():
-                    hold.on_end(reason)
-                self._say(reason.problem)
-                self._dismissed = (operator.key, reason)
-                self._end(bench)
+                try:
+                    for hold in self._holds.values():
+                        hold.on_end(reason)
+                    self._say(reason.problem)
+                finally:  # whoever cannot be told, the devices are closed
+                    self._dismissed = (operator.key, reason)
+                    self._end(bench)
         if failure is not None:
             self.trouble = str(failure)
             self._say(self.trouble)
@@ -193,6 +196,11 @@ class Operation:
         self._bench, self.operator = None, None
         if operator is not None and operator != WATCHER:
             self._say(f"No longer operated by {operator.words}.")
+
+    def _say(self, sentence: str) -> None:
+        """Tell whoever looks after the server; a closed terminal or a full disk ends nothing half-way."""
+        with suppress(OSError, ValueError):
+            self._tell(sentence)
 
     def _close(self, bench: Bench) -> None:
         try:

@@ -326,6 +326,26 @@ def test_calls_that_come_after_the_stop_are_not_kept() -> None:
     assert depths == depths[:1] * 3, "what was raised again holds the calls before"
 
 
+def test_a_server_whose_terminal_is_closed_opens_and_closes_as_ever() -> None:
+    def closed(_: str) -> None:
+        raise BrokenPipeError
+
+    def gone(_: DeviceError) -> None:
+        raise RuntimeError("Event loop is closed")
+
+    operation = Operation(parse_config(BENCH, None), closed)
+    operator = Operator("key", "somebody")
+    device = operation.take("led_array", operator, lambda _: None)
+    assert operation.operator == operator
+    operation.let_go("led_array", operator)
+    assert not device.is_open
+    device = operation.take("led_array", operator, gone)
+    with pytest.raises(RuntimeError, match="loop is closed"):
+        operation.stop("a hand")
+    assert not device.is_open
+    assert operation.operator is None
+
+
 @pytest.mark.parametrize("how", ["let_go", "drop"])
 def test_pieces_that_come_while_their_sender_leaves_are_not_kept(
     how: str, server: BenchServer, options: RemoteOptions, monkeypatch: pytest.MonkeyPatch
