@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 
 
 def chart_page(data: ChartData) -> str:
-    """Return a page: points to hover over, families to switch off, axes to choose; the front by name."""
+    """Return a page: points to hover over, families to switch off, axes to choose; the front by name.
+
+    A click on a point or line picks its setting out, by name.
+    """
 
     def known(axes: Iterable[Any]) -> list[dict[str, Any]]:
         return [asdict(axis) for axis in axes if any(is_known(p, axis.key) for p in data.points)]
@@ -51,7 +54,7 @@ h1{font-size:1.2em}label{margin-right:1em;white-space:nowrap}
 svg text{fill:var(--ink)}svg .grid{stroke:var(--line)}
 #tip{position:absolute;background:var(--ground);border:1px solid #8496a5;padding:.4em .6em;
 font-size:12px;white-space:pre;pointer-events:none;display:none}.front{stroke:var(--ink);stroke-width:1.5}
-polyline{fill:none}
+polyline{fill:none}.reach{stroke:transparent;stroke-width:11;cursor:pointer}circle{cursor:pointer}
 </style></head><body><h1>@TITLE@</h1>
 <p><span id="which">of: <select id="group"></select></span> x: <select id="x"></select>
 y: <select id="y"></select> <span id="keys"></span></p>
@@ -60,6 +63,7 @@ y: <select id="y"></select> <span id="keys"></span></p>
 <script>
 const data = @DATA@, plot = document.getElementById("plot"), tip = document.getElementById("tip");
 const xs = document.getElementById("x"), ys = document.getElementById("y"), off = new Set();
+let picked = null;
 const group = document.getElementById("group"), named = document.getElementById("named");
 for (const axis of data.costs) xs.add(new Option(axis.words, axis.key));
 for (const axis of data.scores) ys.add(new Option(axis.words, axis.key));
@@ -88,13 +92,17 @@ function scale(values, logarithmic, from, to) {
     const steps = high - low > 3 ? [1] : [1, 2, 5];
     for (let e = Math.floor(low); e <= high; e++) for (const s of steps) ticks.push(s * 10 ** e);
     ticks = ticks.filter(v => f(v) >= low && f(v) <= high);
-  } else for (let i = 0; i <= 5; i++) ticks.push(low + (high - low) * i / 5);
+  } else {
+    const ten = 10 ** Math.floor(Math.log10((high - low) / 5)), least = (high - low) / 7;
+    const step = ten * ([1, 2, 5].find(s => s * ten >= least) || 10);
+    for (let i = Math.ceil(low / step); i * step <= high; i++) ticks.push(i * step);
+  }
   return [place, ticks];
 }
 function draw() {
   plot.replaceChildren(); named.replaceChildren();
   const x = data.costs.find(a => a.key === xs.value), y = data.scores.find(a => a.key === ys.value);
-  const left = 60, right = 880, top = 15, bottom = 470;
+  const left = 75, right = 880, top = 15, bottom = 470;
   const seen = data.points.filter(p => p.group === group.value && !off.has(p.family) &&
     p[x.key] !== null && p[y.key] !== null);
   if (!seen.length) { node("text", {x: left, y: 40}, "nothing to show"); return; }
@@ -109,6 +117,8 @@ function draw() {
     node("text", {x: left - 6, y: py(v) + 4, "font-size": 12, "text-anchor": "end"}, short(v));
   }
   node("text", {x: (left + right) / 2, y: bottom + 40, "font-size": 13, "text-anchor": "middle"}, x.words);
+  node("text", {transform: `translate(16 ${(top + bottom) / 2}) rotate(-90)`, "font-size": 13,
+    "text-anchor": "middle"}, y.words);
   const sign = y.more_is_better ? 1 : -1, front = [];
   for (const p of [...seen].sort((a, b) => a[x.key] - b[x.key] || sign * (b[y.key] - a[y.key])))
     if (!front.length || sign * p[y.key] > sign * front[front.length - 1][y.key]) front.push(p);
@@ -116,9 +126,16 @@ function draw() {
   for (const p of seen) runs.set(p.setting, [...(runs.get(p.setting) || []), p]);
   const line = (ps, attributes) => node("polyline", {...attributes,
     points: ps.map(p => px(p[x.key]) + "," + py(p[y.key])).join(" ")});
-  for (const ps of runs.values()) line(ps, {stroke: data.colours[ps[0].family], "stroke-opacity": 0.3});
+  if (!runs.has(picked)) picked = null;
+  const opacity = (setting, usual) => !picked ? usual : setting === picked ? 1 : usual / 3;
+  const pick = setting => event => {
+    event.stopPropagation(); picked = picked === setting ? null : setting; draw();
+  };
+  for (const [setting, ps] of runs) line(ps, {stroke: data.colours[ps[0].family],
+    "stroke-opacity": opacity(setting, 0.3), "stroke-width": setting === picked ? 3 : 1});
   node("polyline", {class: "front", points: front.map((p, i) => (i ? px(p[x.key]) + "," +
     py(front[i - 1][y.key]) + " " : "") + px(p[x.key]) + "," + py(p[y.key])).join(" ")});
+  for (const [setting, ps] of runs) line(ps, {class: "reach"}).onclick = pick(setting);
   const times = n => n ? `, ${n} iteration${n > 1 ? "s" : ""}` : "";
   const words = p => p.setting + times(p.iterations);
   for (const p of front) {
@@ -130,7 +147,8 @@ function draw() {
   for (const p of seen) {
     const on = front.includes(p);
     const dot = node("circle", {cx: px(p[x.key]), cy: py(p[y.key]), r: on ? 6 : 4,
-      fill: data.colours[p.family], "fill-opacity": 0.7, class: on ? "front" : ""});
+      fill: data.colours[p.family], "fill-opacity": opacity(p.setting, 0.7), class: on ? "front" : ""});
+    dot.onclick = pick(p.setting);
     dot.onmousemove = event => {
       tip.style.display = "block";
       tip.style.left = event.pageX + 12 + "px"; tip.style.top = event.pageY + "px";
@@ -140,7 +158,10 @@ function draw() {
     };
     dot.onmouseleave = () => { tip.style.display = "none"; };
   }
+  if (picked) node("text", {x: right, y: bottom - 10, "font-size": 14, "font-weight": "bold",
+    "text-anchor": "end"}, picked);
 }
+plot.onclick = () => { picked = null; draw(); };
 group.onchange = xs.onchange = ys.onchange = draw; draw();
 </script></body></html>
 """
@@ -159,7 +180,7 @@ def write_charts(folder: Path, data: ChartData) -> tuple[Path, ...]:
 def map_figure(record: Mapping[str, Any]) -> Figure:
     """Draw a map as ``stability.json`` has it (one entry of ``maps``).
 
-    Severity is shown from blue (far from failing) over white (at the boundary) to brown (failed); each cell
+    Severity is shown from green (far from failing) over white (at the boundary) to brown (failed); each cell
     carries its error; the red line is the boundary, severity 1. Where a case of one's own was found to lie,
     ``case`` of a method, is a ring.
     """

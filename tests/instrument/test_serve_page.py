@@ -1,10 +1,11 @@
-"""The page of a served bench, in a real browser."""
+"""The pages of a served bench and of a chart, in a real browser."""
 
 from __future__ import annotations
 
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,11 @@ from drivers.remote.camera import RemoteCamera
 from drivers.remote.light_and_motion import RemoteLedArray
 from drivers.remote.options import RemoteOptions
 from instrument.bench.config_file import parse_config
+from instrument.evaluation.chart import ChartData
+from instrument.evaluation.figures import chart_page
 from instrument.serve.server import BenchServer, Serving
 from instrument.serve.watching import picture
+from recon.evaluation.scored import Point
 from tests.drivers.test_remote import BENCH, TOKEN
 from tests.mocks.devices import MockCamera, MockOptions, MockWorld, MockWorldOptions
 
@@ -129,3 +133,24 @@ def test_a_picture_hides_no_saturated_pixel_and_is_no_larger_than_needed() -> No
     place = np.unravel_index(red.argmax(), red.shape)
     assert np.abs(np.subtract(place, (1234 // 3, 2345 // 3))).max() <= 8  # a block of the JPEG's
     assert "2000 x 3000" in said["words"]
+
+
+def test_a_click_on_a_chart_names_a_setting_and_dims_the_others(browser: Any, tmp_path: Path) -> None:
+    points = tuple(
+        Point(f"admm p{n}", count, 1e-3 * count, psnr_db=20 + n + float(np.log10(count)), family="admm")
+        for n in range(3)
+        for count in (3, 10, 30)
+    )
+    page = tmp_path / "chart.html"
+    page.write_text(chart_page(ChartData("reconstruction", {}, points, {}, ())), "utf-8")
+    browser.get(page.as_uri())
+    words = "return [...document.querySelectorAll('svg text')].map(t => t.textContent)"
+    circles = "[...document.querySelectorAll('circle')]"
+    faint = f"return {circles}.filter(c => c.getAttribute('fill-opacity') < 0.5).length"
+    click = "document.querySelectorAll('.reach')[1].dispatchEvent(new MouseEvent('click', {bubbles: true}))"
+    assert {"21", "22", "23"} < set(browser.execute_script(words)), "round numbers"
+    browser.execute_script(click)
+    assert "admm p1" in browser.execute_script(words)
+    assert browser.execute_script(faint) == 6
+    browser.execute_script(click)
+    assert "admm p1" not in browser.execute_script(words)
