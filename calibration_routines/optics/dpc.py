@@ -184,7 +184,7 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
 
     Raises CalibrationError when a half saturates.
     """
-    listener.step("analysing")
+    listener.step("analysing the surface")
     record = DPC.read(run.path)
     optics, index = record.optics, record.setup.index
     dark = dark_model(run)

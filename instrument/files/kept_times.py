@@ -45,12 +45,17 @@ _TRANSFORMS = {
     "table 7.1": 75.0,
     "hologram": 23.0,
     "stability": 36.0,
+    "analysing the surface": 280.0,
+    "finding the screen": 1000.0,
+    "aligning the mask": 4800.0,
+    "render the animal's light": 6500.0,
+    "photograph lights in a volume": 300.0,
     "testing cameras": 950.0,
     "testing solvers": 160.0,
     "testing bench": 250.0,
 }
 """Transforms that steps take the first time, of any sensor; each of those that they count. Drawing is a page
-with its library and the list of fonts; the others are by default options."""
+with its library and the list of fonts; the others are by default options, and those of the demos."""
 _ALONE_IN_IT = "drawing"
 """Keeps to one thread."""
 _FEW, _TRIED_S = 50.0, 0.05
