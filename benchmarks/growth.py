@@ -193,6 +193,13 @@ KINDS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "lights": ("lights", {"size": 160}, {}),
     "gradient, l1": ("gradient", {"size": 160}, {"prior": "l1"}),
     "9 PSFs, large": ("filaments", {"size": 192, "grid": 3, "aberration": 0.5}, {"model": "local"}),
+    "colour, 9 PSFs": (
+        "dense-picture",
+        {"size": 128, "channels": 3, "colourful": True, "grid": 3, "aberration": 0.5},
+        {"model": "local"},
+    ),
+    "volume, lowrank": ("microscope", {"size": 64, "grid": 3}, {"model": "lowrank"}),
+    "volume, colour": ("dense-volume", {"size": 64, "channels": 3}, {}),
     "volume, large": ("dense-volume", {"size": 192}, {}),
     "beads, large": ("beads", {"size": 192}, {}),
 }

@@ -102,7 +102,7 @@ function scale(values, logarithmic, from, to) {
 function draw() {
   plot.replaceChildren(); named.replaceChildren();
   const x = data.costs.find(a => a.key === xs.value), y = data.scores.find(a => a.key === ys.value);
-  const left = 75, right = 880, top = 15, bottom = 470;
+  const left = 75, right = 880, top = 30, bottom = 470;
   const seen = data.points.filter(p => p.group === group.value && !off.has(p.family) &&
     p[x.key] !== null && p[y.key] !== null);
   if (!seen.length) { node("text", {x: left, y: 40}, "nothing to show"); return; }
@@ -158,7 +158,7 @@ function draw() {
     };
     dot.onmouseleave = () => { tip.style.display = "none"; };
   }
-  if (picked) node("text", {x: right, y: bottom - 10, "font-size": 14, "font-weight": "bold",
+  if (picked) node("text", {x: right, y: top - 12, "font-size": 14, "font-weight": "bold",
     "text-anchor": "end"}, picked);
 }
 plot.onclick = () => { picked = null; draw(); };
