@@ -21,7 +21,7 @@ from recon.holography.display import Display
 from recon.holography.learn import Look
 from recon.holography.learned import legendre, terms
 from recon.holography.pose import Pose, nodes_of, on_mask, propagated
-from recon.holography.sections import POWERS, SmoothField, likelihood_of, split_field
+from recon.holography.sections import ORDER, POWERS, SmoothField, likelihood_of, split_field
 from recon.holography.target import ORDER as STEEPNESS
 from recon.holography.target import band_of
 
@@ -38,6 +38,9 @@ _DEEP = 3
 _DC = 2
 _PHASES = [term for term in terms(4) if sum(term) > 1]  # a linear one is the picture's place on the camera
 _SHADES = terms(2)
+Shapes = Sequence[tuple[int, int]]
+_ORDERS = 5
+"""Of the polynomials of both, along each axis."""
 _LIGHT = (1.0, 0.3)  # of the phase (rad) and of the logarithm of the amplitude of a term: taken for likely
 _HALVES = 2  # parts of a mask pixel, along each axis, of what is shown; slopes do without
 _NUDGE = 0.25  # mask pixels, of the differences that slopes are made of
@@ -180,11 +183,8 @@ class _Fit:
         self.y, self.x = (
             (2 * (np.arange(n) + 0.5) / width - n / width).astype(np.float32) for n in (height, width)
         )
-        self.phases, self.shades = (
-            np.array(
-                [np.multiply.outer(legendre(i, height), legendre(j, width)) for i, j in shapes], np.float32
-            )
-            for shapes in (_PHASES, _SHADES)
+        self.down, self.across = (
+            np.array([legendre(order, n) for order in range(_ORDERS)], np.float32) for n in (height, width)
         )
         ey, ex = (e.astype(np.float32) for e in display.envelope(self.band.shape))
         self.envelope = ey[:, None], ex
@@ -222,8 +222,9 @@ class _Fit:
 
     def system(self, vector: Array, look: Look) -> _System:
         """Form a photograph's normal equations about a vector of unknowns."""
-        shown = self._shown(vector, look.slm)
-        far, slopes = self._slopes(vector, look.slm)
+        parts = self._parts(vector, look.slm)
+        shown = self._shown(vector, *parts)
+        far, slopes = self._slopes(vector, *parts)
         wanted = look.lags[self.used] * self.weights
         wanted = wanted / np.sqrt(_power(wanted))
         scale = 1 / np.sqrt(_power(shown))
@@ -247,15 +248,16 @@ class _Fit:
         """Return the light at the SLM, the displacement, and what is uneven in light and wavefront."""
         pattern = (slm + complex(*vector[_BENDS + _DEEP :][:_DC])).astype(np.complex64)
         light = vector[_BENDS + _DEEP + _DC :]
-        uneven = np.exp(np.tensordot(1j * light[: len(_PHASES)], self.phases, 1))
-        uneven *= np.exp(np.tensordot(light[len(_PHASES) :], self.shades, 1))
-        return pattern, self.displacement + self.bent(vector), uneven.astype(np.complex64)
+        uneven = np.zeros((_ORDERS, _ORDERS), complex)
+        for n, (i, j) in enumerate((*_PHASES, *_SHADES)):
+            uneven[i, j] += light[n] * (1j if n < len(_PHASES) else 1)
+        whole = np.exp(self.down.T @ uneven.astype(np.complex64) @ self.across)
+        return pattern, self.displacement + self.bent(vector), np.asarray(whole, np.complex64)
 
-    def _shown(self, vector: Array, slm: Array) -> Array:
+    def _shown(self, vector: Array, pattern: Array, nodes: npt.NDArray[np.float64], uneven: Array) -> Array:
         """Return the lags of what a pattern shows, from halves of the mask's pixels."""
         import scipy.fft
 
-        pattern, nodes, uneven = self._parts(vector, slm)
         field = propagated(on_mask(pattern, self.fine, _HALVES * nodes), self.fine, self.place(vector))
         field = field * np.repeat(np.repeat(self.mask * uneven, _HALVES, axis=0), _HALVES, axis=1)
         for axis, n in enumerate(self.band.shape):
@@ -264,12 +266,13 @@ class _Fit:
             field = whole.take(at % (_HALVES * n), axis=axis) / np.float32(_HALVES)
         return self._lags_of(field.real**2 + field.imag**2, self.fine_envelope)
 
-    def _slopes(self, vector: Array, slm: Array) -> tuple[Array, Iterator[Array]]:
+    def _slopes(
+        self, vector: Array, pattern: Array, nodes: npt.NDArray[np.float64], uneven: Array
+    ) -> tuple[Array, Iterator[Array]]:
         """Return the far field of a pattern, and how it changes with each unknown."""
         import scipy.fft
 
         place = self.place(vector)
-        pattern, nodes, uneven = self._parts(vector, slm)
         mask = self.mask * uneven
 
         def there(field: Array, place: Pose = place) -> Array:
@@ -285,26 +288,31 @@ class _Fit:
         at_mask = there(at_slm)
         nearer = there(at_slm, place.with_(z_um=place.z_um + 1)) - at_mask
         half_um = 0.5 * self.mask.shape[1] * self.display.mask_pitch_um
-        y, x = self.y[:, None], self.x
 
-        def far(field: Array) -> Array:
-            return np.asarray(scipy.fft.fft2(field * mask, self.band.shape))
+        def fars(field: Array, shapes: Shapes, down: Array, across: Array) -> Iterator[Array]:
+            """Of the field times ``down[i] across[j]``: a transform of the rows serves all of one ``j``."""
+            rows: dict[int, Array] = {}
+            lit = field * mask
+            for i, j in shapes:
+                if j not in rows:
+                    rows[j] = scipy.fft.fft(lit * across[j], self.band.shape[1], axis=1)
+                yield np.asarray(scipy.fft.fft(rows[j] * down[i][:, None], self.band.shape[0], axis=0))
 
         def slopes() -> Iterator[Array]:
+            powers = [np.array([at**n for n in range(ORDER + 1)]) for at in (self.y, self.x)]
             for field in moved:
-                for i, j in POWERS:
-                    yield far(field * (y**i * x**j))
-            for tilt in (np.float32(1), y * np.float32(1e-3 * half_um), x * np.float32(1e-3 * half_um)):
-                yield far(nearer * tilt)
-            one = far(even)
+                yield from fars(field, POWERS, *powers)
+            tilts = [p[:2] * np.array([[1], [1e-3 * half_um]], np.float32) for p in powers]
+            yield from fars(nearer, ((0, 0), (1, 0), (0, 1)), *tilts)
+            (one,) = fars(even, ((0, 0),), *powers)
             yield one
             yield np.complex64(1j) * one
-            for shape in self.phases:
-                yield np.complex64(1j) * far(at_mask * shape)
-            for shape in self.shades:
-                yield far(at_mask * shape)
+            bent = fars(at_mask, (*_PHASES, *_SHADES), self.down, self.across)
+            for n, field in enumerate(bent):
+                yield np.complex64(1j) * field if n < len(_PHASES) else field
 
-        return far(at_mask), slopes()
+        (far,) = fars(at_mask, ((0, 0),), self.down, self.across)
+        return far, slopes()
 
     def _lags_of(self, light: Array, envelope: tuple[Array, Array]) -> Array:
         """Return weighted lags of an intensity in FFT order."""
@@ -312,10 +320,10 @@ class _Fit:
 
         light *= envelope[0]
         light *= envelope[1]
-        spectrum = scipy.fft.rfft2(light)
         rows, columns = self.band.kept
         top = self.band.top
-        kept = np.concatenate([spectrum[:top, :columns], spectrum[len(spectrum) - rows + top :, :columns]])
+        spectrum = scipy.fft.fft(scipy.fft.rfft(light, axis=1)[:, :columns], axis=0)
+        kept = np.concatenate([spectrum[:top], spectrum[len(spectrum) - rows + top :]])
         return np.asarray(kept[self.used] * self.weights)
 
 

@@ -222,14 +222,16 @@ def propagated(field: Array, display: Display, pose: Pose) -> Array:
         return field
     pitch_mm = display.mask_pitch_um * 1e-3
     fy2, fx2 = (
-        np.pi * display.wavelength_nm * 1e-6 * scipy.fft.fftfreq(n, pitch_mm)[..., None] ** 2
-        for n in field.shape
+        np.pi * display.wavelength_nm * 1e-6 * scipy.fft.fftfreq(n, pitch_mm) ** 2 for n in field.shape
     )
-    f2 = (fy2 + fx2.T).astype(np.float32)
-    spectrum = scipy.fft.fft2(field) * np.exp(np.complex64(-1e-3j * pose.z_um) * f2)
+    down, across = (np.exp(-1e-3j * pose.z_um * f2).astype(np.complex64) for f2 in (fy2, fx2))
+    spectrum = scipy.fft.fft2(field)
+    spectrum *= down[:, None]
+    spectrum *= across
     there = scipy.fft.ifft2(spectrum)
     if pose.pitch_mrad or pose.yaw_mrad:
         y, x = ((np.arange(n) - (n - 1) / 2) * pitch_mm for n in field.shape)
         depth_mm = (1e-3 * (pose.pitch_mrad * y[:, None] + pose.yaw_mrad * x)).astype(np.float32)
+        f2 = (fy2[:, None] + fx2).astype(np.float32)
         there = there + depth_mm * scipy.fft.ifft2(spectrum * (np.complex64(-1j) * f2))
     return np.asarray(there)
