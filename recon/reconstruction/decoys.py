@@ -95,7 +95,7 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
         return None
     check = _checked(problem, on_stage)
     known = check is not None and check.wrong and check.better not in FAR
-    return replace(check, cause=_cause(problem)) if check is not None and known else check
+    return replace(check, cause=_cause(problem, check.better)) if check is not None and known else check
 
 
 def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | None:
@@ -183,6 +183,11 @@ class _Small:
         beyond = max(float(np.mean(left[valid].astype(np.float64) ** 2)) - 1, 0.0)
         contrast = float(np.std(problem.data[0][valid], dtype=np.float64))
         return float(np.sqrt(beyond)) / max(contrast, 1e-30)
+
+    def otherwise(self, how: Transformation) -> _Small:
+        """Return the same photograph with transformed PSFs."""
+        psfs = transformed(self.calibration.psfs, how)
+        return replace(self, calibration=replace(self.calibration, psfs=psfs))
 
     def decoys(self) -> tuple[Transformation, ...]:
         """Return those that differ from the PSFs: near ones unless one of many serves, then far ones."""
@@ -292,8 +297,12 @@ def _small(problem: Problem, longest_px: int) -> _Small:
     return _Small(photograph, calibration, varies, "local" if local else "convolution", clipped)
 
 
-def _cause(problem: Problem) -> tuple[str, str] | None:
-    """Return what keeps a calibration from fitting and is no other calibration, in words, and what to do."""
+def _cause(problem: Problem, better: Transformation | None) -> tuple[str, str] | None:
+    """Return what keeps a calibration from fitting and is no other calibration, in words, and what to do.
+
+    A photograph of few bright points is explained better by anything once it is raised to a power. What was
+    coded is explained clearly worse then by the calibration that was ``better`` (None: by a mirrored one).
+    """
     light = max(saturated_light(psf) for depth in _given(problem).depths.central for psf in depth)
     if light > SATURATED_LIGHT:
         return "its PSF is saturated", "Take the PSF again with a shorter exposure"
@@ -306,7 +315,10 @@ def _cause(problem: Problem) -> tuple[str, str] | None:
     left = small.unexplained(background=lit)
     for which, calibration in (("the photograph is", small.calibration), ("both are", psfs)):
         tried = replace(small, photograph=straight, calibration=calibration)
-        if tried.unexplained(background=lit) < STRAIGHTER * left:
+        least = tried.unexplained(background=lit)
+        if least >= STRAIGHTER * left:
+            continue
+        if least < STRAIGHTER * tried.otherwise(better or FAR[0]).unexplained(background=lit):
             return (
                 f"its PSF explains it better where {which} gamma-coded",
                 "Take raw frames, or files in proportion to the light: JPEG files and webcams' are not",
