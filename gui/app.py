@@ -95,18 +95,20 @@ def _shown(app: QApplication, config: BenchConfig, settings: QSettings) -> tuple
 
 def show_and_open(window: MainWindow) -> None:
     """Show a window, and open its bench when it was seen: what takes long is done before there is light."""
+    load = extensions_put_off()  # before panels are prepared, which begins with the first events
     application().processEvents()  # to be made and to be shown are turns of their own
     window.show()
     application().processEvents()
-    load = extensions_put_off()
 
-    def load_later() -> None:
+    def settle() -> None:
+        # What stays is not looked through for garbage again and again, 0.1 s during which nothing answers.
+        gc.freeze()
+        gc.enable()  # the terminal's command begins without
         if not window.session.is_closing:
             window.session.jobs.watch("Loading extensions", lambda _: load())
 
-    window.session.pictured.connect(load_later)
-    QTimer.singleShot(PICTURE_MS, window, load_later)  # where no picture comes
-    # What stays is not looked through for garbage again and again, 0.1 s during which nothing answers.
+    window.session.pictured.connect(settle)
+    QTimer.singleShot(PICTURE_MS, window, settle)  # where no picture comes
     window.session.opened.connect(gc.freeze)
     window.maker.made.connect(gc.freeze)
     if not window.session.is_closing:

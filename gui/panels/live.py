@@ -60,6 +60,12 @@ class LivePanel(Panel):
         """The last one that was taken here."""
         self._began = False
         """Whether the scene was lit, or need not be, to begin with."""
+        self._lighting: Job | None = None
+        """Lights the scene, to begin with."""
+        self._lit_ns = 0
+        """When it had."""
+        self._pictured = False
+        """Whether there was a frame in the light that it begins with, or a coarse picture of it."""
 
     @classmethod
     def prepare(cls) -> None:
@@ -199,7 +205,8 @@ class LivePanel(Panel):
         if shown is None:
             self.picture.frame = frame
             self.count()
-            self.session.pictured.emit()
+        if self._lighting is None and frame.metadata.host_time_ns > self._lit_ns:
+            self._say_pictured()
         self.picture.show_frame(frame)
         self.picture.view.set_caption(self._caption(frame))
         self.picture.view.caution_against("")
@@ -212,13 +219,19 @@ class LivePanel(Panel):
             return
         counts, factor = found
         self.picture.show_coarse(counts, factor)
-        self.session.pictured.emit()
+        self._say_pictured()
         view = self.picture.view
         view.set_caption("What the next frame will show, SIMULATED")
         view.caution_against(
             f"Coarse for now: {factor} × {factor} pixels are one, without noise. The frame is being computed."
         )
         self.under_mouse.clear()
+
+    def _say_pictured(self) -> None:
+        """Tell what waits for the first picture of what is lit; a dark one is not what one waits for."""
+        if not self._pictured:
+            self._pictured = True
+            self.session.pictured.emit()
 
     @property
     def screen_rate(self) -> float:
@@ -339,9 +352,9 @@ class LivePanel(Panel):
         """What is lit, as far as the program knows."""
         return light_of(self.session.bench)
 
-    def switch_light(self, light: LightState, *, quiet: bool = False) -> None:
-        """Light the scene, the point source, or nothing; ``quiet`` where nobody asked for it."""
-        job = self.begin(lambda: self.session.switch_light(light, quiet=quiet))
+    def switch_light(self, light: LightState) -> None:
+        """Light the scene, the point source, or nothing."""
+        job = self.begin(lambda: self.session.switch_light(light))
         if job is not None:
             job.ended.connect(self._show_light)
 
@@ -359,16 +372,22 @@ class LivePanel(Panel):
         """
         if self.session.config.scene.control != "simulated" or self.light is not LightState.DARK:
             return
-        if "led_array" in self.session.kinds:
-            self.switch_light(LightState.SCENE, quiet=True)
-        else:  # nobody is asked to darken a point source that may not be there
-            job = self.begin(
-                lambda: self.session.jobs.device(
-                    "Light: scene", lambda _: self.session.bench.scene_on(), {"light"}, quiet=True
-                )
+
+        def start() -> Job:
+            if "led_array" in self.session.kinds:
+                return self.session.switch_light(LightState.SCENE, quiet=True)
+            # nobody is asked to darken a point source that may not be there
+            return self.jobs.device(
+                "Light: scene", lambda _: self.session.bench.scene_on(), {"light"}, quiet=True
             )
-            if job is not None:
-                job.ended.connect(self._show_light)
+
+        self._lighting = self.begin(start)
+        if self._lighting is not None:
+            self._lighting.ended.connect(self._scene_lit)
+
+    def _scene_lit(self) -> None:
+        self._lighting, self._lit_ns = None, time.monotonic_ns()
+        self._show_light()
 
     def _show_light(self) -> None:
         now = self.light

@@ -375,6 +375,8 @@ class ReconstructionsPanel(Panel):
 
     def _progressed(self, so_far: SoFar, *, volume: bool) -> None:
         self.form.show_progress(so_far.share, so_far.note)
+        if self.result is not None or self._opening is not None:
+            return  # another result is looked at meanwhile
         prepared = so_far.prepared
         if so_far.image is None:
             self.facts.show_facts(

@@ -7,12 +7,11 @@ import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from PySide6.QtWidgets import QLineEdit, QProgressBar, QWidget
 from shiboken6 import isValid
 
-from calibration_routines.psf.exposure import AutoExposure, auto_expose
 from drivers.camera import Camera, Roi
 from gui.background import NewestOnly
 from gui.forms.fields import Behaviour, ChoiceField, NumberField
@@ -26,12 +25,14 @@ from gui.widgets.entry import Entry, NumberEdit
 from gui.widgets.kept_bar import KeptBar
 from instrument.bench.camera_settings import CameraOptions, CameraState, read_camera, restore_camera
 from instrument.bench.photograph import Lit
+from instrument.files.atomic import SPARE_BYTES, free_bytes, there_now
 from instrument.files.errors import FileError, duration, size
-from instrument.plan.abilities import SPARE_BYTES
-from instrument.runs.acquire import free_bytes, there_now
-from instrument.runs.recorder import Recorder, RecordingStatus, prepare_recording
-from instrument.runs.run import Run
 from recon.base.declare import options_of
+
+if TYPE_CHECKING:  # the first picture does not wait for what runs and routines need
+    from calibration_routines.psf.exposure import AutoExposure
+    from instrument.runs.recorder import Recorder, RecordingStatus
+    from instrument.runs.run import Run
 
 _READ_BACK_MS = 3000
 _FIRST_READ_MS = 100
@@ -114,6 +115,8 @@ class CameraForm(QWidget):
         """Find an exposure for what is lit now, and say how good it is."""
 
         def work(camera: Camera) -> tuple[AutoExposure, CameraState]:
+            from calibration_routines.psf.exposure import auto_expose
+
             return auto_expose(camera), read_camera(camera)
 
         start = partial(self._session.camera_job, EXPOSING, work, idle=True)
@@ -298,6 +301,8 @@ class RecordBar(QWidget):
         seconds, label = self.seconds.value, self.label.text().strip() or "recording"
 
         def work(context: JobContext) -> Run:
+            from instrument.runs.recorder import prepare_recording
+
             lit = Lit.now(session.bench)
             recorder = prepare_recording(
                 session.bench, session.runs_folder, label=label, seconds=seconds, on_progress=context.report

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
 from collections.abc import Iterator, Mapping
@@ -408,6 +409,7 @@ def gui(
     except BenchError as error:
         _show_too(error)
         raise
+    gc.disable()  # a tenth of the start goes into looking at what is imported; the window turns it on again
     try:
         with signals_wait():
             from gui.app import run

@@ -48,9 +48,10 @@ from instrument.cli.app import App, BenchOption, examples, load_and_say, open_an
 from instrument.cli.plan import rehearsal
 from instrument.cli.progress import keys, one_task, progress_bar
 from instrument.files import kept_times
+from instrument.files.atomic import free_bytes
 from instrument.files.errors import BenchError, duration, size
 from instrument.files.images import read_image
-from instrument.runs.acquire import abilities_of, free_bytes
+from instrument.runs.acquire import abilities_of
 from instrument.runs.rehearsal import rehearsed
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl

@@ -1,7 +1,7 @@
 """Files and folders written whole or not at all: under a temporary name beside the target, synced, moved.
 
 While it is written, what has a temporary name is locked: what a killed program left has no lock, and is
-removed when the next program writes into its folder.
+removed when the next program writes into its folder. What a disk has free is looked up here, too.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from typing import Any
 
 from instrument.files.errors import FileError
 
+SPARE_BYTES = 256 * 2**20
+"""Disk space that a run leaves free."""
 _NEARLY_FULL_BYTES = 1 << 20
 _LEFT = re.compile(r"\..+\.[0-9a-f]{8}\.part(\.[^.]+)?")
 _EXCHANGE, _HERE = 2, -100
@@ -315,3 +317,31 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def free_bytes(folder: Path) -> int:
+    """Return the free space of the disk that ``folder`` is or will be on.
+
+    Raises FileError when nothing can be kept there: its path leads to no disk or through a file, or may not
+    be written to.
+    """
+    there = there_now(folder)
+    if not there.is_dir():
+        raise FileError(folder, f"{there} is a file, not a folder; nothing can be kept there.")
+    if os.statvfs(there).f_flag & os.ST_RDONLY:
+        raise FileError(folder, f"{there} is on a read-only disk; nothing can be kept there.")
+    if not os.access(there, os.W_OK):
+        raise FileError(folder, f"you may not write to {there}; nothing can be kept there.")
+    return shutil.disk_usage(there).free
+
+
+def there_now(folder: Path) -> Path:
+    """Return what there is of a path already: itself, or the nearest folder above it.
+
+    Raises FileError when there is nothing of it, not even its disk.
+    """
+    path = folder.absolute()
+    for there in (path, *path.parents):
+        if there.exists():
+            return there
+    raise FileError(folder, "nothing of this path is there, not even its disk. Is the drive connected?")

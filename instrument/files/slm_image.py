@@ -18,7 +18,6 @@ from drivers.slm import Slm
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, side_car, write_image
 from instrument.files.record import RecordFormat
-from recon.holography.variables import coded
 
 SLM_CALIBRATION = RecordFormat(
     "diffuserbench SLM calibration", "SLM calibration", make="Make one: diffuserbench calibrate slm"
@@ -122,6 +121,8 @@ def field_levels(
     if not mirrors:
         return phase_levels(np.angle(field), binning)
     if np.any(np.imag(field)) or np.min(np.real(field)) < 0:
+        from recon.holography.variables import coded  # late: plans are made where nothing is shown
+
         field = coded(field)
     sent = np.rint(255 * np.clip(np.real(field), 0, 1)).astype(np.uint8)
     return np.repeat(np.repeat(sent, binning, axis=-2), binning, axis=-1)

@@ -10,14 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from drivers.stage import OVER, StageAxis, approached
+from instrument.files.atomic import SPARE_BYTES
 from instrument.files.errors import FileError, count, ranges, size
 from instrument.files.slm_image import read_slm_levels
 from instrument.plan.led_shapes import LedPlaces
 from instrument.plan.model import Part, Plan, PlanError, Step
 from instrument.plan.positions import SourcePosition
 
-SPARE_BYTES = 256 * 2**20
-"""Disk space that a run leaves free."""
 BYTES_A_FRAME_BESIDE_THE_IMAGE = 6_000
 """Log line, folders and part-filled disk blocks of one stored frame."""
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 from instrument.bench.bench import Bench
 from instrument.bench.camera_settings import camera_settings, restore_camera
 from instrument.bench.photograph import Progress
-from instrument.files.errors import FileError
+from instrument.files.atomic import free_bytes
 from instrument.plan import BenchAbilities, Plan, check
 from instrument.runs.inspection import Verification, verify
 from instrument.runs.run import FinishReason, Run, RunCondition
@@ -106,34 +104,6 @@ def record_of(bench: Bench) -> BenchRecord:
         camera=camera_settings(bench.camera),
         stage=bench.stage.position() if bench.stage is not None and bench.stage.is_homed else {},
     )
-
-
-def free_bytes(folder: Path) -> int:
-    """Return the free space of the disk that ``folder`` is or will be on.
-
-    Raises FileError when nothing can be kept there: its path leads to no disk or through a file, or may not
-    be written to.
-    """
-    there = there_now(folder)
-    if not there.is_dir():
-        raise FileError(folder, f"{there} is a file, not a folder; nothing can be kept there.")
-    if os.statvfs(there).f_flag & os.ST_RDONLY:
-        raise FileError(folder, f"{there} is on a read-only disk; nothing can be kept there.")
-    if not os.access(there, os.W_OK):
-        raise FileError(folder, f"you may not write to {there}; nothing can be kept there.")
-    return shutil.disk_usage(there).free
-
-
-def there_now(folder: Path) -> Path:
-    """Return what there is of a path already: itself, or the nearest folder above it.
-
-    Raises FileError when there is nothing of it, not even its disk.
-    """
-    path = folder.absolute()
-    for there in (path, *path.parents):
-        if there.exists():
-            return there
-    raise FileError(folder, "nothing of this path is there, not even its disk. Is the drive connected?")
 
 
 def look(path: Path | str, on_verify: Progress | None = None) -> Verification:

@@ -16,9 +16,9 @@ from drivers.common.stream_reader import StreamReader
 from drivers.errors import DeviceError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from instrument.bench.bench import Bench
+from instrument.files.atomic import SPARE_BYTES, free_bytes
 from instrument.files.errors import BenchError, count, size
-from instrument.plan.abilities import SPARE_BYTES
-from instrument.runs.acquire import free_bytes, record_of
+from instrument.runs.acquire import record_of
 from instrument.runs.finish import end_run
 from instrument.runs.log import Gap
 from instrument.runs.run import FinishReason, Run

@@ -23,10 +23,10 @@ from calibration_routines.psf.sweep_procedure import SweepProcedure
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files import kept_times
+from instrument.files.atomic import SPARE_BYTES
 from instrument.files.errors import SettingsError, duration
 from instrument.files.images import read_image
 from instrument.plan import Part, Plan, PlanError, estimate
-from instrument.plan.abilities import SPARE_BYTES
 from instrument.runs import acquire
 from instrument.runs.acquire import abilities_of
 from instrument.runs.run import FinishReason, Run, RunCondition

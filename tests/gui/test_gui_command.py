@@ -167,8 +167,12 @@ def test_first_frame_waits_for_no_import_that_it_does_not_need() -> None:
         "dask",
         "matplotlib",
         "zarr",
+        "calibration_routines",
+        "instrument.runs",
+        "recon.holography",
     )
-    code = f"import sys, gui.app, drivers.simulated.world; print([m for m in {late} if m in sys.modules])"
+    code = "import sys, gui.app, gui.panels.live, drivers.simulated.world; "
+    code += f"print([m for m in {late} if m in sys.modules])"
     code += "; from gui.panels.led_array import LedPanel; LedPanel.prepare(); sys.modules['scipy.spatial']"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from PySide6.QtWidgets import QApplication, QFileDialog
 from pytestqt.qtbot import QtBot
 
 from gui import making
+from gui.forms.reconstruct import SoFar
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.theme import TURN, apply_theme, change_theme
 from gui.widgets.dialogues import Question
@@ -113,6 +115,22 @@ def test_the_views_exported_are_those_that_were_asked_about(
     assert names == ["view-depth.png", "view-front.png", "view-side.png", "view-top.png"]
     qtbot.waitUntil(lambda: not panel.session.jobs.jobs, timeout=WAIT_MS)
     assert read_image(tmp_path / "view-front.png").pixels.shape == (20, 30, 3)
+
+
+def test_a_picture_in_the_making_does_not_cover_a_result_that_was_opened_meanwhile(
+    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path
+) -> None:
+    write_image(tmp_path / "first.tif", np.random.default_rng(0).random((20, 30), np.float32))
+    prepared = SimpleNamespace(notes={"Model": "convolution"}, warnings=(), simulated=False)
+    so_far = SoFar(0.5, "half", prepared, np.ones((9, 9), np.float32), ())
+    panel._progressed(so_far, volume=False)
+    assert panel.picture.shown.shape == (9, 9)
+    panel.open(tmp_path / "first.tif")
+    panel._progressed(so_far, volume=False)  # also while it is being opened
+    qtbot.waitUntil(lambda: panel.result is not None, timeout=WAIT_MS)
+    panel._progressed(so_far, volume=False)
+    assert panel.picture.shown.shape == (20, 30)
+    assert "first.tif" in panel.heading.text()
 
 
 def test_levels_by_typing_and_automatic(qtbot: QtBot, panel: ReconstructionsPanel, tmp_path) -> None:

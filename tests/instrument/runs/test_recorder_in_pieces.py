@@ -17,8 +17,8 @@ import pytest
 from drivers.errors import DeviceError
 from drivers.frame import Frame
 from instrument.bench.bench import Bench
+from instrument.files.atomic import SPARE_BYTES
 from instrument.files.errors import BenchError
-from instrument.plan.abilities import SPARE_BYTES
 from instrument.runs import recorder as module
 from instrument.runs.log import Gap
 from instrument.runs.recorder import Recorder, RecordingOptions, RecordingStatus, prepare_recording, record

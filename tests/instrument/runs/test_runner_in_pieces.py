@@ -15,10 +15,11 @@ import pytest
 
 from drivers.errors import LimitError, StoppedError
 from instrument.bench.bench import Bench
+from instrument.files.atomic import free_bytes, there_now
 from instrument.files.errors import FileError
 from instrument.plan import Light, Plan, Step
 from instrument.runs import runner as module
-from instrument.runs.acquire import abilities_of, free_bytes, prepare, record_of, there_now
+from instrument.runs.acquire import abilities_of, prepare, record_of
 from instrument.runs.run import FinishReason
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import Runner, RunState, RunStatus, StepSettings, discarded
