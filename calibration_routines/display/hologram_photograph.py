@@ -63,6 +63,8 @@ class Refinement:
     """Of the hologram given and of the best one; the same where nothing was gained."""
     psnr_db: tuple[float, ...]
     """Captured, round by round; the first is the hologram given."""
+    interrupted: bool = False
+    """Whether Ctrl-C ended it before its last round."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +125,7 @@ class HologramCamera:
         asked for what it showed last plus what the photograph lacked. The best pattern by photograph (in the
         fovea, where there is one) is kept:
         the result is the given one where nothing helps (its photograph decides, with the camera's noise
-        averaged).
+        averaged). Ctrl-C during a round ends it with what was best before.
 
         Parameters
         ----------
@@ -137,21 +139,24 @@ class HologramCamera:
         best_slm = now = np.asarray(slm, np.complex64)
         first = self.capture(list(now), target, average=options.average)
         best, measured, history = first, first, [first.scores.asked_psnr_db]
-        plain = HologramModel(self.display, [target], self.computed)
-        for number in range(1, options.refine + 1):
-            shown = plain.seen(now) / plain.peaks[0]
-            aim = shown if target.window is None else np.zeros_like(shown)
-            part = (...,) if target.window is None else target.window.part(aim.shape)
-            aim[part] = np.maximum(shown[part] + _GAIN * (measured.wanted - measured.seen), 0)
-            model = HologramModel(self.display, [replace(target, image=aim, white=1.0)], self.computed)
-            now = compute_hologram(model, initial=now, iterations=_ITERATIONS, tolerance=0).slm
-            measured = self.capture(list(now), target, average=options.average)
-            history.append(measured.scores.asked_psnr_db)
-            if progress is not None:
-                progress(number, history[-1])
-            if measured.scores.asked_psnr_db > best.scores.asked_psnr_db:
-                best, best_slm = measured, now
-        return Refinement(best_slm, first, best, tuple(history))
+        plain, interrupted = HologramModel(self.display, [target], self.computed), False
+        try:
+            for number in range(1, options.refine + 1):
+                shown = plain.seen(now) / plain.peaks[0]
+                aim = shown if target.window is None else np.zeros_like(shown)
+                part = (...,) if target.window is None else target.window.part(aim.shape)
+                aim[part] = np.maximum(shown[part] + _GAIN * (measured.wanted - measured.seen), 0)
+                model = HologramModel(self.display, [replace(target, image=aim, white=1.0)], self.computed)
+                now = compute_hologram(model, initial=now, iterations=_ITERATIONS, tolerance=0).slm
+                measured = self.capture(list(now), target, average=options.average)
+                history.append(measured.scores.asked_psnr_db)
+                if measured.scores.asked_psnr_db > best.scores.asked_psnr_db:
+                    best, best_slm = measured, now
+                if progress is not None:
+                    progress(number, history[-1])
+        except KeyboardInterrupt:
+            interrupted = True
+        return Refinement(best_slm, first, best, tuple(history), interrupted)
 
 
 def wanted_picture(target: Target, display: Display) -> tuple[npt.NDArray[np.float64], float]:

@@ -6,7 +6,7 @@ Without a mask there is no speckle to register the camera by, so single spots ar
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,8 @@ class PhotographedSpots:
     deviations : tuple of float
         Standard deviation over mean, round by round; the first is of the pattern given.
     camera_residual_px : float
+    interrupted : bool
+        Whether Ctrl-C ended it before its last round.
     """
 
     slm: npt.NDArray[np.complex64]
@@ -53,6 +55,7 @@ class PhotographedSpots:
     relative: npt.NDArray[np.float64]
     deviations: tuple[float, ...]
     camera_residual_px: float
+    interrupted: bool = False
 
 
 def photograph_spots(
@@ -67,7 +70,7 @@ def photograph_spots(
     """Photograph spots, and for ``options.refine`` rounds ask for more where the camera saw too little.
 
     ``slm`` is complex (n_frames, height, width), ``computed`` how it was computed; ``progress(round,
-    deviation)``. The most even pattern by photograph is kept.
+    deviation)``. The most even pattern by photograph is kept; Ctrl-C during a round ends it with that.
 
     Raises InputError when the camera does not see the spots, or some are in focus elsewhere; DeviceError when
     a device fails.
@@ -82,16 +85,20 @@ def photograph_spots(
     frame, relative = seen.measure(slm)
     best = PhotographedSpots(np.asarray(slm, np.complex64), frame, relative, (), camera.residual_px)
     deviations, asked, now = [float(relative.std())], spots, np.asarray(slm, np.complex64)
-    for number in range(1, options.refine + 1):
-        asked = brighter_where_dim(asked, relative)
-        now = compute_spots(display, asked, computed, initial=now)[0].slm
-        frame, relative = seen.measure(now)
-        deviations.append(float(relative.std()))
-        if progress is not None:
-            progress(number, deviations[-1])
-        if deviations[-1] < best.relative.std():
-            best = PhotographedSpots(now, frame, relative, (), camera.residual_px)
-    return PhotographedSpots(best.slm, best.frame, best.relative, tuple(deviations), best.camera_residual_px)
+    interrupted = False
+    try:
+        for number in range(1, options.refine + 1):
+            asked = brighter_where_dim(asked, relative)
+            now = compute_spots(display, asked, computed, initial=now)[0].slm
+            frame, relative = seen.measure(now)
+            deviations.append(float(relative.std()))
+            if deviations[-1] < best.relative.std():
+                best = PhotographedSpots(now, frame, relative, (), camera.residual_px)
+            if progress is not None:
+                progress(number, deviations[-1])
+    except KeyboardInterrupt:
+        interrupted = True
+    return replace(best, deviations=tuple(deviations), interrupted=interrupted)
 
 
 def registered_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:

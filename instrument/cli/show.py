@@ -245,6 +245,12 @@ def _capture_colours(
     typer.echo(f"Wrote {options.capture}")
 
 
+def _end_early(*, interrupted: bool) -> None:
+    if interrupted:
+        typer.echo("Interrupted: this is the best pattern so far.", err=True)
+        raise typer.Exit(130)
+
+
 def _warn_of_saturation(fraction: float) -> None:
     if fraction > 1e-3:
         typer.echo(f"Warning: {100 * fraction:.1f} % of the camera's pixels are saturated.", err=True)
@@ -300,6 +306,7 @@ def _capture(
     typer.echo(f"photographed: {score_words(found.capture.scores)}")
     _warn_of_saturation(found.capture.saturated_fraction)
     typer.echo(f"Wrote {options.capture}")
+    _end_early(interrupted=found.refined is not None and found.refined.interrupted)
 
 
 def _capture_spots(
@@ -352,6 +359,7 @@ def _capture_spots(
         f"deviation {best:.2%}"
     )
     typer.echo(f"Wrote {options.capture}")
+    _end_early(interrupted=found.interrupted)
 
 
 def _show_run(run: Path, picture: Path | None) -> None:
