@@ -200,7 +200,6 @@ def _title(shown: object) -> str:
     return shown.path.name if isinstance(shown, ImageFile) else ""
 
 
-@speaking
 def show(*pictures: Any, **titled: Any) -> None:
     """Show pictures beside one another: results, files, arrays, calibrations (the PSF nearest to the axis).
 
@@ -211,6 +210,7 @@ def show(*pictures: Any, **titled: Any) -> None:
     show_figure(figure_of(*pictures, **titled))
 
 
+@speaking
 def figure_of(*pictures: Any, **titled: Any) -> Figure:
     """Return the figure that :func:`show` shows."""
     from matplotlib.figure import Figure
