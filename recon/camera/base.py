@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from numbers import Real
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +36,17 @@ class LinearOperator(ABC):
         self.domain_shape = tuple(int(n) for n in domain_shape)
         self.range_shape = tuple(int(n) for n in range_shape)
         self.dtype: np.dtype[Any] = np.dtype(dtype)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Say what an operator of one's own lacks whose ``__init__`` did not call this one's."""
+            if name in ("domain_shape", "range_shape", "dtype"):
+                raise AttributeError(
+                    f"The operator {type(self).__name__} has no {name}: its __init__ must call "
+                    "super().__init__(domain_shape, range_shape, dtype)."
+                )
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @abstractmethod
     def forward(self, x: Array, out: Array | None = None) -> Array:

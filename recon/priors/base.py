@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from recon.errors import StructureError
+from recon.errors import InputError, StructureError
 
 Array = npt.NDArray[Any]
 
@@ -39,6 +39,17 @@ class Prior(ABC):
     @abstractmethod
     def prox(self, x: Array, step: float) -> Array:
         """Return ``argmin_p  step * value(p) + 1/2 ||p - x||^2``. ``x`` is left as it is."""
+
+    def checked_prox(self, x: Array, step: float) -> Array:
+        """Return ``prox``; InputError where a prior of one's own gives no array like ``x``."""
+        found = self.prox(x, step)
+        if getattr(found, "shape", None) != x.shape:
+            given = f"an array {found.shape}" if hasattr(found, "shape") else type(found).__name__
+            raise InputError(
+                f"The prior {type(self).__name__}: its prox must return an array like its argument, "
+                f"{x.shape}, not {given}."
+            )
+        return found
 
     def for_a_run(self) -> Self:
         """Return the prior with a memory of its own: what a prox keeps belongs to one run."""

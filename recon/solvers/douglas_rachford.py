@@ -187,7 +187,7 @@ class DouglasRachford(VolumeSplitting):
         scale = f(self.gamma / self._used_gamma)
         state = self.z + (1 - scale) * d
         d *= scale
-        u = self.prior.prox((state + 2 * d)[None], self.gamma)[0].astype(state.dtype, copy=False)
+        u = self.prior.checked_prox((state + 2 * d)[None], self.gamma)[0].astype(state.dtype, copy=False)
         r = u - state - d
         self.z = state + f(self.relaxation) * r
         sums = np.array([self.prior.value(u[None]), squares(r), squares(u), squares(d)])

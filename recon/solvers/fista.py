@@ -91,7 +91,7 @@ class Fista(Solver):
         gradient = self.operator.adjoint(forward_y, self._gradient)
         gradient *= -self.x.dtype.type(self.step_length)
         gradient += y
-        new = self.prior.prox(gradient, self.step_length)
+        new = self.prior.checked_prox(gradient, self.step_length)
         against = float(np.vdot(y - new, new - self.x)) > 0
         self._gradient, self.previous, self.x = y, self.x, new
         self.forward_previous, self.forward_x = self.forward_x, self.forward_previous

@@ -67,7 +67,7 @@ class ProxSplit:
         self.sums = (0.0, 0.0, 0.0, 0.0)
 
     def _prox(self) -> Array:
-        split: Array = self.prior.prox(self.state, 1 / self.mu).astype(self.state.dtype, copy=False)
+        split: Array = self.prior.checked_prox(self.state, 1 / self.mu).astype(self.state.dtype, copy=False)
         return split
 
     def meet(self, y: Array, relax: float) -> None:

@@ -8,12 +8,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution
-from recon.errors import StructureError
+from recon.errors import InputError, StructureError
 from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation
-from recon.priors.base import Separable, require_weight
+from recon.priors.base import Prior, Separable, require_weight
 from recon.priors.total_variation import Differences
+from recon.solvers.base import StoppingRules
 from recon.solvers.douglas_rachford import SparseDouglasRachford
+from recon.solvers.fista import Fista
 from recon.solvers.prior_splits import ratio, require_exact, soft_pair
 from recon.solvers.splitting import SensorData
 
@@ -24,6 +27,32 @@ DATA = np.ones((1, 8, 9))
 def volume(prior: Separable, channels: int = 1) -> SparseDouglasRachford:
     camera = Convolution(PSFS, (8, 9), n_channels=channels, dtype=np.float64)
     return SparseDouglasRachford(camera, SensorData(DATA.repeat(channels, 0), np.ones((8, 9), bool)), prior)
+
+
+class Cropping(L1):
+    """Written by somebody in a hurry."""
+
+    def prox(self, x: np.ndarray, step: float) -> np.ndarray:
+        return super().prox(x, step)[..., :2]
+
+
+class Bare(LinearOperator):
+    """Does not call its parent's ``__init__``."""
+
+    norm_bound = 1.0
+
+    def __init__(self) -> None:
+        pass
+
+    def forward(self, x: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        return x
+
+    adjoint = forward
+
+
+def of_own(prior: Prior, operator: LinearOperator | None = None) -> object:
+    camera = operator or Convolution(PSFS[:1, 0], (8, 9), dtype=np.float64)
+    return Fista(camera, DATA, prior).run(StoppingRules(2))
 
 
 WITHIN: list[Callable[[], object]] = [
@@ -39,6 +68,8 @@ REFUSED: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: volume(Box(-1.0, 1.0)), StructureError, "for l1 and non-negativity alone"),
     (lambda: volume(Separable(0.1, lower=-1.0)), StructureError, "for l1 and non-negativity alone"),
     (lambda: require_exact(L1(0.1), HaarTotalVariation(0.1)), StructureError, "HaarTotalVariation is only"),
+    (lambda: of_own(Cropping(0.1)), InputError, "Cropping: its prox must return an array like its argument"),
+    (lambda: of_own(L1(0.1), Bare()), AttributeError, "Bare has no dtype: its __init__ must call super()"),
     (lambda: L1(-0.1), ValueError, "must not be negative; got -0.1"),
     (lambda: require_weight(float("nan")), ValueError, "must not be negative; got nan"),
     (lambda: TotalVariation(-1.0), ValueError, "must not be negative"),
