@@ -2,7 +2,10 @@
 
 Beads stand between planes and pixels, at random places of 10 to 20 mm, planes evenly in 1/z. They are
 rendered lenslet by lenslet (``lenslet_scene``), reconstructed by l1 and looked for in the volume and in its
-metric copy (``export --metric``): by the brightest voxel within four pixels, and the light's centre about it.
+metric copy (``export --metric``): by the brightest voxel, and the light's centre about it, within two planes
+and as far across as a ray from the pattern's edge goes in these, four pixels more. "Perfect" volumes are made
+of the places themselves, without photograph and solver: each bead's light shared by the eight voxels beside
+it, along its ray. What they miss is the resampling's; what the others miss beyond it is the reconstruction's.
 
     python benchmarks/bead_places.py --planes 4 7 13 25
 """
@@ -24,11 +27,11 @@ PHOTONS = 3000.0
 """In the brightest pixel."""
 
 
-def apart(points: np.ndarray) -> np.ndarray:
+def apart(points: np.ndarray, reach: float) -> np.ndarray:
     """Return those beads that stand further from all before them than two windows reach."""
     kept: list[np.ndarray] = []
     for one in points:
-        if all(np.hypot(*(one[:2] - other[:2])) > 2.9 * REACH for other in kept):
+        if all(np.hypot(*(one[:2] - other[:2])) > 2.9 * reach for other in kept):
             kept.append(one)
     return np.array(kept)
 
@@ -43,10 +46,18 @@ def found(volume: np.ndarray, at: np.ndarray, reach: np.ndarray) -> tuple[np.nda
     return low + brightest, low + np.array(center_of_mass(lit))
 
 
+def perfect(shape: tuple[int, int, int], at: np.ndarray) -> np.ndarray:
+    """Return a volume with the light of one bead, 1, shared by the voxels beside its place."""
+    shares = [np.maximum(1 - np.abs(np.arange(n) - where), 0) for n, where in zip(shape, at, strict=True)]
+    return np.einsum("z,y,x->zyx", *shares).astype(np.float32)
+
+
 def offsets(planes: int, seed: int) -> tuple[float, dict[str, np.ndarray]]:
     """Return by how many pixels the pattern's edge moves a plane, and how far beads are off (n, 3)."""
     camera = Camera(SIZE, planes)
-    points = apart(beads(camera, COUNT, seed))
+    moved = 0.33 * SIZE * camera.span / (planes - 1)
+    across = REACH + 2 * moved
+    points = apart(beads(camera, COUNT, seed), across)
     z_um = 1e3 * DISTANCE_MM / (camera.magnifications - 0.7)
     geometry = Geometry(PITCH_UM, DISTANCE_MM)
     calibration = recon.Calibration(camera.psfs(), np.stack([0 * z_um, 0 * z_um, z_um], 1), geometry=geometry)
@@ -59,26 +70,28 @@ def offsets(planes: int, seed: int) -> tuple[float, dict[str, np.ndarray]]:
     grid: Grid = result.grid
     metric, placed = metric_volume(result.volume, grid)
     off: dict[str, list[np.ndarray]] = {}
+
+    def note(name: str, volume: np.ndarray, there: np.ndarray, reach: np.ndarray) -> None:
+        for kind, voxel in zip(("brightest", "centre"), found(volume, there, reach), strict=True):
+            off.setdefault(f"{name}, {kind}", []).append(np.abs(voxel - there))
+
     for y, x, m, _ in points:
         z = 1e3 * DISTANCE_MM / (m - 0.7)
         plane = (camera.magnifications[0] - m) / camera.span * (planes - 1)
         at = np.array([plane, y + grid.centre[0], x + grid.centre[1]])
         place = grid.place_um(0, at[1], at[2])
         scale = z / z_um[0]  # along the ray
-        truth = np.array([place[0] * scale, place[1] * scale, z])
-        names = ("planes, brightest", "planes, centre")
-        for name, voxel in zip(names, found(result.volume, at, np.array([2, REACH, REACH])), strict=True):
-            off.setdefault(name, []).append(np.abs(voxel - at))
         there = np.array([
             (z - placed.z_um[0]) / placed.spacing_um[0],
-            *placed.pixel_of(0, truth[0], truth[1]),
+            *placed.pixel_of(0, place[0] * scale, place[1] * scale),
         ])  # fmt: skip
-        names = ("voxels, brightest", "voxels, centre")
         deep = 2 * np.gradient(z_um)[round(plane)] / placed.spacing_um[0]
-        reach = np.array([abs(deep), REACH, REACH])
-        for name, voxel in zip(names, found(metric, there, reach), strict=True):
-            off.setdefault(name, []).append(np.abs(voxel - there))
-    return 0.33 * SIZE * camera.span / (planes - 1), {name: np.array(each) for name, each in off.items()}
+        reach = np.array([abs(deep), across, across])
+        note("reconstructed, planes", result.volume, at, np.array([2, REACH, REACH]))
+        note("reconstructed, voxels", metric, there, reach)
+        linear = np.array([np.interp(z, z_um, np.arange(planes)), *at[1:]])
+        note("perfect, voxels", metric_volume(perfect(grid.shape, linear), grid)[0], there, reach)
+    return moved, {name: np.array(each) for name, each in off.items()}
 
 
 def main() -> None:

@@ -35,6 +35,13 @@ def depth_in_words(z_um: float) -> str:
     return "infinity" if z_um >= FAR_UM else f"{z_um / 1e3:g} mm"
 
 
+LEAN = 2.0
+"""Logarithm of how much more one end of a plane's light may be raised than the other: enough for steps of
+which one is 1.7 times the next."""
+HALF = 0.5 - SAME
+"""Of evenly spaced planes half a step beyond the last one fills no voxel."""
+
+
 @dataclass(frozen=True, slots=True)
 class Grid:
     """Where the voxels of a reconstruction lie: every depth has its own lateral pitch (Kuo 2020, sec. 4.4).
@@ -171,9 +178,14 @@ def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
     middle = min(n_z // 2, n_z - 2)
     across = float(grid.pitch_um[order][n_z // 2]) if voxel_um is None else voxel_um
     deep = float(steps[middle]) if voxel_um is None else voxel_um
-    first, span = z[0] - steps[0] / 2, z[-1] - z[0] + (steps[0] + steps[-1]) / 2
-    count = max(round(span / deep), 1)
-    places = first + (span - count * deep) / 2 + (np.arange(count) + 0.5) * deep
+    span = z[-1] - z[0] + (steps[0] + steps[-1]) / 2
+    # A voxel lies on the nearest plane, none of the planes outside, and half a step beyond the outermost is
+    # filled: by voxels of which half or more lies there.
+    last = (z[-1] - z[0]) / deep
+    before = int(steps[0] / 2 / deep + HALF)
+    behind = max(int(np.ceil(last - SAME)), int(last + steps[-1] / 2 / deep + HALF))
+    places = z[0] + np.arange(-before, behind + 1) * deep
+    count = len(places)
     sides = []
     for axis, n in ((1, height), (0, width)):  # of axis_um and of rows and columns
         middles, centre = _axis(grid)[:, axis], grid.centre[1 - axis]
@@ -185,7 +197,7 @@ def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
         start = int(np.ceil(low / across - 1e-6))
         sides.append((start, int(np.floor(high / across + 1e-6)) - start + 1))
     (top, rows), (left, columns) = sides
-    if count < 2 or rows < 1 or columns < 1:
+    if 2 * deep > span or rows < 1 or columns < 1:
         raise InputError(
             f"Voxels of {across:g} um are too large: two must fit into the volume's depth of {span:.4g} um, "
             "and one across. Give a smaller edge."
@@ -204,9 +216,10 @@ def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
 def metric_planes(plane: Callable[[int], Plane], grid: Grid, metric: Grid) -> Callable[[int], Plane]:
     """Bring a volume to a metric grid: return what makes its planes.
 
-    Values are light a voxel: what all voxels of a bead add up to stays, to a few per cent. Between planes the
-    mean goes along the rays through the diffuser, pixel by pixel. Where no pixel looks there is 0. Smaller
-    voxels than pixels are interpolated linearly; larger ones are triangular means.
+    Values are light a voxel: what all voxels of a bead add up to stays, and so does the centre of its light;
+    across, where voxels are no whole part of a pixel, the light to a few per cent. Between planes the mean
+    goes along the rays through the diffuser, pixel by pixel. Where no pixel looks there is 0. Smaller voxels
+    than pixels are interpolated linearly; larger ones are triangular means.
 
     Parameters
     ----------
@@ -224,20 +237,18 @@ def metric_planes(plane: Callable[[int], Plane], grid: Grid, metric: Grid) -> Ca
     """
     order = np.argsort(grid.z_um)
     nodes, pitches = grid.z_um[order], grid.pitch_um[order]
-    steps = np.diff(nodes)
-    thickness = (np.append(steps[0], steps) + np.append(steps, steps[-1])) / 2
     axis = _axis(grid)[order]
-    deep, across = float(metric.spacing_um[0]), float(metric.pitch_um[0])
+    across = float(metric.pitch_um[0])
     kept = lru_cache(maxsize=4)(plane)  # neighbours in the result come from the same planes
-    between = _between(nodes, metric.z_um, deep)
+    shares = _shares(nodes, metric.z_um, float(metric.spacing_um[0]))
 
     def made(number: int) -> Plane:
-        z, weights = metric.z_um[number], between[number]
-        pitch = float(np.interp(z, nodes, pitches))
+        z = metric.z_um[number]
+        inside = float(np.clip(z, nodes[0], nodes[-1]))
+        pitch = float(np.interp(z, nodes, pitches)) * z / inside  # rays go on beyond the outermost planes
         mixed: Any = 0
-        for k in np.flatnonzero(weights):
-            # Mixed by direction, and by how much light there is in a micrometre of depth.
-            mixed = mixed + np.float32(weights[k] * deep / thickness[k]) * kept(int(order[k]))
+        for k in np.flatnonzero(shares[number]):
+            mixed = mixed + np.float32(shares[number, k]) * kept(int(order[k]))
         x, y = (float(np.interp(z, nodes, axis[:, i])) for i in (0, 1))
         rows, columns = (
             _seen_by(n, centre, grid.upright, (places - off) / pitch, across / pitch)
@@ -275,6 +286,48 @@ def _places(metric: Grid) -> tuple[Floats, Floats]:
         (np.arange(n) - c) * metric.pitch_um[0] for n, c in zip(metric.shape[1:], metric.centre, strict=True)
     )
     return rows, columns
+
+
+def _shares(nodes: Floats, places: Floats, step: float) -> Floats:
+    """Return which share of each plane's light goes to each place, (n_places, n_nodes).
+
+    Light a micrometre is interpolated; then each plane's shares are tilted, exponentially in depth, so that
+    they add up to one and their centre is the plane's. Without that a bead of a plane whose steps differ on
+    both sides would be deeper than it is, and its light, which lies along an oblique ray, beside it.
+    """
+    steps = np.diff(nodes)
+    first, last = nodes[0] - steps[0] / 2, nodes[-1] + steps[-1] / 2
+    thickness = (np.append(steps[0], steps) + np.append(steps, steps[-1])) / 2
+    # Of a voxel at either end the part counts that is in the volume.
+    inside = np.minimum(places + step / 2, last) - np.maximum(places - step / 2, first)
+    shares = _between(nodes, places, step) * np.clip(inside, 0, step)[:, None] / thickness
+    # Of a plane on one side of all that has a share of it: the two places beside it, by their distances.
+    beside = np.stack([np.interp(nodes, places, unit) for unit in np.eye(len(places))])
+    for k, node in enumerate(nodes):
+        of = np.flatnonzero(shares[:, k])
+        off = (places[of] - node) / step
+        if off.size and off[0] < -SAME and off[-1] > SAME:
+            shares[of, k] = _centred(shares[of, k], off)
+        else:
+            shares[:, k] = beside[:, k]
+    return shares
+
+
+def _centred(shares: Floats, off: Floats) -> Floats:
+    """Return shares times ``exp(a + b off)``: positive, their sum 1 and, by Newton, their mean ``off`` 0.
+
+    As far as :data:`LEAN` lets them: steps that differ by more would leave what is even in bands.
+    """
+    tilt, most = 0.0, LEAN / float(off[-1] - off[0])
+    for _ in range(50):
+        tilted = shares * np.exp(tilt * off)
+        tilted /= tilted.sum()
+        mean = float(tilted @ off)
+        new = float(np.clip(tilt - mean / max(float(tilted @ (off - mean) ** 2), 1e-9), -most, most))
+        if abs(new - tilt) < 1e-9 * most:
+            break
+        tilt = new
+    return tilted
 
 
 def _between(nodes: Floats, places: Floats, step: float) -> Floats:

@@ -232,7 +232,7 @@ def test_export_brings_a_volume_to_voxels_of_one_size(tmp_path, capsys):
     for arguments in (["n.npy", "--metric"], ["v.ome.zarr", "--voxel-um", "5"]):
         assert main(["export", str(tmp_path / arguments[0]), str(tmp_path / "o.tif"), *arguments[1:]]) == 2
     told = capsys.readouterr()
-    assert "z 8.95 to 11.35, y" in told.out
+    assert "z 9 to 11.4, y" in told.out
     assert "are not known" in told.err
     assert "give --metric too" in told.err
 
