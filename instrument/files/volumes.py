@@ -234,17 +234,17 @@ def grid_of(facts: Mapping[str, Any], shape: tuple[int, int, int]) -> Grid:
     from recon.camera.grid import Grid
 
     n_z, *size = shape
-    z_um, pitch_um = (_numbers(facts.get(name), (n_z,)) for name in ("z_um", "pitch_um"))
+    z_um, pitch_um = (numbers(facts.get(name), (n_z,)) for name in ("z_um", "pitch_um"))
     if z_um is None or pitch_um is None:
         z_um = pitch_um = np.full(n_z, np.nan)
-    centre = _numbers(facts.get("centre"), (2,))
+    centre = numbers(facts.get("centre"), (2,))
     row, column = (n // 2 for n in size) if centre is None else centre.astype(int).tolist()
-    axis_um = _numbers(facts.get("axis_um"), (n_z, 2))
+    axis_um = numbers(facts.get("axis_um"), (n_z, 2))
     return Grid(shape, (row, column), z_um, pitch_um, None, axis_um, facts.get("upright") is True)
 
 
-def _numbers(value: Any, shape: tuple[int, ...]) -> npt.NDArray[np.float64] | None:
-    """Return finite numbers of a shape; None where a record has something else."""
+def numbers(value: Any, shape: tuple[int, ...]) -> npt.NDArray[np.float64] | None:
+    """Return finite numbers of a shape, () for one; None where a record has something else."""
     try:
         numbers = np.array(value, np.float64)
     except (TypeError, ValueError):

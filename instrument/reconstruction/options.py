@@ -177,6 +177,26 @@ class InputOptions:
         applies=_EVERY,
         group=_PHOTOGRAPH,
     )
+    pixel_um: float | None = option(
+        None,
+        help="Pixel pitch of PSFs, one a depth, that are files.",
+        default_words="as their file says",
+        unit="um",
+        above=0,
+        applies=("volume",),
+        label="Pixel pitch of PSF files",
+        group=RARE,
+    )
+    distance_mm: float | None = option(
+        None,
+        help="Diffuser to sensor, of PSFs, one a depth, that are files.",
+        default_words="not known",
+        unit="mm",
+        above=0,
+        applies=("volume",),
+        label="Diffuser to sensor, of PSF files",
+        group=RARE,
+    )
     allow_saturated: bool = option(
         False,
         help="Accept a PSF image with much of its light in saturated pixels.",

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, read_stack
+from instrument.files.volumes import numbers
 from instrument.reconstruction.forecast import Forecast, forecast
 from instrument.reconstruction.job import (
     Job,
@@ -37,7 +38,7 @@ from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choice_for
 from recon.reconstruction.solvers import SOLVERS, volume_priors
 from recon.solvers.base import IterationRecord, Keeper
-from recon.types import Calibration
+from recon.types import Calibration, Geometry
 
 Watch = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
 """Called after each iteration with its record and what makes the present picture or volume."""
@@ -199,13 +200,19 @@ def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOpt
 
     ``psfs``: a calibration folder or the run it lies in, or a stack as
     :func:`~instrument.files.images.read_stack` takes it (the photograph may lie there too), whose order the
-    job's notes and record tell. Integer PSFs lose their darkest level; float ones are taken to be free of any
-    offset. ``image`` and ``inputs``: as :func:`~instrument.reconstruction.job.job_from_calibration`.
+    job's notes and record tell. Its depths, where all are above zero, are taken for distances from the
+    diffuser. Integer PSFs lose their darkest level; float ones are taken to be free of any offset. ``image``
+    and ``inputs``: as :func:`~instrument.reconstruction.job.job_from_calibration`.
 
     Raises FileError or BenchError.
     """
     if not isinstance(psfs, ImageFile):
         if psfs.is_dir() and (is_calibration(psfs) or (psfs / STATE).is_file()):  # or the run it was made in
+            if (inputs.pixel_um, inputs.distance_mm) != (None, None):
+                raise BenchError(
+                    f"--pixel-um and --distance-mm are for PSFs that are files: the calibration {psfs} says "
+                    "its own. Leave them out."
+                )
             return job_from_calibration(psfs, image, inputs)
         own = image.path if isinstance(image, ImageFile) else image
         psfs = read_stack(psfs, leave_out=own)
@@ -214,15 +221,42 @@ def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOpt
     if stack.dtype.kind == "u":
         pixels = np.maximum(pixels - min(darkest_block(p) for p in pixels), 0)
     channels = pixels[:, None] if pixels.ndim == 3 else np.moveaxis(pixels, -1, 1)
+    places_um, said = _places_um(psfs)
+    pitch_um = inputs.pixel_um
+    if (
+        pitch_um is None
+        and (told := numbers(psfs.metadata.get("pixel_pitch_um"), ())) is not None
+        and told > 0
+    ):
+        pitch_um = float(told)
+        said = "; ".join(filter(None, (said, f"pixels of {pitch_um:g} um as it says")))
     calibration = Calibration(
-        np.ascontiguousarray(channels), np.full((len(pixels), 3), np.nan), provenance={"psfs": str(psfs.path)}
+        np.ascontiguousarray(channels),
+        places_um,
+        geometry=Geometry(pitch_um, inputs.distance_mm),
+        provenance={"psfs": str(psfs.path), "simulated": psfs.is_simulated},
     )
     job = job_with(calibration, psfs.path, image, inputs)
+    words = "; ".join(filter(None, (*psfs.notes, said)))
     return replace(
         job,
-        notes={**job.notes, **({"PSFs": "; ".join(psfs.notes)} if psfs.notes else {})},
+        notes={**job.notes, **({"PSFs": words} if words else {})},
         provenance={**job.provenance, "psf_stack": dict(psfs.metadata)},
     )
+
+
+def _places_um(psfs: ImageFile) -> tuple[npt.NDArray[np.float64], str]:
+    """Return where the sources of a stack's PSFs were, (n, 3), NaN for what is not known; and what to say."""
+    places_um = np.full((len(psfs.pixels), 3), np.nan)
+    if not psfs.metadata.get("depths_um"):
+        return places_um, ""
+    depths_um = numbers(psfs.metadata["depths_um"], (len(places_um),))
+    if depths_um is None or depths_um.min() <= 0:
+        return places_um, "not all above 0: taken for no distances from the diffuser"
+    if len(np.unique(depths_um)) < len(depths_um):
+        return places_um, "two are the same: taken for no distances from the diffuser"
+    places_um[:, 2] = depths_um
+    return places_um, "taken for distances from the diffuser"
 
 
 def refocused(job: Job, z_um: float, *, beside: bool = False) -> Job:

@@ -147,7 +147,9 @@ class StoredResult:
         try:
             volume = metric_source(self.volume, grid, voxel_um)
         except InputError as error:
-            raise FileError(self.path, str(error)) from error
+            told = np.isfinite(grid.z_um).all() and np.isfinite(grid.pitch_um).all()
+            how = "" if told else "Of PSFs from files --pixel-um and --distance-mm of reconstruct say them."
+            raise FileError(self.path, str(error), how) from error
         return replace(self, volume=volume)
 
     def voxels_in_words(self) -> str:

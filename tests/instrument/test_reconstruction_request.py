@@ -1,6 +1,7 @@
 """Pictures and volumes as requests: what the command line, the window and scripts fill in."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,11 +9,17 @@ import tifffile
 from scipy.signal import fftconvolve
 
 from instrument.cli import main
+from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError
+from instrument.files.images import read_stack
+from instrument.files.volumes import write_volume_tiff, write_volume_zarr
 from instrument.reconstruction.options import InputOptions
-from instrument.reconstruction.request import PictureRequest, VolumeRequest
+from instrument.reconstruction.request import PictureRequest, VolumeRequest, volume_job
+from instrument.reconstruction.stored_result import open_result
+from recon.camera.grid import Grid
 from recon.errors import InputError
 from recon.reconstruction.options import Overrides, ReconstructionOptions
+from recon.types import Calibration
 
 SIZE = 48
 
@@ -171,3 +178,49 @@ def test_options_are_checked_before_any_file_is_read(tmp_path, changes, said):
     inputs = changes.pop("inputs", InputOptions())
     with pytest.raises((InputError, BenchError), match=said):
         PictureRequest(**missing, inputs=inputs, options=ReconstructionOptions(**changes)).prepare()
+
+
+@pytest.mark.parametrize("kind", ["names", "OME-TIFF", "OME-Zarr"])
+def test_depths_of_psf_files_come_as_far_as_the_metric_volume(tmp_path, photograph, psf, kind, capsys):
+    z_mm, stack = (10.0, 12.5, 16.0), np.stack([np.roll(psf, z, 0) for z in range(3)])
+    if kind == "names":
+        (tmp_path / "psfs").mkdir()
+        for z, own in zip(z_mm, stack, strict=True):
+            tifffile.imwrite(tmp_path / "psfs" / f"z{z:g}mm.tif", own.astype(np.float32))
+        psfs = tmp_path / "psfs"
+    else:
+        psfs = tmp_path / ("psfs.ome.tif" if kind == "OME-TIFF" else "psfs.ome.zarr")
+        z_um = 1e3 * np.array(z_mm if kind == "OME-TIFF" else (10.0, 13.0, 16.0))
+        grid = Grid(stack.shape, (24, 24), z_um, np.full(3, 6.5))
+        write = write_volume_tiff if kind == "OME-TIFF" else partial(write_volume_zarr, attributes={})
+        write(psfs, iter(stack.astype(np.float32)), stack.shape, grid)
+        z_mm = z_um / 1e3
+    tifffile.imwrite(tmp_path / "raw.tif", photograph)
+    words = ["reconstruct", "--volume", str(psfs), "--image", str(tmp_path / "raw.tif"), "--iterations", "2"]
+    words += ["--model", "convolution", "--prior", "l1"]
+    optics = ["--distance-mm", "6", *(["--pixel-um", "6.5"] if kind == "names" else [])]
+    assert main([*words, *optics, "--out", str(tmp_path / "v.ome.zarr")]) == 0
+    said = capsys.readouterr().out
+    assert "taken for distances from the diffuser" in said
+    assert ("pixels of 6.5 um as it says" in said) == (kind != "names")
+    grid = open_result(tmp_path / "v.ome.zarr").grid
+    np.testing.assert_allclose(grid.z_um, 1e3 * np.array(z_mm))
+    np.testing.assert_allclose(grid.pitch_um, 6.5 * np.array(z_mm) / 6)
+    assert main(["export", str(tmp_path / "v.ome.zarr"), str(tmp_path / "m.ome.zarr"), "--metric"]) == 0
+    assert open_result(tmp_path / "m.ome.zarr").grid.z_um[0] == pytest.approx(1e4)
+
+
+@pytest.mark.parametrize("depths_um", [[0.0, 500.0], [700.0, 700.0], ["x", 3], [500.0, float("nan")]])
+def test_depths_that_are_no_distances_from_the_diffuser_are_not_taken(volume_files, depths_um):
+    stack = replace(read_stack(volume_files["psfs"]), metadata={"depths_um": depths_um})
+    job = volume_job(stack, volume_files["image"], InputOptions(distance_mm=6.0))
+    assert np.isnan(job.calibration.source_positions_um).all()
+    assert "taken for no distances" in job.notes["PSFs"]
+
+
+def test_a_calibration_says_its_own_optics(tmp_path, psf, photograph):
+    calibration = Calibration(np.float32(psf)[None, None].repeat(2, 0), np.array([(0, 0, 1e4), (0, 0, 2e4)]))
+    save_calibration(calibration, tmp_path / "calibration")
+    tifffile.imwrite(tmp_path / "raw.tif", photograph)
+    with pytest.raises(BenchError, match="says its own"):
+        volume_job(tmp_path / "calibration", tmp_path / "raw.tif", InputOptions(pixel_um=6.5))
