@@ -277,7 +277,7 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
     from instrument.reconstruction.job import find_calibration
     from recon.camera.refocus import refocus as refocused
     from recon.camera.refocus_field import refocus_field
-    from recon.camera.two_part import two_part
+    from recon.camera.two_part import is_cut, two_part
 
     if len(set(options.z_um)) < len(options.z_um):
         raise BenchError("--z-mm: a depth is asked for twice.")
@@ -296,6 +296,11 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
             advance(done)
     if options.response is not None:
         response = load_response(options.response).fall_off()
+        if any(is_cut(field) for field in fields):
+            desk.warn(
+                "Warning: The pattern of the source on the axis goes on beyond the sensor. What is not on it "
+                "is dark in PSFs over the field: measure these (calibrate field), or stop the diffuser down."
+            )
         with desk.step("points over the field", len(fields)) as advance:
             for place, field in enumerate(fields):
                 fields[place] = two_part(field, response, points=options.points)

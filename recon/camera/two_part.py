@@ -83,6 +83,24 @@ def two_part(calibration: Calibration, response: Response, *, points: int = 3) -
     )
 
 
+EDGE_PX, CUT = 2, 0.3
+"""Pixels along a side that tell whether a pattern goes on beyond it, and how bright they are then beside the
+PSF's mean: of simulated patterns on the sensor up to 0.23, of those that go on beyond it up to 1.04."""
+
+
+def is_cut(calibration: Calibration) -> bool:
+    """Whether the pattern of a PSF on the axis goes on beyond the sensor: two-part PSFs do not show it there.
+
+    Their pattern is the photograph's on the axis, moved: what that does not show stays dark over the field.
+    """
+    for group in members_of_depths(calibration.source_positions_um):
+        psf = calibration.psfs[calibration.nearest_to_axis(group)].mean(axis=0, dtype=np.float64)
+        sides = (psf[:EDGE_PX], psf[-EDGE_PX:], psf[:, :EDGE_PX], psf[:, -EDGE_PX:])
+        if max(float(side.mean()) for side in sides) > CUT * float(psf.mean()):
+            return True
+    return False
+
+
 def _seen(response: Response, rows_um: Floats, columns_um: Floats, across_um: float) -> Floats:
     """Light of a point that shines evenly on pixels at these places from below it."""
     tan_y, tan_x = rows_um[:, None] / across_um, columns_um / across_um

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -75,10 +76,17 @@ def test_the_angular_response_makes_a_field_of_one_psf(
     assert main([*words, "--points", "2"]) == 2
     assert "give --response too" in capsys.readouterr().err
     assert main([*words, "--points", "2", "--response", str(tmp_path / "response.json")]) == 0
-    assert "(4 places of the field)" in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert "(4 places of the field)" in told.out
+    assert "beyond the sensor" not in told.err
     made = load_calibration(tmp_path / "field")
     assert len(made.psfs) == 4
     assert len(set(map(tuple, made.source_positions_um[:, :2].tolist()))) == 4
+    given = load_calibration(folder / "calibration")
+    save_calibration(replace(given, psfs=given.psfs[..., 80:-80, 120:-120]), tmp_path / "small")
+    words = ["refocus", str(tmp_path / "small"), "--z-mm", "75", "--out", str(tmp_path / "cut")]
+    assert main([*words, "--response", str(tmp_path / "response.json")]) == 0
+    assert "goes on beyond the sensor" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("depths", [["--z-mm", "0"], ["--z-mm", "75", "--z-mm", "75"]])
