@@ -45,6 +45,7 @@ from instrument.reconstruction.video import VideoRequest, prepare_video
 from instrument.reconstruction.video_work import cluster, in_process, on_cluster
 from recon.base.metrics import psnr
 from recon.base.threads import set_threads
+from recon.camera.field_registration import forget
 from recon.camera.registration import rescaled
 from recon.streams.video import COLD_ITERATIONS, VideoSolver, stream_problem
 from recon.types import Calibration, Geometry
@@ -220,10 +221,12 @@ def choice(height: int, width: int) -> None:
         frames = [frame.astype(np.float32) for frame in seen[:5]]
         known = {"noise": float(np.sqrt(np.mean(frames[0]) * 0.2 * FULL / PHOTONS)), "prior": "tv"}
         for _ in range(2):  # the first compiles
+            forget()
             began_s = time.process_time()
             problem = stream_problem(frames[0], calibration, others=frames[1:], **known)
             took = time.process_time() - began_s
         settled = {"model": problem.model, "estimate_background": problem.options.estimate_background}
+        forget()  # solving needs the PSFs registered, too
         began_s = time.process_time()
         stream_problem(frames[0], calibration, **settled, **known)
         choosing = took - (time.process_time() - began_s)
@@ -238,7 +241,7 @@ def choice(height: int, width: int) -> None:
             f"  choosing {choosing:.1f} CPU s, cold {cold:.2f}, warm {warm_s:.3f} s a frame; of a film of",
             end="",
         )
-        for count in (32, 100, 200, 500):
+        for count in (16, 32, 64, 100, 200, 500):
             film = count * warm_s + -(-count // 32) * (cold - warm_s)
             print(f" {count}: {choosing / (film + took):.1%}", end="")
         print(flush=True)

@@ -14,8 +14,7 @@ from recon.base.checks import select_psf
 from recon.base.registry import Registry
 from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution, field_of
-from recon.camera.field_registration import NOT_ON_AXIS, remembered_field, shown
-from recon.camera.registration import moved
+from recon.camera.field_registration import NOT_ON_AXIS, departure, remembered_field
 from recon.camera.varying_psfs import FieldOfPsfs, interpolation_weights, principal_psfs
 from recon.errors import InputError
 from recon.types import Calibration
@@ -94,14 +93,8 @@ class Depths:
     @cached_property
     def field_error(self) -> float:
         """Root mean square difference of the registered PSFs from the central one, relative to it."""
-        differences = norms = 0.0
-        for central, field in zip(self.central, self.fields, strict=True):
-            for psf, (rows, columns) in zip(field.psfs, field.points, strict=True):
-                # There and back between pixels as the registered one came, so that interpolation is no error.
-                seen = moved(moved(central, rows, columns), -rows, -columns)
-                there = shown(psf.shape[1:], rows, columns)
-                differences += float(np.sum((psf - seen)[:, there].astype(np.float64) ** 2))
-                norms += float(np.sum(seen[:, there].astype(np.float64) ** 2))
+        parts = [departure(*each) for each in zip(self.fields, self.central, strict=True)]
+        differences, norms = np.sum(parts, axis=0)
         return float(np.sqrt(differences / norms)) if norms > 0 else 0.0
 
     def within(self, window: tuple[int, int]) -> Depths:

@@ -11,11 +11,12 @@ import threading
 from collections import OrderedDict
 from dataclasses import replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.registration import Registration, aligned, expected_shift, register
+from recon.camera.registration import Registration, aligned, expected_shift, moved, register
 from recon.camera.varying_psfs import FieldOfPsfs, interpolation_weights
 from recon.errors import InputError
 from recon.types import Calibration
@@ -234,9 +235,33 @@ def remembered_field(calibration: Calibration, group: npt.NDArray[np.intp]) -> R
     return central, field, list(warnings)
 
 
+_departures: WeakKeyDictionary[FieldOfPsfs, tuple[bytes, float, float]] = WeakKeyDictionary()
+
+
+def departure(field: FieldOfPsfs, central: npt.NDArray[np.float32]) -> tuple[float, float]:
+    """Return the squares of what a field's PSFs differ by from a central one, and of what that would show.
+
+    ``central``, (n_channels, height, width); what was asked last of a field is remembered.
+    """
+    key = hashlib.blake2b(np.ascontiguousarray(central).view(np.uint8), digest_size=16).digest()
+    known = _departures.get(field)
+    if known is None or known[0] != key:
+        differences = norms = 0.0
+        for psf, (rows, columns) in zip(field.psfs, field.points, strict=True):
+            # There and back between pixels as the registered one came, so that interpolation is no error.
+            seen = moved(moved(central, rows, columns), -rows, -columns)
+            there = shown(psf.shape[1:], rows, columns)
+            differences += float(np.sum((psf - seen)[:, there].astype(np.float64) ** 2))
+            norms += float(np.sum(seen[:, there].astype(np.float64) ** 2))
+        known = key, differences, norms
+        _departures[field] = known
+    return known[1:]
+
+
 def forget() -> None:
     """Forget what was registered: for timings, of which each is to pay for itself."""
     _fields.clear()
+    _departures.clear()
 
 
 class Remembered:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -134,6 +134,13 @@ class FieldOfPsfs:
                 f"A field of PSFs is (n_points, n_channels, height, width) with a (row, column) each; "
                 f"got PSFs {psfs.shape} and points {self.points.shape}."
             )
+
+    @cached_property
+    def products(self) -> Floats:
+        """Products of the PSFs with one another, (n_points, n_points): their Gram matrix."""
+        columns = self.psfs.reshape(len(self.psfs), -1)
+        gram: Floats = columns.astype(np.float64) @ columns.T.astype(np.float64)
+        return gram
 
 
 def spanned(field: FieldOfPsfs, y: Array, x: Array, margin: float) -> npt.NDArray[np.bool_]:
@@ -348,8 +355,7 @@ def principal_psfs(
         raise InputError(f"{n} PSFs have ranks from 1 to {n}, not {rank}.")
     columns = field.psfs.reshape(n, -1)
     # The small Gram matrix has the same right singular vectors as the tall matrix of PSFs.
-    gram = columns.astype(np.float64) @ columns.T.astype(np.float64)
-    values, vectors = np.linalg.eigh(gram)
+    values, vectors = np.linalg.eigh(field.products)
     values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1]
     missed = np.sqrt(np.maximum(1 - np.cumsum(values) / values.sum(), 0))
     if rank is None:

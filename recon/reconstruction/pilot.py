@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +52,73 @@ class Pilot:
     outcome: Outcome
 
 
+class Begun:
+    """A pilot that goes on from where it is; close it, or use it as a context manager.
+
+    Parameters
+    ----------
+    problem : Problem
+    weight : float, optional
+        Of the prior, in units of the noise; else the table's.
+    solver : str
+        ADMM where that one refuses the problem.
+    """
+
+    def __init__(self, problem: Problem, *, weight: float | None = None, solver: str = "admm-sensor") -> None:
+        offered = SOLVERS.named(solver)
+        self._offered = offered if offered.accepts(problem) is None else SOLVERS.named("admm")
+        own = replace(problem, options=replace(problem.options, solver=self._offered.name))
+        self._part = Part(own, slice(0, problem.n_channels))
+        self._solver: Any = None
+        try:
+            self._part.weigh(None, weight)
+            self._solver = self._offered.make(self._part, None)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def weight(self) -> float:
+        """Of the prior."""
+        return self._part.weight
+
+    def to(
+        self,
+        iterations: int,
+        *,
+        cancel: threading.Event | None = None,
+        enough: Callable[[Array], bool] | None = None,
+    ) -> Pilot:
+        """Go on until so many iterations are done in all; parameters as of :func:`pilot`."""
+        rules, ended, part = (
+            StoppingRules(iterations=iterations, tolerance=0.0),
+            threading.Event(),
+            self._part,
+        )
+
+        def look(solver: Solver, record: IterationRecord) -> None:
+            stopped = cancel is not None and cancel.is_set()
+            if enough is not None and record.iteration % LOOKED_AT == 0:
+                stopped = stopped or enough(_said(part, solver.solution)[2])
+            if stopped:
+                ended.set()
+
+        outcome = self._solver.run(rules, callback=look, cancel=ended)
+        solution, background, left = _said(part, outcome.solution)
+        return Pilot(solution, background, left, part.weight, outcome)
+
+    def close(self) -> None:
+        """Remove what it kept on disk."""
+        self._solver = None
+        self._part.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
 def pilot(
     problem: Problem,
     iterations: int,
@@ -67,36 +134,15 @@ def pilot(
     ----------
     problem : Problem
     iterations : int
-    weight : float, optional
-        Of the prior, in units of the noise; else the table's.
-    solver : str
-        ADMM where that one refuses the problem.
+    weight, solver
+        As of :class:`Begun`.
     cancel : threading.Event, optional
         Set it to stop after the iteration in progress.
     enough : callable, optional
         ``enough(left)`` with what an iterate leaves of the data, at every :data:`LOOKED_AT`-th: True ends it.
     """
-    offered = SOLVERS.named(solver)
-    offered = offered if offered.accepts(problem) is None else SOLVERS.named("admm")
-    own = replace(problem, options=replace(problem.options, solver=offered.name))
-    part = Part(own, slice(0, problem.n_channels))
-    try:
-        part.weigh(None, weight)
-        rules = StoppingRules(iterations=iterations, tolerance=0.0)
-        ended = threading.Event()
-
-        def look(solver: Solver, record: IterationRecord) -> None:
-            stopped = cancel is not None and cancel.is_set()
-            if enough is not None and record.iteration % LOOKED_AT == 0:
-                stopped = stopped or enough(_said(part, solver.solution)[2])
-            if stopped:
-                ended.set()
-
-        outcome = offered.make(part, None).run(rules, callback=look, cancel=ended)
-        solution, background, left = _said(part, outcome.solution)
-        return Pilot(solution, background, left, part.weight, outcome)
-    finally:
-        part.close()
+    with Begun(problem, weight=weight, solver=solver) as begun:
+        return begun.to(iterations, cancel=cancel, enough=enough)
 
 
 MODEL_ERROR = 0.02

@@ -135,11 +135,6 @@ def binning_of(depths: Depths, overrides: Overrides, valid: npt.NDArray[np.bool_
     return Decision("binning", value, why, up, down, asked, numbers, open=binning > 1)
 
 
-FALL = 0.03
-"""Share by which the mean square error of held-out pixels must fall for the object to be shut in between the
-outermost PSFs. Of 71 scenes nine had more and changed by -0.1 to +1.5 dB; up to 1.1 % cost as much as 0.9."""
-
-
 def field_of(
     depths: Depths, overrides: Overrides, model: ModelName, within: Within | None, *, haze: bool, plain: bool
 ) -> tuple[Extent, Decision]:
@@ -172,7 +167,7 @@ def field_of(
         whole = Decision("field", f"{largest} pixels", why, overruled=overruled, numbers=numbers, open=False)
         return Extent((height, width)), whole
     asked = overrides.field == "all"
-    shut = within is not None and within.spanned**2 <= (1 - FALL) * within.anywhere**2
+    shut = within is not None and within.asks
     window = (height, width) if asked or shut else psf_window(depths)
     reach = None if asked or shut else acceptance_px(depths)
     extent = (height + window[0] - 1, width + window[1] - 1)
