@@ -243,7 +243,7 @@ def departure(field: FieldOfPsfs, central: npt.NDArray[np.float32]) -> tuple[flo
 
     ``central``, (n_channels, height, width); what was asked last of a field is remembered.
     """
-    key = hashlib.blake2b(np.ascontiguousarray(central).view(np.uint8), digest_size=16).digest()
+    key = hashlib.blake2b(central.tobytes(), digest_size=16).digest()
     known = _departures.get(field)
     if known is None or known[0] != key:
         differences = norms = 0.0

@@ -182,9 +182,9 @@ def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
     # A voxel lies on the nearest plane, none of the planes outside, and half a step beyond the outermost is
     # filled: by voxels of which half or more lies there.
     last = (z[-1] - z[0]) / deep
-    before = int(steps[0] / 2 / deep + HALF)
-    behind = max(int(np.ceil(last - SAME)), int(last + steps[-1] / 2 / deep + HALF))
-    places = z[0] + np.arange(-before, behind + 1) * deep
+    above = int(steps[0] / 2 / deep + HALF)
+    below = max(int(np.ceil(last - SAME)), int(last + steps[-1] / 2 / deep + HALF))
+    places = z[0] + np.arange(-above, below + 1) * deep
     count = len(places)
     sides = []
     for axis, n in ((1, height), (0, width)):  # of axis_um and of rows and columns
@@ -300,7 +300,7 @@ def _shares(nodes: Floats, places: Floats, step: float) -> Floats:
     thickness = (np.append(steps[0], steps) + np.append(steps, steps[-1])) / 2
     # Of a voxel at either end the part counts that is in the volume.
     inside = np.minimum(places + step / 2, last) - np.maximum(places - step / 2, first)
-    shares = _between(nodes, places, step) * np.clip(inside, 0, step)[:, None] / thickness
+    shares: Floats = _between(nodes, places, step) * np.clip(inside, 0, step)[:, None] / thickness
     # Of a plane on one side of all that has a share of it: the two places beside it, by their distances.
     beside = np.stack([np.interp(nodes, places, unit) for unit in np.eye(len(places))])
     for k, node in enumerate(nodes):
@@ -319,6 +319,7 @@ def _centred(shares: Floats, off: Floats) -> Floats:
     As far as :data:`LEAN` lets them: steps that differ by more would leave what is even in bands.
     """
     tilt, most = 0.0, LEAN / float(off[-1] - off[0])
+    tilted: Floats = shares
     for _ in range(50):
         tilted = shares * np.exp(tilt * off)
         tilted /= tilted.sum()
