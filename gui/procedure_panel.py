@@ -25,6 +25,7 @@ from gui.way_on import WayOn
 from gui.widgets.building import after_rest, button, choice, fill, label, mark, scrolled, split, text_view
 from gui.widgets.tab_order import tab_in_order
 from instrument.bench.config_file import TEMPLATES
+from instrument.bench.safety import LIGHT_DOUBT, MOTION_DOUBT, UNSAFE
 from instrument.files.errors import BenchError, SettingsError, count, duration, size
 
 _CHECK_MS = 250
@@ -452,12 +453,12 @@ class ProcedurePanel(Panel):
     def _ended_early(self, ended: Ended) -> None:
         self._end_with(ended.words, wrong=False)
         self.way_on.offer(ended.run)
-        self.run_bar.show_end("Ended early; nothing moves, light off", complete=False)
+        self.run_bar.show_end(f"Ended early; {_state(ended.words)}", complete=False)
 
     def _failed(self, ended: Ended) -> None:
         self._end_with(ended.words, wrong=True)
         self.way_on.offer(ended.run)
-        self.run_bar.show_end("Failed; light off, nothing moves", complete=False)
+        self.run_bar.show_end(f"Failed; {_state(ended.words)}", complete=False)
 
     def _end_with(self, words: str, *, wrong: bool) -> None:
         """Say how it ended, until something else is asked for."""
@@ -480,3 +481,9 @@ class ProcedurePanel(Panel):
             wrong = wrong or bool(self.verdict.property("refused"))
         self.verdict.setPlainText(self.in_its_words(text))
         mark(self.verdict, "refused", wrong)
+
+
+def _state(words: str) -> str:
+    """Return in which state a procedure that ended so left the bench."""
+    doubted = any(doubt in words for doubt in (UNSAFE, LIGHT_DOUBT, MOTION_DOUBT))
+    return "the bench may not be safe, see above" if doubted else "light off, nothing moves"

@@ -116,7 +116,7 @@ class LiveReconstructionPanel(Panel):
         self.run_button.setChecked(True)
         self.run_button.toggled.connect(self._toggle)
         tip = "Reconstruct the newest frame with the full solver; again ends it"
-        self.refine_button = button("Refine", tip, self.refine)
+        self.refine_button = button("Refine", tip, self.refine, enabled=False)
         tip = "Time for one picture: quality gives way"
         self.budget = NumberEdit("ms", _BUDGET_MS, minimum=5.0, maximum=5000.0, tip=tip)
         self.budget.setFixedWidth(80)
@@ -303,6 +303,7 @@ class LiveReconstructionPanel(Panel):
     def look(self) -> None:
         """Show the newest picture, if it is another than the one shown."""
         self.hint.setVisible(self.loaded is None)
+        self.refine_button.setEnabled(self.loaded is not None or self._refining is not None)
         self.view.setVisible(self.loaded is not None)
         self.status.setVisible(self.loaded is not None or self._reader.is_reading)  # else the hint says it
         runs = self.run_button.isChecked() and self._refining is None and self._loading is None
@@ -329,7 +330,10 @@ class LiveReconstructionPanel(Panel):
         passed = "" if how is None else f", {count(how.passed_over, 'frame')} passed over"
         self.view.caution_against(self._doubt(result))
         self.view.set_caption(self._caption(result.metadata))
-        self.status.setText(f"latency {result.latency_ms:.0f} ms{rate}{passed}\n{result.picture.quality}")
+        # What is doubted stands over the picture.
+        worth = result.picture.quality.removeprefix(result.picture.doubt).removeprefix(": ")
+        latency = f"latency {result.latency_ms:.0f} ms{rate}{passed}"
+        self.status.setText("\n".join(filter(None, (latency, worth))))
 
     def _call_old(self, why: str) -> None:
         """Say over the picture that it stays while no other comes: of frames, or of the preview."""
@@ -397,7 +401,6 @@ class LiveReconstructionPanel(Panel):
             return
         frame, loaded = self.session.live.newest(), self.loaded
         if loaded is None:
-            self.refused(self.file, "Choose a calibration first.")
             return
         if frame is None:
             self.refused(None, "There is no frame yet: start the live view.")

@@ -191,6 +191,8 @@ class SweepsPanel(ProcedurePanel):
         pictures = [file for file in outcome.files if file.suffix == ".png"]
         if pictures:
             self._reader.ask(lambda: QImage(str(pictures[0])), self._show_result, "result")
+        else:
+            self.picture.clear("There is no other picture.")
 
     def _show_result(self, picture: QImage) -> None:
         self.picture.show_pixmap(QPixmap.fromImage(picture))

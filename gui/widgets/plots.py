@@ -39,14 +39,29 @@ class _Plot(pg.PlotWidget):  # type: ignore[misc] # pyqtgraph has no type annota
             self.getAxis(axis).setTextPen(now.dim)
 
 
+class _Counts(pg.AxisItem):  # type: ignore[misc] # pyqtgraph has no type annotations
+    """An axis of things that are counted: nothing stands between two of them."""
+
+    def tickSpacing(self, least: float, most: float, size: float) -> list[tuple[float, float]]:  # noqa: N802
+        """Return the steps of ticks, coarse ones first, without fractions of one."""
+        steps = super().tickSpacing(least, most, size)
+        return [(step, start) for step, start in steps if step >= 1 and step % 1 == 0] or [(1.0, 0.0)]
+
+
 def plot_widget(
-    x_label: str = "", y_label: str = "", *, x_unit: str = "", y_unit: str = "", grid: bool = True
+    x_label: str = "",
+    y_label: str = "",
+    *,
+    x_unit: str = "",
+    y_unit: str = "",
+    grid: bool = True,
+    counts: bool = False,
 ) -> Any:
-    """Return a ``pyqtgraph.PlotWidget`` in the theme's colours, with labelled axes.
+    """Return a ``pyqtgraph.PlotWidget`` in the theme's colours, with labelled axes; ``counts``: x counts.
 
     pyqtgraph has no type annotations, hence ``Any``.
     """
-    plot = _Plot(enableMenu=False)
+    plot = _Plot(enableMenu=False, axisItems={"bottom": _Counts("bottom")} if counts else None)
     plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
     plot.setAccessibleName(" over ".join(filter(None, (y_label, x_label))) or "Plot")
     plot.restyle()

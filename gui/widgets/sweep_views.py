@@ -166,7 +166,8 @@ class PsfTable(QWidget):
         for place, (name, tip) in enumerate(_COLUMNS):
             self.table.setHorizontalHeaderItem(place, cell(name, tip))
         self.table.currentCellChanged.connect(lambda row, *_: self.chosen.emit(row))
-        self.plot: Any = plot_widget("signal / noise of each PSF")  # beside an axis so low it is cut off
+        # Beside an axis so low the words are cut off.
+        self.plot: Any = plot_widget("signal / noise of each PSF", counts=True)
         self.plot.setMinimumHeight(90)
         self._points: Any = self.plot.plot([], [])
         self._least: Any = pg.InfiniteLine(angle=0, pos=MIN_SNR)
@@ -294,6 +295,7 @@ class Picture(QWidget):
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.pixmap = QPixmap()
+        self._empty = NO_PICTURE
         self.setMinimumSize(160, 120)
         self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
 
@@ -302,8 +304,9 @@ class Picture(QWidget):
         self.pixmap = pixmap
         self.update()
 
-    def clear(self) -> None:
-        """Show nothing."""
+    def clear(self, why: str = NO_PICTURE) -> None:
+        """Show nothing but words."""
+        self._empty = why
         self.show_pixmap(QPixmap())
 
     def paintEvent(self, _event: QPaintEvent) -> None:  # noqa: N802 - Qt's name
@@ -314,7 +317,7 @@ class Picture(QWidget):
             font = self.font()
             font.setPointSize(LARGE_PT)
             painter.setFont(font)
-            painter.drawText(self.rect(), Qt.AlignmentFlag.AlignCenter, NO_PICTURE)
+            painter.drawText(self.rect(), Qt.AlignmentFlag.AlignCenter, self._empty)
             painter.end()
             return
         size = self.pixmap.size().scaled(self.size(), Qt.AspectRatioMode.KeepAspectRatio)

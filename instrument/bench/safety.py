@@ -92,6 +92,7 @@ _STOP_REPEAT_S, _STOP_WAIT_S = 0.005, 2.0
 SafeStep = tuple[str, Callable[[], None]]
 """A step in words, e.g. ``"light off, led_array (illuminate)"``, and what does it."""
 
+UNSAFE = "The bench may not be safe"
 LIGHT_DOUBT = "The light may be on"
 MOTION_DOUBT = "The stage may be moving"
 _LOOK = "look, and switch its power off if so."
@@ -111,7 +112,7 @@ class StepsFailedError(BenchError):
     def __init__(self, failures: Iterable[tuple[str, BaseException]]) -> None:
         self.failures = tuple(failures)
         listed = "".join(f"\n{_line(step, error)}" for step, error in self.failures)
-        super().__init__(f"The bench may not be safe. Check by eye what could not be done:{listed}")
+        super().__init__(f"{UNSAFE}. Check by eye what could not be done:{listed}")
 
 
 def note_failures(error: BaseException, failure: BaseException) -> None:

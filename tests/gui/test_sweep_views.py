@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from pytestqt.qtbot import QtBot
 
-from gui.widgets.sweep_views import PsfPictures, small
+from gui.widgets.sweep_views import PsfPictures, PsfTable, small
 
 
 def test_a_long_sweep_stays_small_and_every_psf_can_be_looked_at() -> None:
@@ -23,6 +24,16 @@ def test_a_long_sweep_stays_small_and_every_psf_can_be_looked_at() -> None:
     np.testing.assert_array_equal(newest.image, image)
     assert (oldest.reduced, oldest.image.shape, oldest.image.dtype) == (4, (150, 200), np.uint8)
     assert pictures.get(200) is None
+
+
+def test_between_two_psfs_stands_no_number(qtbot: QtBot) -> None:
+    psfs = PsfTable()
+    qtbot.addWidget(psfs)
+    axis = psfs.plot.getAxis("bottom")
+    for most in (1.4, 5.2, 300.0):
+        places = [place for _, level in axis.tickValues(0.6, most, 300) for place in level]
+        assert places
+        assert all(place % 1 == 0 for place in places)
 
 
 def test_one_that_is_taken_again_takes_the_place_of_the_old_one() -> None:

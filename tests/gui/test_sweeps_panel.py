@@ -16,7 +16,9 @@ from calibration_routines.psf.sweep_procedure import SweepProcedure
 from gui.main_window import MainWindow
 from gui.panels.runs import RunsPanel
 from gui.panels.sweeps import SweepsPanel
+from gui.procedure_run import Ended
 from gui.widgets.tab_order import stops_of
+from instrument.bench.safety import MOTION_DOUBT
 from instrument.runs.run import Run, RunCondition
 
 LEFT = Qt.MouseButton.LeftButton
@@ -265,6 +267,10 @@ def test_after_a_fault_the_way_on_is_a_button_where_it_happened(
     run = run_of(session.runs_folder)
     assert run.condition is RunCondition.COMPLETED
     assert (run.path / "calibration" / "calibration.json").is_file()
+    panel._failed(Ended("The stage was lost."))
+    assert "nothing moves" in panel.run_bar.words.text()
+    panel._failed(Ended(f"{MOTION_DOUBT}: look."))
+    assert "may not be safe" in panel.run_bar.words.text()
 
 
 def answer(question: QMessageBox | None, words: str) -> Any:
