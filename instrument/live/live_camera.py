@@ -48,6 +48,8 @@ class LiveCamera:
         self._acquired_before = self._dropped_before = 0
         self._elsewhere: Callable[[], Frame | None] | None = None
         self._history: deque[tuple[float, int]] = deque()
+        self._counting = threading.Lock()
+        """Held for microseconds, unlike ``_changing``: an end clears what a window's thread counts."""
 
     def start(self) -> None:
         """Start the camera's sequence; does nothing where it runs.
@@ -73,9 +75,10 @@ class LiveCamera:
                 try:
                     stream.close()
                 finally:
-                    self._acquired_before += stream.acquired
-                    self._dropped_before += stream.dropped
-                    self._history.clear()
+                    with self._counting:
+                        self._acquired_before += stream.acquired
+                        self._dropped_before += stream.dropped
+                        self._history.clear()
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -148,14 +151,15 @@ class LiveCamera:
 
     def status(self) -> LiveCameraStatus:
         """Return rates and losses; meant to be asked a few times a second."""
-        stream = self._stream
-        acquired = self._acquired_before + (stream.acquired if stream else 0)
-        dropped = self._dropped_before + (stream.dropped if stream else 0)
-        now_s = time.monotonic()
-        history = self._history
-        history.append((now_s, acquired))
-        while len(history) > 2 and now_s - history[0][0] > _RATE_WINDOW_S:
-            history.popleft()
-        seconds = now_s - history[0][0]
-        rate = (acquired - history[0][1]) / seconds if seconds > 0 else 0.0
+        with self._counting:
+            stream = self._stream
+            acquired = self._acquired_before + (stream.acquired if stream else 0)
+            dropped = self._dropped_before + (stream.dropped if stream else 0)
+            now_s = time.monotonic()
+            history = self._history
+            history.append((now_s, acquired))
+            while len(history) > 2 and now_s - history[0][0] > _RATE_WINDOW_S:
+                history.popleft()
+            seconds = now_s - history[0][0]
+            rate = (acquired - history[0][1]) / seconds if seconds > 0 else 0.0
         return LiveCameraStatus(self.is_running, rate, acquired, dropped)

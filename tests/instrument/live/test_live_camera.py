@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -44,3 +46,20 @@ def test_a_pause_goes_on_and_hides_no_error_where_the_camera_does_not(
         assert not live.is_running
         paused(live, lambda: running.append(live.is_running))  # did not run before: is not started
         live.stop()
+
+
+def test_an_end_in_another_thread_does_not_disturb_who_counts() -> None:
+    class Ended(deque[tuple[float, int]]):
+        def append(self, one: tuple[float, int]) -> None:
+            super().append(one)
+            ending.start()
+            ending.join(0.3)  # as far as it comes meanwhile
+
+    with open_bench(parse_config(BENCH, None)) as bench:
+        live = LiveCamera(bench.camera)
+        live.start()
+        ending = threading.Thread(target=live.stop)
+        live._history = Ended([(0.0, 0)] * 5)
+        assert live.status().frames_per_s >= 0
+        ending.join()
+        assert not live._history

@@ -9,7 +9,7 @@ import pytest
 
 from recon.camera.convolution import Convolution
 from recon.errors import StructureError
-from recon.priors import L1, HaarTotalVariation, NonNegativity, TotalVariation, Zero
+from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation, Zero
 from recon.solvers.douglas_rachford import (
     EXCESS,
     PATIENCE,
@@ -54,7 +54,11 @@ def test_an_iteration_is_what_the_text_says(case: int) -> None:
     power = CAMERA.power()[0].mean()
     if prior in (TV, CASES[2][1]):
         assert solver.gamma == pytest.approx(1 / power)
+    roughly = solver.e.copy()
+    followed: list[float] = []
+    solver.system.follow = followed.append  # type: ignore[method-assign]
     solver._solve_data_term(solver._forward(solver.z))  # to the last digit
+    assert np.linalg.norm(roughly - solver.e) < 0.2 * np.linalg.norm(solver.e)
     for n in range(10):
         gamma, used = solver.gamma, solver._used_gamma
         seen = CAMERA.adjoint(solver.e[None] * VALID)[0]  # A^H e
@@ -73,6 +77,7 @@ def test_an_iteration_is_what_the_text_says(case: int) -> None:
         )
         gap = (squared(u - x) / squared(u)) ** 0.5
         assert record.primal_residual == pytest.approx(gap, rel=1e-4)
+        assert followed[-1] == record.primal_residual
         assert record.change == pytest.approx(1.7 * gap, rel=1e-4)
         assert record.data_residual == pytest.approx(np.linalg.norm(residual))
         worth = prior.value(u[None])
@@ -84,21 +89,44 @@ def test_an_iteration_is_what_the_text_says(case: int) -> None:
     np.testing.assert_allclose(solver.solution, expected, atol=1e-5)
 
 
-def test_the_first_step_is_a_tenth_of_the_height_that_a_voxel_may_have() -> None:
-    solver = solver_of(DouglasRachford, SPARSE)
-    spectrum = np.fft.rfft2(CAMERA.adjoint(DATA * VALID)[0])
+def test_the_first_step_is_a_tenth_of_the_height_that_a_voxel_may_have(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     power = CAMERA.power()[0]
+    between = np.zeros(CAMERA.domain_shape)
+    between[0, 1, 4, 5] = 9.0  # each plane is asked for its height, where there are few
+    seen = CAMERA.forward(between)
+    solver = DouglasRachford(CAMERA, SensorData(seen, VALID), SPARSE)
+    spectrum = np.fft.rfft2(CAMERA.adjoint(seen * VALID)[0])
     regularised = np.fft.irfft2(spectrum / (power + 0.01 * power.mean()), CAMERA.grid_shape)
     assert solver.gamma == pytest.approx(0.1 * regularised.max() / 0.05)
     assert solver_of(DouglasRachford, SPARSE, first=3.0).gamma == 3.0
+    faint = DouglasRachford(CAMERA, SensorData(1e-6 * seen, VALID), SPARSE)
+    assert faint.gamma == pytest.approx(1e-6 * solver.gamma)
+    monkeypatch.setattr("recon.solvers.douglas_rachford._PLANES", 1)
+    first = np.fft.irfft2((spectrum / (power + 0.01 * power.mean()))[:1], CAMERA.grid_shape).max()
+    assert solver._expected_height() == pytest.approx(first), "of many planes every so-manyth"
     dark = DouglasRachford(CAMERA, SensorData(0 * DATA, VALID), SPARSE)
     assert dark.gamma == pytest.approx(1 / power.mean())
+    for _ in range(4):  # what is dark changes no step, and has no relative change
+        record = dark.advance()
+        assert (record.primal_residual, record.objective, dark.gamma) == (0.0, 0.0, dark._used_gamma)
+
+
+@pytest.mark.parametrize(("first", "factor"), [(10.0, 0.2), (1e-6, 5.0)])
+def test_a_step_is_balanced_by_a_factor_of_five_at_most(first: float, factor: float) -> None:
+    solver = solver_of(DouglasRachford, SPARSE, first=first)
+    for _ in range(3):
+        solver.advance()
+    assert solver.gamma == pytest.approx(factor * first)
 
 
 def test_what_it_has_no_sweep_or_no_prox_for_is_refused() -> None:
     assert SparseDouglasRachford.knows(SPARSE)
     assert SparseDouglasRachford.knows(L1(1.0))
     assert not SparseDouglasRachford.knows(TV)
+    with pytest.raises(StructureError, match="for l1 and non-negativity alone"):
+        solver_of(SparseDouglasRachford, Box(0.0, 1.0))
     with pytest.raises(StructureError, match="HaarTotalVariation"):
         solver_of(DouglasRachford, HaarTotalVariation(0.1))
 
@@ -161,12 +189,44 @@ def test_planes_left_out_come_back_where_the_residual_asks_for_them(prior: Any) 
 
 
 def test_planes_are_looked_at_every_tenth_iteration(monkeypatch: pytest.MonkeyPatch) -> None:
-    left, back = [], []
-    monkeypatch.setattr(SparseDouglasRachford, "_leave_out", lambda self: left.append(self.iteration))
-    monkeypatch.setattr(SparseDouglasRachford, "_bring_back", lambda self: bool(back.append(self.iteration)))
-    for prior, drop in ((SPARSE, True), (SPARSE, False), (NonNegativity(), True)):
+    left: list[tuple[int, int]] = []
+    back: list[tuple[int, int]] = []
+    cases: list[tuple[Any, bool]] = [(SPARSE, True), (SPARSE, False), (NonNegativity(), True)]
+    for case, (prior, drop) in enumerate(cases):
         solver = solver_of(SparseDouglasRachford, prior, drop_empty=drop)
+        monkeypatch.setattr(solver, "_leave_out", lambda: left.append((case, solver.iteration)))  # noqa: B023
+        monkeypatch.setattr(solver, "_bring_back", lambda: back.append((case, solver.iteration)))  # noqa: B023
         for _ in range(31):
             solver.advance()
-    assert left == [10, 20, 30]
-    assert back == [2, 4, 6, 8, 12, 16, 24]
+    assert left == [(0, 10), (0, 20), (0, 30)]
+    assert back == [(0, n) for n in (2, 4, 6, 8, 12, 16, 24)]
+
+
+def test_what_was_empty_for_long_takes_no_part() -> None:
+    solver = solver_of(SparseDouglasRachford, SPARSE)
+    assert isinstance(solver, SparseDouglasRachford)
+    solver._leave_out()
+    assert solver.watch.active.all()
+    solver.watch.empty_for[:] = [PATIENCE, 0, PATIENCE]
+    solver._leave_out()
+    assert solver.watch.active.tolist() == [False, True, False]
+    assert solver._planes.tolist() == [1]
+    solver.advance()
+    assert solver.watch.empty_for.tolist() == [PATIENCE + 1, 0, PATIENCE + 1]
+    again = solver_of(SparseDouglasRachford, SPARSE)
+    assert isinstance(again, SparseDouglasRachford)
+    again.restore(solver.checkpoint())
+    assert again._planes.tolist() == [1]
+    plain = solver_of(SparseDouglasRachford, NonNegativity())
+    plain._end()
+    assert plain.empty == EmptyPlanes()
+
+
+def test_it_begins_with_what_the_data_lack_of_the_starting_point() -> None:
+    initial = RNG.random(CAMERA.domain_shape)
+    solver = DouglasRachford(CAMERA, SensorData(DATA, VALID), SPARSE, initial=initial)
+    np.testing.assert_allclose(solver.z, initial[0])
+    roughly = solver.e.copy()
+    solver.system.tolerance, solver.system.max_steps = 1e-13, 200
+    solver._solve_data_term(VALID * CAMERA.forward(initial)[0])
+    assert np.linalg.norm(roughly - solver.e) < 0.2 * np.linalg.norm(solver.e)
