@@ -39,6 +39,7 @@ class MicroManagerSlm(MicroManagerDevice, Slm):
         self.options = MicroManagerSlmOptions.of(options)
         self._share(shared)
         self._slm: Part | None = None
+        self._shown: npt.NDArray[np.uint8] | None = None
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
@@ -125,6 +126,7 @@ class MicroManagerSlm(MicroManagerDevice, Slm):
         """Show grey levels; see the interface."""
         part = self._part_now()
         self._check(levels)
+        self._shown = None
         part.call("take an image", "setSLMImage", np.ascontiguousarray(levels))
         part.call("show its image", "displaySLMImage")
         self._shown = levels.copy()
@@ -132,8 +134,10 @@ class MicroManagerSlm(MicroManagerDevice, Slm):
 
     @property
     def displayed(self) -> npt.NDArray[np.uint8]:
-        """The grey levels shown last."""
+        """The grey levels shown last; after an image that failed an error until the next one."""
         self._part_now()
+        if self._shown is None:
+            raise DeviceError(self.name, "what it shows is unknown after a failure.", "Display again.")
         return read_only(self._shown)
 
     def _part_now(self) -> Part:

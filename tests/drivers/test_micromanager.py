@@ -157,6 +157,22 @@ class TestSlm(SlmContract):
         options = MicroManagerSlmOptions(device="SLM", pixel_pitch_um=8.0, settle_ms=0.0)
         return MicroManagerSlm(options, manager)
 
+    def test_after_an_image_that_failed_it_does_not_tell_the_one_before(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        slm = self.make()
+        slm.open()
+        levels = np.full(slm.shape, 7, np.uint8)
+        with monkeypatch.context() as patch:
+            patch.setattr(FakeSlmCore, "displaySLMImage", lambda *_: int("an adapter's own words"))
+            with pytest.raises(DeviceError):
+                slm.display(levels)
+        with pytest.raises(DeviceError, match="unknown after a failure"):
+            _ = slm.displayed
+        slm.display(levels)
+        assert (slm.displayed == 7).all()
+        slm.close()
+
 
 class _WithoutAdapters(MicroManager):
     def _loaded(self, name: str) -> Any:
