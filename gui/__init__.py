@@ -11,5 +11,6 @@ with contextlib.suppress(ImportError, AttributeError):  # without Qt, or with an
 
     # Each import after Qt's has its module's source read again, for the name of PySide, and kept in memory:
     # a seventh of the processor time of a start. It tells whether spellings that nobody here uses may be
-    # switched off in a module; in all of them they may.
+    # switched off in a module; in all of them they may. No public way is known: PySide 6.11
+    # has neither an option nor a variable of the environment for it.
     feature._mod_uses_pyside = lambda _: True

@@ -158,6 +158,8 @@ class TaskRun(QObject):
         self._jobs = jobs
         self._job: Job | None = None
         self._desk: WindowDesk | None = None
+        self._held = False
+        """Whether it is to wait, also where its job has not begun yet."""
         self._timer = every(self, _LOOK_MS, self._look)
         self._timer.stop()
 
@@ -173,9 +175,11 @@ class TaskRun(QObject):
 
         def work(context: JobContext) -> Done:
             self._desk = desk = WindowDesk(context, seen or {})
+            if self._held:
+                desk.pause(True)
             return do(desk)
 
-        self._desk = None
+        self._desk, self._held = None, False
         self._job = job = self._jobs.compute(title, work)
         job.succeeded.connect(self._succeeded)
         job.failed.connect(lambda why: self._end(self.failed, why))
@@ -186,11 +190,13 @@ class TaskRun(QObject):
 
     def pause(self) -> None:
         """Let it wait where it next tells how far it is."""
+        self._held = True
         if self._desk is not None:
             self._desk.pause(True)
 
     def resume(self) -> None:
         """Go on."""
+        self._held = False
         if self._desk is not None:
             self._desk.pause(False)
 

@@ -58,6 +58,8 @@ class FilmsPanel(Panel):
         self._step = 1
         """Pictures from one that is shown to the next."""
         self._curves_job: Job | None = None
+        self._going: list[Job] = []
+        """What reads curves or exports."""
         self._opening: Job | None = None
 
     def parts(self) -> Iterator[None]:
@@ -226,7 +228,6 @@ class FilmsPanel(Panel):
         if self._curves_job is not None:
             self._curves_job.cancel()
             self._curves_job = None
-            self.progress.hide()
         self.measure.clear()
         self.courses = np.empty((0, 0))
         self._draw_curves()
@@ -244,10 +245,24 @@ class FilmsPanel(Panel):
             return curves(film, regions, lambda done, total: context.report(done / total))
 
         self._curves_job = job = self.follow(self.jobs.compute("Reading the curves of regions", work))
-        self.progress.show()
-        job.progressed.connect(lambda share: self.progress.setValue(round(1000 * share)))
+        self._show_progress(job)
         job.succeeded.connect(lambda courses: self._take_curves(job, courses))
-        job.ended.connect(lambda: self.progress.hide() if job is self._curves_job else None)
+
+    def _show_progress(self, job: Job) -> None:
+        """Show how far the newest job is, until none goes on."""
+
+        def told(share: float) -> None:
+            if job is self._going[-1]:
+                self.progress.setValue(round(1000 * share))
+
+        def ended() -> None:
+            self._going.remove(job)
+            self.progress.setVisible(bool(self._going))
+
+        self._going.append(job)
+        self.progress.show()
+        job.progressed.connect(told)
+        job.ended.connect(ended)
 
     def _colour_regions(self) -> None:
         """Draw each region in its curve's colour."""
@@ -299,12 +314,10 @@ class FilmsPanel(Panel):
             )
 
         job = self.follow(self.jobs.compute(f"Exporting {target.name}", write))
-        self.progress.show()
-        job.progressed.connect(lambda share: self.progress.setValue(round(1000 * share)))
+        self._show_progress(job)
         job.succeeded.connect(lambda path: self.session.log("info", f"Wrote {path}"))
         if words := slowed(target, film.fps):
             job.succeeded.connect(lambda _: self.session.log("warning", words))
-        job.ended.connect(self.progress.hide)
         return job
 
     def _hand_on(self, task: str, option: str) -> None:

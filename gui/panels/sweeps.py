@@ -162,6 +162,7 @@ class SweepsPanel(ProcedurePanel):
         self.no_frame.show()
         self.frame_words.clear()
         self.psfs.clear()
+        self._reader.forget()  # the last one's picture
         self.picture.clear()
         self._pictures = PsfPictures()
         self._tabs_for_routine()

@@ -291,6 +291,7 @@ class TasksPanel(Panel):
         self.run.start(TASKS[self.name].title, do, seen)
 
     def _clear(self) -> None:
+        self._reader.forget()  # a picture of what was there before
         self.words.setPlainText("")
         self.words.show()
         self.results.setCurrentIndex(0)  # a picture comes to the front once there is one

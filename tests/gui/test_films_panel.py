@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -99,6 +100,16 @@ def test_a_film_is_played_followed_and_written(
     with qtbot.waitSignal(panel.open(tmp_path).failed, timeout=WAIT_MS):
         pass
     assert panel.film is not None  # the one before stays
+    held = threading.Event()
+    first = session.jobs.compute("Exporting", lambda _: held.wait(WAIT_MS / 1000))
+    second = session.jobs.compute("Reading curves", lambda _: None)
+    panel._show_progress(first)
+    panel._show_progress(second)
+    with qtbot.waitSignal(second.ended, timeout=WAIT_MS):
+        pass
+    assert not panel.progress.isHidden(), "the other goes on"
+    held.set()
+    qtbot.waitUntil(panel.progress.isHidden, timeout=WAIT_MS)
     panel.shutdown()
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from PySide6.QtCore import Qt
+from PySide6.QtGui import QImage
 from pytestqt.qtbot import QtBot
 
 from gui.jobs import JobCancelledError
@@ -98,7 +99,13 @@ def test_what_was_found_comes_to_the_front_and_a_picture_when_there_is_one(
     with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
         panel.start()
     qtbot.waitUntil(lambda: panel.results.currentWidget() is panel.picture, timeout=WAIT_MS)
+    go = threading.Event()
+    late = QImage(str(tmp_path / "page.png"))
+    panel._reader.ask(lambda: late if go.wait(WAIT_MS / 1000) else None, panel._show_picture)
     shown(qtbot, panel, "etendue")
+    go.set()
+    qtbot.waitUntil(lambda: not panel._reader.is_reading, timeout=WAIT_MS)
+    assert panel.picture.pixmap.isNull(), "a picture of the task before"
     with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
         panel.start()
     assert panel.results.currentIndex() == 0, "its table, and no place for a picture that there is not"
@@ -224,8 +231,7 @@ def test_a_task_waits_ends_and_keeps_what_it_can(qtbot: QtBot, panel: TasksPanel
 
     run = panel.run
     run.start("Counting", counts)
-    qtbot.waitUntil(lambda: run._desk is not None, timeout=WAIT_MS)
-    run.pause()
+    run.pause()  # before its job has begun
     go.set()
     qtbot.waitUntil(lambda: counted[0] == 1, timeout=WAIT_MS)
     with qtbot.waitSignal(run.looked, check_params_cb=lambda now: now.paused, timeout=WAIT_MS):
