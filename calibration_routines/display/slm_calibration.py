@@ -39,11 +39,11 @@ from recon.holography.slm_response import MODES, flatness_jacobian, mode, phases
 Array = npt.NDArray[Any]
 SLM_FILE = "slm-calibration.json"
 """Where the command line writes it."""
-MAX_PHASE_ERROR_RAD = 0.0027
+MAX_PHASE_ERROR_RAD = 0.0022
 """Standard deviation of a phase beyond which no table is made. What flickers with the phase's own cosine and
 sine bends the whole table, unseen: two independent parts of this size, the worst level off by twice their
-root sum of squares, beyond 0.02 rad in some tables of a thousand (docs/decisions/0227)."""
-MOST_SERIES = 4
+root sum of squares, beyond 0.02 rad in three tables of 100,000 at the limit (docs/decisions/0234)."""
+MOST_SERIES = 7
 """Times that all pictures are taken where their mean over so many is steady enough and one series is not."""
 _REFERENCE_EVERY = 8  # levels between two pictures of level 0
 _FLATNESS_FRAMES = 22
