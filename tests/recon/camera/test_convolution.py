@@ -6,7 +6,7 @@ from scipy.signal import convolve2d
 
 from recon.base import threads
 from recon.camera.base import estimate_norm
-from recon.camera.convolution import Convolution
+from recon.camera.convolution import Convolution, field_of
 from recon.errors import InputError
 
 
@@ -79,3 +79,15 @@ def test_threads_do_not_change_a_bit():
 def test_refuses_an_empty_depth_list():
     with pytest.raises(InputError, match="list of depths is empty"):
         Convolution(np.zeros((0, 1, 4, 4), np.float32), (4, 4))
+
+
+@pytest.mark.parametrize(("sensor", "psf_shape"), [((7, 9), (5, 4)), ((8, 6), (4, 5))])
+def test_a_source_on_the_axis_casts_the_psfs_centre_on_the_sensors(sensor, psf_shape) -> None:
+    (height, width), (row, column) = field_of(sensor, psf_shape)
+    assert (height, width) == (sensor[0] + psf_shape[0] - 1, sensor[1] + psf_shape[1] - 1)
+    psf = np.random.default_rng(0).random(psf_shape)
+    camera = Convolution(psf[None], sensor, dtype=np.float64)
+    scene = np.zeros(camera.domain_shape)
+    scene[..., row, column] = 1.0  # an index: a whole number
+    seen = camera.forward(scene)[0]
+    assert seen[sensor[0] // 2, sensor[1] // 2] == pytest.approx(psf[psf_shape[0] // 2, psf_shape[1] // 2])
