@@ -113,7 +113,7 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/recon/video",
             "tests/recon/live",
             "tests/instrument/live",
-            "tests/instrument/video/test_video.py",
+            "tests/instrument/video",
             "tests/golden/test_golden.py",
         ),
     ),

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import json
 import os
-import pickle
 import shutil
-import signal
-import socket
 import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +14,6 @@ import numpy as np
 import pytest
 import zarr
 from ome_zarr_models.v05 import Image
-from threadpoolctl import threadpool_info, threadpool_limits
 
 from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
@@ -38,85 +31,26 @@ from instrument.reconstruction.video import (
 )
 from instrument.reconstruction.video_files import VideoPictures, levels_of, require_video
 from instrument.reconstruction.video_job import VideoJob
-from instrument.reconstruction.video_work import BlockReport, cluster, on_cluster
-from instrument.runs.acquire import settle
+from instrument.reconstruction.video_work import BlockReport
 from instrument.runs.run import Run
 from recon import reconstruct
 from recon.base.metrics import psnr
 from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.problem import Problem
-from recon.solvers.sensor_admm import SensorAdmm
 from recon.streams.stillness import has_light
 from recon.streams.video import VideoSolver
+from tests.instrument.video.recorded import (
+    MISSING,
+    SHAPE,
+    assert_same,
+    cast,
+    pictures,
+    request,
+    scene,
+    solved,
+)
 from tests.mocks.recordings import write_recording
-
-SHAPE = (40, 52)
-LENSES = np.random.default_rng(0).uniform(-14, 14, (30, 2))
-MISSING = 5
-
-
-def cast(points: list[tuple[float, float, float]]) -> np.ndarray:
-    """What points (row, column, light) cast through lenslets, spot by spot: no FFT, no grid."""
-    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    image = np.zeros(SHAPE)
-    for row, column, light in points:
-        for dy, dx in LENSES:
-            distance = (y - 20 - row - dy) ** 2 + (x - 26 - column - dx) ** 2
-            image += light * np.exp(-distance / (2 * 1.2**2))
-    return image
-
-
-def scene(t: int) -> np.ndarray:
-    clean = cast([(-4, -6 + 0.3 * t, 1.0), (5, 3, 0.6 + 0.3 * np.sin(t))])
-    rng = np.random.default_rng(t)
-    return np.clip(rng.poisson(clean * 500) + rng.normal(20, 2, SHAPE), 0, 4095).astype(np.uint16)
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("recording")
-    np.save(folder / "psf.npy", cast([(0, 0, 100.0)]).astype(np.float32))
-    frames = {t: scene(t) for t in range(11) if t != MISSING}
-    return write_recording(folder, frames)
-
-
-def request(recording: Path, folder: Path, **changes: object) -> VideoRequest:
-    given = VideoRequest(
-        run=recording,
-        out=folder / "v.ome.zarr",
-        psf=recording.parent / "psf.npy",
-        inputs=InputOptions(dark=20.0, binning=1),
-        options=ReconstructionOptions(iterations=25),
-        video=VideoOptions(block=4, warm_iterations=5),
-    )
-    of_video = {name: changes.pop(name) for name in list(changes) if hasattr(given.video, name)}
-    return replace(given, video=replace(given.video, **of_video), **changes)  # type: ignore[arg-type]
-
-
-def solved(wanted: VideoRequest) -> list[BlockReport]:
-    reports: list[BlockReport] = []
-    prepared = prepare_video(wanted)
-    assert solve_video(prepared, reports.append, threading.Event())
-    finish_video(prepared)
-    return reports
-
-
-@pytest.fixture(scope="module")
-def video(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("video")
-    solved(request(recording, folder))
-    return folder
-
-
-def pictures(folder: Path) -> np.ndarray:
-    return np.asarray(zarr.open_array(folder / "v.ome.zarr" / "0", mode="r")[:])
-
-
-def assert_same(one: np.ndarray, other: np.ndarray) -> None:
-    """To the tolerance that docs/video.md states."""
-    np.testing.assert_allclose(one, other, rtol=0, atol=1e-5 * float(np.nanmax(other)))
 
 
 def test_every_frame_is_there_and_like_its_own_reconstruction(recording: Path, video: Path) -> None:
@@ -201,77 +135,6 @@ def test_a_kill_between_pictures_and_mark_loses_nothing(
     assert not begun.exists()
 
 
-def test_a_video_goes_on_without_a_frame_that_was_lost_meanwhile(
-    recording: Path, video: Path, tmp_path: Path
-) -> None:
-    """Its block begins anew, as its pictures hang together; blocks that are done stay."""
-    run = tmp_path / "recording"
-    shutil.copytree(recording, run)
-    shutil.copy(recording.parent / "psf.npy", tmp_path)
-    wanted = request(run, tmp_path)
-    prepared = prepare_video(wanted)
-    for block in (0, 1):
-        block_module.solve_block(str(prepared.job.folder), str(wanted.out), block)
-    stamps = [VideoPictures(wanted.out)._file(t).stat().st_mtime_ns for t in range(4)]
-    os.truncate(run / "frames.ome.zarr/0/c/6/0/0", 1000)
-    assert "marked as lost: frames 6" in "\n".join(settle(run))
-    with pytest.raises(FileError, match=r"frames, warm_iterations"):
-        prepare_video(request(run, tmp_path, warm_iterations=7))
-    again = prepare_video(wanted)
-    assert (again.resumed, again.left) == (True, [1, 2])
-    assert not VideoPictures(wanted.out).is_written(6)
-    plan = again.job.plan
-    assert again.job.goes_on_without(replace(plan, frames=plan.frames[1:])) == [0]
-    assert again.job.goes_on_without(replace(plan, frames=plan.frames[4:])) is None, (
-        "blocks have other numbers"
-    )
-    assert solve_video(again, lambda _: None, threading.Event())
-    assert [VideoPictures(wanted.out)._file(t).stat().st_mtime_ns for t in range(4)] == stamps
-    whole, found = pictures(video), pictures(tmp_path)
-    assert np.isnan(found[6]).all()
-    left = [t for t in range(11) if t not in (MISSING, *range(4, 8))]
-    assert_same(found[left], whole[left])
-
-
-def test_other_settings_do_not_go_on_and_finished_videos_stay(
-    recording: Path, video: Path, tmp_path: Path
-) -> None:
-    prepare_video(request(recording, tmp_path))
-    with pytest.raises(FileError, match=r"other settings or frames \(warm_iterations\)"):
-        prepare_video(request(recording, tmp_path, warm_iterations=7))
-    assert not prepare_video(request(recording, tmp_path, warm_iterations=7), force=True).resumed
-    with pytest.raises(FileError, match="exists"):
-        prepare_video(request(recording, video))
-
-
-@pytest.mark.parametrize("name", ["v.mp4", "v.json"])
-def test_files_beside_a_new_video_stay(recording: Path, tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_text("mine")
-    with pytest.raises(FileError, match=f"{name}: exists"):
-        prepare_video(request(recording, tmp_path))
-    assert [p.name for p in tmp_path.iterdir()] == [name]
-    assert (tmp_path / name).read_text() == "mine"
-    assert not prepare_video(request(recording, tmp_path), force=True).resumed
-
-
-def test_force_never_replaces_what_is_read(recording: Path, tmp_path: Path) -> None:
-    frames = recording / "frames.ome.zarr"
-    before = sorted(frames.rglob("*"))
-    with pytest.raises(FileError, match="it is read"):
-        prepare_video(request(recording, tmp_path, out=frames), force=True)
-    assert sorted(frames.rglob("*")) == before
-    assert not prepare_video(request(recording, recording), force=True).resumed
-    assert prepare_video(request(recording, recording)).resumed
-
-
-def test_a_film_that_is_not_written_may_be_there(recording: Path, tmp_path: Path) -> None:
-    (tmp_path / "v.mp4").write_text("mine")
-    prepared = prepare_video(request(recording, tmp_path, film=False))
-    prepared.request.film_path.unlink()
-    prepared.request.record_path.write_text("{}")  # as when finishing was cut off
-    assert prepare_video(request(recording, tmp_path, film=False)).resumed
-
-
 def test_a_damaged_frame_is_named_in_a_sentence(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -285,230 +148,6 @@ def test_a_damaged_frame_is_named_in_a_sentence(
     said = capsys.readouterr().err
     assert "has 1000 bytes; frame 6 takes 4160: it is damaged" in said
     assert "Traceback" not in said
-
-
-def test_a_file_error_of_a_worker_process_arrives_whole() -> None:
-    error = FileError("a.npy", "is damaged.", "Mend it.")
-    arrived = pickle.loads(pickle.dumps(error))
-    assert (type(arrived), str(arrived), arrived.path) == (FileError, str(error), error.path)
-
-
-def test_force_begins_anew_whatever_there_is(recording: Path, tmp_path: Path) -> None:
-    wanted = request(recording, tmp_path)
-    job = prepare_video(wanted).job
-    job.mark_done(0)
-    anew = prepare_video(wanted, force=True)
-    assert (anew.resumed, anew.left) == (False, [0, 1, 2])
-    (job.folder / "job.json").write_text("{")
-    with pytest.raises(FileError, match="--force"):
-        prepare_video(wanted)
-    assert not prepare_video(wanted, force=True).resumed
-
-
-def test_another_noise_or_a_changed_calibration_file_is_another_video(
-    recording: Path, tmp_path: Path
-) -> None:
-    psf = tmp_path / "psf.npy"
-    lens = np.load(recording.parent / "psf.npy")
-    np.save(psf, lens)
-    wanted = request(recording, tmp_path, psf=psf)
-    prepare_video(wanted)
-    noisier = replace(wanted, inputs=replace(wanted.inputs, noise=9.0))
-    with pytest.raises(FileError, match="noise_deviation"):
-        prepare_video(noisier)
-    assert prepare_video(noisier, force=True).job.plan.settings["noise_deviation"] == [9.0]
-    lens[20, 26] += 100
-    np.save(psf, lens)
-    with pytest.raises(FileError, match="optics_sha256"):
-        prepare_video(noisier)
-
-
-def test_blocks_solved_together_are_in_memory_one_after_the_other(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    at_once: list[int] = []
-    present: set[int] = set()
-    threads: list[int] = []
-
-    def solve(_folder: str, _out: str, number: int, **_: object) -> BlockReport:
-        present.add(number)
-        time.sleep(0.05)
-        at_once.append(len(present))
-        present.remove(number)
-        return BlockReport(number, 0, 0, 0.0)
-
-    monkeypatch.setattr("instrument.reconstruction.video_work.get_threads", lambda: 4)
-    monkeypatch.setattr("instrument.reconstruction.video_work.set_threads", threads.append)
-    monkeypatch.setattr("instrument.reconstruction.video_work.solve_block", solve)
-    prepared = prepare_video(request(recording, tmp_path, over_time="tv"))
-    assert solve_video(prepared, lambda _: None, threading.Event())
-    assert (at_once, threads) == ([1, 1, 1], [4, 4])
-
-
-def test_blocks_solved_together_hold_no_other_solver(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(block_module, "VideoSolver", None)
-    wanted = request(recording, tmp_path, over_time="tv", options=ReconstructionOptions(iterations=2))
-    assert solved(wanted)
-
-
-@pytest.mark.slow
-def test_workers_take_the_weight_that_the_first_frame_told(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    prepared = prepare_video(request(recording, tmp_path))
-
-    def anew(_: Problem) -> None:
-        raise AssertionError("a worker looked again")
-
-    blas = []
-    move = SensorAdmm.set_data
-
-    def set_data(solver: SensorAdmm, data: np.ndarray) -> None:
-        blas.append(max(found["num_threads"] for found in threadpool_info() if found["user_api"] == "blas"))
-        move(solver, data)
-
-    with monkeypatch.context() as patched, threadpool_limits(2):
-        patched.setattr("recon.streams.video.look_at", anew)
-        patched.setattr(SensorAdmm, "set_data", set_data)
-        block_module.solve_block(str(prepared.job.folder), str(prepared.request.out), 0)
-    assert set(blas) == {1}  # its threads would wait for one another by spinning
-    told = prepared.job.plan.settings["weight"]
-    with VideoSolver(prepared.job.problem) as again:
-        assert told == pytest.approx(max(again.weights), rel=1e-12)
-    with VideoSolver(prepared.job.problem, times_noise=prepared.job.times_noise) as again:
-        assert told == pytest.approx(max(again.weights), rel=1e-12)
-
-
-def test_a_cluster_here_takes_work_from_its_owner_only() -> None:
-    pytest.importorskip("cryptography", reason="a cluster's keys need cryptography")
-    distributed = pytest.importorskip("distributed")
-    with cluster(workers=1) as client:
-        addresses = [client.scheduler_info()["address"], *client.scheduler_info()["workers"]]
-        assert all(address.startswith("tls://127.0.0.1:") for address in addresses)
-        assert client.submit(abs, -1).result() == 1
-        for scheme, security in (("tcp", None), ("tls", distributed.Security.temporary())):
-            address = addresses[0].replace("tls", scheme)
-            with pytest.raises(OSError):  # noqa: PT011 # which, is Dask's
-                distributed.Client(address, security=security, timeout=1)
-        known = client.scheduler_info()
-        ports = [port for one in (known, *known["workers"].values()) for port in one["services"].values()]
-        assert ports
-        for port in ports:
-            with socket.create_connection(("127.0.0.1", port), timeout=10) as page:
-                page.sendall(b"GET /info/main/workers.html HTTP/1.0\r\n\r\n")
-                assert b" 404 " in page.recv(100)
-
-
-@pytest.mark.slow
-def test_the_same_on_a_cluster_that_loses_a_worker(
-    recording: Path, video: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    pytest.importorskip("cryptography", reason="a cluster's keys need cryptography")
-    wanted = request(recording, tmp_path)
-    prepared = prepare_video(wanted)
-    reports: list[BlockReport] = []
-    with cluster(workers=2) as client:
-        pids = client.run(os.getpid)
-
-        def told(report: BlockReport) -> None:
-            reports.append(report)
-            if len(reports) == 1:
-                os.kill(next(iter(pids.values())), signal.SIGKILL)
-
-        on_cluster(client, prepared.job.folder, wanted.out, prepared.left, told, threading.Event())
-    assert sorted(report.block for report in reports) == [0, 1, 2]
-    assert sum(report.written for report in reports) <= 10
-    assert not prepared.left
-    assert not [record for record in caplog.records if record.name.startswith("distributed")]
-    finish_video(prepared)
-    assert_same(pictures(tmp_path), pictures(video))
-
-
-def test_workers_that_are_lost_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    distributed = pytest.importorskip("distributed")
-
-    class Future:
-        asked = 0
-
-        def done(self) -> bool:
-            self.asked += 1
-            return self.asked > 2
-
-        def result(self) -> BlockReport:
-            raise distributed.KilledWorker("block", None, 3)
-
-    class Client:
-        crews = iter([{"a", "b"}, {"b", "c"}, {"c"}])
-        cancelled: list[object] | None = None
-
-        def submit(self, *_: object, **__: object) -> Future:
-            return Future()
-
-        def scheduler_info(self, n_workers: int) -> dict[str, set[str]]:
-            return {"workers": next(self.crews)}
-
-        def cancel(self, left: list[object]) -> None:
-            self.cancelled = left
-
-    client = Client()
-    with pytest.raises(BenchError, match="Every worker that took one of the blocks was lost"):
-        on_cluster(client, tmp_path, tmp_path, [0], lambda _: None, threading.Event())
-    assert len(client.cancelled or ()) == 1
-    assert [record.getMessage().split(":")[0] for record in caplog.records] == [
-        "1 worker ended or cannot be reached"
-    ] * 2
-
-
-def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("instrument.reconstruction.video_work.CONNECT_S", 1)
-    with pytest.raises(BenchError, match="No Dask scheduler answers"), cluster(scheduler="tcp://127.0.0.1:9"):
-        pass
-
-
-def test_a_scheduler_of_somebody_else_is_refused_unless_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-
-    class Dask:
-        @staticmethod
-        def Client(address: str, **_: object) -> contextlib.AbstractContextManager[str]:
-            asked.append(address)
-            return contextlib.nullcontext(address)
-
-    monkeypatch.setattr(block_module, "_dask", lambda: Dask)
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        listener.listen()
-        address = f"tcp://localhost:{listener.getsockname()[1]}"
-        with cluster(scheduler=address):
-            assert asked == [address]
-        with pytest.raises(BenchError, match="not eve's"), cluster(scheduler=address, owner="eve"):
-            pass
-        monkeypatch.setattr(block_module, "_listening", lambda _: {"eve"})
-        with pytest.raises(BenchError, match=r"is eve's.*--scheduler-owner"), cluster(scheduler=address):
-            pass
-        with cluster(scheduler=address, owner="eve"):
-            pass
-    with pytest.raises(BenchError, match="nothing says the owner of"), cluster(scheduler="10.0.0.1:8786"):
-        pass
-    with cluster(scheduler="tcp://10.0.0.1:8786", owner="ann"), cluster(scheduler="tls://10.0.0.1:8786"):
-        pass
-    for wrong in ("tcp://", "tcp://a:b", "x" * 9):
-        with pytest.raises(BenchError, match="No Dask scheduler"), cluster(scheduler=wrong):
-            pass
-    assert len(asked) == 4
-
-
-def test_an_unknown_scheduler_leaves_nothing_behind(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("instrument.reconstruction.video_work.CONNECT_S", 1)
-    arguments = ["reconstruct", str(recording), "--video", "--psf", str(recording.parent / "psf.npy")]
-    out = ["--out", str(tmp_path / "s.ome.zarr"), "--scheduler", "tcp://127.0.0.1:9"]
-    assert main([*arguments, "--dark", "20", *out]) == 2
-    assert "No Dask scheduler answers" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
 
 
 def test_the_run_of_a_plan_is_no_video_unless_its_frames_are_alike(recording: Path, tmp_path: Path) -> None:
@@ -657,46 +296,6 @@ def test_the_command(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["reconstruct", "--image", str(psf), "--psf", str(psf), "--warm", "3"]) == 2
     assert "--video" in capsys.readouterr().err
     assert main(["reconstruct", "--video"]) == 2
-
-
-def test_a_full_disk_is_said_with_what_is_kept_and_the_video_goes_on(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    psf, out = str(recording.parent / "psf.npy"), str(tmp_path / "v.ome.zarr")
-    given = ["--psf", psf, "--dark", "20", "--bin", "2", "--iterations", "2", "--block", "4", "--out", out]
-    write = VideoPictures.write
-
-    def until_full(self: VideoPictures, index: int, picture: np.ndarray) -> None:
-        if index > 4:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        write(self, index, picture)
-
-    monkeypatch.setattr("instrument.reconstruction.video_work.get_threads", lambda: 1)
-    with monkeypatch.context() as patch:
-        patch.setattr(VideoPictures, "write", until_full)
-        assert main(["reconstruct", str(recording), "--video", *given]) == 2
-    said = capsys.readouterr().err
-    assert "no space left" in said
-    assert f"4 of 10 frames are in {out}: the same command goes on" in said
-    assert main(["reconstruct", str(recording), "--video", *given]) == 0
-    assert "4 frames are done already" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("what", ["numpy.savez", "zarr.Group.create_array"])
-def test_a_disk_that_is_full_at_the_beginning_leaves_nothing_in_the_way(
-    what: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    wanted = request(recording, tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr(what, full)
-        with pytest.raises(OSError, match="No space left"):
-            prepare_video(wanted)
-    assert not wanted.out.exists()
-    assert not prepare_video(wanted).resumed
-    assert {path.name for path in tmp_path.iterdir()} == {"v.ome.zarr", ".v.job"}
 
 
 def test_a_calibration_of_another_camera_is_said(recording: Path, tmp_path: Path) -> None:
