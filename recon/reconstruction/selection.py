@@ -145,7 +145,7 @@ def choice_for(problem: Problem, on_stage: Stage | None = None, *, film: bool = 
     lit = unsaid and (looked or all(floor(c.data[0][c.valid[0]]) >= FLOOR for c in coarse))
     costs = {m: camera_cost(coarse[0], m) for m in scale} if len(scale) > 1 else {}
     tell(0.2, "choosing: where light is")
-    contrast = None if kind == "l1" or picture else _contrast(data, valid, deviation)
+    contrast = None if kind == "l1" or picture else _contrast(counts.data, counts.valid, deviation)
     model, by_model = model_of(depths, overrides, contrast, costs)
     sparse = coarse_passes(coarse) if looked else None
     tell(0.4, "choosing: a background")

@@ -531,3 +531,10 @@ def test_a_solver_that_has_no_way_for_varying_psfs_has_one_convolution_and_says_
     assert held.model == "convolution"
     assert "one PSF" in decision(held, "model").why
     assert not decision(held, "model").overruled
+
+
+def test_a_volume_whose_colours_are_alike_is_solved_as_one_by_default() -> None:
+    made = make_scene("dense-volume", seed=1, size=32, channels=3)
+    found = recon.reconstruct(made.measurement, made.calibration, iterations=1, judged=False)
+    assert found.choice is not None
+    assert found.choice.merged
