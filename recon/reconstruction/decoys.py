@@ -293,7 +293,8 @@ def _small(problem: Problem, longest_px: int) -> _Small:
     calibration = replace(calibration, psfs=_on_sensor(psfs, problem.sensor_shape), background=None)
     calibration = reduced_calibration(calibration, factor, None)
     varies = _given(problem).depths.varies
-    clipped = max(clipped, saturated_share(counts))  # erased ones, too
+    # Erased ones, too, which a reduced problem has forgotten.
+    clipped = max(clipped, *(saturated_share(c) for c in _given(problem).measurement.channels()))
     return _Small(photograph, calibration, varies, "local" if local else "convolution", clipped)
 
 
