@@ -14,6 +14,7 @@ import numpy.typing as npt
 from instrument.files.calibration_file import is_calibration, load_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, read_image
+from instrument.reconstruction.defects import mended_psf
 from instrument.reconstruction.mosaic import (
     in_colour,
     matched_mosaic,
@@ -131,11 +132,14 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
     if isinstance(psf_file, Path) and psf_file.is_dir():
         other = "PSFs of several depths in a folder are given by --volume, a calibration by --calibration."
         raise FileError(psf_file, "is a folder; a file is expected.", other)
-    psf, image = read_image(psf_file), read_image(image_file, holes=True)
+    raw_psf, image = read_image(psf_file), read_image(image_file, holes=True)
     crop, binning = inputs.crop, inputs.binning
     _refuse_constant(image)
-    warnings = check_psf(psf, allow_saturated=inputs.allow_saturated)
     pattern = pattern_of(inputs.mosaic, image)
+    mends = pattern is None and inputs.erasures != "none"
+    pixels, n_mended = mended_psf(raw_psf.pixels) if mends else (raw_psf.pixels, 0)
+    psf = replace(raw_psf, pixels=pixels)
+    warnings = check_psf(psf, allow_saturated=inputs.allow_saturated)
     check_pair(psf, image, allow_mixed_depth=inputs.allow_mixed_depth, mosaic=pattern is not None)
     level = dark_level(inputs.dark, psf, image)
     window = _window(crop, image)
@@ -160,7 +164,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
         measurement,
         _calibration_of(psf_pixels, psf),
         {
-            "PSF": describe(psf),
+            "PSF": ", ".join((describe(psf), *mended_note(n_mended))),
             "Image": describe(image),
             "Dark": level.reason,
             "Pixels": describe_window(crop, binning, factor, measurement),
@@ -171,7 +175,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
         valid,
         (*warnings, *_converted(psf, image), *_saturation(image, erased), *_suspicion(inputs, image)),
         {
-            "psf": source_record(psf),
+            "psf": source_record(raw_psf) | ({"mended_pixels": n_mended} if n_mended else {}),
             "image": source_record(image),
             "dark": dark_record(level),
             "crop": crop_record(crop, image),
@@ -397,6 +401,12 @@ def mosaic_note(pattern: Pattern | None) -> dict[str, str]:
     if pattern is None:
         return {}
     return {"Mosaic": f"{pattern}: every pixel counts for its own colour, nothing is demosaiced"}
+
+
+def mended_note(count: int) -> tuple[str, ...]:
+    """Tell of a PSF's pixels that were filled; empty where none was."""
+    what = "hot or dead pixel" if count == 1 else "hot or dead pixels"
+    return (f"{count} {what} filled by their neighbours (--erasures none: as they are)",) if count else ()
 
 
 def describe(file: ImageFile) -> str:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, read_image
+from instrument.reconstruction.defects import defective_pixels
 from recon.base.blocks import block_mean
 from recon.base.checks import saturated_share
 from recon.errors import InputError
@@ -25,15 +26,6 @@ FloatImage = npt.NDArray[np.float32]
 ErasuresChoice = Literal["none", "saturated"] | float | Path
 """Nothing; saturated pixels; a random share; a mask file, zero where a pixel is erased."""
 DarkChoice = Literal["auto"] | float | Path | ImageFile
-
-SPREAD = 0.01
-"""Share of a PSF's pixels above a fifth of its maximum from which its light is spread out: spots of lenslets
-are as narrow as a hot pixel, those of a diffuser's caustic are not alone."""
-TAIL = 99.99
-ODD, LEAST_ODD = 4.0, 0.05
-"""Times its 99th percentile by which a defective pixel differs from its neighbours, and twice what the
-:data:`TAIL` of the PSF's own pixels do; and at least so much of the photograph's range. Photographs through
-simulated and measured PSFs, without such pixels, reach 2.3 times."""
 
 AUTO_PIXELS = 500_000
 """Automatic binning goes on until the image has at most this many pixels."""
@@ -188,40 +180,6 @@ def saturated_pixels(pixels: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
 def is_full_scale(pixels: npt.NDArray[Any]) -> bool:
     """Tell whether the maximum is that of an 8, 10, 12, 14 or 16 bit sensor, left-aligned in 16 bit too."""
     return pixels.dtype.kind == "u" and int(pixels.max()) in _FULL_SCALES
-
-
-def defective_pixels(pixels: npt.NDArray[Any], psf: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
-    """Return which pixels are hot or dead, in their shape: no light through this PSF differs so on one pixel.
-
-    None where the PSF (height, width[, n_channels]) has spots as narrow, as sharp lenslets have.
-    """
-    channels = pixels[..., None] if pixels.ndim == 2 else pixels
-    defective = np.zeros(channels.shape, bool)
-    shape = psf if psf.ndim == 2 else psf.mean(axis=-1)
-    level = np.median(shape[[0, 0, -1, -1], [0, -1, 0, -1]])
-    if np.mean(shape - level > (shape.max() - level) / 5) >= SPREAD:
-        usual, tail = np.percentile(_oddness(shape), [99, TAIL])
-        times = max(ODD, 2 * float(tail) / max(float(usual), 1e-30))
-        for c in range(channels.shape[2]):
-            odd = _oddness(channels[..., c])
-            low, high = np.nanpercentile(channels[::4, ::4, c], [1, 99])
-            if usual := float(np.percentile(odd, 99)):
-                defective[..., c] = odd > max(times * usual, LEAST_ODD * (high - low))
-    defective &= np.isfinite(channels)
-    return defective.reshape(pixels.shape)
-
-
-def _oddness(plane: npt.NDArray[Any]) -> FloatImage:
-    """Return how far pixels differ from the middle two of their four neighbours, (height, width)."""
-    known = np.asarray(plane, np.float32)
-    if np.isnan(known).any():  # holes
-        known = np.where(np.isnan(known), np.float32(np.nanmedian(known)), known)
-    padded = np.pad(known, 1, mode="reflect")
-    above, below, left, right = padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]
-    middle = np.maximum(np.minimum(above, below), np.minimum(left, right))
-    middle += np.minimum(np.maximum(above, below), np.maximum(left, right))
-    middle /= 2
-    return np.abs(np.subtract(known, middle, out=middle), out=middle)
 
 
 # Dark ----------------------------------------------------------------------------------------------

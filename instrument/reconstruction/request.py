@@ -14,12 +14,14 @@ from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, read_stack
 from instrument.files.volumes import numbers
+from instrument.reconstruction.defects import mended_psf
 from instrument.reconstruction.forecast import Forecast, forecast
 from instrument.reconstruction.job import (
     Job,
     job_from_calibration,
     job_from_files,
     job_with,
+    mended_note,
 )
 from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.reconstruction.preparation import darkest_block
@@ -216,7 +218,11 @@ def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOpt
             return job_from_calibration(psfs, image, inputs)
         own = image.path if isinstance(image, ImageFile) else image
         psfs = read_stack(psfs, leave_out=own)
-    stack = psfs.pixels
+    stack, n_mended = psfs.pixels, 0
+    if inputs.erasures != "none":
+        mended = [mended_psf(p) for p in stack]
+        n_mended = sum(count for _, count in mended)
+        stack = np.stack([p for p, _ in mended]) if n_mended else stack
     pixels = stack.astype(np.float32)
     if stack.dtype.kind == "u":
         pixels = np.maximum(pixels - min(darkest_block(p) for p in pixels), 0)
@@ -237,7 +243,7 @@ def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOpt
         provenance={"psfs": str(psfs.path), "simulated": psfs.is_simulated},
     )
     job = job_with(calibration, psfs.path, image, inputs)
-    words = "; ".join(filter(None, (*psfs.notes, said)))
+    words = "; ".join(filter(None, (*psfs.notes, said, *mended_note(n_mended))))
     return replace(
         job,
         notes={**job.notes, **({"PSFs": words} if words else {})},

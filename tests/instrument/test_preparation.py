@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, write_image
+from instrument.reconstruction.defects import defective_pixels, mended_psf
 from instrument.reconstruction.job import find_calibration, job_from_calibration, job_from_files
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import (
@@ -24,7 +25,6 @@ from instrument.reconstruction.preparation import (
     check_psf,
     dark_from_corners,
     dark_from_file,
-    defective_pixels,
     erasures_of,
     reduce,
     reduce_valid,
@@ -285,6 +285,30 @@ def test_hot_and_dead_pixels_are_erased_unless_the_psf_has_spots_as_narrow() -> 
     assert erased.reason == "4 hot or dead pixels; --erasures none uses them"
     holes = erasures_of("saturated", file(np.where(np.arange(160) == 5, np.nan, image).astype(np.float32)))
     assert holes.reason == "120 pixels that are NaN"
+
+
+def test_hot_and_dead_pixels_of_a_psf_are_filled_unless_they_are_its_spots() -> None:
+    rng = np.random.default_rng(5)
+    spread = gaussian_filter(rng.random((120, 160)), 2.5)
+    psf = (100 + 4e5 * np.maximum(spread - spread.mean(), 0) + rng.normal(0, 50, spread.shape)).clip(0)
+    psf = np.round(psf).astype(np.uint16)
+    assert mended_psf(psf)[0] is psf
+    hot = psf.copy()
+    where = rng.choice(
+        psf.size, 190, replace=False
+    )  # ten times the tail by which a PSF's own pixels are known
+    hot.flat[where] = 65535
+    mended, count = mended_psf(hot)
+    assert count > 0.8 * len(where)
+    assert mended.dtype == psf.dtype
+    assert np.mean(np.abs(mended - psf.astype(float))[mended != hot]) < 0.05 * psf.max()
+    np.testing.assert_array_equal(mended[hot == psf], hot[hot == psf])
+    colour, count_of_two = mended_psf(np.stack([hot, psf, hot], axis=-1))
+    np.testing.assert_array_equal(colour[..., 2], mended)
+    assert count_of_two == 2 * count
+    spots = np.zeros(psf.shape, np.uint16)
+    spots[rng.integers(0, 120, 30), rng.integers(0, 160, 30)] = 60_000
+    assert mended_psf(spots)[1] == 0
 
 
 def test_a_share_is_erased_at_random_and_the_same_every_time() -> None:

@@ -1,0 +1,132 @@
+"""Hot and dead pixels: which they are in a photograph, and a PSF without them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+FloatImage = npt.NDArray[np.float32]
+
+SPREAD = 0.01
+"""Share of a PSF's pixels above a fifth of its maximum from which its light is spread out: spots of lenslets
+are as narrow as a hot pixel, those of a diffuser's caustic are not alone."""
+TAIL = 99.99
+ODD, LEAST_ODD = 4.0, 0.05
+"""Times its 99th percentile by which a defective pixel differs from its neighbours, and twice what the
+:data:`TAIL` of the PSF's own pixels do; and at least so much of the photograph's range. Photographs through
+simulated and measured PSFs, without such pixels, reach 2.3 times."""
+
+ALONE = 8.0
+"""Times by which one pixel of a PSF differs more than any of its eight neighbours does, as optics cannot: the
+image of a point whose standard deviation is half a pixel has 7.4."""
+MOST_LIGHT = 0.5
+"""Share of a PSF's light from which such pixels are its spots and not defects."""
+
+
+def mended_psf(pixels: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], int]:
+    """Return a PSF image whose hot and dead pixels are filled by their neighbours, and how many those were.
+
+    They are told by the PSF alone, however many there are: each differs from its neighbours, which do not
+    differ from theirs. What is left has to be spread out; else nothing is filled.
+
+    Parameters
+    ----------
+    pixels : ndarray, (height, width[, n_channels])
+        With any offset.
+
+    Returns
+    -------
+    ndarray
+        Shape and dtype of ``pixels``, which is it itself where nothing is filled.
+    int
+        Filled pixels, of all channels.
+    """
+    channels = pixels[..., None] if pixels.ndim == 2 else pixels
+    filled, count = channels.copy(), 0
+    for c in range(channels.shape[2]):
+        plane = channels[..., c].astype(np.float32)
+        middle = _middle(plane)
+        where = _alone(plane, np.abs(plane - middle))
+        if not where.any():
+            continue
+        mended = np.where(where, middle, plane)
+        light = float(np.sum(mended - _level(mended), dtype=np.float64))
+        alone = float(np.sum(np.abs(plane - mended), dtype=np.float64))
+        if alone < MOST_LIGHT * (light + alone) and is_spread(mended):
+            values = middle[where]
+            filled[..., c][where] = np.round(values) if channels.dtype.kind in "ui" else values
+            count += int(np.count_nonzero(where))
+    return (filled.reshape(pixels.shape), count) if count else (pixels, 0)
+
+
+def _alone(plane: FloatImage, odd: FloatImage) -> npt.NDArray[np.bool_]:
+    """Return where a pixel lies beyond its four neighbours by far more than its eight are ``odd``."""
+    near = _four_neighbours(plane)
+    beyond = np.maximum(plane - np.max(near, axis=0), np.min(near, axis=0) - plane)
+    low, high = np.percentile(plane[::4, ::4], [1, 99])
+    rows, columns = np.nonzero(beyond > max(LEAST_ODD * float(high - low), np.finfo(np.float32).tiny))
+    padded = np.pad(odd, 1)
+    most = np.zeros(rows.shape, np.float32)
+    for row in range(3):
+        for column in range(3):
+            if (row, column) != (1, 1):
+                np.maximum(most, padded[rows + row, columns + column], out=most)
+    where = np.zeros(plane.shape, bool)
+    where[rows, columns] = beyond[rows, columns] > ALONE * most
+    return where
+
+
+def is_spread(psf: npt.NDArray[Any]) -> bool:
+    """Tell whether the light of a PSF (height, width) is spread out: none of it is on one pixel alone."""
+    level = _level(psf)
+    return bool(np.mean(psf - level > (psf.max() - level) / 5) >= SPREAD)
+
+
+def _level(psf: npt.NDArray[Any]) -> float:
+    return float(np.median(psf[[0, 0, -1, -1], [0, -1, 0, -1]]))
+
+
+def defective_pixels(pixels: npt.NDArray[Any], psf: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """Return which pixels are hot or dead, in their shape: no light through this PSF differs so on one pixel.
+
+    None where the PSF (height, width[, n_channels]) has spots as narrow, as sharp lenslets have.
+    """
+    channels = pixels[..., None] if pixels.ndim == 2 else pixels
+    defective = np.zeros(channels.shape, bool)
+    shape = psf if psf.ndim == 2 else psf.mean(axis=-1)
+    if is_spread(shape):
+        usual, tail = np.percentile(_oddness(shape), [99, TAIL])
+        times = max(ODD, 2 * float(tail) / max(float(usual), 1e-30))
+        for c in range(channels.shape[2]):
+            odd = _oddness(channels[..., c])
+            low, high = np.nanpercentile(channels[::4, ::4, c], [1, 99])
+            if usual := float(np.percentile(odd, 99)):
+                defective[..., c] = odd > max(times * usual, LEAST_ODD * (high - low))
+    defective &= np.isfinite(channels)
+    return defective.reshape(pixels.shape)
+
+
+def _oddness(plane: npt.NDArray[Any]) -> FloatImage:
+    """Return how far pixels differ from the middle two of their four neighbours, (height, width)."""
+    known = np.asarray(plane, np.float32)
+    if np.isnan(known).any():  # holes
+        known = np.where(np.isnan(known), np.float32(np.nanmedian(known)), known)
+    middle = _middle(known)
+    return np.abs(np.subtract(known, middle, out=middle), out=middle)
+
+
+def _middle(known: FloatImage) -> FloatImage:
+    """Return the mean of the middle two of every pixel's four neighbours, (height, width)."""
+    above, below, left, right = _four_neighbours(known)
+    middle = np.maximum(np.minimum(above, below), np.minimum(left, right))
+    middle += np.minimum(np.maximum(above, below), np.maximum(left, right))
+    middle /= 2
+    return middle
+
+
+def _four_neighbours(plane: FloatImage) -> tuple[FloatImage, ...]:
+    """Return every pixel's neighbour above, below, on the left and on the right, each (height, width)."""
+    padded = np.pad(plane, 1, mode="reflect")
+    return padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]
