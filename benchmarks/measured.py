@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.measured_variants import coarse_pairs, variants
 from benchmarks.uncertainty import measured_pairs_held
 from recon import Calibration, Reconstruction, reconstruct
 from recon.base.blocks import block_mean
@@ -271,6 +272,8 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Path], list[str]]]] = {
     "usaf": ("The tilted USAF target, half size", lambda folder: usaf(folder, 2)),
     "usaf-full": ("The tilted USAF target, full size", lambda folder: usaf(folder, 1)),
     "pairs": ("The pairs", pairs),
+    "variants": ("The hand as other files are", variants),
+    "coarse": ("Pairs in coarse pixels", coarse_pairs),
     "intervals": ("How far the pairs' pictures may be off", intervals),
 }
 """By name: a title, and what makes the section."""

@@ -98,6 +98,9 @@ class Trial:
     taken : Taken
     dim : bool
         Whether the darkest pixels leave hardly any room for stray light.
+    least : float
+        Least of the background where it is expected to be light (0 where it is not, or nowhere negative),
+        relative to the mean of the data: what pulls it below zero is the object.
     """
 
     without: float
@@ -106,11 +109,12 @@ class Trial:
     dark: float
     taken: Taken
     dim: bool = False
+    least: float = 0.0
 
     def asks(self, share: float = 1.0) -> bool:
         """Whether held-out pixels ask for a background: it explains (``share`` of it asked), or is light."""
         fall = self.without**2 - self.lit**2
-        is_light = not self.dim and self.light >= LIGHT
+        is_light = not self.dim and self.least >= 0 and self.light >= LIGHT
         return self._explains(share) or (is_light and fall >= self.taken.fall * self.without**2)
 
     def _explains(self, share: float) -> bool:
@@ -125,7 +129,8 @@ class Trial:
     @property
     def helps(self) -> bool:
         """Whether a background explains what nothing else does, is light, or lies over a dark scene."""
-        return self.asks() or (self.dark >= self.taken.dark and self.light >= self.taken.light)
+        is_light = self.least >= 0 and self.light >= self.taken.light
+        return self.asks() or (self.dark >= self.taken.dark and is_light)
 
 
 def trial_of(channels: Sequence[Problem], *, whole: bool = False) -> Trial:
@@ -139,8 +144,10 @@ def trial_of(channels: Sequence[Problem], *, whole: bool = False) -> Trial:
     without, lit = (
         float(np.sqrt(np.mean([getattr(t, side) ** 2 for t in tried]))) for side in ("without", "lit")
     )
-    light, dark = (float(np.mean([getattr(t, side) for t in tried])) for side in ("light", "dark"))
-    return Trial(without, lit, light, dark, tried[0].taken)
+    light, dark, least = (
+        float(np.mean([getattr(t, side) for t in tried])) for side in ("light", "dark", "least")
+    )
+    return Trial(without, lit, light, dark, tried[0].taken, least=least)
 
 
 def _tried(problem: Problem, *, whole: bool) -> Trial:
@@ -158,7 +165,9 @@ def _tried(problem: Problem, *, whole: bool) -> Trial:
     taken = LIT_PICTURE if expects_background(problem) else POINTS
     if problem.n_planes > 1 and kind_of(problem.prior_name) != "l1":
         taken = VOLUME
-    trial = Trial(np.inf, error(lit.left), light, dark, taken)
+    expected = taken is LIT_PICTURE
+    least = min(0.0, float(lit.background[0][valid].min()) / max(mean, 1e-30)) if expected else 0.0
+    trial = Trial(np.inf, error(lit.left), light, dark, taken, least=least)
     plain = replace(coarse, smooth=False)
     # One prior for both: less light has less of it.
     found = pilot(
@@ -215,7 +224,9 @@ def background_of(trial: Trial | None, overrides: Overrides, *, given: bool) -> 
         f"held-out pixels are missed by {trial.without:.1f} times the error to expect, with a background of "
         f"{trial.light:.0%} of the light by {trial.lit:.1f} times"
     )
-    if not trial.helps:
+    if not trial.helps and replace(trial, least=0.0).helps:
+        why += ", which falls below zero: no light"
+    elif not trial.helps:
         why += ": too little for one"
     elif not trial.asks():
         why += f", and {trial.dark:.0%} of the picture would be dark under it"

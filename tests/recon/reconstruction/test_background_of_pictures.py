@@ -74,7 +74,7 @@ def test_moderate_stray_light_is_told_from_a_scene_that_is_lit(
     choice = selection.choice_for(problem)
     assert choice.background == found
     (why,) = (d.why for d in choice.decisions if d.name == "background")
-    assert "dark" in why
+    assert ("dark under it" if found else "too little for one") in why
 
 
 def test_total_variation_leaves_even_light_to_the_background() -> None:
@@ -123,6 +123,8 @@ def test_held_out_pixels_prove_no_stray_light_where_the_darkest_have_none():
     assert trial.helps
     assert not replace(trial, dim=True).helps
     assert replace(trial, dim=True, dark=0.7).helps, "a dark scene under even light"
+    assert not replace(trial, least=-0.1).helps, "light is nowhere negative"
+    assert not replace(trial, dark=0.7, least=-0.1).helps
     black = np.full((20, 20), 1.0)
     black[:3] = 0.02
     assert floor(black, DARKEST_PERCENTILE) < DARKEST < floor(black + 0.1, DARKEST_PERCENTILE)

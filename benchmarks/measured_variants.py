@@ -1,0 +1,153 @@
+"""The measured hand as other laboratories' files are, and pairs in coarse pixels: for ``measured.py``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.errors import FileError
+from instrument.files.images import ImageFile
+from instrument.reconstruction.job import job_from_files
+from instrument.reconstruction.options import InputOptions
+from recon import reconstruct
+from recon.base.blocks import block_mean
+from recon.blind.known_pictures import psf_from_pictures
+from recon.blind.left_out import judged_by
+from recon.evaluation.measured_sets import HAND_DARK, data_folder, measured_pairs, measured_set
+
+Array = npt.NDArray[Any]
+BINNING, COARSE = 8, 6
+FULL = 65520
+
+
+def variants(_: Path) -> list[str]:
+    """Show what becomes of the hand, by defaults, as files of many kinds."""
+    psfs, photograph = measured_set("hand")
+    reference = reconstruct(
+        block_mean(photograph, BINNING),
+        block_mean(psfs[0], BINNING),
+        solver="admm-sensor",
+        iterations=400,
+        tolerance=1e-5,
+        judged=False,
+    ).image
+    lines = [
+        f"Files by defaults and `--bin {BINNING}`, PSNR to the converged picture of the clean ones after the "
+        "best shift and gain.",
+        "",
+        "| files | dB | correlation | calibration | verdict | CPU s |",
+        "|---|---|---|---|---|---|",
+    ]
+    folder = data_folder() / "diffusercam_hand"
+    psf, raw = (
+        np.asarray(cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED))
+        for name in ("psf_sample.tif", "rawdata_hand_sample.tif")
+    )
+    for name, make in VARIANTS.items():
+        began = time.process_time()
+        files = [ImageFile(Path(n), a) for n, a in zip(("psf.tif", "raw.tif"), make(psf, raw), strict=True)]
+        try:
+            job = job_from_files(files[0], files[1], InputOptions(binning=BINNING))
+        except FileError as error:
+            lines.append(f"| {name} | refused: {error} | | | | |")
+            continue
+        result = reconstruct(job.as_measurement(None), job.calibration)
+        seconds = time.process_time() - began
+        decibels, correlation = alike(result.image, reference)
+        verdict = result.verdict
+        assert verdict is not None
+        fit = "not asked" if verdict.calibration is None else str(verdict.calibration.fit)
+        said = verdict.sentences[0].split(":")[0]
+        lines.append(f"| {name} | {decibels:.1f} | {correlation:.3f} | {fit} | {said} | {seconds:.1f} |")
+        print(lines[-1], flush=True)
+    return lines
+
+
+def counts(values: Array) -> Array:
+    """Return 16-bit counts."""
+    return np.clip(np.round(values), 0, FULL).astype(np.uint16)
+
+
+def light(raw: Array) -> Array:
+    """Return what is above the dark level."""
+    return np.asarray(raw - raw[HAND_DARK].mean())
+
+
+def planted(raw: Array, share: float, value: int | None = None) -> Array:
+    """Return a copy with defective pixels, always the same: at one value, or at random ones."""
+    rng = np.random.default_rng(3)
+    where = rng.choice(raw.size, round(share * raw.size), replace=False)
+    copy = raw.copy()
+    copy.flat[where] = rng.integers(0, FULL, len(where)) if value is None else value
+    return copy
+
+
+def vignetted(raw: Array) -> Array:
+    """Return light that falls off to a half in the corners, which the PSF does not know."""
+    y, x = (np.linspace(-1, 1, n) for n in raw.shape)
+    return light(raw) * (1 - 0.25 * (y[:, None] ** 2 + x**2))
+
+
+def fewer(raw: Array, share: float, counts_per_electron: float = 8.0) -> Array:
+    """Return a photograph with a share of its light."""
+    electrons = np.round(np.maximum(light(raw), 0) / counts_per_electron).astype(int)
+    return np.random.default_rng(5).binomial(electrons, share) * counts_per_electron
+
+
+VARIANTS: Mapping[str, Callable[[Array, Array], tuple[Array, Array]]] = {
+    "as they are": lambda p, y: (p, y),
+    "8 bits": lambda p, y: ((p >> 8).astype(np.uint8), (y >> 8).astype(np.uint8)),
+    "dark level taken off, below zero cut": lambda p, y: (counts(light(p) - 300), counts(light(y) - 300)),
+    "fractions of the peak, with negative ones": lambda p, y: (
+        (light(p) / FULL).astype(np.float32),
+        (light(y) / FULL).astype(np.float32),
+    ),
+    "a dark level of 1000 in the photograph alone": lambda p, y: (p, counts(light(y) + 1000)),
+    "a tenth of the light": lambda p, y: (p, counts(fewer(y, 0.1) + 30)),
+    "PSF at a thirtieth of the exposure": lambda p, y: (counts(light(p) / 30 + 30), y),
+    "PSF moved by 40 and 60 pixels": lambda p, y: (np.roll(p, (40, -60), axis=(0, 1)), y),
+    "PSF: 1 % of the pixels at random values": lambda p, y: (planted(p, 0.01), y),
+    "photograph: 1 % of the pixels at random values": lambda p, y: (p, planted(y, 0.01)),
+    "both: the same 0.1 % at full scale": lambda p, y: (planted(p, 0.001, FULL), planted(y, 0.001, FULL)),
+    "photograph vignetted": lambda p, y: (p, counts(vignetted(y) + 30)),
+    "photograph exposed 4 times as long": lambda p, y: (p, counts(4 * light(y) + 30)),
+    "photograph exposed 8 times as long": lambda p, y: (p, counts(8 * light(y) + 30)),
+}
+"""By name: from PSF and photograph, raw counts, what is given."""
+
+
+def alike(image: Array, reference: Array) -> tuple[float, float]:
+    """Return PSNR, dB, and correlation with a reference after the best whole shift and gain."""
+    shape = tuple(2 * n for n in reference.shape)
+    spectra = np.fft.rfft2(reference, shape) * np.conj(np.fft.rfft2(image, shape))
+    peak = np.unravel_index(int(np.fft.irfft2(spectra, shape).argmax()), shape)
+    rows, columns = (int(p) - n * (p >= n // 2) for p, n in zip(peak, shape, strict=True))
+    height, width = reference.shape
+    kept = np.s_[max(rows, 0) : height + min(rows, 0), max(columns, 0) : width + min(columns, 0)]
+    moved = np.roll(image, (rows, columns), axis=(0, 1))[kept].astype(np.float64)
+    truth = reference[kept].astype(np.float64)
+    gain = float(np.sum(moved * truth) / np.sum(moved**2))
+    error = float(np.sqrt(np.mean((gain * moved - truth) ** 2)))
+    correlation = float(np.corrcoef(moved.ravel(), truth.ravel())[0, 1])
+    return float(20 * np.log10(float(reference.max()) / error)), correlation
+
+
+def coarse_pairs(_: Path, names: tuple[str, ...] = ("394", "65")) -> list[str]:
+    """Show the two pairs that a background spoilt in coarse pixels, each by the PSF of the other six."""
+    known, photographs, pictures = measured_pairs()
+    data, truths = (block_mean(images, COARSE, about_axis=True) for images in (photographs, pictures))
+    truths = truths / truths.max()
+    lines = [f"Binned {COARSE} x {COARSE}.", "", "| picture | even | by default, dB |", "|---|---|---|"]
+    for name in names:
+        number = known.index(name)
+        others = np.arange(len(data)) != number
+        solved = psf_from_pictures(data[others], truths[others])
+        found = judged_by(solved.psf, data[number], truths[number] ** solved.gamma, name)
+        lines.append(f"| {name} | {found.flat_db:.1f} | {found.psnr_db:.1f} |")
+    return lines
