@@ -181,13 +181,20 @@ def _triggered(wire: Wire, count: int) -> Iterator[Camera]:
         try:
             try_all(as_before)
         except StepsFailedError as failure:
-            for _, problem in failure.failures:
-                note_failures(error, problem)
+            _note_each(error, failure.failures)
         raise
     try:
         try_all(as_before)
     except StepsFailedError as failure:
-        raise failure.failures[0][1] from None
+        (_, first), *rest = failure.failures
+        _note_each(first, rest)
+        raise first from None
+
+
+def _note_each(error: BaseException, failures: Iterable[tuple[str, BaseException]]) -> None:
+    """Note on an error each step that failed beside it; none of them leaves light or motion behind."""
+    for _, problem in failures:
+        note_failures(error, problem)
 
 
 def _listen(camera: Camera, line: str, edge: TriggerEdge) -> None:

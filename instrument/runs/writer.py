@@ -266,7 +266,7 @@ class RunWriter:
         try:
             with interrupts_held() as held:
                 self._store(frames)
-        except RunError as error:
+        except Exception as error:
             held.answer(str(error))
             raise
         held.answer()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
@@ -156,18 +156,20 @@ class Operation:
             bench.stop()  # not behind a device that is being opened
         except StepsFailedError as error:
             failure = error
-        with self._taking:
-            if self._bench is bench:
-                try:
-                    for hold in self._holds.values():
-                        hold.on_end(reason)
-                    self._say(reason.problem)
-                finally:  # whoever cannot be told, the devices are closed
+        try:
+            with self._taking, ExitStack() as last:
+                if self._bench is bench:
+                    # Whoever cannot be told, the others are, and the devices are closed.
+                    last.callback(self._end, bench)
                     self._dismissed = (operator.key, reason)
-                    self._end(bench)
+                    last.callback(self._say, reason.problem)
+                    for hold in self._holds.values():
+                        last.callback(hold.on_end, reason)
+        finally:
+            if failure is not None:
+                self.trouble = str(failure)
+                self._say(self.trouble)
         if failure is not None:
-            self.trouble = str(failure)
-            self._say(self.trouble)
             raise failure
 
     def stop(self, who: str) -> None:

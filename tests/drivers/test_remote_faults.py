@@ -31,6 +31,7 @@ from drivers.remote.options import RemoteOptions
 from drivers.remote.wire import LONGEST_REQUEST, OPERATOR_HEADER, Values
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
+from instrument.bench.safety import StepsFailedError
 from instrument.files.errors import BenchError
 from instrument.serve import server as serving
 from instrument.serve.operation import Operation, Operator
@@ -344,6 +345,29 @@ def test_a_server_whose_terminal_is_closed_opens_and_closes_as_ever() -> None:
         operation.stop("a hand")
     assert not device.is_open
     assert operation.operator is None
+
+
+def test_a_stop_that_fails_and_holders_who_cannot_be_told_hide_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told: list[str] = []
+
+    def gone(reason: DeviceError) -> None:
+        told.append(reason.problem)
+        raise RuntimeError("Event loop is closed")
+
+    def stuck(_: Bench) -> None:
+        raise StepsFailedError([("light off", DeviceError("led_array", "does not answer."))])
+
+    operation = Operation(parse_config(BENCH, None), lambda _: None)
+    operator = Operator("key", "somebody")
+    for kind in ("led_array", "stage"):
+        operation.take(kind, operator, gone)
+    monkeypatch.setattr(Bench, "stop", stuck)
+    with pytest.raises(RuntimeError, match="loop is closed"):
+        operation.stop("a hand")
+    assert told == ["STOP was pressed by a hand."] * 2
+    assert "light off" in operation.trouble
 
 
 @pytest.mark.parametrize("how", ["let_go", "drop"])

@@ -200,18 +200,28 @@ def test_ctrl_c_between_an_image_and_its_line_waits_for_the_line(
     assert verify(run).is_sound
 
 
+@pytest.mark.parametrize(
+    ("why", "said"),
+    [
+        (
+            OSError(errno.ENOSPC, "No space left on device"),
+            "frame 0 could not be stored: No space left on device",
+        ),
+        (MemoryError("Unable to allocate 1 GiB"), "Unable to allocate 1 GiB"),
+    ],
+)
 def test_ctrl_c_while_a_frame_cannot_be_stored_is_answered_and_says_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    why: Exception, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
         signal.raise_signal(signal.SIGINT)
-        raise OSError(errno.ENOSPC, "No space left on device")
+        raise why
 
     with new_run(tmp_path) as writer:
         monkeypatch.setattr(FrameArray, "write", full)
         with pytest.raises(KeyboardInterrupt) as caught:
             writer.write([frame(0)])
-    assert "frame 0 could not be stored: No space left on device" in caught.value.__notes__[0]
+    assert said in caught.value.__notes__[0]
 
 
 def test_a_frame_of_another_shape_or_place_is_refused(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.camera import TriggerMode
 from drivers.errors import DeviceError, LimitError
 from drivers.led_array import LedArray, LedPattern
 from drivers.sequence import SequenceLimits
@@ -138,26 +139,33 @@ def test_a_sequence_that_is_never_whole_is_refused(
         take_sequence(Wire(bench), patterns)
 
 
-def test_what_fails_while_the_camera_is_put_back_hides_no_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("ctrl_c", [True, False])
+def test_what_fails_while_the_camera_is_put_back_is_named_and_hides_no_ctrl_c(
+    ctrl_c: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def pressed(_: object) -> None:
-        raise KeyboardInterrupt
+        if ctrl_c:
+            raise KeyboardInterrupt
 
-    put_back: list[str] = []
-
-    def lost(_: object, mode: str) -> str:
-        if mode == "free_run":
-            put_back.append(mode)
-            raise DeviceError("camera", "was unplugged.")
-        return mode
+    def no_stop(_: object) -> None:
+        raise DeviceError("camera", "does not stop.")
 
     patterns = [LedPattern("lit", ((0, (200, 200, 200)),))] * 2
     with open_bench() as bench:
+        set_trigger_mode = type(bench.camera).set_trigger_mode
+
+        def lost(camera: Any, mode: TriggerMode) -> TriggerMode:
+            if mode == "free_run":
+                raise DeviceError("camera", "was unplugged.")
+            return set_trigger_mode(camera, mode)
+
         monkeypatch.setattr(type(bench.camera), "set_trigger_mode", lost)
-        with pytest.raises(KeyboardInterrupt) as caught:
+        monkeypatch.setattr(type(bench.camera), "stop_sequence", no_stop)
+        with pytest.raises(KeyboardInterrupt if ctrl_c else DeviceError) as caught:
             take_sequence(Wire(bench), patterns, on_frame=pressed)
         monkeypatch.undo()
-    assert put_back == ["free_run"]
-    assert caught.value.__notes__ == ["camera: was unplugged."]
+    said = [*([] if ctrl_c else [str(caught.value)]), *caught.value.__notes__]
+    assert said == ["camera: does not stop.", "camera: was unplugged."]
 
 
 def test_times_are_put_to_places() -> None:
