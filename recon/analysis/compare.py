@@ -213,24 +213,14 @@ def _verdict(changes: list[Change], geometry: Geometry) -> tuple[bool, tuple[str
             "size and rotation tell nothing then. Use the new calibration.",
         )
     spot = max(c.spot for c in changes)
-    edge = max(changes, key=lambda c: c.edge_px)
+    # What a recalibration is due for, else what is seen most clearly: one depth may be noisier than another.
+    edge = max(changes, key=lambda c: (c.edge_px > EDGE_PX, c.edge_px / _seen_edge_px(c)))
     if spot > WIDER:
         due = True
         reasons.append(f"With the old PSFs, spots come out {spot:.2f} times as wide as they could be.")
-    least_px = seen_px(edge.scale_error * edge.extent_px)
-    if edge.edge_px > min(EDGE_PX, least_px):
+    if edge.edge_px > min(EDGE_PX, _seen_edge_px(edge)):
         due = due or edge.edge_px > EDGE_PX
-        turn_px = abs(math.radians(edge.rotation_deg or 0.0)) * edge.extent_px
-        turned = f" and turned by {edge.rotation_deg:+.2f} degrees" if turn_px > least_px else ""
-        cause = "" if along is None else f" {along.sentence}"
-        if along is None and distance_um is not None:
-            cause += _either(edge, distance_um)
-        elif along is not None and len(along.parts) > 1 and distance_um is not None:
-            cause += _source_instead(edge, distance_um)
-        reasons.append(
-            f"The pattern is {edge.scale - 1:+.2%} in size{turned}, {edge.edge_px:.2g} pixels at its "
-            f"edge.{cause}"
-        )
+        reasons.append(_edge(edge, along, distance_um))
     least = min(c.aligned for c in changes)
     if least < FRESH:
         due = due or spot > WIDER or least < FRESH - 0.08
@@ -239,8 +229,9 @@ def _verdict(changes: list[Change], geometry: Geometry) -> tuple[bool, tuple[str
             "of the diffuser."
         )
     shifts = np.array([[c.rows, c.columns] for c in changes])
-    largest = float(np.hypot(*shifts.T).max())
     spread = float(np.hypot(*np.ptp(shifts, axis=0)))
+    limits = [min(SHIFT_PX, seen_px(c.place_error_px)) for c in changes]  # each depth's own
+    largest = max((m for m, px in zip(np.hypot(*shifts.T), limits, strict=True) if m > px), default=0.0)
     if spread > SHIFT_PX:
         due = True
         reasons.append(
@@ -252,13 +243,34 @@ def _verdict(changes: list[Change], geometry: Geometry) -> tuple[bool, tuple[str
             f"The pattern moved by {largest:.3g} pixels: pictures move by as much, and stay as sharp."
             + _said(across, len(changes))
         )
-    elif across is not None or largest > seen_px(min(c.place_error_px for c in changes)):
+    elif largest > 0:
         reasons.append(f"The pattern moved by {largest:.2g} pixels.{_said(across, len(changes))}")
     reasons += _light(changes)
-    reasons.append(unseen(_seen(changes), distance_um, geometry.pixel_pitch_um, DRIFTED))
+    reasons.append(unseen(_seen(changes), distance_um, geometry.pixel_pitch_um, (SHIFT_PX, DRIFTED)))
     if not due:
         reasons.insert(0, "The old calibration still serves.")
     return due, tuple(reasons)
+
+
+def _seen_edge_px(change: Change) -> float:
+    return seen_px(change.scale_error * change.extent_px)
+
+
+def _edge(change: Change, along: Explanation | None, distance_um: float | None) -> str:
+    """Return what became of a pattern's size and turn, whichever is seen, and what explains the size."""
+    least_px = _seen_edge_px(change)
+    turned = abs(math.radians(change.rotation_deg or 0.0)) * change.extent_px > least_px
+    grown = abs(change.scale - 1) * change.extent_px > least_px
+    found = [f"{change.scale - 1:+.2%} in size"] if grown or not turned else []
+    found += [f"turned by {change.rotation_deg:+.2f} degrees"] if turned else []
+    words = f"The pattern is {' and '.join(found)}, {change.edge_px:.2g} pixels at its edge."
+    if along is not None:
+        words += f" {along.sentence}"
+    if not grown or distance_um is None:
+        return words
+    if along is None:
+        return words + _either(change, distance_um)
+    return words + (_source_instead(change, distance_um) if len(along.parts) > 1 else "")
 
 
 def _said(across: Explanation | None, depths: int) -> str:

@@ -74,16 +74,26 @@ def seen_px(error_px: float) -> float:
     return max(_WORTH_PX, _SEEN * error_px)
 
 
-def unseen(seen: Sequence[Seen], distance_um: float | None, pitch_um: float | None, drifted: float) -> str:
+def unseen(
+    seen: Sequence[Seen],
+    distance_um: float | None,
+    pitch_um: float | None,
+    told: tuple[float, float],
+) -> str:
     """Return in a sentence what may have changed without being seen.
 
-    ``drifted`` is the relative difference of light between depths that is told.
+    ``told`` are the shift, pixels, that is told however little it is known, and the relative difference of
+    light between depths.
     """
+    told_px, drifted = told
     across = min(seen, key=lambda each: seen_px(each.place_error_px) * each.z_um)
     along = min(seen, key=lambda each: seen_px(each.edge_error_px) / each.extent_px * each.z_um)
     shift_px, edge_px = seen_px(across.place_error_px), seen_px(along.edge_error_px)
     if not math.isfinite(shift_px):
-        moved = "what moved along the axis or turned, as too few parts of the pattern were recognised"
+        moved = (
+            f"what moves the pattern by less than {told_px:.2g} pixel{'s' * (told_px != 1)}, nor what moved "
+            "along the axis or turned, as too few parts of the pattern were recognised"
+        )
     elif distance_um is None or pitch_um is None:
         moved = (
             f"what moves the pattern by less than {shift_px:.2g} pixels, its edge by less than {edge_px:.2g}"
@@ -106,7 +116,14 @@ def unseen(seen: Sequence[Seen], distance_um: float | None, pitch_um: float | No
 def _length(um: float) -> str:
     if um >= 1e3:
         return f"{um / 1e3:.2g} mm"
-    return f"{um:.0f} um" if um >= 10 else f"{um:.1f} um"
+    return f"{um:.{_decimals(um)}f} um"
+
+
+def _decimals(um: float) -> int:
+    """Return how many decimals a length is told with that is not to read as none: pixels may be small."""
+    if um >= 10:
+        return 0
+    return min(max(1, math.ceil(-math.log10(um))), 4) if um > 0 else 1
 
 
 def moved_across(seen: Sequence[Seen], distance_um: float, pitch_um: float) -> Explanation | None:
@@ -127,7 +144,9 @@ def moved_across(seen: Sequence[Seen], distance_um: float, pitch_um: float) -> E
     for part, per_um in parts.items():
         by = complex((per_um * shifts / known**2).sum() / (per_um**2 / known**2).sum())
         misfit = float((np.abs(shifts - per_um * by) ** 2 / known**2).sum())
-        found[f"{part} moved across by ({by.real:+.0f}, {by.imag:+.0f}) um"] = misfit
+        digits = _decimals(abs(by))
+        x, y = (round(part_um, digits) + 0.0 for part_um in (by.real, by.imag))  # no -0
+        found[f"{part} moved across by ({x:+.{digits}f}, {y:+.{digits}f}) um"] = misfit
     return _allowed(found, 2 * (len(seen) - 1))
 
 
@@ -155,10 +174,11 @@ def moved_along(seen: Sequence[Seen], distance_um: float) -> Explanation | None:
     diffuser = ((growth - apart / (z + distance_um)) ** 2 / known**2).sum()
     source = ((growth - (size - 1)) ** 2 / known**2).sum()
     to, of = ("farther from", "nearer to")[apart < 0], ("farther away", "nearer")[nearer < 0]
+    apart_um, nearer_um = (f"{um:.{_decimals(um)}f} um" for um in (abs(apart), abs(nearer)))
     return _allowed(
         {
-            f"the diffuser moved, it is about {abs(apart):.0f} um {to} the sensor": float(diffuser),
-            f"the source moved, it stands about {abs(nearer):.0f} um {of} than is recorded": float(source),
+            f"the diffuser moved, it is about {apart_um} {to} the sensor": float(diffuser),
+            f"the source moved, it stands about {nearer_um} {of} than is recorded": float(source),
         },
         len(seen) - 1,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -13,10 +14,11 @@ from scipy import ndimage
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.compare import compare, compare_psfs
+from recon.analysis.pattern_change import Change
 from recon.analysis.what_moved import Seen, moved_across
 from recon.base.blocks import block_mean
 from recon.errors import InputError
-from recon.types import Calibration
+from recon.types import Calibration, Geometry
 
 Floats = npt.NDArray[np.float64]
 
@@ -139,6 +141,103 @@ def test_what_moved_across_is_told_by_how_the_shift_goes_with_depth(
     found = moved_across(torn, 8900.0, 13.0)
     assert found is not None
     assert "more than one did" in found.sentence
+
+
+FINE = Geometry(pixel_pitch_um=2.0, diffuser_distance_mm=3.0)
+
+
+def change(
+    z_mm: float,
+    columns: float = 0.0,
+    *,
+    grown_px: float = 0.0,
+    turned_deg: float = 0.0,
+    errors_px: tuple[float, float] = (0.001, 0.001),
+) -> Change:
+    """A pattern 200 pixels from its middle to its corner; errors of its shift and of where its edge is."""
+    scale = 1 + grown_px / 200
+    edge_px = abs(scale * np.exp(1j * np.deg2rad(turned_deg)) - 1) * 200
+    known = dict(zip(("place_error_px", "scale_error"), np.array(errors_px) / (1, 200), strict=True))
+    alike = {"as_is": 1.0, "aligned": 1.0, "spot": 1.0, "decoy": 0.3, "brightness": 1.0}
+    return Change(
+        1e3 * z_mm, 0.0, columns, scale, turned_deg, edge_px=edge_px, extent_px=200.0, **alike, **known
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "geometry", "says", "not_said"),
+    [
+        pytest.param(
+            [change(60, grown_px=0.45, errors_px=(0.001, 0.1)), change(90, grown_px=0.2)],
+            FINE,
+            r"\+0.10% in size, 0.2 pixels at its edge\. Which part moved cannot be told",
+            "0.45",
+            id="the clear one of two depths sees a size",
+        ),
+        pytest.param(
+            [change(60, grown_px=0.6, errors_px=(0.001, 0.2)), change(90, grown_px=0.2)],
+            Geometry(),
+            r"^The pattern is \+0.30% in size, 0.6 pixels",
+            "still serves",
+            id="what a recalibration is due for is named",
+        ),
+        pytest.param(
+            [change(60, 0.3, errors_px=(0.1, 0.001)), change(90)],
+            Geometry(),
+            "The old calibration still serves. This comparison",
+            "moved by",
+            id="noise of one depth is no shift",
+        ),
+        pytest.param(
+            [change(60, 0.3, errors_px=(0.1, 0.001)), change(90, 0.2)],
+            Geometry(),
+            r"The pattern moved by 0\.2 pixels\.",
+            r"0\.3",
+            id="the shift that is seen is named",
+        ),
+        pytest.param(
+            [change(60, 0.06), change(90, 0.06)],
+            FINE,
+            r"the sensor, .* moved across by \(-0\.1, \+0\.0\) um",
+            r"by \(.0, .0\)",
+            id="small pixels, across",
+        ),
+        pytest.param(
+            [change(0.2, grown_px=0.06), change(0.3, grown_px=0.06 * 0.25 / 0.35)],
+            Geometry(pixel_pitch_um=0.3, diffuser_distance_mm=0.05),
+            r"the diffuser moved, it is about 0\.0[78] um farther",
+            "about 0 um",
+            id="a short camera, along",
+        ),
+        *(
+            pytest.param(
+                [change(z, grown_px=0.04, turned_deg=0.2) for z in depths],
+                FINE,
+                r"The pattern is turned by \+0\.20 degrees, 0\.7 pixels at its edge\. This comparison",
+                "in size|farther",
+                id=f"a turn alone, {len(depths)} depths",
+            )
+            for depths in ((90,), (60, 90, 150))
+        ),
+        pytest.param(
+            [change(90, 0.9, errors_px=(np.inf, np.inf))],
+            FINE,
+            "not see what moves the pattern by less than 1 pixel, nor what moved along the axis or turned",
+            "um",
+            id="not recognised",
+        ),
+    ],
+)
+def test_each_depth_is_held_against_what_it_is_known_to(
+    changes: list[Change], geometry: Geometry, says: str, not_said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places_um = np.array([(0.0, 0.0, each.z_um) for each in changes])
+    one = Calibration(np.ones((len(changes), 1, 8, 8), np.float32), places_um, geometry=geometry)
+    given = {each.z_um: each for each in changes}
+    monkeypatch.setattr("recon.analysis.compare.compare_psfs", lambda new, old, z_um, *_: given[z_um])
+    said = " ".join(compare(one, one).reasons)
+    assert re.search(says, said)
+    assert not re.search(not_said, said)
 
 
 def test_another_diffuser_is_another_calibration() -> None:
