@@ -287,6 +287,30 @@ def test_a_hologram_shows_and_saves_itself(tmp_path: Path) -> None:
         db.hologram(np.ones((20, 30), np.float32), "display", slm=(32, 32), iterations=1)
 
 
+def test_a_pictures_transparency_is_left_out_of_arrays_as_of_files_and_true_is_light(tmp_path: Path) -> None:
+    colour = np.zeros((16, 16, 3), np.uint8)
+    colour[4:9, 3:8, 0] = 255
+    clear = np.dstack([colour, np.full((16, 16), 255, np.uint8)])
+    db.write_image(tmp_path / "colour.png", colour)
+    given = {"bench": "display", "slm": (32, 32), "iterations": 1}
+    with pytest.warns(UserWarning, match=r"^The picture is in colour"):
+        wanted = db.hologram(tmp_path / "colour.png", **given).wanted[0]
+    for array, said in (
+        (clear, "^the picture, an array: alpha channel left out. The picture is in colour"),
+        (colour > 0, "^The picture is in colour"),
+    ):
+        with pytest.warns(UserWarning, match=said):
+            np.testing.assert_array_equal(db.hologram(array, **given).wanted[0], wanted)
+    with pytest.warns(UserWarning, match="^the picture, an array: alpha channel left out.$"):
+        db.hologram(clear[..., ::3], **given)
+    with pytest.raises(
+        db.BenchError, match=r"\(height, width, 3\) of real numbers, not ndarray uint8 .*, 5\)"
+    ):
+        db.hologram(np.dstack([clear, clear[..., 0]]), **given)
+    with pytest.raises(db.BenchError, match="fourth channel is 1 everywhere"):
+        db.reconstruct(clear > 0, np.ones((16, 16)))
+
+
 def test_a_chart_of_a_result_is_drawn(
     scene: tuple[np.ndarray, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -269,7 +269,7 @@ def field_words(
             f"The field is square: the middle {side} x {side} of the picture's {height} x {width} pixels are "
             f"shown ({otherwise})."
         )
-    if not in_colour and pixels.ndim == 3 and np.ptp(pixels, axis=2).any():
+    if not in_colour and pixels.ndim == 3 and (pixels != pixels[..., :1]).any():
         said.append("The picture is in colour: the mean of its channels is shown, in one colour.")
     return " ".join(said)
 

@@ -310,7 +310,7 @@ def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> Im
         array, more = _one_image(path, array)
         array = array[None]
     elif array.ndim == 4:
-        array, more = _drop_alpha(array)
+        array, more = drop_alpha(array)
     elif array.ndim == 3:
         more = ()
     else:
@@ -352,7 +352,7 @@ def _one_image(path: Path, array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], t
     if array.ndim == 3 and array.shape[0] in (3, 4) and array.shape[-1] not in (1, 2, 3, 4) and _is_npy(path):
         array, notes = np.moveaxis(array, 0, -1), ("channels-first array taken as colour",)
     if array.ndim == 3 and array.shape[-1] in (1, 2, 3, 4):
-        array, dropped = _drop_alpha(array)
+        array, dropped = drop_alpha(array)
         array = array[..., 0] if array.shape[-1] == 1 else array
         notes += dropped
     elif array.ndim == 3:
@@ -368,7 +368,8 @@ def _is_npy(path: Path) -> bool:
     return path.suffix.lower() in (".npy", ".npz")
 
 
-def _drop_alpha(array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
+def drop_alpha(array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
+    """Return an image (..., channels) without its transparency, the second or fourth, and that in words."""
     if array.shape[-1] in (2, 4):
         return array[..., :-1], (ALPHA,)
     return array, ()

@@ -24,7 +24,7 @@ from instrument.display.hologram import (
 )
 from instrument.display.hologram_files import HologramFiles, hologram_figure
 from instrument.files.errors import BenchError
-from instrument.files.images import ImageFile, read_image
+from instrument.files.images import ImageFile, drop_alpha, read_image
 from instrument.files.sample_images import SAMPLES
 from instrument.notebook.reconstruct import bench_config
 from instrument.notebook.result import figure_png, show_figure
@@ -132,24 +132,35 @@ def hologram(
         display = load_alignment(Path(alignment)).of(display)
     pictures = list(picture) if isinstance(picture, list | tuple) else [picture]
     depths = [float(z) for z in np.broadcast_to(np.asarray(z_mm, float), (len(pictures),))]
-    pixels = [_pixels(one) for one in pictures]
-    if said := next(filter(None, (field_words(p, options.fit) for p in pixels)), ""):
-        warnings.warn(in_python(said), stacklevel=3)
-    targets = [prepare_target(p, display, options, z_mm=z) for p, z in zip(pixels, depths, strict=True)]
+    images = [_image(one) for one in pictures]
+    said = [f"{image.path}: {note}." for image in images for note in image.notes]
+    said += list(filter(None, (field_words(image.pixels, options.fit) for image in images)))[:1]
+    if said:
+        warnings.warn(in_python(" ".join(said)), stacklevel=3)
+    targets = [
+        prepare_target(image.pixels, display, options, z_mm=z)
+        for image, z in zip(images, depths, strict=True)
+    ]
     found = compute_and_judge(display, targets, options, callback=on_progress, cancel=cancel)
     files = HologramFiles(Path("slm.png"), config.display.slm_binning, options, [display])
     return HologramShown(**{f.name: getattr(found, f.name) for f in fields(HologramResult)}, files=files)
 
 
-def _pixels(picture: Any) -> npt.NDArray[Any]:
+def _image(picture: Any) -> ImageFile:
+    """Return a picture as of a file: an array's alpha channel is left out as a file's is, and that noted."""
     if isinstance(picture, str) and picture in SAMPLES and not Path(picture).exists():
-        return np.asarray(SAMPLES[picture].load())
+        sample: Any = SAMPLES[picture].load()
+        return ImageFile(Path(picture), np.asarray(sample))
     if isinstance(picture, Path | str | ImageFile):
-        return read_image(picture).pixels
-    pixels = plain_array(picture)
-    if pixels.dtype.kind not in "uifb" or pixels.ndim not in (2, 3) or not pixels.size:
+        return read_image(picture)
+    pixels: Any = plain_array(picture)
+    notes: tuple[str, ...] = ()
+    if pixels.ndim == 3:
+        pixels, notes = drop_alpha(pixels)
+    one = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] in (1, 3))
+    if pixels.dtype.kind not in "uifb" or not one or not pixels.size:
         raise BenchError(
             "A picture is a file, the name of a sample, or an array (height, width) or (height, width, 3) of "
-            f"real numbers, not {type(picture).__name__} {pixels.dtype} {pixels.shape}."
+            f"real numbers, not {type(picture).__name__} {pixels.dtype} {np.shape(picture)}."
         )
-    return pixels
+    return ImageFile(Path("the picture, an array"), pixels, notes)

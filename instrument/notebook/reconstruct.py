@@ -185,9 +185,14 @@ def _require_no_alpha(given: Any, name: str) -> None:
     if isinstance(given, Measurement | Calibration):
         return
     pixels = plain_array(given)
-    if pixels.ndim == 3 and pixels.shape[-1] == 4 and pixels.size and np.ptp(pixels[..., 3]) == 0:
+    if (
+        pixels.ndim == 3
+        and pixels.shape[-1] == 4
+        and pixels.size
+        and (fourth := pixels[..., 3]).min() == fourth.max()
+    ):
         raise BenchError(
-            f"The {name}'s fourth channel is {pixels[0, 0, 3]:g} everywhere: transparency (RGBA), no light. "
+            f"The {name}'s fourth channel is {fourth[0, 0]:g} everywhere: transparency (RGBA), no light. "
             f"Give the colours alone: [..., :3]."
         )
 
