@@ -15,7 +15,7 @@ from drivers.common.port_stage import AxisState, PortOptions, PortStage, distinc
 from drivers.common.serial_transport import SerialTransport
 from drivers.common.stage_axes import MRAD_PER_DEG, UM_PER_MM, AxisMap, AxisName, AxisOptions
 from drivers.device import DriverOptions, SharedPart
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, DeviceTimeoutError
 from drivers.stage import StageAxis
 
 _NUMBER = r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?"
@@ -41,6 +41,7 @@ _REFUSALS = {
     "C": "the value is missing or out of range",
     "D": "it cannot be done now",
     "E": "homing has already begun",
+    "F": "it does not know its stage",
     "G": "the target is out of its limits",
     "H": "it is not referenced",
     "I": "it is being configured",
@@ -53,6 +54,8 @@ _REFUSALS = {
     "S": "communication timed out",
     "U": "its memory failed",
     "V": "the command failed",
+    "W": "an SMC100PP does not know it",
+    "X": "an SMC100CC does not know it",
 }
 _SETTLING = {"um": 1.0, "mrad": 0.05}
 
@@ -103,9 +106,12 @@ class Smc100Stage(PortStage):
     def _tell(self, name: str, words: str) -> None:
         """Send a command, and ask whether it was taken.
 
+        The controller keeps a refusal until it is asked: an older one, of a STOP at rest, is asked for first.
+
         Raises DeviceError with the controller's reason when it was not.
         """
         number = self.axis_options[name].number  # type: ignore[attr-defined]
+        self._query(name, "TE", "[@A-Z]")
         self._link.send_now(f"{number}{words}\r\n".encode())
         refusal = self._query(name, "TE", "[@A-Z]")
         if refusal != "@":
@@ -132,8 +138,15 @@ class Smc100Stage(PortStage):
             options,
             ends=(self._value(name, "SL", "?"), self._value(name, "SR", "?")),
             speed_per_s=self._value(name, "VA", "?"),
-            resolution=self._value(name, "SU", "?"),
+            resolution=self._resolution(name),
         )
+
+    def _resolution(self, name: str) -> float:
+        """Return the smallest step: an encoder's, or a stepping motor's, whose SMC100PP has no SU."""
+        try:
+            return self._value(name, "SU", "?")
+        except DeviceTimeoutError:  # a question that is refused is not answered
+            return self._value(name, "FRS", "?") / self._value(name, "FRM", "?")
 
     def _axis_state(self, name: str) -> AxisState:
         errors, state = self._status(name)

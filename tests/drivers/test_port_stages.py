@@ -288,6 +288,18 @@ def test_smc100_failures_are_said_and_a_disabled_axis_is_enabled(tmp_path: Path)
     chain.port.unplug()
 
 
+def test_an_smc100pp_opens_and_a_stop_at_rest_refuses_nothing_later(tmp_path: Path) -> None:
+    chain = Smc100Chain(tmp_path)
+    chain.steppers.add(1)
+    with smc100(chain) as stage:
+        x, z = stage.axes
+        assert (x.resolution, z.resolution) == pytest.approx((1.0, 0.1))
+        stage.stop()  # refused by axes without a reference, and kept by them until they are asked
+        stage.home()
+        assert stage.is_homed
+    chain.port.unplug()
+
+
 def test_esp301_failures_are_said_and_its_units_are_kept(tmp_path: Path) -> None:
     controller = EspController(tmp_path)
     found = Esp301Stage.probe(str(controller.link))

@@ -88,6 +88,8 @@ class Smc100Chain:
         self.states = dict.fromkeys(self.axes, 0x0A)
         self.errors = dict.fromkeys(self.axes, 0)
         self.refusal = dict.fromkeys(self.axes, "@")
+        self.steppers: set[int] = set()
+        """Those that are SMC100PP: they know no encoder."""
         self.port = PtyDevice(folder, self.answer)
         self.link = self.port.link
 
@@ -101,7 +103,7 @@ class Smc100Chain:
         return self.states[number]
 
     def answer(self, line: bytes) -> list[Answer]:
-        found = re.fullmatch(r"(\d+)([A-Z]{2})(.*)", line.decode().strip())
+        found = re.fullmatch(r"(\d+)(FR[MS]|[A-Z]{2})(.*)", line.decode().strip())
         if found is None or int(found[1]) not in self.axes:
             return []
         number, words, value = int(found[1]), found[2], found[3]
@@ -112,6 +114,9 @@ class Smc100Chain:
         axis, state = self.axes[number], self.state(number)
         fixed = {"ID": "LTA-HS", "VE": " SMC_CC_2.0", "VA": "40", "SU": "0.0001"}
         ends = {"SL": axis.lowest, "SR": axis.highest}
+        if number in self.steppers:
+            del fixed["SU"]
+            fixed |= {"FRM": "20", "FRS": "0.02"}
         if words in fixed:
             return fixed[words]
         if words in ends:
@@ -124,7 +129,7 @@ class Smc100Chain:
             case "TE":
                 refused, self.refusal[number] = self.refusal[number], "@"
                 return refused
-            case "ST":
+            case "ST" if state != 0x0A:
                 axis.stop()
             case "OR" if state == 0x0A:
                 axis.home(0)
