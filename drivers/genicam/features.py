@@ -10,6 +10,7 @@ from drivers.errors import DeviceError, LimitError
 
 _ONCE = "Once"
 """Of automatics: what is set by itself now, after which the feature reads "Off" (SFNC)."""
+SWITCHED = {"true": True, "false": False, "1": True, "0": False}
 FeatureValue = str | bool | int | float
 FeatureKind = Literal["number", "choice", "switch", "command", "text"]
 
@@ -100,12 +101,14 @@ class Features(ABC):
 
     # What is made of it ----------------------------------------------------------------------------
     def set_number(self, name: str, value: float) -> float:
-        """Set a number (a whole one to the nearest of its steps); returns what it reads afterwards."""
+        """Set a number to the nearest that it takes, within its limits; returns what it reads afterwards."""
         with self.words(f"take {value:g} for its {name}"):
-            step = self.increment(name)
-            if step:
-                low, high = self.bounds(name)
-                value = min(max(int(low) + round((value - low) / step) * step, int(low)), int(high))
+            low, high = self.bounds(name)
+            value = min(max(value, low), high)  # a limit in other units and back is off by a rounding
+            if (step := self.increment(name)) == 1:
+                value = round(value)
+            elif step:
+                value = int(low) + min(round((value - low) / step), int(high - low) // step) * step
             self._write_number(name, value)
         return self.number(name)
 
@@ -143,8 +146,11 @@ class Features(ABC):
         elif kind == "command":
             self.execute(name)
         elif kind == "switch":
+            if (text := str(value).lower()) not in SWITCHED:
+                problem = f"takes no {name} {value!r}."
+                raise LimitError(self.name, problem, f"It takes {', '.join(list(SWITCHED)[:2])}.")
             with self.words(f"take {value} for its {name}"):
-                self._write_switch(name, bool(value))
+                self._write_switch(name, SWITCHED[text])
         elif kind == "number" and not isinstance(value, str):
             low, high = self.bounds(name)
             if not low <= value <= high:

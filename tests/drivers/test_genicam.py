@@ -1,0 +1,94 @@
+"""What GenICam cameras have in common, over a camera that is a table of features."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from drivers.errors import DeviceError, LimitError
+from drivers.genicam.features import FeatureKind, Features
+
+
+class Table(Features):
+    """Features by name: numbers ``[value, low, high, step]``, choices ``[entry, *offered]``, switches."""
+
+    listed_by = "this test"
+
+    def __init__(self, **features: Any) -> None:
+        super().__init__("camera (table)")
+        self.of = features
+
+    @contextlib.contextmanager
+    def words(self, doing: str) -> Iterator[None]:
+        try:
+            yield
+        except ValueError as error:
+            raise DeviceError(self.name, f"did not {doing}: {error}.") from error
+
+    def find(self, *names: str) -> str | None:
+        return next((name for name in names if name in self.of), None)
+
+    def kind(self, name: str) -> FeatureKind | None:
+        if name not in self.of:
+            return None
+        value = self.of[name]
+        return "switch" if isinstance(value, bool) else "choice" if isinstance(value[0], str) else "number"
+
+    def number(self, name: str) -> float:
+        return float(self.of[name][0])
+
+    def bounds(self, name: str) -> tuple[float, float]:
+        return float(self.of[name][1]), float(self.of[name][2])
+
+    def increment(self, name: str) -> int:
+        return int(self.of[name][3])
+
+    def _write_number(self, name: str, value: float) -> None:
+        _, low, high, step = self.of[name]
+        if not low <= value <= high or (step and (value - low) % step):
+            raise ValueError(f"{value!r} is not within {low} to {high} in steps of {step}")
+        self.of[name][0] = value
+
+    def unit(self, name: str) -> str:
+        return "dB" if name == "Gain" else ""
+
+    def text(self, name: str) -> str:
+        value = self.of[name]
+        return str(value).lower() if isinstance(value, bool) else str(value[0])
+
+    def entries(self, name: str) -> tuple[str, ...]:
+        return tuple(self.of[name][1:])
+
+    def _write_text(self, name: str, value: str) -> None:
+        self.of[name][0] = value
+
+    def _write_switch(self, name: str, value: bool) -> None:
+        self.of[name] = value
+
+    def _execute(self, name: str) -> None:
+        raise ValueError("nothing to execute")
+
+
+def test_a_number_is_brought_to_the_nearest_that_the_camera_takes() -> None:
+    features = Table(
+        ExposureTime=[9.0, 1001.0, 59_000.5, 0], Width=[6, 6, 1023, 4], Offset=[0, -(2**63), 2**63 - 1, 1]
+    )
+    for limit_us in (1001.0, 59_000.5):
+        assert features.set_number("ExposureTime", limit_us / 1e3 * 1e3) == limit_us  # a rounding apart
+    assert 1001.0 / 1e3 * 1e3 != 1001.0
+    assert features.set_number("Width", 1023) == 1022  # the largest on its steps
+    assert features.set_number("Width", 13) == 14
+    assert features.set_number("Offset", 4660) == 4660
+
+
+def test_a_switch_is_not_on_because_a_word_was_given() -> None:
+    features = Table(ReverseX=True)
+    for word, on in (("false", False), ("True", True), (0, False), (1, True), (False, False)):
+        features.set_any("ReverseX", word)
+        assert features.of["ReverseX"] is on
+    with pytest.raises(LimitError, match=r"takes no ReverseX 'off'\. It takes true, false\."):
+        features.set_any("ReverseX", "off")
+    assert features.of["ReverseX"] is False
