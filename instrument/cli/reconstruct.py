@@ -48,7 +48,6 @@ class _Asked:
         "diffuserbench reconstruct --psf psf.tif --image raw.tif --dark dark.tif --bin 4 --out hand.tif",
         "diffuserbench reconstruct --calibration demo/calibration --image photo.tif --z-mm 30 --rotate 180",
         "diffuserbench reconstruct --volume psfs/ --image raw.tif --prior l1 --checkpoint kept/ --out v.tif",
-        "diffuserbench reconstruct --volume field/ --image photo.tif --explain",
         "diffuserbench reconstruct runs/2026-11-21-recording --video --calibration demo/calibration",
         "diffuserbench reconstruct runs/scene --patterned runs/sheet --calibration demo/calibration",
     )

@@ -151,7 +151,7 @@ class InputOptions:
     )
     erasures: ErasuresChoice = option(
         "saturated",
-        help="Pixels left out: none, saturated (hot and dead ones too), FILE's zeros, a share.",
+        help="Left out: none, saturated (hot, dead), FILE's zeros, a share.",
         metavar="WHICH",
         parse=_erasures,
         applies=_EVERY,
