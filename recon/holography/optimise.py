@@ -319,10 +319,14 @@ def _on_levels(variable: Phase, x: Array, levels: int, watch: _Watch, stages: St
     step = x.dtype.type(2 * np.pi / levels)
     if variable.model.wraps:
         # Stages would search across the jumps, and a phase that is rounded up to a whole turn jumps.
-        unrounded = replace(watch, options=replace(watch.options, psnr_db=None))
-        found = _in_turns(variable, _Lbfgs(variable, x), unrounded)
-        near = np.rint(np.mod(variable.pack(found.slm), x.dtype.type(2 * np.pi)) / step)
-        return _rounded(variable, np.minimum(near, levels - 1) * step, found.history, found.stop_reason)
+        def nearest(slm: Array) -> Array:
+            near = np.rint(np.mod(variable.pack(slm), x.dtype.type(2 * np.pi)) / step)
+            return np.minimum(near, levels - 1) * step
+
+        found = _in_turns(
+            variable, _Lbfgs(variable, x), watch, lambda slm: variable.evaluate(nearest(slm))[0].psnr_db
+        )
+        return _rounded(variable, nearest(found.slm), found.history, found.stop_reason)
     history: tuple[HologramRecord, ...] = ()
     reason = HologramStop.ITERATIONS
     done = 0.0
@@ -394,8 +398,13 @@ TURNS = ((0.25, False), (0.2, False), (0.15, False), (0.2, True), (0.2, True))
 at the ends of their turn then, so that nothing jumps afterwards."""
 
 
-def _in_turns(variable: Phase, search: _Lbfgs, watch: _Watch) -> Hologram:
-    """Search with phases that do not wrap, and wrap them in between; the best wrapped ones count."""
+def _in_turns(
+    variable: Phase, search: _Lbfgs, watch: _Watch, shown_db: Callable[[Array], float] | None = None
+) -> Hologram:
+    """Search with phases that do not wrap, and wrap them in between; the best wrapped ones count.
+
+    ``shown_db`` is the PSNR of what is shown of them, where that is not they themselves.
+    """
     model = variable.model
     history: tuple[HologramRecord, ...] = (HologramRecord(0, 0.0, *search.point),)
     best, slm = search.point, search.slm
@@ -412,8 +421,10 @@ def _in_turns(variable: Phase, search: _Lbfgs, watch: _Watch) -> Hologram:
         if search.point.loss < best.loss:
             best, slm = search.point, now
         history = (*history[:-1], replace(history[-1], loss=best.loss, psnr_db=best.psnr_db))
-        if watch.options.psnr_db is not None and best.psnr_db >= watch.options.psnr_db:
-            reason = HologramStop.QUALITY
+        wanted_db = watch.options.psnr_db
+        if wanted_db is not None and best.psnr_db >= wanted_db:
+            if shown_db is None or shown_db(slm) >= wanted_db:
+                reason = HologramStop.QUALITY
         if reason not in (HologramStop.ITERATIONS, HologramStop.CONVERGED):
             break
     return Hologram(slm.astype(np.complex64), history, reason, history[-1].seconds)

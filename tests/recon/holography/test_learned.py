@@ -153,6 +153,13 @@ def test_the_psnr_asked_for_and_levels_are_of_what_the_display_shows():
         np.abs(rounded.phase_rad * 256 / (2 * np.pi) - np.rint(rounded.phase_rad * 256 / (2 * np.pi))).max()
         < 1e-3
     )
+    coarse = compute_hologram(model, iterations=60, phase_levels=4)
+    asked = compute_hologram(model, iterations=60, phase_levels=4, psnr_db=coarse.history[-1].psnr_db - 1)
+    assert asked.stop_reason is HologramStop.QUALITY
+    assert asked.history[-1].psnr_db >= coarse.history[-1].psnr_db - 1
+    assert asked.history[-1].iteration < coarse.history[-1].iteration
+    beyond = compute_hologram(model, iterations=60, phase_levels=4, psnr_db=coarse.history[-1].psnr_db + 1)
+    assert beyond.stop_reason is not HologramStop.QUALITY  # although it is, before phases are rounded
     with pytest.raises(InputError, match="use the method 'lbfgs'"):
         compute_hologram(model, method="nesterov")
 
