@@ -63,8 +63,8 @@ class Refinement:
     """Of the hologram given and of the best one; the same where nothing was gained."""
     psnr_db: tuple[float, ...]
     """Captured, round by round; the first is the hologram given."""
-    interrupted: bool = False
-    """Whether Ctrl-C ended it before its last round."""
+    ended_by: BaseException | None = None
+    """What ended it before its last round (Ctrl-C, a signal): to be raised once the best is written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,7 @@ class HologramCamera:
         asked for what it showed last plus what the photograph lacked. The best pattern by photograph (in the
         fovea, where there is one) is kept:
         the result is the given one where nothing helps (its photograph decides, with the camera's noise
-        averaged). Ctrl-C during a round ends it with what was best before.
+        averaged). Ctrl-C or a signal during a round ends it with what was best before.
 
         Parameters
         ----------
@@ -139,7 +139,8 @@ class HologramCamera:
         best_slm = now = np.asarray(slm, np.complex64)
         first = self.capture(list(now), target, average=options.average)
         best, measured, history = first, first, [first.scores.asked_psnr_db]
-        plain, interrupted = HologramModel(self.display, [target], self.computed), False
+        plain = HologramModel(self.display, [target], self.computed)
+        ended_by: BaseException | None = None
         try:
             for number in range(1, options.refine + 1):
                 shown = plain.seen(now) / plain.peaks[0]
@@ -154,9 +155,9 @@ class HologramCamera:
                     best, best_slm = measured, now
                 if progress is not None:
                     progress(number, history[-1])
-        except KeyboardInterrupt:
-            interrupted = True
-        return Refinement(best_slm, first, best, tuple(history), interrupted)
+        except (KeyboardInterrupt, SystemExit) as interruption:
+            ended_by = interruption
+        return Refinement(best_slm, first, best, tuple(history), ended_by)
 
 
 def wanted_picture(target: Target, display: Display) -> tuple[npt.NDArray[np.float64], float]:
@@ -299,9 +300,14 @@ def photograph_hologram(
     )
 
 
+def refined_path(pattern: Path) -> Path:
+    """Return where the refined pattern goes, beside the one it came from."""
+    return pattern.with_name(f"{pattern.stem}-refined.png")
+
+
 def write_refined(pattern: Path, refined: Refinement, facts: Mapping[str, Any], binning: int) -> Path:
     """Write the refined pattern beside the one it came from, and return its path."""
-    path = pattern.with_name(f"{pattern.stem}-refined.png")
+    path = refined_path(pattern)
     kept = {name: fact for name, fact in facts.items() if name not in ("format", "levels_per_turn")}
     kept |= {"refined_by_camera": True, "captured_psnr_db": list(refined.psnr_db)}
     write_slm_image(path, field_levels(refined.slm[0], binning, mirrors=is_of_mirrors(facts)), kept)

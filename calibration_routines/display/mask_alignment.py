@@ -179,7 +179,7 @@ class MaskAlignment:
             if isinstance(error, InputError):
                 raise AlignmentFailedError(str(error)) from error
             raise
-        except (EndedEarlyError, StoppedError, KeyboardInterrupt) as error:
+        except (EndedEarlyError, StoppedError, KeyboardInterrupt, SystemExit) as error:
             if stage is not None:
                 here = stage.commanded_position()
                 moved = f"moved from {_told(start)}" if here != start else "not moved"

@@ -46,8 +46,8 @@ class PhotographedSpots:
     deviations : tuple of float
         Standard deviation over mean, round by round; the first is of the pattern given.
     camera_residual_px : float
-    interrupted : bool
-        Whether Ctrl-C ended it before its last round.
+    ended_by : BaseException or None
+        What ended it before its last round (Ctrl-C, a signal): to be raised once the best is written.
     """
 
     slm: npt.NDArray[np.complex64]
@@ -55,7 +55,7 @@ class PhotographedSpots:
     relative: npt.NDArray[np.float64]
     deviations: tuple[float, ...]
     camera_residual_px: float
-    interrupted: bool = False
+    ended_by: BaseException | None = None
 
 
 def photograph_spots(
@@ -70,7 +70,8 @@ def photograph_spots(
     """Photograph spots, and for ``options.refine`` rounds ask for more where the camera saw too little.
 
     ``slm`` is complex (n_frames, height, width), ``computed`` how it was computed; ``progress(round,
-    deviation)``. The most even pattern by photograph is kept; Ctrl-C during a round ends it with that.
+    deviation)``. The most even pattern by photograph is kept; Ctrl-C or a signal during a round
+    ends it with that.
 
     Raises InputError when the camera does not see the spots, or some are in focus elsewhere; DeviceError when
     a device fails.
@@ -85,7 +86,7 @@ def photograph_spots(
     frame, relative = seen.measure(slm)
     best = PhotographedSpots(np.asarray(slm, np.complex64), frame, relative, (), camera.residual_px)
     deviations, asked, now = [float(relative.std())], spots, np.asarray(slm, np.complex64)
-    interrupted = False
+    ended_by: BaseException | None = None
     try:
         for number in range(1, options.refine + 1):
             asked = brighter_where_dim(asked, relative)
@@ -96,9 +97,9 @@ def photograph_spots(
                 best = PhotographedSpots(now, frame, relative, (), camera.residual_px)
             if progress is not None:
                 progress(number, deviations[-1])
-    except KeyboardInterrupt:
-        interrupted = True
-    return replace(best, deviations=tuple(deviations), interrupted=interrupted)
+    except (KeyboardInterrupt, SystemExit) as interruption:
+        ended_by = interruption
+    return replace(best, deviations=tuple(deviations), ended_by=ended_by)
 
 
 def registered_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:

@@ -15,7 +15,7 @@ from instrument.cli.progress import one_task
 from instrument.display.hologram import HOLOGRAM, PHOTOGRAPHED, CaptureOptions
 from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError, FileError
-from instrument.tasks.task import Given
+from instrument.tasks.task import Given, saying_what_is_left
 from recon.base.declare import option
 
 if TYPE_CHECKING:
@@ -245,10 +245,10 @@ def _capture_colours(
     typer.echo(f"Wrote {options.capture}")
 
 
-def _end_early(*, interrupted: bool) -> None:
-    if interrupted:
-        typer.echo("Interrupted: this is the best pattern so far.", err=True)
-        raise typer.Exit(130)
+def _end_early(ended_by: BaseException | None) -> None:
+    if ended_by is not None:
+        ended_by.add_note("This is the best pattern so far.")
+        raise ended_by
 
 
 def _warn_of_saturation(fraction: float) -> None:
@@ -269,6 +269,7 @@ def _capture(
         display_of_pattern,
         options_of_pattern,
         photograph_hologram,
+        refined_path,
         require_focus,
         target_of_pattern,
         write_capture,
@@ -285,28 +286,32 @@ def _capture(
     display = display_of_pattern(opened.config, slm, facts, place)
     require_focus(facts.get("z_mm", [0.0]), refined=options.refine > 0)
     computed = options_of_pattern(facts)
-    found = photograph_hologram(
-        io,
-        fields,
-        display,
-        target_of_pattern(read_image(options.target).pixels, display, facts),
-        options,
-        progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
-        computed=computed,
-    )
-    mark = " (SIMULATED)" if found.simulated else ""
-    typer.echo(f"camera registered to {found.camera_residual_px:.2f} px{mark}")
-    if found.background_estimated:
-        typer.echo("Background estimated (--as-is): the darkest 10 x 10 pixels.", err=True)
-    if found.refined is not None:
-        path = write_refined(pattern, found.refined, facts, io.binning)
-        first, best = found.refined.psnr_db[0], found.capture.scores.asked_psnr_db
-        typer.echo(f"camera in the loop: {first:.2f} dB -> {best:.2f} dB; {path}")
-    write_capture(options.capture, found)
-    typer.echo(f"photographed: {score_words(found.capture.scores)}")
-    _warn_of_saturation(found.capture.saturated_fraction)
-    typer.echo(f"Wrote {options.capture}")
-    _end_early(interrupted=found.refined is not None and found.refined.interrupted)
+    written = (refined_path(pattern), options.capture) if options.refine else (options.capture,)
+    with saying_what_is_left(*written):
+        found = photograph_hologram(
+            io,
+            fields,
+            display,
+            target_of_pattern(read_image(options.target).pixels, display, facts),
+            options,
+            progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
+            computed=computed,
+        )
+        # First of all: the terminal may be closed.
+        if found.refined is not None:
+            write_refined(pattern, found.refined, facts, io.binning)
+        write_capture(options.capture, found)
+        mark = " (SIMULATED)" if found.simulated else ""
+        typer.echo(f"camera registered to {found.camera_residual_px:.2f} px{mark}")
+        if found.background_estimated:
+            typer.echo("Background estimated (--as-is): the darkest 10 x 10 pixels.", err=True)
+        if found.refined is not None:
+            first, best = found.refined.psnr_db[0], found.capture.scores.asked_psnr_db
+            typer.echo(f"camera in the loop: {first:.2f} dB -> {best:.2f} dB; {written[0]}")
+        typer.echo(f"photographed: {score_words(found.capture.scores)}")
+        _warn_of_saturation(found.capture.saturated_fraction)
+        typer.echo(f"Wrote {options.capture}")
+        _end_early(found.refined.ended_by if found.refined is not None else None)
 
 
 def _capture_spots(
@@ -320,7 +325,7 @@ def _capture_spots(
     """Photograph spots, say how even they are, write."""
     import numpy as np
 
-    from calibration_routines.display.hologram_photograph import display_of_pattern
+    from calibration_routines.display.hologram_photograph import display_of_pattern, refined_path
     from calibration_routines.display.spot_photograph import photograph_spots, write_spots_seen
     from instrument.display.spots import spots_of_facts
     from instrument.files.slm_image import phase_levels, write_slm_image
@@ -334,32 +339,35 @@ def _capture_spots(
     computed = HologramOptions(
         seed=said["seed"], phase_levels=said["phase_levels"], envelope=said["envelope"]
     )
-    found = photograph_spots(
-        io,
-        np.array(fields),
-        display_of_pattern(opened.config, slm, facts, place),
-        spots_of_facts(pattern, facts),
-        options,
-        computed,
-        progress=lambda n, deviation: typer.echo(f"round {n}: deviation {deviation:.2%}", err=True),
-    )
-    simulated = bool(opened.simulated_kinds)
-    typer.echo(f"camera registered to {found.camera_residual_px:.2f} px{' (SIMULATED)' if simulated else ''}")
-    first, best = found.deviations[0], min(found.deviations)
-    if options.refine:
-        path = pattern.with_name(f"{pattern.stem}-refined.png")
-        kept = {name: fact for name, fact in facts.items() if name not in ("format", "levels_per_turn")}
-        kept |= {"refined_by_camera": True, "captured_deviations": list(found.deviations)}
-        write_slm_image(path, phase_levels(np.angle(found.slm[0]), io.binning), kept)
-        typer.echo(f"camera in the loop: deviation {first:.2%} -> {best:.2%}; {path}")
-    write_spots_seen(options.capture, found, simulated=simulated)
-    least, greatest = found.relative.min(), found.relative.max()
-    typer.echo(
-        f"photographed: {len(found.relative)} spots, {least:.3f} to {greatest:.3f} of what was asked for, "
-        f"deviation {best:.2%}"
-    )
-    typer.echo(f"Wrote {options.capture}")
-    _end_early(interrupted=found.interrupted)
+    written = (refined_path(pattern), options.capture) if options.refine else (options.capture,)
+    with saying_what_is_left(*written):
+        found = photograph_spots(
+            io,
+            np.array(fields),
+            display_of_pattern(opened.config, slm, facts, place),
+            spots_of_facts(pattern, facts),
+            options,
+            computed,
+            progress=lambda n, deviation: typer.echo(f"round {n}: deviation {deviation:.2%}", err=True),
+        )
+        simulated = bool(opened.simulated_kinds)
+        if options.refine:  # first of all: the terminal may be closed
+            kept = {name: fact for name, fact in facts.items() if name not in ("format", "levels_per_turn")}
+            kept |= {"refined_by_camera": True, "captured_deviations": list(found.deviations)}
+            write_slm_image(written[0], phase_levels(np.angle(found.slm[0]), io.binning), kept)
+        write_spots_seen(options.capture, found, simulated=simulated)
+        mark = " (SIMULATED)" if simulated else ""
+        typer.echo(f"camera registered to {found.camera_residual_px:.2f} px{mark}")
+        first, best = found.deviations[0], min(found.deviations)
+        if options.refine:
+            typer.echo(f"camera in the loop: deviation {first:.2%} -> {best:.2%}; {written[0]}")
+        least, greatest = found.relative.min(), found.relative.max()
+        typer.echo(
+            f"photographed: {len(found.relative)} spots, {least:.3f} to {greatest:.3f} of what was asked "
+            f"for, deviation {best:.2%}"
+        )
+        typer.echo(f"Wrote {options.capture}")
+        _end_early(found.ended_by)
 
 
 def _show_run(run: Path, picture: Path | None) -> None:

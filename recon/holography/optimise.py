@@ -421,10 +421,10 @@ def _in_turns(
         if search.point.loss < best.loss:
             best, slm = search.point, now
         history = (*history[:-1], replace(history[-1], loss=best.loss, psnr_db=best.psnr_db))
-        wanted_db = watch.options.psnr_db
-        if wanted_db is not None and best.psnr_db >= wanted_db:
-            if shown_db is None or shown_db(slm) >= wanted_db:
-                reason = HologramStop.QUALITY
+        asked_db = watch.options.psnr_db
+        good = asked_db is not None and best.psnr_db >= asked_db
+        if good and (shown_db is None or shown_db(slm) >= (asked_db or 0.0)):
+            reason = HologramStop.QUALITY
         if reason not in (HologramStop.ITERATIONS, HologramStop.CONVERGED):
             break
     return Hologram(slm.astype(np.complex64), history, reason, history[-1].seconds)

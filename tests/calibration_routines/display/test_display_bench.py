@@ -11,16 +11,13 @@ import pytest
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.hologram_photograph import (
     Capture,
-    HologramCamera,
     Photographed,
     write_capture,
 )
 from calibration_routines.display.slm_calibration import measure_look_up_table
-from instrument.display.hologram import CaptureOptions
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
-from recon.holography import Display, HologramModel, HologramOptions, Scores, Target
-from recon.holography.display import no_mask
+from recon.holography import Scores
 
 DARK = 100
 """Counts without light, of 12 bits: more than a fiftieth of full scale."""
@@ -70,24 +67,3 @@ def test_a_photograph_is_written_square_as_the_field_is(tmp_path: Path):
     seen = read_image(tmp_path / "seen.png").pixels > 127
     assert seen.shape == (30, 30)
     assert abs(int(seen.any(axis=0).sum()) - int(seen.any(axis=1).sum())) <= 2
-
-
-def test_a_camera_in_the_loop_that_is_interrupted_keeps_what_was_best(monkeypatch: pytest.MonkeyPatch):
-    display, target = Display((24, 32), no_mask((24, 32))), Target(np.ones((24, 32)))
-    dark = np.zeros(HologramModel(display, [target]).band.seen_shape)
-    taken = []
-
-    def capture(*_args, **_options) -> Capture:
-        if len(taken) == 2:
-            raise KeyboardInterrupt
-        taken.append(20.0 + len(taken))
-        return Capture(dark, dark, Scores(taken[-1], 0.0, 0.0, 0.0), 0.0)
-
-    monkeypatch.setattr(HologramCamera, "capture", capture)
-    start = np.ones((1, 24, 32), np.complex64)
-    seen = HologramCamera(None, display, None, 1.0, HologramOptions())
-    found = seen.refine(start, target, CaptureOptions(refine=5))
-    assert found.interrupted
-    assert found.psnr_db == (20.0, 21.0)
-    assert found.best.scores.psnr_db == 21.0
-    assert (found.slm != start).any()

@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from calibration_routines.display import hologram_photograph, spot_photograph
+from calibration_routines.display.hologram_photograph import Capture
 from instrument.bench.config_file import template
 from instrument.cli import main
+from instrument.cli.app import Terminated
 from instrument.files.images import write_image
-from instrument.files.slm_image import read_slm_image
+from instrument.files.slm_image import phase_levels, read_slm_image
+from recon.holography import Scores, Target
 
 WITHOUT_MASK = {
     "shape": "[96, 128]",
@@ -93,3 +98,60 @@ def test_spots_are_found_measured_and_evened_out(
     assert Path("spots-refined.png").exists()
     assert main(["show", "spots.png", "--capture", "b.png", "--target", "seen.png"]) == 2
     assert "leave --target out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("interruption", "status", "words"),
+    [(KeyboardInterrupt(), 130, "interrupted."), (Terminated(143), 143, "stopped by a signal.")],
+    ids=["Ctrl-C", "signal"],
+)
+@pytest.mark.parametrize("spots", [True, False], ids=["spots", "picture"])
+def test_what_ends_the_camera_in_the_loop_keeps_what_was_best(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    spots: bool,
+    interruption: BaseException,
+    status: int,
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_bench()
+    seen: list[np.ndarray] = []
+
+    def photographed(slm: np.ndarray) -> float:
+        if len(seen) == 2:
+            raise interruption
+        seen.append(np.array(slm))
+        return 20.0 + len(seen)  # dB; the second is better
+
+    def measure(_spots: object, slm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        off = 1 / photographed(slm)
+        return np.ones((16, 20)), np.array([1 + off, 1 - off] * 3)
+
+    def capture(_camera: object, slm: list[np.ndarray], target: Target, **_: int) -> Capture:
+        wanted = np.ones(target.image.shape)
+        return Capture(wanted, wanted, Scores(photographed(np.array(slm)), 0.0, 0.0, 0.0), 0.0)
+
+    def camera(*_: object) -> tuple[object, float]:
+        return SimpleNamespace(residual_px=0.1), 1.0
+
+    monkeypatch.setattr(spot_photograph, "registered_camera", camera)
+    monkeypatch.setattr(hologram_photograph, "registered_camera", camera)
+    monkeypatch.setattr(spot_photograph._Spots, "measure", measure)
+    monkeypatch.setattr(hologram_photograph.HologramCamera, "capture", capture)
+    write_image("picture.png", np.add.outer(np.arange(80), np.arange(90)).astype(np.uint8))
+    made = ["--spots", "2x3"] if spots else ["picture.png", "--iterations", "1"]
+    assert main(["hologram", *made]) == 0
+    shown = ["show", "slm.png", "--capture", "seen.png", *([] if spots else ["--target", "picture.png"])]
+    assert main([*shown, "--refine", "9"]) == status
+    said = capsys.readouterr().err
+    assert words in said
+    assert "This is the best pattern so far." in said
+    assert "Written: slm-refined.png, seen.png." in said
+    levels = read_slm_image("slm-refined.png")[0]
+    np.testing.assert_array_equal(levels, phase_levels(np.angle(seen[1][0])))
+    Path("seen.png").unlink()
+    assert main([*shown, "--force"]) == status
+    assert "Nothing was written." in capsys.readouterr().err
+    assert not Path("seen.png").exists()
