@@ -39,6 +39,7 @@ from instrument.display.hologram import (
     colour_shares,
     prepare_target,
     save_alignment,
+    square,
 )
 from instrument.display.hologram_files import CHANNELS
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
@@ -219,13 +220,13 @@ def _in_colour(bench: Bench, place: Alignment, settings: DisplayDemoSettings) ->
 
 
 def _figure(aligned: Capture, learned: Capture, colour: ColourCapture, lesson: Lesson) -> Figure:
-    panels = [Panel("Wanted", aligned.wanted, caption="through the eye's low-pass", white=1.0)]
+    panels = [Panel("Wanted", square(aligned.wanted), caption="through the eye's low-pass", white=1.0)]
     for title, capture in (("Photographed: aligned", aligned), ("Photographed: learned", learned)):
         score = capture.scores
         panels.append(
             Panel(
                 title,
-                np.maximum(capture.seen, 0),
+                np.maximum(square(capture.seen), 0),
                 caption=f"{score.psnr_db:.1f} dB, SSIM {score.ssim:.2f}",
                 white=1.0,
             )

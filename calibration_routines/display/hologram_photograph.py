@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -22,6 +21,7 @@ from instrument.display.hologram import (
     CaptureOptions,
     bench_display,
     prepare_target,
+    square,
     within,
 )
 from instrument.display.hologram_files import CHANNELS
@@ -316,9 +316,7 @@ def write_refined(pattern: Path, refined: Refinement, facts: Mapping[str, Any], 
 
 def write_capture(path: Path, found: Photographed) -> None:
     """Write what was seen as an 8-bit image, square as the field, white at 255, and its metrics beside it."""
-    side = max(found.capture.seen.shape)
-    square = cv2.resize(found.capture.seen, (side, side), interpolation=cv2.INTER_CUBIC)
-    pixels = np.clip(np.rint(square * 255), 0, 255).astype(np.uint8)
+    pixels = np.clip(np.rint(square(found.capture.seen) * 255), 0, 255).astype(np.uint8)
     facts = {
         "simulated": found.simulated,
         "background": "estimated" if found.background_estimated else "measured",

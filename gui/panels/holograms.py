@@ -31,7 +31,7 @@ from gui.widgets.building import Hint, button, fill, in_column, in_row, scrolled
 from gui.widgets.dialogues import choose_path
 from gui.widgets.hologram_views import WEIGHTS_SHAPE, HologramViews, WeightsMode
 from instrument.bench.config_file import TEMPLATES
-from instrument.display.hologram import depth_limit_mm, expansion_side, field_picture, field_words
+from instrument.display.hologram import depth_limit_mm, expansion_side, field_picture, field_words, square
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from recon.base.declare import expression, option, options_of
@@ -353,7 +353,7 @@ class HologramsPanel(Panel):
                 if wanted == self._target_shown:
                     return None
                 pixels = read_image(path).pixels
-                return wanted, field_picture(pixels, fit=fit, srgb=srgb), field_words(pixels, fit)
+                return wanted, square(field_picture(pixels, fit=fit, srgb=srgb)), field_words(pixels, fit)
             except (BenchError, InputError, OSError) as error:
                 return str(error)
 

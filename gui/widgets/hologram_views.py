@@ -22,6 +22,7 @@ from gui.widgets.building import choice, fill, narrow, offer, split
 from gui.widgets.image_view import ImageView, StretchedImage
 from gui.widgets.plots import curve_pen, plot_widget
 from gui.widgets.result_views import FactsView, ViewGrid
+from instrument.display.hologram import square
 from instrument.display.hologram_files import drawn_pattern, score_words
 from instrument.files.errors import percent
 from recon.holography import HologramRecord, foveal_weights, painted_weights
@@ -338,7 +339,7 @@ class HologramViews(QWidget):
     def show_photographed(self, photographed: Photographed, picture: str) -> None:
         """Show what the camera saw of it, and how close it is to the target."""
         assert self.computed is not None
-        self.captured.show_image(np.maximum(photographed.capture.seen, 0), 0.0, 1.0)
+        self.captured.show_image(np.maximum(square(photographed.capture.seen), 0), 0.0, 1.0)
         self._say_what_is_missing()
         warnings = []
         if photographed.capture.saturated_fraction > _SATURATED:
@@ -364,7 +365,7 @@ class HologramViews(QWidget):
 
     def _show_plane(self, number: int) -> None:
         if self.computed is not None and number >= 0:
-            self.seen.show_image(np.maximum(self.computed.result.seen[number], 0), 0.0, 1.0)
+            self.seen.show_image(np.maximum(square(self.computed.result.seen[number]), 0), 0.0, 1.0)
 
     def _draw_history(self, history: Sequence[HologramRecord]) -> None:
         plot: Any = self.plot

@@ -148,6 +148,18 @@ def within(window: Window | None, image: npt.NDArray[Any]) -> Image:
     return np.asarray(inside, np.float64)
 
 
+def square(image: npt.NDArray[Any]) -> Image:
+    """Return an image over the square field, (height, width), on as many pixels along both axes, float64.
+
+    What is seen has as many pixels along an axis as there is detail; looked at, it would be stretched.
+    """
+    side = max(image.shape)
+    drawn = np.asarray(image, np.float64)
+    if image.shape != (side, side):
+        drawn = np.asarray(cv2.resize(drawn, (side, side), interpolation=cv2.INTER_CUBIC), np.float64)
+    return drawn
+
+
 def prepare_target(
     pixels: npt.NDArray[Any],
     display: Display,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.display.hologram import HologramResult, colour_shares
+from instrument.display.hologram import HologramResult, colour_shares, square
 from instrument.files.atomic import require_new, write_text
 from instrument.files.errors import BenchError, FileError
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
@@ -177,10 +177,10 @@ def hologram_figure(result: HologramResult, *, title: str, facts: list[tuple[str
     if is_of_light(result.hologram.slm[0]):
         slm = Panel("Mirrors", drawn, caption=f"{width} x {height}, white sends light", white=2 * np.pi)
     panels = (
-        Panel("Wanted", result.wanted[0], caption="through the eye's low-pass", white=1.0),
+        Panel("Wanted", square(result.wanted[0]), caption="through the eye's low-pass", white=1.0),
         Panel(
             "Seen (computed)",
-            np.maximum(result.seen[0], 0),
+            np.maximum(square(result.seen[0]), 0),
             caption=f"low-pass: {score.psnr_db:.1f} dB, SSIM {score.ssim:.2f}",
             white=1.0,
         ),
@@ -188,7 +188,9 @@ def hologram_figure(result: HologramResult, *, title: str, facts: list[tuple[str
         slm,
     )
     strip = tuple(
-        Panel(f"plane {number + 2}", np.maximum(seen, 0), caption=f"{other.psnr_db:.1f} dB", white=1.0)
+        Panel(
+            f"plane {number + 2}", np.maximum(square(seen), 0), caption=f"{other.psnr_db:.1f} dB", white=1.0
+        )
         for number, (seen, other) in enumerate(zip(result.seen[1:], result.scores[1:], strict=True))
     )
     history = result.hologram.history

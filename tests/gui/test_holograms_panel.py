@@ -16,13 +16,14 @@ from pytestqt.qtbot import QtBot
 
 import gui.panels.holograms as holograms
 import instrument
+from calibration_routines.display.hologram_photograph import Capture, Photographed
 from gui.jobs import JobState
 from gui.panel import whole
 from gui.panels.holograms import HologramsPanel
 from gui.session import BenchSession
 from gui.widgets.result_views import best_columns
 from instrument.bench.config_file import parse_config
-from instrument.display.hologram import bench_display, depth_limit_mm
+from instrument.display.hologram import bench_display, depth_limit_mm, square
 from instrument.files.images import read_image, write_image
 from instrument.files.slm_image import levels_phase, read_slm_image
 from recon.errors import InputError
@@ -129,13 +130,22 @@ def test_compute_show_and_photograph(qtbot: QtBot, panel: HologramsPanel) -> Non
     assert panel.views.captured.image is not None
 
 
-def test_a_preview_writes_nothing(qtbot: QtBot, panel: HologramsPanel) -> None:
+def test_a_preview_writes_nothing_and_is_square_as_the_field_is(qtbot: QtBot, panel: HologramsPanel) -> None:
     assert panel.views.seen.caption == "Preview or Compute fills this in"
+    panel.form.widgets["expansion"].setText("1")
     computed(qtbot, panel, panel.preview_button)
+    assert panel.computed is not None
+    rows, columns = panel.computed.result.seen[0].shape
+    assert rows < columns
     assert panel.views.seen.image is not None
+    assert panel.views.seen.image.shape == (columns, columns)
     assert (panel.views.seen.caption, panel.views.phase.caption) == ("", "")
     assert panel.views.captured.caption == "Show and photograph takes it"
     assert not (panel.session.runs_folder / "holograms").exists()
+    wide = np.ones((20, 30))
+    capture = Capture(wide, wide, panel.computed.result.scores[0], 0.0)
+    panel.views.show_photographed(Photographed(capture, None, 0.1, False, simulated=True), "seen.png")
+    assert panel.views.captured.image.shape == (30, 30)
 
 
 def test_photographs_of_a_preview_each_have_a_name_of_their_own(qtbot: QtBot, panel: HologramsPanel) -> None:
@@ -334,8 +344,8 @@ def test_the_target_is_shown_as_it_fills_the_field(
     picture = pixels / pixels.max()
     np.testing.assert_allclose(panel.target.image, picture[:, 20:100])
     panel.form.widgets["fit"].setCurrentText("stretch")
-    qtbot.waitUntil(lambda: panel.target.image.shape == picture.shape, timeout=WAIT_MS)
-    np.testing.assert_allclose(panel.target.image, picture)
+    qtbot.waitUntil(lambda: panel.target.image.shape == (120, 120), timeout=WAIT_MS)
+    np.testing.assert_allclose(panel.target.image, square(picture))
     with qtbot.waitSignal(panel.session.logged, timeout=WAIT_MS) as said:
         panel.form.widgets["fit"].setCurrentText("cover")
     assert "the middle 80 x 80 of the picture's 80 x 120 pixels are shown" in said.args[1]
