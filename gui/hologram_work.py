@@ -30,11 +30,11 @@ from instrument.display.hologram import (
     compute_and_judge,
     load_alignment,
     prepare_target,
+    read_picture,
 )
 from instrument.display.hologram_files import HologramFiles, drawn_pattern
 from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError
-from instrument.files.images import read_image
 from instrument.files.results import free_result
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import EndedEarlyError, RunControl
@@ -107,9 +107,9 @@ class HologramOrder:
         return display if self.alignment is None else load_alignment(self.alignment).of(display)
 
     def targets(self, display: Display) -> list[Target]:
-        """Return the picture of each plane as a target; errors as ``read_image``."""
+        """Return the picture of each plane as a target; errors as ``read_picture``."""
         return [
-            prepare_target(read_image(picture).pixels, display, self.options, z_mm=z_mm)
+            prepare_target(read_picture(picture, self.options).pixels, display, self.options, z_mm=z_mm)
             for picture, z_mm in ((self.picture, self.z_mm), *self.further)
         ]
 
@@ -270,12 +270,11 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
 
     ``weights`` is the expression that makes the weights; None where there are none.
     """
-    hologram = ("bench_display", "compute_and_judge", "prepare_target", "slm_size")
+    hologram = ("bench_display", "compute_and_judge", "prepare_target", "read_picture", "slm_size")
     imports = Imports({("instrument.display.hologram", name) for name in hologram})
     imports.names |= {
         ("instrument.bench.config_file", "load_config"),
         ("instrument.display.hologram_files", "HologramFiles"),
-        ("instrument.files.images", "read_image"),
     }
     options = expression(replace(order.options, weights=None), imports)
     if weights is not None:
@@ -292,7 +291,7 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
     lines += [
         f"planes = {expression([(order.picture, order.z_mm), *order.further], imports)}",
         "targets = [",
-        "    prepare_target(read_image(picture).pixels, display, options, z_mm=z_mm)",
+        "    prepare_target(read_picture(picture, options).pixels, display, options, z_mm=z_mm)",
         "    for picture, z_mm in planes",
         "]",
         "result = compute_and_judge(display, targets, options)",

@@ -336,14 +336,14 @@ class AlignmentProcedure(Procedure):
             load_slm_correction(self.settings.slm_calibration)
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
         self.settings.require(display)
-        moves = self.settings.moves
+        moves, most = self.settings.moves, self.settings.most_frames(display)
         return Outlook(
             (
                 f"Mask of {display.mask.shape[0]} x {display.mask.shape[1]} pixels, searched for within "
                 f"±{self.settings.reach:g} of its pixels and ±{self.settings.depth_um:g} µm",
-                f"{self.settings.max_frames} frames at most; "
+                f"{most} frames at most, {self.settings.search_pictures(display)} of them to search; "
                 + (f"the stage moves {moves} times at most" if moves and bench.stage else "nothing moves"),
-                kept_words(bench, self.settings.max_frames, self.settings.again),
+                kept_words(bench, most, self.settings.again),
             )
         )
 
@@ -353,13 +353,14 @@ class AlignmentProcedure(Procedure):
         out = writable(bench, folder, settings.out, "alignment")
         correction = load_slm_correction(settings.slm_calibration) if settings.slm_calibration else None
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
+        most = settings.most_frames(display)
         with KeptFrames(bench, folder, "align mask", settings) as kept:
             io = DisplayBench(
                 bench,
                 bench.config.display.slm_binning,
                 correction,
                 check=control.check,
-                on_frame=lambda frames: listener.share(frames, settings.max_frames, at_most=True),
+                on_frame=lambda frames: listener.share(frames, most, at_most=True),
                 kept=kept,
             )
             if settings.moves:

@@ -33,6 +33,10 @@ ALIGNMENT_FILE = "alignment.json"
 """Where the command line writes it."""
 
 
+FRAMES, AFTER_SEARCH = 80, 58
+"""Frames at most where no number is given: at 16x, 22 of them search as far as the defaults go. At 4x it is
+84 behind SLM pixels of 16 um."""
+
 STEADY_FRAMES = 5
 """Pictures of the blank SLM at the end, by which flicker and motion are told."""
 
@@ -56,8 +60,13 @@ class AlignmentSettings(SeenAgain, Checked):
     reach: float = option(72.0, unit="mask px", above=0, help="Largest shift to look for, mask pixels.")
     depth_um: float = option(1000.0, unit="um", above=0, help="Largest distance to look for.")
     moves: int = option(4, least=0, label="Stage moves", help="Stage moves at most; 0: nothing moves.")
-    max_frames: int = option(
-        80, least=1, label="Frames", help="Frames at most: gives up rather than take more."
+    max_frames: int | None = option(
+        None,
+        least=1,
+        label="Frames",
+        metavar="N",
+        help="Frames at most: gives up rather than take more.",
+        default_words=f"{FRAMES}, or {AFTER_SEARCH} beyond those of the search",
     )
     division: Size = option(
         Size(3, 5),
@@ -114,6 +123,17 @@ class AlignmentSettings(SeenAgain, Checked):
         """Return how many depths the search for the shift has, and steps of an SLM pixel to each side."""
         return max(1, ceil(self.depth_um / depth_um(display))), ceil(self.reach / display.factor)
 
+    def search_pictures(self, display: Display) -> int:
+        """Return how many pictures the search for the shift takes."""
+        layers, steps = self.search_grid(display)
+        return ceil(layers * (2 * steps + 1) ** 2 / self.spots)
+
+    def most_frames(self, display: Display) -> int:
+        """Return how many frames may be taken."""
+        if self.max_frames is not None:
+            return self.max_frames
+        return max(FRAMES, self.search_pictures(display) + AFTER_SEARCH)
+
     def require(self, display: Display) -> None:
         """Refuse before anything moves what could only fail: no mask, sections, a search without end.
 
@@ -122,12 +142,11 @@ class AlignmentSettings(SeenAgain, Checked):
         if len(np.unique(display.mask.levels)) == 1:
             raise BenchError("The bench's [display] has no mask (its expansion is 1): none can be aligned.")
         Sections(display.slm_shape, self.division.shape)
-        layers, steps = self.search_grid(display)
-        pictures = ceil(layers * (2 * steps + 1) ** 2 / self.spots)
-        if pictures + self.last_frames > self.max_frames:
+        pictures, most = self.search_pictures(display), self.most_frames(display)
+        if pictures + self.last_frames > most:
             raise BenchError(
                 f"To search ±{self.reach:g} mask pixels and ±{self.depth_um:g} um takes {pictures} pictures "
-                f"of {self.spots} spots, and what follows {self.last_frames} or more; {self.max_frames} may "
+                f"of {self.spots} spots, and what follows {self.last_frames} or more; {most} may "
                 "be taken. Search less (--reach, --depth-um), or allow more (--max-frames)."
             )
 
@@ -157,7 +176,7 @@ class AlignmentSession:
     @property
     def frames_left(self) -> int:
         """Frames that may still be taken."""
-        return self.settings.max_frames - self.io.frames
+        return self.settings.most_frames(self.display) - self.io.frames
 
     def register(self) -> None:
         """Blank SLM: register the camera, and learn how bright the mean intensity is."""

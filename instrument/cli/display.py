@@ -22,9 +22,10 @@ from instrument.display.hologram import (
     prepare_target,
     read_weights,
     slm_size,
+    unshowable,
 )
-from instrument.display.hologram_files import HologramFiles, light_words, score_words
-from instrument.files.errors import BenchError
+from instrument.display.hologram_files import CHANNELS, HologramFiles, light_words, score_words
+from instrument.files.errors import BenchError, FileError
 from instrument.files.images import Pixels, read_image, read_stack
 from instrument.tasks.spots import HologramInputs, make_spots, say_distance, tell_limit
 from instrument.tasks.task import Given, saying_what_is_left
@@ -85,6 +86,7 @@ def hologram(
     told = (field_words(p, options.fit, in_colour=inputs.color) for planes in pictures for p in planes)
     if said := next(filter(None, told), ""):
         typer.echo(said, err=True)
+    _require_light(target, pictures, options, color=inputs.color)
     depths = inputs.depths(1 if inputs.video else len(target))
     lasers = inputs.wavelengths if inputs.color else (None,)
     displays = [
@@ -167,6 +169,21 @@ def _frames(target: list[Path], *, video: bool) -> list[list[Pixels]]:
     if len(target) != 1:
         raise BenchError("--video takes one folder or stack of pictures.")
     return [[frame] for frame in read_stack(target[0]).pixels]
+
+
+def _require_light(
+    target: list[Path], pictures: list[list[Pixels]], options: HologramOptions, *, color: bool
+) -> None:
+    """Refuse a picture, frame or colour that no hologram can show, before any is computed."""
+    channels: tuple[tuple[int | None, str], ...] = ((None, ""),)
+    if color:
+        channels = tuple((number, f"its {name} ") for number, name in enumerate(CHANNELS))
+    for frame, planes in enumerate(pictures):
+        for path, picture in zip(target, planes, strict=True):
+            for number, name in channels:
+                if words := unshowable(_channel(picture, number), options):
+                    which = f"frame {frame + 1} " if len(pictures) > 1 else ""
+                    raise FileError(path, f"{which}{name}{words}")
 
 
 def _channel(picture: Pixels, channel: int | None) -> npt.NDArray[Any]:

@@ -229,11 +229,11 @@ def _capture_colours(
 ) -> None:
     """Photograph one colour after the other, say how good the picture is, write."""
     from calibration_routines.display.colour_photograph import photograph_colours, write_colours
-    from instrument.files.images import read_image
+    from instrument.display.hologram import read_picture
 
     assert options.capture is not None
     assert options.target is not None
-    picture = read_image(options.target).pixels
+    picture = read_picture(options.target).pixels
     found = photograph_colours(lights, colours, picture, place, average=options.average)
     write_colours(options.capture, found)
     mark = " (SIMULATED)" if found.simulated else ""
@@ -275,8 +275,8 @@ def _capture(
         write_capture,
         write_refined,
     )
+    from instrument.display.hologram import read_picture
     from instrument.display.hologram_files import score_words
-    from instrument.files.images import read_image
 
     assert options.capture is not None
     assert options.target is not None
@@ -292,7 +292,7 @@ def _capture(
             io,
             fields,
             display,
-            target_of_pattern(read_image(options.target).pixels, display, facts),
+            target_of_pattern(read_picture(options.target, computed).pixels, display, facts),
             options,
             progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
             computed=computed,

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from instrument.bench.config import BenchConfig
 from instrument.files.errors import BenchError, FileError
-from instrument.files.images import read_image
+from instrument.files.images import ImageFile, read_image
 from instrument.files.record import RecordFormat, plain, value_of
 from instrument.files.slm_image import mismatch
 from recon.base.declare import option, record
@@ -181,6 +181,8 @@ def prepare_target(
     """
     options = options or HologramOptions()
     image = options.lift + (1 - options.lift) * field_picture(pixels, fit=options.fit, srgb=options.srgb)
+    if not image.any():
+        raise BenchError(f"The picture {unshowable(pixels, options)}")
     white = float(image.max())
     window = None if options.mirrors is None else FIRST_ORDER
     if display.near:
@@ -241,12 +243,9 @@ def field_picture(
 
     Raises BenchError for a picture with values below 0, which are no intensities.
     """
+    if words := _below_zero(pixels):
+        raise BenchError(f"The picture {words}")
     image = np.asarray(pixels, np.float64)
-    if (least := float(image.min())) < 0:
-        raise BenchError(
-            f"The picture has values below 0 (the least is {least:.4g}), and light has none. Add an offset, "
-            "or set them to 0."
-        )
     height, width = image.shape[:2]
     side = min(height, width) if fit == "cover" else max(height, width)
     if fit == "cover":
@@ -260,6 +259,33 @@ def field_picture(
         image = image / _full_scale(pixels)
         image = np.where(image <= 0.04045, image / 12.92, ((np.abs(image) + 0.055) / 1.055) ** 2.4)
     return _to_white(image.mean(axis=2) if image.ndim == 3 else image)
+
+
+def unshowable(pixels: npt.NDArray[Any], options: HologramOptions | None = None) -> str:
+    """Say, after a picture's name, why no hologram can show it; empty where one can."""
+    options = options or HologramOptions()
+    if words := _below_zero(pixels):
+        return words
+    if options.lift or field_picture(pixels, fit=options.fit).any():
+        return ""
+    where = "in the square that is shown of it" if np.any(pixels) else "everywhere"
+    return f"is black {where}, and a hologram sends its light somewhere."
+
+
+def _below_zero(pixels: npt.NDArray[Any]) -> str:
+    if (least := float(np.min(pixels))) >= 0:
+        return ""
+    return (
+        f"has values below 0 (the least is {least:.4g}), and light has none. Add an offset, or set them to 0."
+    )
+
+
+def read_picture(path: Path | str | ImageFile, options: HologramOptions | None = None) -> ImageFile:
+    """Read a picture that is to be shown; errors as ``read_image``, and FileError for :func:`unshowable`."""
+    image = read_image(path)
+    if words := unshowable(image.pixels, options):
+        raise FileError(image.path, words)
+    return image
 
 
 def field_words(

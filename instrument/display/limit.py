@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -33,11 +34,28 @@ def lifts_of(options: HologramOptions) -> tuple[float, ...]:
     return (options.lift, *(lift for lift in LIFTS if lift > options.lift))
 
 
+class SharedTime:
+    """Seconds that several searches share: each may take an equal part of what is left."""
+
+    def __init__(self, options: HologramOptions, searches: int) -> None:
+        self._left, self._began_s = searches, time.perf_counter()
+        self._time_s = options.time_s
+
+    def next(self, options: HologramOptions) -> HologramOptions:
+        """Return a search's options with the time that it may take."""
+        if self._time_s is not None:
+            left_s = max(self._time_s - (time.perf_counter() - self._began_s), 1e-3)
+            options = replace(options, time_s=left_s / max(self._left, 1))
+        self._left -= 1
+        return options
+
+
 def limits_of_lifts(
     picture: Pixels,
     display: Display,
     options: HologramOptions,
     *,
+    shared: SharedTime,
     z_mm: float = 0.0,
     callback: Callable[[float, HologramRecord], object] | None = None,
     cancel: threading.Event | None = None,
@@ -56,7 +74,8 @@ def limits_of_lifts(
                 callback(lift, record)
 
         before = found[-1].columns if found else None
-        found.append(hologram_limit(display, target, options, initial=before, callback=show, cancel=cancel))
+        timed = shared.next(options)
+        found.append(hologram_limit(display, target, timed, initial=before, callback=show, cancel=cancel))
         if found[-1].stop_reason is HologramStop.CANCELLED:
             break
     return found

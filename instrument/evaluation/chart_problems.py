@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import bench_display, field_words, prepare_target, slm_size
+from instrument.display.hologram import bench_display, field_words, prepare_target, read_picture, slm_size
 from instrument.files.errors import BenchError
-from instrument.files.images import read_image
 from instrument.files.sample_images import SAMPLES
 from instrument.reconstruction.job import Job
 from recon.base.noise import NoiseModel, averaged_noise
@@ -167,4 +166,4 @@ def _picture(name: str) -> Any:
         return np.asarray(SAMPLES[name].load())
     if not Path(name).exists() and not Path(name).suffix:
         raise BenchError(f"{name}: there is no such file, and no such sample picture ({', '.join(SAMPLES)}).")
-    return read_image(Path(name)).pixels
+    return read_picture(Path(name)).pixels

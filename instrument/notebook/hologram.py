@@ -20,11 +20,12 @@ from instrument.display.hologram import (
     field_words,
     load_alignment,
     prepare_target,
+    read_picture,
     slm_size,
 )
 from instrument.display.hologram_files import HologramFiles, hologram_figure
 from instrument.files.errors import BenchError
-from instrument.files.images import ImageFile, drop_alpha, read_image
+from instrument.files.images import ImageFile, drop_alpha
 from instrument.files.sample_images import SAMPLES
 from instrument.notebook.reconstruct import bench_config
 from instrument.notebook.result import figure_png, show_figure
@@ -132,7 +133,7 @@ def hologram(
         display = load_alignment(Path(alignment)).of(display)
     pictures = list(picture) if isinstance(picture, list | tuple) else [picture]
     depths = [float(z) for z in np.broadcast_to(np.asarray(z_mm, float), (len(pictures),))]
-    images = [_image(one) for one in pictures]
+    images = [_image(one, options) for one in pictures]
     said = [f"{image.path}: {note}." for image in images for note in image.notes]
     said += list(filter(None, (field_words(image.pixels, options.fit) for image in images)))[:1]
     if said:
@@ -146,13 +147,13 @@ def hologram(
     return HologramShown(**{f.name: getattr(found, f.name) for f in fields(HologramResult)}, files=files)
 
 
-def _image(picture: Any) -> ImageFile:
+def _image(picture: Any, options: HologramOptions) -> ImageFile:
     """Return a picture as of a file: an array's alpha channel is left out as a file's is, and that noted."""
     if isinstance(picture, str) and picture in SAMPLES and not Path(picture).exists():
         sample: Any = SAMPLES[picture].load()
         return ImageFile(Path(picture), np.asarray(sample))
     if isinstance(picture, Path | str | ImageFile):
-        return read_image(picture)
+        return read_picture(picture, options)
     pixels: Any = plain_array(picture)
     notes: tuple[str, ...] = ()
     if pixels.ndim == 3:

@@ -13,10 +13,12 @@ from instrument.display.hologram import (
     field_words,
     load_alignment,
     prepare_target,
+    read_picture,
     slm_size,
 )
 from instrument.display.hologram_files import HologramFiles
 from instrument.display.limit import (
+    SharedTime,
     at_most,
     coarser_mask,
     frames_line,
@@ -26,7 +28,7 @@ from instrument.display.limit import (
 )
 from instrument.display.spots import SpotFiles, spots_of
 from instrument.files.errors import BenchError
-from instrument.files.images import Pixels, read_image
+from instrument.files.images import Pixels
 from instrument.tasks.task import BenchFile, Desk, Done, Only, bench_of, saying_what_is_left, task
 from recon.base.declare import option
 from recon.holography import (
@@ -129,7 +131,7 @@ def limit(
     display = options.display_of(bench_display(config, slm_size(config), expansion=options.expansion))
     if inputs.alignment is not None:
         display = load_alignment(inputs.alignment).of(display)
-    pixels = read_image(picture.target).pixels
+    pixels = read_picture(picture.target, options).pixels
     if said := field_words(pixels, options.fit):
         desk.warn(said)
     return tell_limit(desk, pixels, display, options, inputs.depths(1)[0])
@@ -158,15 +160,18 @@ def tell_limit(desk: Desk, picture: Pixels, display: Display, options: HologramO
             black = "" if lift == options.lift else f"black at {lift:g}: "
             advance(float(before + record.iteration), note=f"{black}{record.psnr_db:.2f} dB")
 
-        found = limits_of_lifts(picture, display, options, z_mm=z_mm, callback=show, cancel=cancel)
+        coarser = coarser_mask(display)
+        shared = SharedTime(options, len(lifts) + (coarser is not None))
+        found = limits_of_lifts(
+            picture, display, options, shared=shared, z_mm=z_mm, callback=show, cancel=cancel
+        )
         lines = limit_lines(found, display, options)
         if not cancel.is_set():
             target = prepare_target(picture, display, options, z_mm=z_mm)
             lines.append(frames_line(gain_of_frames(display, [target], options)))
-        coarser = coarser_mask(display)
         if coarser is not None and not cancel.is_set():
             target = prepare_target(picture, coarser, options, z_mm=z_mm)
-            better = at_most(hologram_limit(coarser, target, options, cancel=cancel))
+            better = at_most(hologram_limit(coarser, target, shared.next(options), cancel=cancel))
             lines.append(f"  half of the field, along each axis (--expansion {coarser.expansion}): {better}")
     if cancel.is_set():
         desk.warn("Interrupted: this is a bound all the same, less sharp than it could be.")

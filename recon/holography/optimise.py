@@ -321,7 +321,8 @@ def _on_levels(variable: Phase, x: Array, levels: int, watch: _Watch, stages: St
         # Stages would search across the jumps, and a phase that is rounded up to a whole turn jumps.
         def nearest(slm: Array) -> Array:
             near = np.rint(np.mod(variable.pack(slm), x.dtype.type(2 * np.pi)) / step)
-            return np.minimum(near, levels - 1) * step
+            rounded: Array = np.minimum(near, levels - 1) * step
+            return rounded
 
         found = _in_turns(
             variable, _Lbfgs(variable, x), watch, lambda slm: variable.evaluate(nearest(slm))[0].psnr_db

@@ -192,7 +192,7 @@ class HologramOptions:
     )
     time_s: float | None = option(
         None,
-        help="At most so many seconds.",
+        help="At most so many seconds; of a limit, all of its searches together.",
         default_words="no limit",
         unit="s",
         above=0,

@@ -30,7 +30,7 @@ from instrument.display.hologram import (
     field_words,
     prepare_target,
 )
-from instrument.display.limit import coarser_mask, limit_lines
+from instrument.display.limit import SharedTime, coarser_mask, limit_lines
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image, write_image
 from instrument.files.sample_images import SAMPLES, load_sample
@@ -324,6 +324,15 @@ def test_the_limit_is_said_before_anything_is_computed(capsys):
     assert prepare_target(read_image("picture.png").pixels, bench(), lifted).image.min() >= 0.2
 
 
+def test_the_time_of_a_limit_is_that_of_all_its_searches(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = iter((100.0, 100.0, 101.0, 109.0, 120.0, 130.0))
+    monkeypatch.setattr("time.perf_counter", lambda: next(now))
+    asked = HologramOptions(time_s=10.0)
+    shared = SharedTime(asked, 4)
+    assert [shared.next(asked).time_s for _ in range(4)] == pytest.approx([2.5, 3.0, 0.5, 1e-3])
+    assert SharedTime(HologramOptions(), 4).next(HologramOptions()).time_s is None
+
+
 def test_the_limit_says_why_coarse_contrast_is_not_reached_behind_a_lens_and_near():
     mask = no_mask((96, 96), design_wavelength_nm=532.0)
     lens = Display((96, 96), mask, slm_pitch_um=16.0, wavelength_nm=532.0)
@@ -386,9 +395,22 @@ def test_an_existing_file_is_spared_and_quality_ends_the_work(capsys):
         (["picture.png", "--z-mm", "100000"], "too far"),
         (["picture.png", "--distance-mm", "2", "--z-mm", "20"], "the farthest plane's distance"),
         (["picture.png", "--distance-mm", "-2"], "distance"),
+        (["black.png"], "black.png: is black everywhere"),
+        (["picture.png", "black.png", "--z-mm", "0", "--z-mm", "9"], "black.png: is black everywhere"),
+        (["black.png", "--limit"], "black.png: is black everywhere"),
+        (["beside.png"], "beside.png: is black in the square that is shown"),
+        (["red.png", "--color"], "red.png: its green is black everywhere"),
+        (["video.npy", "--video"], "video.npy: frame 2 is black everywhere"),
     ],
 )
 def test_mistakes_end_in_a_sentence(capsys, arguments, words):
+    picture = np.zeros((8, 20, 3), np.uint8)
+    write_image("black.png", picture)
+    picture[:, 0] = 9
+    write_image("beside.png", picture)
+    picture[:] = (9, 0, 0)
+    write_image("red.png", picture)
+    np.save("video.npy", np.stack([picture[..., 0], picture[..., 1] * 0]))
     assert main(["hologram", *arguments]) == 2
     error = capsys.readouterr().err
     assert words in error

@@ -125,6 +125,17 @@ def test_a_wrong_wavelength_or_focal_length_is_told_by_the_scale(changes: dict[s
         aligned(bench)
 
 
+def test_as_many_frames_may_be_taken_as_the_search_of_the_bench_at_hand_needs() -> None:
+    config = parse_config(template("display"), None)
+    assert config.display.slm_binning == 2
+    for expansion, frames in ((16, 80), (4, 84 + 58)):
+        display = bench_display(config, ((1080, 1920), 8.0), expansion=expansion)
+        AlignmentSettings().require(display)
+        assert AlignmentSettings().most_frames(display) == frames
+    with pytest.raises(BenchError, match=r"takes 84 pictures .* 90 may be taken"):
+        AlignmentSettings(max_frames=90).require(display)
+
+
 def test_frames_are_counted_and_limited() -> None:
     few = AlignmentSettings(reach=16.0, depth_um=300.0, spots=27, max_frames=4)
     with (
