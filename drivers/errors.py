@@ -34,7 +34,7 @@ class DeviceNotOpenError(DeviceError):
     """A device was used before ``open`` or after ``close``."""
 
     def __init__(self, device: str) -> None:
-        super().__init__(device, "is not open.", "Open it first (Bench does so on entering its context).")
+        super().__init__(device, "is not open.", "Open it first; where it was lost, reconnect it.")
 
 
 class DeviceLostError(DeviceError):

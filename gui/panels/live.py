@@ -12,7 +12,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QButtonGroup, QWidget
 
 from drivers.frame import Frame
-from gui.jobs import Job, JobContext
+from gui.jobs import BusyError, Job, JobContext
 from gui.journey import EXPOSE
 from gui.panel import Panel, on_bench
 from gui.session import BenchSession
@@ -59,7 +59,7 @@ class LivePanel(Panel):
         self.photograph: Path | None = None
         """The last one that was taken here."""
         self._began = False
-        """Whether the scene was lit, or need not be, to begin with."""
+        """Whether the scene is being lit, or need not be, to begin with."""
         self._lighting: Job | None = None
         """Lights the scene, to begin with."""
         self._lit_ns = 0
@@ -118,6 +118,7 @@ class LivePanel(Panel):
         )
         yield
         session.device_changed.connect(self._device_changed)
+        session.stop_pressed.connect(self._leave_dark)
         self.put_below(ReconnectButton(session, ("camera",), self))
         every(self, _LOOK_MS, self.look).setTimerType(Qt.TimerType.PreciseTimer)
         every(self, _STATISTICS_MS, self.count)
@@ -192,8 +193,7 @@ class LivePanel(Panel):
         if not self.isVisible():
             return
         if not self._began and self.session.is_ready:
-            self._began = True
-            self._light_the_scene()
+            self._began = self._light_the_scene()
         if self._shown_at and time.monotonic() - self._shown_at[-1] < _LEAST_GAP_S:
             return
         frame, shown = self.session.live.newest(), self.picture.frame
@@ -205,7 +205,7 @@ class LivePanel(Panel):
         if shown is None:
             self.picture.frame = frame
             self.count()
-        if self._lighting is None and frame.metadata.host_time_ns > self._lit_ns:
+        if self._began and self._lighting is None and frame.metadata.host_time_ns > self._lit_ns:
             self._say_pictured()
         self.picture.show_frame(frame)
         self.picture.view.set_caption(self._caption(frame))
@@ -365,13 +365,14 @@ class LivePanel(Panel):
             self.form.set_region(sensor_roi(frame.metadata, *rectangle))
             self.picture.region_button.setChecked(False)
 
-    def _light_the_scene(self) -> None:
+    def _light_the_scene(self) -> bool:
         """Begin with something to see, where the simulated world can light it by itself.
 
         Before the first frame: a dark one of megapixels takes a second that nobody wants to wait for.
+        Returns whether that is settled: not while something else has the light.
         """
         if self.session.config.scene.control != "simulated" or self.light is not LightState.DARK:
-            return
+            return True
 
         def start() -> Job:
             if "led_array" in self.session.kinds:
@@ -381,9 +382,16 @@ class LivePanel(Panel):
                 "Light: scene", lambda _: self.session.bench.scene_on(), {"light"}, quiet=True
             )
 
-        self._lighting = self.begin(start)
-        if self._lighting is not None:
-            self._lighting.ended.connect(self._scene_lit)
+        try:
+            self._lighting = self.follow(start())
+        except BusyError:
+            return False
+        self._lighting.ended.connect(self._scene_lit)
+        return True
+
+    def _leave_dark(self) -> None:
+        """After STOP nothing is lit by itself any more."""
+        self._began = True
 
     def _scene_lit(self) -> None:
         self._lighting, self._lit_ns = None, time.monotonic_ns()

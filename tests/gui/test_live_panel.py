@@ -68,6 +68,44 @@ def test_the_scene_is_lit_before_the_first_frame(
     assert not session.bench.scene_lit, "to begin with, and never again by itself"
 
 
+def test_no_dark_frame_is_the_picture_that_others_wait_for_and_a_busy_light_is_asked_for_again(
+    qtbot: QtBot, make_session: Callable[[], BenchSession]
+) -> None:
+    session = make_session()
+    held = threading.Event()
+    pictured: list[bool] = []
+    session.pictured.connect(lambda: pictured.append(session.bench.scene_lit))
+    session.opened.connect(
+        lambda: session.jobs.device("Light held", lambda _: held.wait(WAIT_MS / 1e3), {"light"}, endless=True)
+    )
+    panel = whole(LivePanel(session))
+    qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
+    panel.show()
+    with qtbot.waitSignal(session.opened, timeout=WAIT_MS):
+        session.open()
+    qtbot.waitUntil(lambda: len(panel._shown_at) > 1, timeout=WAIT_MS)
+    assert not pictured
+    assert not panel._note.text(), "nobody asked for the light: nothing is refused"
+    held.set()
+    qtbot.waitUntil(lambda: bool(pictured), timeout=WAIT_MS)
+    assert pictured == [True]
+
+
+def test_after_stop_nothing_is_lit_to_begin_with(
+    qtbot: QtBot, make_session: Callable[[], BenchSession]
+) -> None:
+    session = make_session()
+    panel = whole(LivePanel(session))
+    qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
+    with qtbot.waitSignal(session.opened, timeout=WAIT_MS):
+        session.open()
+    with qtbot.waitSignal(session.stopped, timeout=WAIT_MS):
+        session.stop()
+    with qtbot.waitSignal(session.pictured, timeout=WAIT_MS):
+        panel.show()
+    assert not session.bench.scene_lit
+
+
 def test_it_opens_running_with_the_scene_lit(qtbot: QtBot, live: LivePanel) -> None:
     qtbot.waitUntil(lambda: live.session.bench.scene_lit, timeout=WAIT_MS)
     shown = live.picture.frame
