@@ -165,6 +165,8 @@ class ProcedurePanel(Panel):
         self._started: set[str] = set()
         self._said_at_end = ""
         """How the last procedure ended, as long as that is shown."""
+        self._doubted = False
+        """Whether it left doubts about the bench, with what was lost still lost."""
         self._check_job: Job | None = None
         self._again = False
         self._unchecked = False
@@ -180,6 +182,7 @@ class ProcedurePanel(Panel):
         self.run.failed.connect(self._failed)
         self.run.over.connect(self._over)
         session.device_changed.connect(lambda _: self._rest.start())
+        session.device_changed.connect(self._reconnected)
         session.jobs.job_ended.connect(self._job_ended)
         self._chosen()
         self._look_for_unfinished()
@@ -314,7 +317,7 @@ class ProcedurePanel(Panel):
         self.other_button.hide()
         self.way_on.offer(None)
         self._left.forget()
-        self._said_at_end = ""
+        self._said_at_end, self._doubted = "", False
         self._say(f"{title} has begun.", wrong=False)
         self.run_bar.set_running(True)
         self.views.setEnabled(False)
@@ -465,6 +468,15 @@ class ProcedurePanel(Panel):
         self._said_at_end = ""
         self._say(words, wrong=wrong)
         self._said_at_end = words
+        self._doubted = _is_doubted(words)
+
+    def _reconnected(self, kind: str) -> None:
+        """Let go of a doubt about the bench once what was lost is there again; STOP settles it."""
+        states = [self.session.state(kind).condition for kind in self.session.kinds]
+        if self._doubted and self.session.is_open(kind) and "failed" not in states:
+            self._doubted = False
+            self.run_bar.words.setText("Failed; connected again since. STOP makes sure that it is safe")
+            mark(self.verdict, "refused", False)
 
     def _over(self) -> None:
         self.accepted()  # what ended it stands below the form
@@ -483,7 +495,11 @@ class ProcedurePanel(Panel):
         mark(self.verdict, "refused", wrong)
 
 
+def _is_doubted(words: str) -> bool:
+    """Whether light may be on or something move after a procedure that ended so."""
+    return any(doubt in words for doubt in (UNSAFE, LIGHT_DOUBT, MOTION_DOUBT))
+
+
 def _state(words: str) -> str:
     """Return in which state a procedure that ended so left the bench."""
-    doubted = any(doubt in words for doubt in (UNSAFE, LIGHT_DOUBT, MOTION_DOUBT))
-    return "the bench may not be safe, see above" if doubted else "light off, nothing moves"
+    return "the bench may not be safe, see above" if _is_doubted(words) else "light off, nothing moves"

@@ -13,6 +13,7 @@ from PySide6.QtWidgets import QMessageBox, QWidget
 from pytestqt.qtbot import QtBot
 
 from calibration_routines.psf.sweep_procedure import SweepProcedure
+from drivers.errors import DeviceError
 from gui.main_window import MainWindow
 from gui.panels.runs import RunsPanel
 from gui.panels.sweeps import SweepsPanel
@@ -271,6 +272,12 @@ def test_after_a_fault_the_way_on_is_a_button_where_it_happened(
     assert "nothing moves" in panel.run_bar.words.text()
     panel._failed(Ended(f"{MOTION_DOUBT}: look."))
     assert "may not be safe" in panel.run_bar.words.text()
+    session.note_failure(DeviceError(session.bench.camera.name, "was lost."), surely=True)
+    assert "may not be safe" in panel.run_bar.words.text()
+    qtbot.waitUntil(again.isVisible, timeout=WAIT_MS)
+    press(qtbot, again)
+    qtbot.waitUntil(lambda: "connected again" in panel.run_bar.words.text(), timeout=WAIT_MS)
+    assert not panel.verdict.property("refused")
 
 
 def answer(question: QMessageBox | None, words: str) -> Any:
