@@ -8,6 +8,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from drivers.device import Device, Setting
+from drivers.errors import DeviceError
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +90,18 @@ class Stage(Device):
     @abstractmethod
     def is_homed(self) -> bool:
         """Whether positions refer to a known reference."""
+
+    @property
+    def needs_unlocking(self) -> bool:
+        """Whether an alarm holds it that nothing but ``unlock`` ends; known from its last report."""
+        return False
+
+    def unlock(self) -> None:
+        """End an alarm that no homing ends; somebody has looked what it was for. Positions are lost with it.
+
+        Raises DeviceError where there is no such thing.
+        """
+        raise DeviceError(self.name, "has no lock that an alarm leaves.", "Home it.")
 
     @abstractmethod
     def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:

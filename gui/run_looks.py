@@ -88,7 +88,7 @@ def _picture(what: str, image: npt.NDArray[Any], metadata: FrameMetadata) -> Pic
     low, high = usual_levels(image)
     words = [
         what,
-        f"{metadata.utc.astimezone():%Y-%m-%d %H:%M:%S}",
+        f"{metadata.utc.astimezone():%H:%M:%S}",  # the run's name has the day
         f"{metadata.exposure_ms:.4g} ms",
         f"LEDs: {metadata.led_pattern}" if metadata.led_pattern else "",
     ]

@@ -305,8 +305,8 @@ class GrblStage(PolledStage):
                     self.name,
                     f"is locked by an alarm{f' ({self._alarmed})' if self._alarmed else ''}, and nothing but "
                     "unlocking ends that where it has no homing; what it knew of its position is lost then.",
-                    "Look what the alarm was for and free the axes by hand; then bench.stage.unlock() from "
-                    "Python, and home.",
+                    "Look what the alarm was for and free the axes by hand; then unlock it (in the window: "
+                    "Stage, Unlock; in Python: bench.stage.unlock()), and home.",
                 )
             self._zero, self._homed = self._places, True
             return
@@ -315,12 +315,22 @@ class GrblStage(PolledStage):
                 self.name,
                 "has homing switched off ($22=0).",
                 'Send $22=1 if it has switches; if not, set homing = "here" in bench.toml. '
-                "Locked by an alarm, bench.stage.unlock() from Python releases it.",
+                "Unlocking releases it after an alarm (in the window: Stage, Unlock; in Python: "
+                "bench.stage.unlock()).",
             )
         self._homed = False
         self.stuck_s = self.options.homing_timeout_s
         self._link.begin(b"$H\n")
         self._homing = True
+
+    @property
+    def needs_unlocking(self) -> bool:
+        """Whether an alarm holds it that homing does not end."""
+        return self._locked and not self._homes_by_switches
+
+    @property
+    def _homes_by_switches(self) -> bool:
+        return self.options.homing == "switches" and self._controller.homing
 
     def unlock(self) -> None:
         """Release the lock of an alarm (``$X``) where no homing does; the position has no reference after it.
@@ -328,7 +338,7 @@ class GrblStage(PolledStage):
         Raises DeviceError where the stage homes by switches, which is its way out of an alarm.
         """
         self._require()
-        if self.options.homing == "switches" and self._controller.homing:
+        if self._homes_by_switches:
             raise DeviceError(self.name, "homes by its switches, which ends an alarm too.", "Home it.")
         with self._commanding:
             self._state()  # a critical alarm is ended by a reset before

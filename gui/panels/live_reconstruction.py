@@ -332,7 +332,10 @@ class LiveReconstructionPanel(Panel):
         self.view.set_caption(self._caption(result.metadata))
         # What is doubted stands over the picture.
         worth = result.picture.quality.removeprefix(result.picture.doubt).removeprefix(": ")
-        latency = f"latency {result.latency_ms:.0f} ms{rate}{passed}"
+        late = (
+            f"{result.latency_ms:.0f} ms" if result.latency_ms < 1000 else f"{result.latency_ms / 1e3:.2f} s"
+        )
+        latency = f"latency {late}{rate}{passed}"
         self.status.setText("\n".join(filter(None, (latency, worth))))
 
     def _call_old(self, why: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -98,6 +99,9 @@ class StagePanel(DevicePanel):
         self.setFocusProxy(self.pad)
         tip = "Find the reference of every axis: the stage moves; asks first, and reconnects after a fault"
         self.home_button = button("Home…", tip, self.ask_home)
+        tip = "End an alarm that homing does not end; asks first"
+        self.unlock_button = button("Unlock…", tip, self.ask_unlock)
+        self.unlock_button.hide()
         self._here: dict[str, float] | None = None
         """Where the stage said that it is."""
         self.places = KeptBar(session, "places", "Places", lambda: self._here, self._go_to, "Go")
@@ -109,7 +113,7 @@ class StagePanel(DevicePanel):
         self._grid.setHorizontalSpacing(6)
         self._grid.setColumnStretch(2, 1)
         self._step_row = in_row()
-        pad = in_row((self.pad, 1), self.home_button)
+        pad = in_row((self.pad, 1), self.unlock_button, self.home_button)
         fill(
             self.body,
             self.state,
@@ -191,10 +195,13 @@ class StagePanel(DevicePanel):
         """Ask the stage where it is, whatever else is going on."""
         stage = self.session.bench.stage
         if stage is not None and self.is_ready and not self._reader.is_reading:
-            self._reader.ask(lambda: (stage.position(), stage.is_homed, stage.is_moving), self._show)
+            self._reader.ask(
+                lambda: (stage.position(), stage.is_homed, stage.is_moving, stage.needs_unlocking), self._show
+            )
 
-    def _show(self, reading: tuple[dict[str, float], bool, bool]) -> None:
-        position, is_homed, is_moving = reading
+    def _show(self, reading: tuple[dict[str, float], bool, bool, bool]) -> None:
+        position, is_homed, is_moving, is_locked = reading
+        self.unlock_button.setVisible(is_locked)
         self._here = position
         for name, row in self.rows.items():
             here = position[name]
@@ -205,6 +212,8 @@ class StagePanel(DevicePanel):
                 row.target.set_value(round(here, 3))
         if is_moving:
             self.state.setText("Moving …  Esc stops")
+        elif is_locked:
+            self.state.setText("Locked by an alarm. Look what it was for, then unlock the stage and home it.")
         elif not is_homed:
             self.state.setText("Not homed: positions have no reference. Home it first.")
         else:
@@ -271,18 +280,27 @@ class StagePanel(DevicePanel):
 
     def ask_home(self) -> None:
         """Ask whether the stage may be homed, then do it."""
-        if self.question is not None:
-            self.question.ask()
-            return
-        self.question = box = Question(
-            self,
-            "Home the stage?",
-            "Every axis moves to its reference and then to its home position. Is its way free?",
-            ("Home", "Stay"),
-            self._home_answered,
-        )
-        self.session.stop_pressed.connect(box.reject)
-        box.ask()
+        text = "Every axis moves to its reference and then to its home position. Is its way free?"
+        self._ask("Home the stage?", text, ("Home", "Stay"), self._home_answered)
+
+    def ask_unlock(self) -> None:
+        """Ask whether somebody has looked what the alarm was for, then end it."""
+        text = "Its position is lost with the alarm. Was its cause looked at, and are the axes free?"
+        self._ask("Unlock the stage?", text, ("Unlock", "Leave it locked"), self._unlock_answered)
+
+    def _ask(
+        self, title: str, text: str, answers: tuple[str, str], answered: Callable[[bool], object]
+    ) -> None:
+        if self.question is None:
+            self.question = Question(self, title, text, answers, answered)
+            self.session.stop_pressed.connect(self.question.reject)
+        self.question.ask()
+
+    def _unlock_answered(self, agreed: bool) -> None:
+        self.question = None
+        stage = self.session.bench.stage
+        if agreed and stage is not None:
+            self.command("Unlocking the stage", lambda _: stage.unlock(), self.unlock_button)
 
     def _home_answered(self, agreed: bool) -> None:
         self.question = None

@@ -377,9 +377,12 @@ def test_without_homing_an_alarm_is_unlocked_by_who_asks_for_it(
             stage.move_to({"x_um": 100.0})
             plain.hit_limit_switch()
             wait_until(lambda: not stage.is_homed)
-        with pytest.raises(DeviceError, match=r"locked by an alarm.*is lost then.*unlock\(\) from Python"):
+        with pytest.raises(DeviceError, match=r"locked by an alarm.*is lost then.*Stage, Unlock.*unlock\(\)"):
             stage.home()
+        assert stage.needs_unlocking
         stage.unlock()
+        stage.position()
+        assert not stage.needs_unlocking
         assert not stage.is_homed
         with pytest.raises(DeviceError, match="was unlocked: its position has no reference"):
             stage.move_to({"x_um": 50.0})

@@ -44,6 +44,27 @@ def test_what_stood_in_the_way_is_told_until_it_has_ended(
     assert not stage.home_button.property("refused")
 
 
+def test_an_alarm_that_homing_does_not_end_is_unlocked_after_a_question(
+    qtbot: QtBot, window: MainWindow, stage: StagePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = window.session.bench.stage
+    assert device is not None
+    assert not stage.unlock_button.isVisible()
+    locked = [True]
+    monkeypatch.setattr(type(device), "needs_unlocking", property(lambda _: bool(locked)))
+    monkeypatch.setattr(type(device), "unlock", lambda _: locked.clear(), raising=False)
+    qtbot.waitUntil(stage.unlock_button.isVisible, timeout=WAIT_MS)
+    assert stage.state.text().startswith("Locked by an alarm")
+    for answer in ("Leave it locked", "Unlock"):
+        assert locked
+        qtbot.mouseClick(stage.unlock_button, LEFT)
+        assert stage.question is not None
+        (yes_or_no,) = [b for b in stage.question.buttons() if b.text() == answer]
+        qtbot.mouseClick(yes_or_no, LEFT)
+    qtbot.waitUntil(lambda: not stage.unlock_button.isVisible(), timeout=WAIT_MS)
+    assert not locked
+
+
 def test_a_step_that_makes_no_sense_moves_nothing(
     qtbot: QtBot, window: MainWindow, stage: StagePanel
 ) -> None:
