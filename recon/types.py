@@ -26,12 +26,24 @@ _DTYPES: Mapping[str, type[np.floating]] = {
 }
 
 
-def _real(given: Any, name: str, dtype: type[np.floating]) -> npt.NDArray[Any]:
-    """Return an array of real numbers of any kind as one of ``dtype``; InputError where it is none."""
+def real_array(given: Any, name: str, dtype: type[np.floating] = np.float32) -> npt.NDArray[Any]:
+    """Return an array of real numbers of any kind as one of ``dtype``.
+
+    Raises InputError where it is none, or holds finite numbers that are beyond ``dtype``.
+    """
     array = np.asarray(given)
     if array.dtype.kind not in "uifb":
-        raise InputError(f"{name} must be real numbers, not {array.dtype}.")
-    return array.astype(dtype)
+        raise InputError(f"{name} must hold real numbers, not {array.dtype}.")
+    with np.errstate(over="ignore"):
+        cast = np.asarray(array, dtype)
+    if cast.dtype.itemsize < array.dtype.itemsize:
+        beyond = array[np.isinf(cast) & np.isfinite(array)]
+        if beyond.size:
+            most, precision = float(np.finfo(dtype).max), f"float{8 * cast.dtype.itemsize}"
+            raise InputError(
+                f"{name} must hold real numbers up to {most:.2g} ({precision}), not {float(beyond[0]):.3g}."
+            )
+    return cast
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +92,7 @@ class Calibration:
     def __post_init__(self) -> None:
         for name, dtype in _DTYPES.items():
             if (given := getattr(self, name)) is not None and getattr(given, "dtype", None) != dtype:
-                object.__setattr__(self, name, _real(given, name, dtype))
+                object.__setattr__(self, name, real_array(given, name, dtype))
         if self.psfs.ndim != 4:
             hint = {2: ": psf[None, None] of a grey one", 3: ": psfs[:, None] of grey ones"}
             raise InputError(

@@ -130,6 +130,7 @@ def test_a_files_image_is_no_array_and_says_where_its_array_is(
         (lambda: db.hologram(psf[0]), r"A picture is .* not ndarray .* \(48,\)"),
         (lambda: db.calibration(psf), "read by its folder, not ndarray. .* db.Calibration"),
         (lambda: db.Calibration(psf, [[0, 0, 3e3]]), r"not \(48, 48\): psf\[None, None\]"),
+        (lambda: db.Calibration(np.full((1, 1, 4, 4), 1e39), [[0, 0, 3]]), "psfs must hold .* not 1e.39"),
         (lambda: db.chart(photo), "ImageFile is neither a result nor a scene .* charted by its result"),
     ):
         with pytest.raises((AttributeError, TypeError, db.BenchError, InputError), match=said):

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from recon.base.blocks import block_mean
 from recon.base.noise import NoiseModel, estimate_deviation
 from recon.errors import InputError
-from recon.types import Calibration
+from recon.types import Calibration, real_array
 
 SATURATED_SHARE = 1e-5
 """Share of pixels at exactly the maximum above which an image is taken for saturated."""
@@ -30,6 +30,8 @@ DETAIL_PX = 200
 """Longest side that details are looked for on, pixels, about."""
 DARKEST = 1.0
 """Percentile of the pixels that is black."""
+NEIGHBOURS = "Put the mean of their neighbours there."
+"""What helps where a pixel is no finite number, and is not erased."""
 LEAST_PX = 32
 """Sides of images so small tell nothing of frequencies."""
 DETAILS = ((0.1, 0.25), (0.02, 0.06))
@@ -45,35 +47,40 @@ def plain_array(given: npt.ArrayLike) -> npt.NDArray[Any]:
     return np.asarray(given)
 
 
-def as_channels(image: npt.ArrayLike, name: str) -> npt.NDArray[np.float32]:
+def as_channels(
+    image: npt.ArrayLike, name: str, remedy: str = NEIGHBOURS, of_infinities: str = ""
+) -> npt.NDArray[np.float32]:
     """Return an image (height, width[, n_channels]) of any numeric dtype as float32, channels first.
 
-    Raises InputError when it has another number of axes, is empty, is no array of real numbers, or is not
-    finite.
+    Raises InputError when it has another number of axes, is empty, is no array of real numbers of float32,
+    or is not finite; the last with a remedy, as :func:`require_finite`.
     """
-    array = plain_array(image)
-    if array.dtype.kind not in "uifb":
-        raise InputError(f"The {name} must hold real numbers, not {array.dtype}.")
-    if array.ndim not in (2, 3):
+    single = real_array(plain_array(image), f"The {name}")
+    if single.ndim not in (2, 3):
         raise InputError(
-            f"The {name} must be (height, width) or (height, width, n_channels); it is {array.shape}."
+            f"The {name} must be (height, width) or (height, width, n_channels); it is {single.shape}."
         )
-    if min(array.shape) == 0:
-        raise InputError(f"The {name} is empty: its shape is {array.shape}.")
-    single = np.asarray(array, np.float32)
-    require_finite(single, name)  # where the caller has them; beyond float32 there is infinity
-    return np.ascontiguousarray(single[None] if array.ndim == 2 else np.moveaxis(single, 2, 0))
+    if min(single.shape) == 0:
+        raise InputError(f"The {name} is empty: its shape is {single.shape}.")
+    require_finite(single, name, remedy, of_infinities)
+    return np.ascontiguousarray(single[None] if single.ndim == 2 else np.moveaxis(single, 2, 0))
 
 
-def require_finite(array: npt.NDArray[Any], name: str) -> None:
-    """Raise InputError when there are NaN or infinite values, saying how many and where the first is."""
+def require_finite(
+    array: npt.NDArray[Any], name: str, remedy: str = NEIGHBOURS, of_infinities: str = ""
+) -> None:
+    """Raise InputError when there are NaN or infinite values, saying how many and where the first is.
+
+    ``remedy`` is what helps, ``of_infinities`` what does where none is NaN, if that is something else.
+    """
     wrong = ~np.isfinite(array)
     count = int(np.count_nonzero(wrong))
     if count:
         first = tuple(int(i) for i in np.argwhere(wrong)[0])
-        remedy = (
-            "Put the mean of their neighbours there." if name == "PSF" else "Make bad pixels NaN: erased."
-        )
+        if of_infinities and not np.isnan(array).any():
+            remedy = of_infinities
+        if count == array.size:
+            remedy = "There is nothing else in it."
         raise InputError(
             f"The {name} holds {count} values that are not finite numbers, the first at {first} "
             f"(of shape {array.shape}). {remedy}"

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from recon.base.brief import brief
 from recon.base.checks import (
+    NEIGHBOURS,
     as_channels,
     plain_array,
     require_finite,
@@ -22,7 +23,7 @@ from recon.camera.camera_model import Depths, members_of_depths, one_depth, sort
 from recon.camera.field_registration import one_psf
 from recon.errors import InputError
 from recon.reconstruction.options import ReconstructionOptions
-from recon.types import Calibration
+from recon.types import Calibration, real_array
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
@@ -30,6 +31,10 @@ Noise = NoiseModel | float | None
 
 LEAST_NOISE = 1e-5
 """Noise assumed at least, relative to the measurement's root mean square: float32 holds no more."""
+
+
+MARKED = "Put numbers there, and mark them in erasures."
+"""What helps where pixels of a measurement that are NaN are not erased by themselves."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +92,7 @@ class Measurement:
     def channels(self) -> Floats:
         """Return the image as it came, channels first; under patterns each channel's frames in turn."""
         if self.patterns is None:
-            return as_channels(self.image, "measurement")
+            return as_channels(self.image, "measurement", MARKED, "Make bad pixels NaN: erased.")
         return _frames(self.image, self.light())
 
     def light(self) -> Floats:
@@ -95,7 +100,7 @@ class Measurement:
 
         Raises InputError when they are no patterns.
         """
-        light = np.asarray(self.patterns, np.float32)
+        light = real_array(self.patterns, "patterns")
         if light.ndim != 3 or not np.isfinite(light).all():
             raise InputError(f"Patterns are finite numbers, (n, height, width); got {light.shape}.")
         if light.min() < 0 or not light.any():
@@ -128,13 +133,16 @@ class Measurement:
         Raises InputError when it is shaped otherwise.
         """
         if np.ndim(image) == 0:
-            return np.full_like(data, float(np.asarray(image)))
+            number = real_array(image, f"The {name}")
+            if not np.isfinite(number):
+                raise InputError(f"The {name} must be finite, not {number:g}.")
+            return np.full_like(data, number)
         if self.patterns is not None and np.ndim(image) >= 3:  # shaped as the frames: patterns first
             frames = np.asarray(image)
             if frames.ndim == 3 and not self.flat:  # one for all colours
                 frames = np.repeat(frames[..., None], np.shape(self.image)[-1], axis=-1)
             image = np.moveaxis(_by_channel(frames), 0, -1)
-        channels = as_channels(image, name)
+        channels = as_channels(image, name, "Put 1 or 0 there." if name == "erasures" else NEIGHBOURS)
         if channels.shape[1:] != data.shape[1:] or len(channels) not in (1, len(data)):
             if self.patterns is not None:
                 shape = np.shape(self.image)
@@ -256,13 +264,13 @@ def central(calibration: Calibration) -> Calibration:
 
 def _frames(frames: npt.ArrayLike, light: Floats) -> Floats:
     """Return frames that fit their patterns, each channel's in turn."""
-    data = np.asarray(frames, np.float32)
+    data = real_array(plain_array(frames), "The measurement")
     if data.ndim not in (3, 4) or data.shape[:3] != light.shape:
         raise InputError(
             "One pattern a frame is expected, patterns (n, height, width), frames alike or with channels "
             f"last; got frames {data.shape} and patterns {light.shape}."
         )
-    require_finite(data, "measurement")
+    require_finite(data, "measurement", MARKED)
     return _by_channel(data)
 
 

@@ -38,7 +38,7 @@ from recon.streams.live_picture import (
 from recon.streams.pace import Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch
 from recon.streams.video import require_steps, stream_problem
-from recon.types import Calibration
+from recon.types import Calibration, real_array
 
 Array = npt.NDArray[Any]
 
@@ -439,6 +439,7 @@ class LiveReconstructor:
                 f"A frame must be (height, width[, n_channels]) of numbers, not {image.dtype} {image.shape}."
             )
         if image.dtype.kind == "f":
+            image = real_array(image, "The frame")
             require_finite(image, "frame")
         height, width = self._sensor
         factor = image.shape[0] // height

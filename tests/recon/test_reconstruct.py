@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon import Calibration, Geometry, InputError, NoiseModel
+from recon import Calibration, Geometry, InputError, Measurement, NoiseModel
 from recon import reconstruct as reconstruct_and_judge
 from recon.base.metrics import psnr
 from recon.camera.refocus import refocus
@@ -228,7 +228,19 @@ BAD = np.where(np.arange(12 * 14).reshape(12, 14) == 30, np.nan, GOOD)
         (GOOD, 0 * GOOD, {}, "zero everywhere: the point source was not seen"),
         (GOOD, 0 * GOOD + 3, {}, "constant .3 everywhere."),
         (GOOD, BAD, {}, r"PSF holds 1 values that are not finite numbers, the first at .2, 2."),
-        (np.nan_to_num(BAD, nan=np.inf), GOOD, {}, r"measurement holds 1 values that are not finite"),
+        (np.nan_to_num(BAD, nan=np.inf), GOOD, {}, r"measurement holds 1 values that .* pixels NaN: erased"),
+        (BAD * np.nan, GOOD, {}, "holds 168 values that are not finite .* nothing else in it"),
+        (
+            Measurement([BAD, BAD], patterns=np.ones((2, 12, 14))),
+            GOOD,
+            {},
+            "holds 2 values that are not finite .* Put numbers there, and mark them in erasures",
+        ),
+        (GOOD, GOOD, {"background": BAD}, "background holds 1 values .* the mean of their neighbours there"),
+        (GOOD, GOOD, {"background": np.nan}, "background must be finite, not nan"),
+        (GOOD, GOOD, {"erasures": BAD}, "erasures holds 1 values that are not finite .* Put 1 or 0 there"),
+        (GOOD * 1e39, GOOD, {}, r"measurement must hold real numbers up to 3.4e.38 .float32., not 2e.39"),
+        (GOOD, GOOD, {"background": 1e39}, r"background must hold real numbers up to 3.4e.38"),
         (GOOD, GOOD - 2, {}, "sums to a negative number"),
         (GOOD[1:], GOOD, {}, "PSF has 12 x 14 pixels and the measurement 11 x 14"),
         (np.ones((12, 14, 2)), np.dstack([GOOD] * 3), {}, "PSF has 3 channels and the measurement 2"),

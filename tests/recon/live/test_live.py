@@ -186,7 +186,9 @@ def test_calibration_with_background_and_depths() -> None:
     [
         (np.zeros((10, 10), np.uint16), "10 x 10 pixels and the PSF 64 x 96"),
         (np.zeros((128, 96), np.uint16), "whole factor"),
-        (np.full(SHAPE, np.nan, np.float32), "not finite"),
+        (np.full(SHAPE, np.nan, np.float32), "not finite .* nothing else in it"),
+        (np.where(np.eye(*SHAPE) > 0, np.nan, 1), "not finite .* Put the mean of their neighbours there"),
+        (np.full(SHAPE, 1e39), "frame must hold real numbers up to"),
         (np.zeros(5, np.uint16), "must be"),
     ],
 )
