@@ -31,6 +31,10 @@ Examples:
 """
 
 
+_TELLING = 3
+"""Letters of a command from which it is guessed where several begin so."""
+
+
 class Command(NamedTuple):
     """A row of the table; ``place``, in this package, is imported only when the command is used."""
 
@@ -205,7 +209,9 @@ def _unknown(name: str) -> str:
     if name.startswith("-"):
         problem = f"diffuserbench: there is no option {name!r} before a command."
     else:
-        close = [one for one in COMMANDS if one.startswith(name)] or difflib.get_close_matches(name, COMMANDS)
+        begin = [one for one in COMMANDS if one.startswith(name)]
+        meant = begin if len(begin) == 1 or len(name) >= _TELLING else []
+        close = meant or difflib.get_close_matches(name, COMMANDS)
         hint = f" Did you mean {close[0]!r}?" if close else ""
         problem = f"diffuserbench: there is no command {name!r}.{hint}"
     return f"{problem}\n{USAGE}\nCommands: {', '.join(COMMANDS)}\n"

@@ -251,4 +251,6 @@ def _missing(o: Option) -> str:
     said = o.declaration
     words, unit = said.help.partition(". ")[0].rstrip("."), said.shown_unit or said.unit
     in_unit = f", in {unit}" if unit else ""
-    return f"{o.flag} must be given" + (f": {words[0].lower()}{words[1:]}{in_unit}." if words else ".")
+    if not words[1:2].isupper():  # TIFF, PSFs
+        words = f"{words[:1].lower()}{words[1:]}"
+    return f"{o.flag} must be given" + (f": {words}{in_unit}." if words else ".")

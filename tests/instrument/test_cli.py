@@ -126,12 +126,17 @@ def test_the_module_is_the_program() -> None:
     [
         (["snpa"], "no command 'snpa'. Did you mean 'snap'?"),
         (["recon"], "Did you mean 'reconstruct'?"),
+        (["d"], "no command 'd'.\nUsage"),  # demo, drivers, devices
+        ([""], "no command ''.\nUsage"),
+        (["im"], "Did you mean 'import'?"),
         (["--colour"], "no option '--colour'"),
         (["help", "snpa"], "no command 'snpa'"),
         (["snap", "--averge", "3"], "--average"),
         (["snap", "--average", "many"], "--average"),
         (["snap", "--average", "0"], "--average"),
         (["snap", "--dark", "--source"], "choose one of"),
+        (["import"], "FILM must be given: TIFF stack"),
+        (["compare"], "OLD must be given: a calibration"),
         (["check", "--bench", "absent.toml"], "absent.toml: there is no such file"),
         (["snap", "--out", "photo.jpg"], "'.jpg' is no format"),
         (["snap", "--out", "absent/photo.tif"], "absent does not exist"),
