@@ -12,13 +12,13 @@ from drivers.common.camera_settings import GainScale, GainUnit
 from drivers.device import DriverOptions, OwnSetting, Setting
 from drivers.errors import DeviceError, LimitError
 from drivers.genicam.features import (
-    AUTOMATICS,
     BLACK_LEVEL,
     DRIVERS_OWN,
     EXPOSURE,
     FRAME_RATE,
     FRAME_RATE_ENABLE,
     GAIN,
+    STEADY,
     Features,
 )
 from drivers.genicam.images import TRIGGER_EDGES, Images, set_trigger, trigger_lines
@@ -62,11 +62,9 @@ class GenicamCamera(BufferedCamera):
     def _prepare(self) -> None:
         """Bring the camera to a state in which nothing happens by itself, and read what it is."""
         features = self._features
-        for automatic in AUTOMATICS:
-            if features.find(automatic) and "Off" in features.entries(automatic):
-                features.choose(automatic, "Off")
-        if features.find("AcquisitionMode"):
-            features.choose("AcquisitionMode", "Continuous")
+        for name, entry in STEADY:
+            if features.find(name) and features.text(name) != entry and entry in features.entries(name):
+                features.choose(name, entry)
         self._pitch_um = self._read_pitch()
         exposure = features.find(*EXPOSURE)
         if exposure is None:
@@ -82,9 +80,15 @@ class GenicamCamera(BufferedCamera):
         self._lines = trigger_lines(features)
         self._trigger_line = next((line for line in ("Line1", *self._lines) if line in self._lines), "")
         self._images = Images(features, self._read_sensor)
-        self._roi = self._images.roi
         for name, value in self.options.features.items():
             features.set_any(name, value)
+        self._look_again()
+
+    def _look_again(self) -> None:
+        """Read what a feature may have changed with itself: a mosaic's order, region, exposure, gain."""
+        features = self._features
+        self._images.look_again()
+        self._roi = self._images.roi
         self._rate = features.number(self._rate_name) if self._rate_name else 0.0
         self._exposure_ms = features.number(self._exposure_name) / 1e3
         self._gain = self._read_gain()
@@ -150,6 +154,10 @@ class GenicamCamera(BufferedCamera):
         self._features.set_any(
             name, number if kind == "number" else value == "true" if kind == "switch" else value
         )
+        before = self._images.format_name
+        self._look_again()
+        if (now := self._images.format_name) != before and "pixel_format" in self._remembered:
+            self._remember("pixel_format", lambda: self.set_pixel_format(now))
         return self._features.text(name)
 
     # Exposure, gain, black level -------------------------------------------------------------------

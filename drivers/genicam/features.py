@@ -23,8 +23,14 @@ FRAME_RATE_ENABLE = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled"
 FRAME_TRIGGERS = ("FrameStart", "FrameTrigger", "AcquisitionStart")
 FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
 AUTOMATICS = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto")
+STEADY = (
+    *((name, "Off") for name in AUTOMATICS),
+    ("AcquisitionMode", "Continuous"),
+    ("ExposureMode", "Timed"),
+)
+"""What features are on opening, where they can be: no exposure lasts as long as a pulse."""
 DRIVERS_OWN = {*EXPOSURE, *GAIN, *BLACK_LEVEL, *FRAME_RATE, *FRAME_RATE_ENABLE, *AUTOMATICS}
-DRIVERS_OWN |= {"AcquisitionMode", "PixelFormat", "Width", "Height", "OffsetX", "OffsetY"}
+DRIVERS_OWN |= {"AcquisitionMode", "ExposureMode", "PixelFormat", "Width", "Height", "OffsetX", "OffsetY"}
 DRIVERS_OWN |= {"BinningHorizontal", "BinningVertical", "TriggerSelector", "TriggerMode", "TriggerSource"}
 DRIVERS_OWN |= {"TriggerActivation"}
 """What the driver itself sets and remembers."""

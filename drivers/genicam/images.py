@@ -9,6 +9,8 @@ from drivers.common.pixels import PixelFormat, compile_kernels, genicam_format
 from drivers.errors import DeviceError, LimitError
 from drivers.genicam.features import FRAME_TRIGGERS, Features
 
+_AXES = ("Horizontal", "Vertical")
+
 
 class Images:
     """Format, region and binning of an open camera's images; at first all of the sensor, unbinned.
@@ -31,11 +33,17 @@ class Images:
 
     def __init__(self, features: Features, sensor: Callable[[], tuple[int, int]]) -> None:
         self._features = features
-        if features.find("BinningHorizontal"):
-            features.set_number("BinningHorizontal", 1)
-            features.set_number("BinningVertical", 1)
+        for name in (f"{what}{axis}" for what in ("Binning", "Decimation") for axis in _AXES):
+            if features.find(name) and features.number(name) != 1:
+                features.set_number(name, 1)
         self.binning = 1
         self.sensor = sensor()
+        self.formats = self._read_formats()
+        self.apply_format(next(iter(self.formats)))
+        self._apply_whole()
+
+    def _read_formats(self) -> dict[str, PixelFormat]:
+        features = self._features
         offered = features.entries("PixelFormat")
         known = {name: pixels for name in offered if (pixels := genicam_format(name)) is not None}
         if not known:
@@ -48,9 +56,32 @@ class Images:
         best = sorted(
             known.items(), key=lambda item: (item[1].channels, item[1].bayer, -item[1].bits, len(item[0]))
         )
-        self.formats: dict[str, PixelFormat] = dict(best)
-        self.apply_format(best[0][0])
-        self._apply_whole()
+        return dict(best)
+
+    def look_again(self) -> None:
+        """Read format, region and binning, which another feature may have changed.
+
+        Raises DeviceError when the format is none that can be read; LimitError when it bins differently along
+        the two axes.
+        """
+        features = self._features
+        self.formats = self._read_formats()
+        if (now := features.text("PixelFormat")) not in self.formats:
+            raise DeviceError(
+                features.name, f"sends {now}, which cannot be read.", f"Readable: {', '.join(self.formats)}."
+            )
+        self.format_name = now
+        compile_kernels(self.format.packing)
+        if features.find("BinningHorizontal"):
+            self.binning = self._same_along([features.number(f"Binning{axis}") for axis in _AXES])
+        self.roi = self._read_roi()
+
+    def _same_along(self, made: list[float]) -> int:
+        if made[0] != made[1]:
+            raise LimitError(
+                self._features.name, f"bins {made[0]:g} x {made[1]:g} pixels.", "Bin both axes alike."
+            )
+        return int(made[0])
 
     @property
     def format(self) -> PixelFormat:
@@ -114,14 +145,8 @@ class Images:
     def apply_binning(self, binning: int) -> None:
         """Set the binning along both axes; the region becomes the whole sensor."""
         if self._features.find("BinningHorizontal"):
-            made = [
-                self._features.set_number(f"Binning{axis}", binning) for axis in ("Horizontal", "Vertical")
-            ]
-            if made[0] != made[1]:
-                raise LimitError(
-                    self._features.name, f"bins {made[0]:g} x {made[1]:g} pixels.", f"Asked for {binning}."
-                )
-            self.binning = int(made[0])
+            made = [self._features.set_number(f"Binning{axis}", binning) for axis in _AXES]
+            self.binning = self._same_along(made)
         self._apply_whole()
 
 

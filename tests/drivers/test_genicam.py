@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from drivers.errors import DeviceError, LimitError
+from drivers.genicam.camera import GenicamCamera, GenicamOptions
 from drivers.genicam.features import FeatureKind, Features
 
 
@@ -92,3 +93,72 @@ def test_a_switch_is_not_on_because_a_word_was_given() -> None:
     with pytest.raises(LimitError, match=r"takes no ReverseX 'off'\. It takes true, false\."):
         features.set_any("ReverseX", "off")
     assert features.of["ReverseX"] is False
+
+
+class OfTable(GenicamCamera):
+    """A camera without frames; colour, and turning its pixels changes the order of its mosaic."""
+
+    name = "camera (table)"
+    _connected = True
+
+    def __init__(self, table: Table, **options: Any) -> None:
+        super().__init__()
+        self.options = GenicamOptions(pixel_pitch_um=3.0, **options)
+        self._features = table
+        self._prepare()
+
+
+OfTable.__abstractmethods__ = frozenset()
+
+
+class Turning(Table):
+    """The formats that it offers follow the switch."""
+
+    def _write_switch(self, name: str, value: bool) -> None:
+        super()._write_switch(name, value)
+        if name == "ReverseX":
+            self.of["PixelFormat"] = ["BayerGR12", "BayerGR12"] if value else ["BayerRG12", "BayerRG12"]
+            self.of["Gain"][0] = 6.0
+
+
+def table(**more: Any) -> Turning:
+    return Turning(
+        **{
+            "ExposureTime": [1e4, 20.0, 1e6, 0],
+            "Gain": [0.0, 0.0, 24.0, 0],
+            "PixelFormat": ["BayerRG12", "BayerRG12"],
+            "ReverseX": False,
+            "SensorHeight": [48, 48, 48, 1],
+            "SensorWidth": [64, 64, 64, 1],
+            "Height": [48, 2, 48, 2],
+            "Width": [64, 2, 64, 2],
+            "OffsetX": [0, 0, 62, 2],
+            "OffsetY": [0, 0, 46, 2],
+            **more,
+        }
+    )
+
+
+def test_what_somebody_left_set_does_not_outlive_the_opening() -> None:
+    features = table(
+        ExposureMode=["TriggerWidth", "Timed", "TriggerWidth"],
+        ExposureAuto=["Continuous", "Off", "Continuous"],
+        DecimationHorizontal=[2, 1, 4, 1],
+    )
+    OfTable(features)  # type: ignore[abstract]
+    said = [features.text(name) for name in ("ExposureMode", "ExposureAuto", "DecimationHorizontal")]
+    assert said == ["Timed", "Off", "1"]
+
+
+def test_a_feature_that_changes_the_images_is_known_to_have() -> None:
+    camera = OfTable(table(), features={"ReverseX": True, "Width": 32})  # type: ignore[abstract]
+    assert (camera.pixel_format, camera.pixel_formats) == ("BayerGR12", ("BayerGR12",))
+    assert camera.roi.as_tuple() == (0, 0, 48, 32)
+    assert camera.gain == pytest.approx(10 ** (6 / 20))
+    camera.set_pixel_format("BayerGR12")
+    camera.set_own("ReverseX", "false")
+    assert camera.pixel_format == "BayerRG12"
+    camera._remembered["pixel_format"]()  # as the camera has it now
+    camera._features.of["PixelFormat"] = ["YUV422", "YUV422", "BayerRG12"]  # type: ignore[attr-defined]
+    with pytest.raises(DeviceError, match=r"sends YUV422, which cannot be read\. Readable: BayerRG12"):
+        camera._look_again()
