@@ -282,10 +282,14 @@ class RaspberryCamera(RunningCamera):
         with self._fetching:
             try:
                 self._begin(2)
-                raw = self._take(_START_S + 4 * self._exposure_ms / 1e3)
+                until_s = time.monotonic() + _START_S + 4 * self._exposure_ms / 1e3
+                raw = self._take(until_s - time.monotonic())
                 while raw is not None and not self._is_settled(raw):
-                    self._give_back(raw)
-                    raw = self._take(_START_S)
+                    self._give_back(raw)  # a sensor that never gets there would send for ever
+                    raw = self._take(max(0.0, until_s - time.monotonic()))
+                    if raw is not None and time.monotonic() > until_s:
+                        self._give_back(raw)
+                        raw = None
                 if raw is None:
                     raise DeviceTimeoutError(
                         self.name, "sends no frame with the exposure it was set to.", "Check its cable."

@@ -114,6 +114,14 @@ def test_a_pulled_cable_is_said(library: type[Picamera2], monkeypatch: pytest.Mo
             camera.set_exposure_ms(7.0)
 
 
+def test_an_exposure_that_the_sensor_never_makes_is_not_waited_for_without_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "_START_S", 0.1)
+    with pytest.raises(DeviceTimeoutError, match="sends no frame with the exposure it was set to"):
+        camera_of(controls={"ExposureTime": 40_000}).open()  # whatever else is asked for
+
+
 def test_what_is_not_there_is_said(library: type[Picamera2], monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DeviceError, match=r"there is no such camera; found 0: imx000"):
         camera_of(index=1).open()
