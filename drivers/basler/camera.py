@@ -26,6 +26,9 @@ from drivers.genicam.camera import GIGE_BLOCK_IDS, GenicamCamera, GenicamOptions
 
 _SLICE_MS = 50
 """A wait in the library cannot be ended from outside: it is cut into pieces of this length."""
+_NS_PER_S = 1_000_000_000
+_TICKS = "GevTimestampTickFrequency"
+"""Ticks a second of a GigE camera's clock: 125 MHz of many, 1 GHz under PTP. USB cameras count ns."""
 
 
 class BaslerOptions(GenicamOptions):
@@ -49,6 +52,7 @@ class BaslerCamera(GenicamCamera):
         self._pylon: Any = None
         self._camera: Any = None
         self._woken = threading.Event()
+        self._ticks_per_s = _NS_PER_S
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
@@ -93,6 +97,8 @@ class BaslerCamera(GenicamCamera):
         camera = self._camera
         self._woken.clear()
         self._apply_rate()
+        ticks = self._features.find(_TICKS)
+        self._ticks_per_s = int(self._features.number(ticks)) if ticks else _NS_PER_S
         with self._features.words("start streaming"):
             camera.MaxNumBuffer.SetValue(max(2, n_buffers))
             camera.StartGrabbing(self._pylon.GrabStrategy_OneByOne)
@@ -117,7 +123,8 @@ class BaslerCamera(GenicamCamera):
     def _raw(self, result: Any) -> RawFrame:
         complete = result.GrabSucceeded() and (result.Height, result.Width) == self.image_shape
         data = np.frombuffer(result.GetBuffer() if complete else b"", np.uint8)
-        return RawFrame(data, int(result.BlockID), int(result.TimeStamp) or None, bool(complete), result)
+        time_ns = int(result.TimeStamp) * _NS_PER_S // self._ticks_per_s
+        return RawFrame(data, int(result.BlockID), time_ns or None, bool(complete), result)
 
     def _give_back(self, raw: RawFrame) -> None:
         raw.buffer.Release()  # type: ignore[attr-defined]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,26 @@ def test_frames_that_fail_count_as_lost(camera: BaslerCamera) -> None:
     assert camera.incomplete_frames == 3
     assert sum(metadata.dropped_before for metadata in frames) == 3
     assert frames[-1].frame_id == frames[0].frame_id + 11 + 3
+
+
+def test_a_gige_cameras_ticks_are_told_as_nanoseconds(
+    camera: BaslerCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find, number = camera._features.find, camera._features.number
+    clock = "GevTimestampTickFrequency"
+    monkeypatch.setattr(camera._features, "find", lambda *names: clock if clock in names else find(*names))
+    monkeypatch.setattr(camera._features, "number", lambda name: 125e6 if name == clock else number(name))
+    camera._begin(2)
+    camera._end()
+    result = SimpleNamespace(
+        GrabSucceeded=lambda: True,
+        Height=256,
+        Width=512,
+        GetBuffer=lambda: b"",
+        BlockID=7,
+        TimeStamp=(1 << 60) + 1,
+    )
+    assert camera._raw(result).device_time_ns == 8 * ((1 << 60) + 1)
 
 
 def test_a_picture_from_its_file_arrives_whole(camera: BaslerCamera) -> None:
