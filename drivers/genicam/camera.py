@@ -19,6 +19,7 @@ from drivers.genicam.features import (
     FRAME_RATE_ENABLE,
     GAIN,
     STEADY,
+    SWITCHED,
     Features,
 )
 from drivers.genicam.images import TRIGGER_EDGES, Images, set_trigger, trigger_lines
@@ -82,6 +83,8 @@ class GenicamCamera(BufferedCamera):
         self._images = Images(features, self._read_sensor)
         for name, value in self.options.features.items():
             features.set_any(name, value)
+        enable = features.find(*FRAME_RATE_ENABLE)
+        self._found_limited = bool(enable and SWITCHED.get(features.text(enable).lower()))
         self._look_again()
 
     def _look_again(self) -> None:
@@ -166,14 +169,19 @@ class GenicamCamera(BufferedCamera):
         return 1 / self._rate if self._rate else 0.0
 
     def _apply_rate(self) -> None:
-        """Set the configured frame rate, whose limits depend on region and exposure; note the present one."""
+        """Set the configured frame rate, whose limits depend on region and exposure; note the present one.
+
+        Triggers are not held to it: of those that come sooner a camera makes no frame, and no number.
+        """
         features, wanted = self._features, self.options.frames_per_s
-        if wanted is not None:
+        is_free = self._trigger_mode == "free_run"
+        if (enable := features.find(*FRAME_RATE_ENABLE)) and features.kind(enable) == "switch":
+            limited = is_free and (self._found_limited or wanted is not None)
+            if SWITCHED.get(features.text(enable).lower()) != limited:
+                features.set_any(enable, limited)
+        if wanted is not None and is_free:
             if self._rate_name is None:
                 raise DeviceError(self.name, "its frame rate cannot be set.", "Leave frames_per_s out.")
-            enable = features.find(*FRAME_RATE_ENABLE)
-            if enable:
-                features.set_any(enable, True)
             low, high = features.bounds(self._rate_name)
             if not low <= wanted <= high:
                 raise LimitError(

@@ -162,3 +162,22 @@ def test_a_feature_that_changes_the_images_is_known_to_have() -> None:
     camera._features.of["PixelFormat"] = ["YUV422", "YUV422", "BayerRG12"]  # type: ignore[attr-defined]
     with pytest.raises(DeviceError, match=r"sends YUV422, which cannot be read\. Readable: BayerRG12"):
         camera._look_again()
+
+
+def test_no_frame_rate_holds_triggers_back() -> None:
+    rate = {"AcquisitionFrameRate": [5.0, 1.0, 100.0, 0], "AcquisitionFrameRateEnable": True}
+    lines = {"TriggerMode": ["Off", "On", "Off"], "TriggerSource": ["Line1", "Line1", "Software"]}
+    for options in ({}, {"frames_per_s": 20.0}):
+        features = table(**{name: list(value) if value is not True else True for name, value in rate.items()})
+        features.of |= {name: list(value) for name, value in lines.items()}
+        camera = OfTable(features, **options)  # type: ignore[abstract]
+        for mode, limited in (
+            ("free_run", True),
+            ("hardware", False),
+            ("software", False),
+            ("free_run", True),
+        ):
+            camera.set_trigger_mode(mode)  # type: ignore[arg-type]
+            camera._apply_rate()
+            assert features.of["AcquisitionFrameRateEnable"] is limited
+        assert features.number("AcquisitionFrameRate") == options.get("frames_per_s", 5.0)
