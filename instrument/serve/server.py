@@ -101,6 +101,8 @@ class BenchServer:
         self._links: weakref.WeakSet[web.WebSocketResponse] = weakref.WeakSet()
         self._frames: asyncio.Task[Any] | None = None
         """Sends the frames of the newest sequence."""
+        self._filmed: Camera | None = None
+        """The camera whose frames these are: one that was lost before must not end them."""
         self._sequences = asyncio.Lock()
         """No sequence is started while the end of one before it is still being carried out."""
         self._overtakers = 0
@@ -319,7 +321,7 @@ class BenchServer:
         except ConnectionError:
             pass  # lost, as below
         finally:
-            if kind == "camera" and self._frames is not None:
+            if device is self._filmed and self._frames is not None:
                 self._frames.cancel()
             await asyncio.shield(self._after(kind, operator, link if let_go else None))
         return link
@@ -351,6 +353,8 @@ class BenchServer:
         """Start a sequence and send its frames, ``window`` of them ahead of what the operator has fetched."""
         key = self._operator(request).key
         n_buffers, window = int(request.query["n_buffers"]), int(request.query["window"])
+        if window < 1:
+            raise ValueError(f"a sequence of which {window} frames may be under way never begins")
         link = await self._linked(request)
         try:
             camera = cast(Camera, self.operation.device("camera", key))
@@ -358,6 +362,7 @@ class BenchServer:
                 await self._in_thread(camera.start_sequence, n_buffers)
                 credit = asyncio.Semaphore(window)
                 sending = self._frames = asyncio.create_task(self._send_frames(link, camera, credit))
+                self._filmed = camera
         except DeviceError as error:
             await _part(link, error)
             return link

@@ -398,6 +398,31 @@ def _said_to_be(descr: str, *shape: int) -> str:
     return base64.b64encode(file.getvalue() + bytes(8)).decode()
 
 
+def test_an_operator_who_is_long_in_leaving_does_not_end_the_next_ones_frames(
+    server: BenchServer, options: RemoteOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serving, "_CLOSING_S", 0.3)
+
+    def film() -> None:
+        with RemoteCamera(options) as camera:
+            camera.start_sequence(4)
+            until_s = time.monotonic() + 3 * 0.3
+            while time.monotonic() < until_s:
+                camera.next_frame(2.0)
+
+    async def stopped_and_silent() -> None:
+        headers = {"Authorization": f"Bearer {TOKEN}", OPERATOR_HEADER: "other"}
+        async with (
+            aiohttp.ClientSession(server.url, headers=headers) as session,
+            session.ws_connect("/api/devices/camera/hold", protocols=("diffuserbench",)) as hold,
+        ):
+            await hold.receive()
+            await asyncio.to_thread(server.operation.stop, "a test")
+            await asyncio.to_thread(film)  # nobody answers the hold's closing
+
+    asyncio.run(stopped_and_silent())
+
+
 def test_without_the_token_nothing_is_answered(
     server: BenchServer, options: RemoteOptions, tmp_path: Any
 ) -> None:
@@ -432,6 +457,7 @@ def test_without_the_token_nothing_is_answered(
         ("POST", "/api/devices/stage/close", 404, "takes no POST close"),
         ("GET", "/api/devices/stage/position", 404, "takes no GET position"),
         ("POST", "/api/devices/stage/position", 409, "is not open for this program"),
+        ("GET", "/api/devices/camera/frames?n_buffers=4&window=0", 400, "never begins"),
         ("GET", "/api/state", 200, "simulated"),
     ):
         assert asyncio.run(ask(verb, path, headers=with_token))[0] == status, path
