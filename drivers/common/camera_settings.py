@@ -60,6 +60,7 @@ _ORDER = (
     *("trigger_line", "trigger_edge", "trigger_mode"),
 )
 """The order in which settings are brought back: each may change the limits of those after it."""
+_OWN = "own "
 
 
 class KeptSettings(Camera):
@@ -235,6 +236,11 @@ class KeptSettings(Camera):
         """Keep how a setting is made again after a reconnection; the latest counts."""
         self._remembered[name] = again
 
+    def _remember_own(self, name: str, value: str) -> None:
+        """Keep one of the device's own settings, too; they come back first, in the order they were set in."""
+        self._forget(key := f"{_OWN}{name}")
+        self._remember(key, lambda: self.set_own(name, value))
+
     def _forget(self, name: str) -> None:
         """Let a setting be as after opening: another one has undone it."""
         self._remembered.pop(name, None)
@@ -243,7 +249,8 @@ class KeptSettings(Camera):
         """Make all settings again; where one fails, all stay remembered."""
         remembered = dict(self._remembered)  # bringing one back may forget another
         try:
-            for name in _ORDER:
+            own = [name for name in remembered if name.startswith(_OWN)]
+            for name in (*own, *_ORDER):
                 if name in remembered:
                     remembered[name]()
         except BaseException:

@@ -157,6 +157,7 @@ class GenicamCamera(BufferedCamera):
         self._features.set_any(
             name, number if kind == "number" else value == "true" if kind == "switch" else value
         )
+        self._remember_own(name, value)
         before = self._images.format_name
         self._look_again()
         if (now := self._images.format_name) != before and "pixel_format" in self._remembered:

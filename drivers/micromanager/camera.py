@@ -166,7 +166,9 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
         """Set a property of the adapter; errors as :meth:`Part.set`, and LimitError for the driver's own."""
         if name not in self.own_settings():
             return super().set_own(name, value)
-        return self._camera.set(name, value)
+        made = self._camera.set(name, value)
+        self._remember_own(name, value)
+        return made
 
     # Exposure, gain, black level -------------------------------------------------------------------
     @property

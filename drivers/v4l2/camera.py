@@ -241,6 +241,7 @@ class V4l2Camera(RunningCamera):
                 self.name, f"control {name} does not take {value!r}.", f"It takes {known.takes}."
             ) from None
         self.set_control(name, number)
+        self._remember_own(name, value)
         return self._controls.text(self._controls.named(name))
 
     # Exposure, gain, black level -------------------------------------------------------------------

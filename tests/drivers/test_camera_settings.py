@@ -59,6 +59,11 @@ class Told(KeptSettings):
         self._write("black", black_level)
         self.black_level = black_level + 0.125
 
+    def set_own(self, name: str, value: str) -> str:
+        self._write("own", name, value)
+        self._remember_own(name, value)
+        return value
+
     def _write_trigger(self, mode: str) -> None:
         self._write("trigger", mode, self._trigger_line, self._trigger_edge)
 
@@ -109,6 +114,16 @@ def test_what_was_set_comes_back_in_the_order_in_which_settings_bind_each_other(
     camera.written.clear()
     camera._bring_back()
     assert camera.written[:2] == [("black", 9.0), ("exposure", 12.2)]
+
+
+def test_its_own_settings_come_back_first_as_they_were_set_last() -> None:
+    camera = told()
+    camera.set_gain(2.0)
+    for name, value in (("flip", "1"), ("lens", "near"), ("flip", "0")):
+        camera.set_own(name, value)
+    camera.written.clear()
+    camera._bring_back()
+    assert camera.written == [("own", "lens", "near"), ("own", "flip", "0"), ("gain", 2.0)]
 
 
 def test_where_one_fails_to_come_back_all_stay_remembered() -> None:
