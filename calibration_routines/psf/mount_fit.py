@@ -70,7 +70,9 @@ class MountFit:
         )
         if self.beside_um is not None:
             x, y = (value / 1e3 for value in self.beside_um)
-            words += f", x = {x:+.2f} and y = {y:+.2f} mm (+- {self.beside_error_um / 1e3:.2f}) off the axis"
+            words += (
+                f", x = {x:+z.2f} and y = {y:+z.2f} mm (+- {self.beside_error_um / 1e3:.2f}) off the axis"
+            )
         for told, configured, name, unit in (
             (self.distance, geometry.diffuser_distance_mm, "d", "mm"),
             (self.pitch, geometry.pixel_pitch_um, "pixels of", "um"),
@@ -168,8 +170,8 @@ def fit_mount(
         )
     if beside is not None and way > _BESIDE_PX and np.hypot(*beside) > _SURE * beside_error:
         found.append(
-            f"the pattern moves with depth as if the source stood x = {beside[0] / 1e3:.2f}, y = "
-            f"{beside[1] / 1e3:.2f} mm (+- {beside_error / 1e3:.2f}) beside the axis through the aperture's "
+            f"the pattern moves with depth as if the source stood x = {beside[0] / 1e3:z.2f}, y = "
+            f"{beside[1] / 1e3:z.2f} mm (+- {beside_error / 1e3:.2f}) beside the axis through the aperture's "
             "middle: centre it, set [source] offset_um, or see whether the rail leans."
         )
     d_mm, distance = geometry.diffuser_distance_mm, None
