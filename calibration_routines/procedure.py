@@ -252,12 +252,17 @@ class Procedure(ABC):
 
 
 def _note_kept(interruption: BaseException, run: Path | None) -> None:
-    """Say how the result of a run is made whose frames are there; nothing where that is said already."""
+    """Say where the result of a run is, or how it is made of its frames, unless that is said already."""
     notes = getattr(interruption, "__notes__", ())
     if run is None or any("diffuserbench resume" in note for note in notes):
         return
-    if any(one.purpose is not None and one.purpose.lacks_result(run) for one in routines.values()):
-        interruption.add_note(f"Its frames are kept. For its result: diffuserbench resume {run}")
+    for purpose in (one.purpose for one in routines.values() if one.purpose is not None):
+        if purpose.lacks_result(run):
+            interruption.add_note(f"Its frames are kept. For its result: diffuserbench resume {run}")
+            return
+        if purpose.is_of(run):
+            interruption.add_note(f"Its result is saved: {purpose.kept(run)}")
+            return
 
 
 @dataclass(frozen=True, slots=True)

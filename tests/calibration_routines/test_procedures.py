@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -25,7 +26,7 @@ from instrument.bench.config_file import parse_config
 from instrument.files import kept_times
 from instrument.files.atomic import SPARE_BYTES
 from instrument.files.errors import SettingsError, duration
-from instrument.files.images import read_image
+from instrument.files.images import read_image, write_image
 from instrument.plan import Part, Plan, PlanError, estimate
 from instrument.runs import acquire
 from instrument.runs.acquire import abilities_of
@@ -131,9 +132,13 @@ def test_what_it_took_last_time_tells_how_long_all_of_it_takes(
     # What is exposed or moved longer takes longer by that; what came on top goes with the frames.
     slow = Plan(label="wait", parts=(Part(label="scene", repeats=10, exposures_ms=(9000.0,)),))
     costs_s = [estimate(plan, abilities_of(bench, Path())).seconds for plan in (few, slow)]
-    assert told(Waiting(slow)) == (
-        f"In all, by what it took last time: about {duration(20 - costs_s[0] + costs_s[1])}.",
-    )
+    assert told(Waiting(slow)) == told(Waiting(few))  # a bench that waits for nothing
+    with monkeypatch.context() as patched:
+        patched.setattr("instrument.runs.acquire.time_scale", lambda bench: 1.0)
+        Waiting(few).carry_out(bench)
+        assert told(Waiting(slow)) == (
+            f"In all, by what it took last time: about {duration(20 - costs_s[0] + costs_s[1])}.",
+        )
     key = times._key(Waiting(few), bench, Waiting(few).outlook(bench))
     for damaged in (
         "[10, NaN, 1]",
@@ -257,6 +262,20 @@ def test_who_interrupts_the_analysis_is_told_how_the_result_is_made(
     (note,) = caught.value.__notes__
     run = Path(note.removeprefix("Its frames are kept. For its result: diffuserbench resume "))
     assert [file.name for file in ResumeProcedure(run).carry_out(bench).files] == ["photograph.tif"]
+
+
+def test_who_interrupts_what_comes_after_the_result_is_told_where_that_is(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def written(path: Path, *given: Any, **named: Any) -> None:
+        write_image(path, *given, **named)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(photograph, "write_image", written)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        PhotographProcedure(exposure_ms=2.0, binning=2).carry_out(bench, tmp_path)
+    (note,) = caught.value.__notes__
+    assert read_image(Path(note.removeprefix("Its result is saved: "))).pixels.shape == (120, 160)
 
 
 def _aborted(bench: Bench, folder: Path) -> Run:
