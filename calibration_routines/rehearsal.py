@@ -14,7 +14,8 @@ from calibration_routines.procedure import Listener, Routine
 from calibration_routines.times import IN_ALL
 from drivers.errors import DeviceError
 from instrument.files.errors import BenchError, duration
-from instrument.runs.rehearsal import not_waited_s, time_scale, twin_of
+from instrument.runs.acquire import time_scale
+from instrument.runs.rehearsal import not_waited_s, twin_of
 from instrument.runs.run_control import RunControl
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ def took_before(procedure: Procedure, bench: Bench, outlook: Outlook) -> tuple[s
     try:
         known = kept_times.recall(_key(procedure, bench, outlook))
         frames, took_s, planned_s = (kept_times.sane(number) for number in known)
-        now_s = 0.0 if outlook.cost is None else outlook.cost.seconds
+        now_s = 0.0 if outlook.cost is None else outlook.cost.waited_s
         if took_s >= planned_s:  # what came on top of exposures and motion goes with the frames
             expected_s = now_s + (took_s - planned_s) * _frames(outlook) / frames
         else:  # quicker than planned: a simulated bench whose time runs faster
@@ -39,7 +39,7 @@ def took_before(procedure: Procedure, bench: Bench, outlook: Outlook) -> tuple[s
 
 def took(procedure: Procedure, bench: Bench, outlook: Outlook, seconds: float) -> None:
     """Remember how long all of it took, and what was planned, unless nobody sees what is foretold."""
-    planned_s = 0.0 if outlook.cost is None else outlook.cost.seconds
+    planned_s = 0.0 if outlook.cost is None else outlook.cost.waited_s
     known = [_frames(outlook), round(seconds, 2), round(planned_s, 2)]
     kept_times.remember(_key(procedure, bench, outlook), known)
 

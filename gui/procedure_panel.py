@@ -26,7 +26,7 @@ from gui.widgets.building import after_rest, button, choice, fill, label, mark, 
 from gui.widgets.tab_order import tab_in_order
 from instrument.bench.config_file import TEMPLATES
 from instrument.bench.safety import LIGHT_DOUBT, MOTION_DOUBT, UNSAFE
-from instrument.files.errors import BenchError, SettingsError, count, duration, size
+from instrument.files.errors import BenchError, SettingsError, count, size
 
 _CHECK_MS = 250
 """Rest after a key before what was typed is checked."""
@@ -295,7 +295,7 @@ class ProcedurePanel(Panel):
             free = "" if outlook.free_bytes is None else f" of {size(outlook.free_bytes)} free"
             lines.insert(
                 0,
-                f"{count(cost.frames, 'frame')}, {size(cost.total_bytes)}{free}, {duration(cost.seconds)} of "
+                f"{count(cost.frames, 'frame')}, {size(cost.total_bytes)}{free}, {cost.time} of "
                 f"exposure and motion, {count(cost.moves, 'move')}",
             )
         self._say("\n".join(lines), wrong=False)

@@ -14,7 +14,7 @@ from calibration_routines.psf.exposure import AutoExposure, TooDarkError, expose
 from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.sweep_options import AxialSweep, PointSweep
 from instrument.bench.bench import Bench
-from instrument.files.errors import SettingsError, count
+from instrument.files.errors import SettingsError, count, duration
 from instrument.files.record import RecordFormat, plain
 from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints, check, estimate
 from instrument.runs.acquire import abilities_of
@@ -148,13 +148,13 @@ def plan_lines(bench: Bench, sweep: PointSweep, plan: Plan, folder: Path | None)
     lines.append(
         f"Plan: {what} x {count(sweep.average, 'frame')}{revisits} + {count(dark, 'dark frame')} "
         f"= {count(cost.frames, 'frame')}, {cost.total_bytes / 1e6:.0f} MB at most, "
-        f"{cost.seconds:.0f} s of exposure and motion."
+        f"{cost.time} of exposure and motion."
     )
     if cost.approaches:
         axes = ", ".join(f"{name[0]} {play:g} um" for name, play in bench.play.items())
         lines.append(
             f"Because of the stage's play ({axes}) {count(cost.approaches, 'move')} go below the place "
-            f"first, which costs {cost.approach_seconds:.0f} s of these."
+            f"first, which costs {duration(cost.approach_seconds)} of these."
         )
     if cost.total_bytes > _MUCH_BYTES:
         lines.append(

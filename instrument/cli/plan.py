@@ -17,7 +17,7 @@ from instrument.bench.bench import Bench
 from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.cli.progress import one_task
 from instrument.files.atomic import require_new, write_text
-from instrument.files.errors import BenchError, FileError, duration, size
+from instrument.files.errors import BenchError, FileError, size
 from instrument.plan import BenchAbilities, Plan, check, estimate
 from instrument.plan.illumination import IlluminationOptions
 from instrument.plan.model import load_plan, save_plan
@@ -190,7 +190,7 @@ def _describe(plan: Plan, abilities: BenchAbilities) -> None:
         typer.echo(f"  {part.label}: {', '.join(words)}")
     typer.echo(f"Exposures: {cost.exposures}, moves: {cost.moves}")
     typer.echo(f"Disk:      {size(cost.total_bytes)}" + _free(abilities))
-    typer.echo(f"Time:      {duration(cost.seconds)}, read-out and writing apart")
+    typer.echo(f"Time:      {cost.time}, read-out and writing apart")
     places = [abilities.target(step) for step in plan.steps() if abilities.target(step)]
     axes = sorted({axis for place in places for axis in place})
     moving = [axis for axis in axes if len({place.get(axis) for place in places}) > 1]

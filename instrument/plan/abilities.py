@@ -11,12 +11,13 @@ import numpy as np
 
 from drivers.stage import OVER, StageAxis, approached
 from instrument.files.atomic import SPARE_BYTES
-from instrument.files.errors import FileError, count, ranges, size
+from instrument.files.errors import FileError, count, duration, ranges, size
 from instrument.files.slm_image import read_slm_levels
 from instrument.plan.led_shapes import LedPlaces
 from instrument.plan.model import Part, Plan, PlanError, Step
 from instrument.plan.positions import SourcePosition
 
+_SHOWN_S = 0.1
 BYTES_A_FRAME_BESIDE_THE_IMAGE = 6_000
 """Log line, folders and part-filled disk blocks of one stored frame."""
 
@@ -59,6 +60,8 @@ class BenchAbilities:
     trigger_lines: tuple[str, ...] = ()
     trigger_edges: tuple[str, ...] = ()
     """What the camera's hardware trigger offers."""
+    time_scale: float = 1.0
+    """Real seconds that a second of exposures and motion takes: of a simulated bench, which may not wait."""
     free_bytes: int | None = None
     """Free space where the run will be kept; None leaves the disk unchecked."""
 
@@ -86,6 +89,16 @@ class PlanEstimate:
     """Everything the run will write, metadata included."""
     seconds: float
     """Exposures, moves, settling and waiting; read-out and disk are not known beforehand."""
+    waited_s: float
+    """What of them goes by on the clock: a simulated bench's time may run faster, or not at all."""
+
+    @property
+    def time(self) -> str:
+        """The seconds in words, and what of them goes by on the clock where that is another time."""
+        words = duration(self.seconds) if self.seconds >= _SHOWN_S else f"less than {duration(_SHOWN_S)}"
+        if self.waited_s == self.seconds:
+            return words
+        return f"{words} (simulated: {duration(self.waited_s)} by the clock)"
 
 
 def estimate(
@@ -101,13 +114,17 @@ def estimate(
     frame_bytes = math.prod(abilities.frame_shape) * bytes_a_pixel
     speeds = {axis.name: axis.speed_per_s for axis in abilities.stage_axes}
     position = dict(abilities.stage_position or {})
-    seconds, part_start, part, moves = 0.0, 0.0, -1, 0
+    seconds, waited_s, begun, part, moves = 0.0, 0.0, (0.0, 0.0), -1, 0
     approaches, approach_seconds, seated = 0, 0.0, set[str]()
     slm_image, exposure_ms = None, abilities.exposure_ms
     for step in steps:
         if step.part != part:
-            part, part_start = step.part, seconds - step.start_after_s
-        seconds = max(seconds, part_start + step.start_after_s)
+            part, begun = step.part, (seconds - step.start_after_s, waited_s - step.start_after_s)
+        seconds, waited_s = (
+            max(now_s, part_s + step.start_after_s)
+            for now_s, part_s in zip((seconds, waited_s), begun, strict=True)
+        )
+        took_s = 0.0
         target = abilities.target(step)
         if any(position.get(axis) != value for axis, value in target.items()):
             direct_s = _move_s(position, target, speeds)
@@ -118,15 +135,16 @@ def estimate(
                 way_s += _move_s(position, place, speeds)
                 position.update(place)
             moves += len(path)
-            seconds += way_s
+            took_s += way_s
             approaches += len(path) - 1
             approach_seconds += way_s - direct_s
             seated |= target.keys()
         if step.slm_image is not None and step.slm_image != slm_image:
             slm_image = step.slm_image
-            seconds += abilities.slm_settle_ms / 1e3
+            took_s += abilities.slm_settle_ms / 1e3
         exposure_ms = step.exposure_ms if step.exposure_ms is not None else exposure_ms
-        seconds += step.average * exposure_ms / 1e3
+        took_s += step.average * exposure_ms / 1e3
+        seconds, waited_s = seconds + took_s, waited_s + abilities.time_scale * took_s
     n = len(steps)
     return PlanEstimate(
         frames=n,
@@ -136,6 +154,7 @@ def estimate(
         approach_seconds=approach_seconds,
         total_bytes=n * (frame_bytes + BYTES_A_FRAME_BESIDE_THE_IMAGE),
         seconds=seconds,
+        waited_s=waited_s,
     )
 
 

@@ -89,8 +89,14 @@ def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
         has_trigger_wire=bench.trigger_source is not None,
         trigger_lines=camera.trigger_lines,
         trigger_edges=camera.trigger_edges,
+        time_scale=time_scale(bench),
         free_bytes=free_bytes(folder) if folder is not None else None,
     )
+
+
+def time_scale(bench: Bench) -> float:
+    """Return the real seconds that a simulated second of a bench takes."""
+    return max((getattr(s.options, "time_scale", 1.0) for s in bench.config.shared.values()), default=1.0)
 
 
 def record_of(bench: Bench) -> BenchRecord:

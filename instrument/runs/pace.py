@@ -38,7 +38,7 @@ class Pace:
     def words(self, plan: Plan, abilities: BenchAbilities) -> str:
         """Say how long a plan will take with it."""
         cost = estimate(plan, abilities)
-        whole_s = cost.seconds + cost.frames * self.frame_s
+        whole_s = cost.waited_s + cost.frames * self.frame_s
         return f"Its frames, with read-out and writing as in {self.run}: about {duration(whole_s)}."
 
 
@@ -103,4 +103,4 @@ def _measured(run: Run, abilities: BenchAbilities, toml: str) -> Pace | None:
     begun = replace(abilities, stage_position=abilities.target(next(iter(run.plan.steps()))))
     further = sorted(run.records)[1:]
     cost = estimate(run.plan, begun, todo=further, start=run.start)
-    return Pace(max(took_s - cost.seconds, 0.0) / len(further), run.path.name)
+    return Pace(max(took_s - cost.waited_s, 0.0) / len(further), run.path.name)

@@ -13,8 +13,8 @@ from typing import Any
 
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config import BenchConfig, SharedConfig
-from instrument.plan import Plan, estimate
-from instrument.runs.acquire import abilities_of, record_of
+from instrument.plan import Plan
+from instrument.runs.acquire import record_of
 from instrument.runs.pace import Pace
 from instrument.runs.runner import Runner, RunStatus
 from instrument.runs.writer import RunWriter
@@ -74,9 +74,8 @@ def rehearse(
     )
     for kind in kinds:
         kind.seconds.extend(took[index] for index in kind.steps[:OF_EACH])
-    cost = estimate(plan, abilities_of(bench))
-    whole_s = sum(kind.all_s for kind in kinds) + (time_scale(bench) - 1) * cost.seconds
-    return Pace(whole_s / cost.frames, f"a rehearsal of {len(todo)} of them")
+    frames = sum(len(kind.steps) for kind in kinds)
+    return Pace(sum(kind.all_s for kind in kinds) / frames, f"a rehearsal of {len(todo)} of them")
 
 
 @contextmanager
@@ -95,11 +94,6 @@ def twin_of(bench: Bench) -> Iterator[tuple[Bench, Path] | None]:
         except BaseException as error:  # its notes tell of frames that are kept: these go with the folder
             error.__notes__ = [note for note in getattr(error, "__notes__", ()) if folder not in note]
             raise
-
-
-def time_scale(bench: Bench) -> float:
-    """Return the real seconds that a simulated second of a bench takes."""
-    return max(getattr(shared.options, "time_scale", 1.0) for shared in bench.config.shared.values())
 
 
 def not_waited_s(twin: Bench) -> float:

@@ -229,6 +229,14 @@ def test_the_estimate_counts_frames_bytes_moves_and_seconds() -> None:
     assert found.total_bytes == 3 * (10 * 20 * 4 + BESIDE)
     assert found.exposures == 30
     assert found.seconds == pytest.approx(120 + 0.1)
+    # A simulated bench that waits for nothing waits for intervals all the same.
+    found = estimate(averaged, abilities(time_scale=0.0))
+    assert (found.seconds, found.waited_s) == pytest.approx((120 + 0.1, 120))
+    short = Plan(label="x", parts=(Part(label="a", exposures_ms=(2,)),))
+    assert estimate(short, abilities()).time == "less than 0.1 s"
+    assert (
+        estimate(short, abilities(time_scale=0.0)).time == "less than 0.1 s (simulated: 0.0 s by the clock)"
+    )
 
 
 def test_a_key_that_stands_twice_in_a_plan_is_a_mistake(tmp_path: Path) -> None:
