@@ -135,8 +135,6 @@ def test_the_module_is_the_program() -> None:
         (["snap", "--average", "many"], "--average"),
         (["snap", "--average", "0"], "--average"),
         (["snap", "--dark", "--source"], "choose one of"),
-        (["import"], "FILM must be given: TIFF stack"),
-        (["compare"], "OLD must be given: a calibration"),
         (["check", "--bench", "absent.toml"], "absent.toml: there is no such file"),
         (["snap", "--out", "photo.jpg"], "'.jpg' is no format"),
         (["snap", "--out", "absent/photo.tif"], "absent does not exist"),

@@ -11,9 +11,10 @@ import pytest
 import typer
 
 from instrument.cli.app import App
+from instrument.cli.options import _missing
 from instrument.files.errors import BenchError
 from instrument.tasks.task import Given, Only
-from recon.base.declare import RARE, identity, option, require, with_overrides
+from recon.base.declare import RARE, identity, option, options_of, require, with_overrides
 from recon.errors import InputError
 
 KINDS = ["plain", "fancy"]
@@ -85,6 +86,19 @@ def run(*words: str) -> tuple[Path, Main, More, Given, bool]:
     with parser.make_context("made", list(words)) as context:
         parser.invoke(context)
     return calls[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [("TIFF stack.", "TIFF stack"), ("A run.", "a run"), ("PSFs, one a depth.", "PSFs, one a depth")],
+)
+def test_what_is_missing_is_told_with_its_capitals(words: str, told: str) -> None:
+    @dataclass(frozen=True, kw_only=True)
+    class Film:
+        film: Path = option(help=words)
+
+    (declared,) = options_of(Film)
+    assert _missing(declared) == f"--film must be given: {told}."
 
 
 def test_nothing_given_is_every_default() -> None:
