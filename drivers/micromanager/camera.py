@@ -7,10 +7,10 @@ import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from drivers.camera import Roi, TriggerMode
 from drivers.common.buffered_camera import BufferedCamera, RawFrame
@@ -64,6 +64,17 @@ class MicroManagerCameraOptions(DriverOptions):
     software_trigger: dict[str, PropertyValue] = Field(
         default_factory=dict, description="Properties whose setting is one software trigger."
     )
+
+    @model_validator(mode="after")
+    def _no_trigger_stays_set(self) -> Self:
+        free = self.triggers.get("free_run", {})
+        for mode, properties in self.triggers.items():
+            if missing := [name for name in properties if name not in free]:
+                raise ValueError(
+                    f"triggers.free_run must say what {', '.join(missing)} is then, which "
+                    f"triggers.{mode} sets: else the camera would go on waiting for triggers"
+                )
+        return self
 
 
 class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
@@ -387,7 +398,10 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
         return self._binning
 
     def _write_trigger(self, mode: TriggerMode) -> None:
-        self._camera.set_all(self.options.triggers.get(mode, {}))
+        # What another mode has set goes back first: free_run has all of it.
+        self._camera.set_all(self.options.triggers.get("free_run", {}))
+        if mode != "free_run":
+            self._camera.set_all(self.options.triggers[mode])
 
     # Streaming -------------------------------------------------------------------------------------
     def _begin(self, n_buffers: int) -> FrameNumberCounter | None:

@@ -294,6 +294,18 @@ def test_a_trigger_is_made_of_properties(manager: MicroManager) -> None:
         assert float(str(camera.settings()["property.StripeWidth"])) == 1.0
 
 
+def test_no_property_of_a_trigger_mode_stays_set() -> None:
+    modes = {"hardware": {"TriggerMode": "External"}, "free_run": {"TriggerMode": "Internal"}}
+    assert MicroManagerCameraOptions(pixel_pitch_um=3.0, triggers=modes).triggers == modes
+    modes["hardware"]["TriggerDelay"] = "5"
+    with pytest.raises(
+        ValidationError, match=r"free_run must say what TriggerDelay is then, which .*hardware"
+    ):
+        MicroManagerCameraOptions(pixel_pitch_um=3.0, triggers=modes)
+    with pytest.raises(ValidationError, match="free_run must say what TriggerMode is then"):
+        MicroManagerCameraOptions(pixel_pitch_um=3.0, triggers={"hardware": {"TriggerMode": "External"}})
+
+
 def test_a_silent_camera_is_waited_for_no_longer_than_asked(manager: MicroManager) -> None:
     with camera_on(manager) as camera:
         camera.set_exposure_ms(800.0)
