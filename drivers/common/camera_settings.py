@@ -251,8 +251,10 @@ class KeptSettings(Camera):
         try:
             own = [name for name in remembered if name.startswith(_OWN)]
             for name in (*own, *_ORDER):
-                if name in remembered:
-                    remembered[name]()
+                if (
+                    name in remembered
+                ):  # what one before it has forgotten, and as one before it has renamed it
+                    self._remembered.get(name, remembered[name])()
         except BaseException:
             self._remembered = remembered
             raise

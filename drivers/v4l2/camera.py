@@ -212,10 +212,25 @@ class V4l2Camera(RunningCamera):
         """
         if not self._connected:
             self._require()
-        made = self._controls.set(self._controls.named(name), value)
+        control = self._controls.named(name)
+        if turns := bool(control.flags & api.CTRL_FLAG_MODIFY_LAYOUT):
+            self._require_idle(name)
+        made = self._controls.set(control, value)
         with suppress(DeviceLostError):  # it was set; what comes next says that the camera has gone since
+            if turns:
+                self._look_at_images()
             self._look_at_controls()
         return made
+
+    def _look_at_images(self) -> None:
+        """Take over what a control has made of format and region: one that turns them moves the mosaic."""
+        before, roi, whole = self._images.format.name, self._roi, self._images.whole
+        self._images.look_again()
+        self._roi = self._images.whole
+        if roi != whole and self._roi == whole:
+            self._roi = self._images.cut(roi)
+        if (now := self._images.format.name) != before and "pixel_format" in self._remembered:
+            self._remember("pixel_format", lambda: self.set_pixel_format(now))
 
     def own_settings(self) -> Mapping[str, OwnSetting]:
         """Return the controls that can be set, but for what the driver looks after."""

@@ -179,6 +179,22 @@ class Images:
         self.period_s = frame_period_s(self._device, self._frames_per_s)
         self._say_what_differs(made.height, made.width)
 
+    def look_again(self) -> None:
+        """Set the format anew that a control has made of the present one: the order of a turned mosaic."""
+        before = self.format
+        self.formats = offered_formats(self._device)
+        made = api.Format(type=self._device.buffer_type)
+        self._device.call(api.G_FMT, made, "say its image format")
+        planes = self._device.buffer_type == api.BUF_TYPE_VIDEO_CAPTURE_MPLANE
+        code = (made.fmt.planes if planes else made.fmt.pix).pixelformat
+        same = (before.pixels.packing, before.pixels.bits, before.pixels.channels)
+        likely = [
+            *(known for known in (before, *self.formats) if known.code == code and known in self.formats),
+            *(f for f in self.formats if (f.pixels.packing, f.pixels.bits, f.pixels.channels) == same),
+            *self.formats,
+        ]
+        self.apply(likely[0])
+
     def _say_what_differs(self, height: int, width: int) -> None:
         """Log where the driver made something else of size and frame rate than was asked for."""
         name, size, rate = self._device.name, self._size, self._frames_per_s

@@ -103,6 +103,27 @@ def test_pixels_and_lines_with_padding_are_as_the_camera_sent_them(code: str, na
     np.testing.assert_array_equal(image, (rows * 7 + columns * 3) % 256 * factor)
 
 
+def test_a_control_that_turns_the_pixels_turns_the_mosaic() -> None:
+    kernel = FakeKernel(formats=("RGGB", "YUYV"))
+    kernel.controls[0x980914] = fake.FakeControl("Horizontal Flip", 2, 0, 1, 1, 0, 0, flags=0x400)
+    with camera_on(kernel, controls={"horizontal_flip": 1}) as camera:
+        assert camera.pixel_format == "BayerGR8"
+        camera.set_pixel_format("BayerGR8")
+        camera.set_roi(Roi(4, 8, 20, 30))
+        camera.set_own("horizontal_flip", "0")
+        assert (camera.pixel_format, camera.roi) == ("BayerRG8", Roi(4, 8, 20, 30))
+        assert camera.snap().metadata.pixel_format == "BayerRG8"
+        camera.start_sequence()
+        with pytest.raises(DeviceError, match="streams: no new horizontal_flip now"):
+            camera.set_own("horizontal_flip", "1")
+        kernel.unplugged = True
+        with pytest.raises(DeviceLostError):
+            [camera.next_frame(1.0) for _ in range(20)]
+        kernel.unplugged = False
+        camera.open()  # as bench.toml has it, then as it was set since
+        assert (camera.pixel_format, camera.roi) == ("BayerRG8", Roi(4, 8, 20, 30))
+
+
 @pytest.mark.parametrize("crop_step", [0, 8])
 def test_a_region_shows_the_same_pixels_whoever_cuts_it(crop_step: int) -> None:
     kernel = FakeKernel(formats=("GREY",))

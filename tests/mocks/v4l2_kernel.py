@@ -25,7 +25,18 @@ G_CTRL, S_CTRL, QUERYCTRL, QUERYMENU = 0xC008561B, 0xC008561C, 0xC0445624, 0xC02
 ENUM_FRAMESIZES, G_SELECTION, S_SELECTION = 0xC02C564A, 0xC040565E, 0xC040565F
 
 EXPOSURE, AUTO_EXPOSURE, GAIN, AUTOGAIN, BLACK = 0x9A0902, 0x9A0901, 0x980913, 0x980912, 0x98090B
-_BYTES = {"GREY": 1, "RGGB": 1, "Y10 ": 2, "Y16 ": 2, "RG10": 2, "YUYV": 2, "UYVY": 2, "NV12": 1, "RGB3": 3}
+_BYTES = {
+    "GREY": 1,
+    "RGGB": 1,
+    "GRBG": 1,
+    "Y10 ": 2,
+    "Y16 ": 2,
+    "RG10": 2,
+    "YUYV": 2,
+    "UYVY": 2,
+    "NV12": 1,
+    "RGB3": 3,
+}
 
 
 @dataclass
@@ -291,6 +302,9 @@ class FakeKernel:
             if self.controls[AUTO_EXPOSURE].value != 1:
                 return errno.EACCES
             value = max(value // self.exposure_step * self.exposure_step, control.minimum)
+        if control.flags & 0x400 and value != control.value:  # its pixels turn, and with them the mosaic
+            self.formats = tuple({"RGGB": "GRBG", "GRBG": "RGGB"}.get(code, code) for code in self.formats)
+            self.code = {"RGGB": "GRBG", "GRBG": "RGGB"}.get(self.code, self.code)
         control.value = value
         return 0
 
