@@ -235,6 +235,11 @@ def weights_on(weights: npt.NDArray[Any], shape: tuple[int, int]) -> npt.NDArray
     return np.asarray(smooth / weights.max(), np.float64)
 
 
+def _places(n: int) -> npt.NDArray[np.float64]:
+    """Return where an image's pixels are in the field, in fractions of it: the middle one is on the axis."""
+    return 0.5 + (np.arange(n) - n // 2) / n
+
+
 def foveal_weights(
     shape: tuple[int, int],
     *,
@@ -262,7 +267,7 @@ def foveal_weights(
             f"Foveal weights need radius and edge above 0 and periphery in 0 to 1, not {radius:g}, {edge:g}, "
             f"{periphery:g}."
         )
-    y, x = ((np.arange(n) + 0.5) / n for n in shape)
+    y, x = (_places(n) for n in shape)
     distance = np.hypot(y[:, None] - centre[0], x[None, :] - centre[1])
     falling = np.clip((distance - radius) / edge, 0.0, 1.0)
     return periphery + (1 - periphery) * (0.5 + 0.5 * np.cos(np.pi * falling))
@@ -289,7 +294,7 @@ def painted_weights(
     if not all(0 <= value <= 1 for value in values) or max(values) == 0:
         raise InputError("Painted weights lie in 0 to 1, and not all of them are 0.")
     weights = np.full(shape, background, np.float64)
-    y, x = ((np.arange(n) + 0.5) / n for n in shape)
+    y, x = (_places(n) for n in shape)
     for row, column, radius, weight in strokes:
         if not radius > 0:
             raise InputError(f"A brush has a radius above 0, not {radius:g}.")

@@ -18,6 +18,7 @@ from recon.holography import (
     random_mask,
 )
 from recon.holography.scores import intensity, judge, low_pass, seen_image
+from recon.holography.target import weights_on
 
 RNG = np.random.default_rng(7)
 
@@ -160,6 +161,15 @@ def test_work_arrays_are_allocated_once_and_counted(loss):
 def test_impossible_requests_are_refused_in_words(make, words):
     with pytest.raises(InputError, match=words):
         make()
+
+
+@pytest.mark.parametrize("n", [20, 21])
+def test_a_fovea_in_the_middle_lies_around_the_axis(n: int) -> None:
+    weights = foveal_weights((n, n)), painted_weights((n, n), [(0.5, 0.5, 0.3, 1.0)])
+    for asked in (weights_on(one, (30, 30)) for one in weights):
+        assert np.ptp(asked) > 0.8
+        across = asked[0, 1:]  # in FFT order: the axis first
+        np.testing.assert_allclose(across, across[::-1], atol=1e-12)
 
 
 def test_painted_weights_are_the_brush_where_it_went_and_background_elsewhere():
