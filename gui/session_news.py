@@ -92,6 +92,10 @@ def is_gone(device: Device, error: DeviceError) -> bool:
     return False
 
 
+_OWN = frozenset({"calibration_routines", "drivers", "gui", "instrument", "recon"})
+"""What an operator has no use for the names of; those of other packages say who speaks."""
+
+
 class LogBridge(logging.Handler):
     """Hands on what is logged, in whatever thread, as a level of the log panel and a text.
 
@@ -111,4 +115,5 @@ class LogBridge(logging.Handler):
             record.levelno, "info"
         )
         with contextlib.suppress(RuntimeError):  # the window is gone
-            self._callback(level, f"{record.name}: {record.getMessage()}")
+            own = record.name.partition(".")[0] in _OWN
+            self._callback(level, record.getMessage() if own else f"{record.name}: {record.getMessage()}")

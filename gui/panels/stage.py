@@ -172,7 +172,8 @@ class StagePanel(DevicePanel):
             plus.setAccessibleName(f"{letter}: one step forward")
             minus.setFixedWidth(34)
             plus.setFixedWidth(34)
-            limit = label(f"{lower.removesuffix(upper.split()[-1]).rstrip()} … {upper}", "dim")
+            span = f"{lower.removesuffix(upper.split()[-1]).rstrip()} … {upper}"
+            limit = label(span.replace("-", "−"), "dim")
             limit.setToolTip("Soft limits")
             self._grid.addWidget(label(letter, "value"), number, 0)
             self._grid.addLayout(in_column(gauge, limit, spacing=1), number, 2)

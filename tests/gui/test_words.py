@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import logging
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import instrument
+from gui.session_news import LogBridge
 from gui.words import in_the_window
 
 ROOT = Path(instrument.__file__).parents[1]
@@ -61,3 +63,11 @@ def _messages() -> Iterator[str]:
             said = node.value if isinstance(node, ast.Constant) and id(node) not in documents else None
             if isinstance(said, str) and not re.search(r"^diffuserbench |^ *[#\[]", said, re.MULTILINE):
                 yield said
+
+
+def test_the_log_names_no_module_of_this_program() -> None:
+    lines: list[tuple[str, str]] = []
+    bridge = LogBridge(lambda *line: lines.append(line))
+    for name in ("instrument.bench.bench", "drivers.stage", "pypylon"):
+        bridge.emit(logging.LogRecord(name, logging.INFO, "", 0, "opened", None, None))
+    assert [text for _, text in lines] == ["opened", "opened", "pypylon: opened"]
