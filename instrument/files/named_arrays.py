@@ -14,7 +14,14 @@ import numpy.typing as npt
 from instrument.files import matlab, reading
 from instrument.files.errors import FileError
 from instrument.files.ome_tiff import MICROMETRES, MOST_PLANES
-from instrument.files.pieces import hdf5_pieces, piece_bytes, require_pieces
+from instrument.files.pieces import (
+    MOST_LZF_EXPANSION,
+    hdf5_pieces,
+    lzf_place,
+    piece_bytes,
+    require_lzf_pieces,
+    require_pieces,
+)
 
 Read = tuple[npt.NDArray[Any], tuple[str, ...]]
 _AXES = ("t", "c", "z", "y", "x", "s")
@@ -96,9 +103,12 @@ def read_hdf5(path: Path, inside: str, *, of_matlab: bool = False) -> Read:
             raise FileError(
                 path, f"keeps the numbers of {name} in other files.", "Copy them into one file (h5repack)."
             )
-        reading.require_plausible(path, file[name].nbytes, reading.stored_bytes(path))
-        if file[name].chunks is not None and file[name].id.get_create_plist().get_nfilters():
-            require_pieces(path, hdf5_pieces(file[name].id), piece_bytes(file[name]))
+        stored = file[name].id
+        most = reading.MOST_EXPANSION if lzf_place(stored) is None else MOST_LZF_EXPANSION
+        reading.require_plausible(path, file[name].nbytes, reading.stored_bytes(path), most=most)
+        if file[name].chunks is not None and stored.get_create_plist().get_nfilters():
+            require_lzf_pieces(path, stored, piece_bytes(file[name]))
+            require_pieces(path, hdf5_pieces(stored), piece_bytes(file[name]))
         return np.asarray(file[name][()])
 
     try:

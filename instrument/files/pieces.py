@@ -23,6 +23,12 @@ _HARMLESS_BYTES = 512
 """A piece so small inflates to some megabytes at most, whatever it is."""
 _DEFLATES = 1040
 """By how much deflate shrinks zeros, at most (1032)."""
+_LZF = 32000
+"""HDF5's number of h5py's own filter."""
+_LZF_SHRINKS = 88
+"""By how much LZF shrinks zeros, at most: 264 bytes in three."""
+MOST_LZF_EXPANSION = 40
+"""No photograph shrinks so much under LZF."""
 _BLOCK_BYTES = 1 << 16
 _ZSTD_BLOCK_BYTES = 1 << 17
 _UNTOLD_BYTES = 1 << 28
@@ -62,11 +68,53 @@ def require_pieces(
             continue
         with opened() as piece:
             if inflates_beyond(piece, stored, most):
-                raise error(
-                    path,
-                    f"holds a piece that inflates to over {size(most)}, for {size(holds_bytes)} of numbers: "
-                    "it is damaged, or made to fill the memory.",
-                )
+                raise _beyond(path, most, holds_bytes, error)
+
+
+def _beyond(path: Path, most: int, holds_bytes: int, error: type[FileError]) -> FileError:
+    return error(
+        path,
+        f"holds a piece that inflates to over {size(most)}, for {size(holds_bytes)} of numbers: "
+        "it is damaged, or made to fill the memory.",
+    )
+
+
+def lzf_place(stored: Any) -> int | None:
+    """Return which of an HDF5 dataset's filters is LZF; None where none is."""
+    plist = stored.get_create_plist()
+    numbers = [plist.get_filter(n)[0] for n in range(plist.get_nfilters())]
+    return numbers.index(_LZF) if _LZF in numbers else None
+
+
+def require_lzf_pieces(path: Path, stored: Any, holds_bytes: int) -> None:
+    """Refuse an HDF5 dataset with an LZF chunk that becomes far more than a chunk holds; as `require_pieces`.
+
+    Chunks that cannot become more than 256 MB are not walked through: that is slower than to inflate them.
+    """
+    place, most = lzf_place(stored), max(2 * holds_bytes + _SLACK_BYTES, _UNTOLD_BYTES)
+    chunks: list[Any] = []
+    if place is not None:
+        stored.chunk_iter(chunks.append)
+    for chunk in chunks:
+        could = not chunk.filter_mask >> place & 1 and chunk.size * _LZF_SHRINKS > most
+        if could and _lzf_beyond(stored.read_direct_chunk(chunk.chunk_offset)[1], most):
+            raise _beyond(path, most, holds_bytes, FileError)
+
+
+def _lzf_beyond(data: bytes, most: int) -> bool:
+    """Add up what the runs and copies of LZF data say of their lengths (liblzf, lzf_d.c)."""
+    at = n_bytes = 0
+    while at < len(data) and n_bytes <= most:
+        if data[at] < 32:  # so many bytes as they are, and one
+            n_bytes += data[at] + 1
+            at += data[at] + 2
+        elif data[at] < 224:
+            n_bytes += (data[at] >> 5) + 2
+            at += 2
+        else:
+            n_bytes += 9 + (data[at + 1] if at + 1 < len(data) else 0)
+            at += 3
+    return n_bytes > most
 
 
 def hdf5_pieces(stored: Any) -> Iterator[tuple[int, Callable[[], IO[bytes]]]]:

@@ -75,7 +75,7 @@ def _too_large(n_bytes: int, most: int) -> str:
 
 
 _SMALL_BYTES = 1 << 27
-_MOST_EXPANSION = 200
+MOST_EXPANSION = 200
 """No photograph shrinks so much when it is compressed; a bomb or a damaged header does."""
 
 
@@ -85,13 +85,15 @@ def require_plausible(
     stored_bytes: int,
     *,
     small: int = _SMALL_BYTES,
+    most: int = MOST_EXPANSION,
     error: type[FileError] = FileError,
 ) -> None:
     """Refuse pixels that say they are far more than their file can hold, before memory is taken for them.
 
     ``small`` bytes are taken whatever the file's size: sparse volumes and even masks shrink without end.
+    ``most``: times the file's size, by what its compression can do at all.
     """
-    if n_bytes > small and n_bytes > _MOST_EXPANSION * stored_bytes:
+    if n_bytes > small and n_bytes > most * stored_bytes:
         raise error(
             path,
             f"says that it holds {size(n_bytes)} in {size(stored_bytes)} of file: it is damaged, or made to "

@@ -119,6 +119,24 @@ def test_a_piece_that_inflates_beyond_what_its_array_holds_is_refused(tmp_path: 
         read_image(path)
 
 
+@pytest.mark.parametrize("what", ["array", "piece"])
+def test_what_lzf_shrinks_to_nothing_is_refused_by_its_size(tmp_path: Path, what: str) -> None:
+    """Zeros by LZF are an 88th, which is less than what other compressions' files are refused for."""
+    h5py = pytest.importorskip("h5py")
+    path, zeros = tmp_path / "lzf.h5", b"\0\0" + b"\xe0\xff\0"  # a zero, then 264 more by each three bytes
+    with h5py.File(path, "w") as file:
+        shape = (8000, 9000) if what == "array" else (1000, 1000)
+        stored = file.create_dataset("image", shape, "u2", chunks=(1000, 1000), compression="lzf")
+        for at in np.ndindex(shape[0] // 1000, shape[1] // 1000):
+            stored.id.write_direct_chunk(
+                (1000 * at[0], 1000 * at[1]), zeros + zeros[2:] * (7575 if what == "array" else 1_100_000)
+            )
+    with pytest.raises(
+        BenchError, match="says that it holds 144 MB" if what == "array" else "inflates to over 268 MB"
+    ):
+        read_image(path)
+
+
 @pytest.mark.parametrize("compression", [8, 34925])
 def test_a_tiffs_strip_is_inflated_as_far_as_it_holds(tmp_path: Path, compression: int) -> None:
     whole, zeros = np.arange(6144, dtype=np.uint16).tobytes(), bytes(60 << 20)
