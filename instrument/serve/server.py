@@ -10,7 +10,7 @@ import json
 import logging
 import threading
 import weakref
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import resources
@@ -19,6 +19,7 @@ from typing import Any, Self, TypeVar, cast
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from drivers.camera import Camera
+from drivers.device import Device
 from drivers.errors import DeviceError, DeviceLostError, DeviceTimeoutError, LimitError
 from drivers.frame import Frame
 from drivers.remote.device import said_facts
@@ -304,7 +305,7 @@ class BenchServer:
             self._loop.call_soon_threadsafe(lambda: self._loop.create_task(_part(link, reason)))
 
         try:
-            device = await self._in_thread(self.operation.take, kind, operator, on_end)
+            device, facts = await self._in_thread(self._taken, kind, operator, on_end)
         except (DeviceError, BenchError) as error:
             if not isinstance(error, DeviceError):
                 error = DeviceError(kind, str(error))
@@ -312,7 +313,6 @@ class BenchServer:
             return link
         let_go = False
         try:
-            facts = await self._in_thread(said_facts, device, kind)
             await link.send_json({"facts": facts}, dumps=_dumps)
             async for message in link:
                 let_go = let_go or (message.type is WSMsgType.TEXT and message.data == "close")
@@ -325,6 +325,26 @@ class BenchServer:
                 self._frames.cancel()
             await asyncio.shield(self._after(kind, operator, link if let_go else None))
         return link
+
+    def _taken(
+        self, kind: Kind, operator: Operator, on_end: Callable[[DeviceError], None]
+    ) -> tuple[Device, Mapping[str, Any]]:
+        """Open a device, and return it and what it says of itself; one that fails at that is closed again.
+
+        Raises DeviceError or BenchError: what it said, and what could not be made safe.
+        """
+        device = self.operation.take(kind, operator, on_end)
+        try:
+            return device, said_facts(device, kind)
+        except Exception as error:
+            said = error if isinstance(error, DeviceError | BenchError) else f"failed when opened: {error}."
+            try:
+                self.operation.let_go(kind, operator)
+            except (DeviceError, BenchError) as failure:
+                raise BenchError(f"{said} {failure}") from error
+            if isinstance(said, str):
+                raise DeviceError(kind, said) from error
+            raise
 
     async def _after(self, kind: Kind, operator: Operator, link: web.WebSocketResponse | None) -> None:
         """Close a device that was let go; without its ``link`` the operator is lost, and all is made safe."""

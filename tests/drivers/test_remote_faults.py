@@ -146,6 +146,31 @@ def test_a_lost_operator_leaves_no_light_and_no_motion(
         device.close()
 
 
+@pytest.mark.parametrize(
+    "failure", [DeviceError("stage", "does not answer."), OSError("Input/output error")], ids=["said", "raw"]
+)
+def test_a_device_that_fails_when_asked_for_its_facts_is_closed_and_told_of(
+    options: RemoteOptions, said: list[str], monkeypatch: pytest.MonkeyPatch, failure: Exception
+) -> None:
+    """Its connection was said to be lost, and the operator's other devices were closed with it."""
+
+    def fails(*_: Any) -> None:
+        raise failure
+
+    leds, stage = RemoteLedArray(options), RemoteStage(options)
+    leds.open()
+    monkeypatch.setattr(serving, "said_facts", fails)
+    with pytest.raises(DeviceError, match=r"does not answer|failed when opened: Input/output") as told:
+        stage.open()
+    assert not isinstance(told.value, DeviceLostError)
+    leds.set_pattern(LIT)  # is held as before
+    assert not any("lost" in sentence for sentence in said)
+    monkeypatch.undo()
+    stage.open()
+    stage.close()
+    leds.close()
+
+
 def test_a_command_that_a_stop_has_overtaken_is_not_carried_out(
     network: BadNetwork, options: RemoteOptions
 ) -> None:
