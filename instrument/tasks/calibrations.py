@@ -330,27 +330,28 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
         places = f" ({len(field.psfs)} places of the field)" if len(field.psfs) > 1 else ""
         desk.say(f"{depth_in_words(one.z_um)}{places}: {one}")
         if one.extrapolated:
-            near, far = (v / 1e3 for v in one.calibrated_um)
-            desk.warn(
-                f"Warning: {depth_in_words(one.z_um)} lies outside the calibrated "
-                f"{f'{near:.4g} to {far:.4g} mm' if far > near else f'depth, {near:.4g} mm'}: the pattern is "
-                "extrapolated, by scaling alone. Measure a PSF there where it matters."
-            )
+            desk.warn(f"Warning: {one.warning}")
     if options.figure is None:
         return Done((path,))
     from instrument.files.figures import save_figure
 
+    used = {z_um for one in made for z_um in one.from_z_um}
     with desk.step("drawing"):
-        return Done((path, save_figure(_refocused_page(measured, new), options.figure)))
+        return Done((path, save_figure(_refocused_page(measured, new, used), options.figure)))
 
 
-def _refocused_page(measured: Calibration, new: Calibration) -> Figure:
+def _refocused_page(measured: Calibration, new: Calibration, used_um: set[float]) -> Figure:
+    """Return the page of new PSFs beside those that they were made of, whose depths are ``used_um``."""
     from instrument.files.figures import Panel, pictures_figure
     from instrument.files.seen import as_seen
 
     panels = []
-    for called, calibration, at_most in (("measured", measured, 2), ("refocused", new, 3)):
-        depths_um = sorted(set(calibration.source_positions_um[:, 2].tolist()))
+    new_um = set(new.source_positions_um[:, 2].tolist())
+    for called, calibration, depths, at_most in (
+        ("measured", measured, used_um, 2),
+        ("refocused", new, new_um, 3),
+    ):
+        depths_um = sorted(depths)
         for z_um in depths_um[:: max(1, -(-len(depths_um) // at_most))]:
             members = (calibration.source_positions_um[:, 2] == z_um).nonzero()[0]
             psf = calibration.psfs[members[calibration.part(members).nearest_to_axis()]].mean(axis=0)

@@ -25,7 +25,7 @@ from recon.camera.depth_mixture import (
     paraxial_scale,
     sensor_distance_um,
 )
-from recon.camera.grid import FAR_UM
+from recon.camera.grid import FAR_UM, depth_in_words
 from recon.camera.registration import displacement, moved, rescaled
 from recon.errors import InputError
 from recon.types import Calibration
@@ -82,6 +82,19 @@ class Refocused:
         """Whether the depth lies outside the calibrated ones, by more than a stage's repeatability."""
         near, far = self.calibrated_um
         return not (1 - SAME_DEPTH) * near <= self.z_um <= (1 + SAME_DEPTH) * far
+
+    @property
+    def warning(self) -> str:
+        """What is doubtful about a depth outside the calibrated ones, in words; empty inside."""
+        if not self.extrapolated:
+            return ""
+        near, far = (v / 1e3 for v in self.calibrated_um)
+        calibrated = f"{near:.4g} to {far:.4g} mm" if far > near else f"depth, {near:.4g} mm"
+        asked = depth_in_words(self.z_um)
+        return (
+            f"{asked[0].upper()}{asked[1:]} lies outside the calibrated {calibrated}: the pattern is "
+            "extrapolated, by scaling alone. Measure a PSF there where it matters."
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return how it was made, for a record."""

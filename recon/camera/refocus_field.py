@@ -187,4 +187,6 @@ def at_depth(calibration: Calibration, z_um: float) -> tuple[Calibration, Refocu
         return calibration, None
     made = refocus(calibration, z_um)
     provenance = {**calibration.provenance, "refocused": made.to_json()}
+    if made.extrapolated:
+        provenance["extrapolated"] = made.warning
     return replace(refocus_field(calibration, z_um), provenance=provenance), made

@@ -164,7 +164,7 @@ class Problem:
                 reason = "patterned light takes one PSF a depth where no other model is asked for"
         asked = True if options.positive_background else options.estimate_background
         unmoved = calibration.provenance.get("not_refocused")
-        said = (holes, unmoved and f"The PSF was {unmoved}.")
+        said = (holes, unmoved and f"The PSF was {unmoved}.", calibration.provenance.get("extrapolated"))
         deviation = measurement.deviations(counts).astype(np.float32)
         problem = cls(
             measurement,

@@ -190,6 +190,7 @@ def test_infinity_is_where_light_comes_in_parallel() -> None:
     psf = made.psfs[0, 0] / made.psfs.max()
     photo = psf + np.roll(psf, (7, -20), (0, 1))
     picture = reconstruct(photo, made, z_um=math.inf, iterations=2, judged=False)
+    assert sum("Infinity lies outside the calibrated 60 to 300 mm" in text for text in picture.warnings) == 1
     pitch_um = WORLD.geometry.pixel_pitch_um
     assert picture.grid.pixel_mrad == pytest.approx(1e3 * pitch_um / WORLD.distance_um)
     row, column = picture.grid.centre
