@@ -103,6 +103,11 @@ class LearningProcedure(SeenAgain, Checked, Procedure):
         slm, out = require_slm(bench), writable(bench, folder, self.out, "display")
         place = load_alignment(self.alignment) if self.alignment is not None else None
         nominal = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
+
+        def progress(share: float, _words: str) -> None:
+            control.check()
+            listener.share(share, 1.0)
+
         with KeptFrames(bench, folder, "calibrate display", self) as kept:
             io = DisplayBench(
                 bench,
@@ -120,13 +125,8 @@ class LearningProcedure(SeenAgain, Checked, Procedure):
             seen = HologramCamera.registered(io, place.of(nominal))
             looks = photograph_looks(seen, self.patterns)
             bench.stop()
-        listener.step("learning")
-
-        def progress(share: float, _words: str) -> None:
-            control.check()
-            listener.share(share, 1.0)
-
-        lesson = learn_display(seen.display, looks, aside=ASIDE, on_progress=progress)
+            listener.step("learning")  # who interrupts it is told how to go on with the frames
+            lesson = learn_display(seen.display, looks, aside=ASIDE, on_progress=progress)
         found = learned_alignment(place, nominal, lesson, corrected=self.slm_calibration is not None)
         facts = {
             "bench": bench.label,
