@@ -68,7 +68,8 @@ class Verification:
         done = list(dict.fromkeys(file.remedy for file in self.files if file.remedy))
         if self.is_recording:
             if self.damaged:
-                done.append(f"marks frames {ranges([f.index for f in self.damaged], 8)} as lost")
+                many = "s" if len(self.damaged) > 1 else ""
+                done.append(f"marks frame{many} {ranges([f.index for f in self.damaged], 8)} as lost")
             if self.without_a_line:
                 done.append("keeps the images without a line")
         else:

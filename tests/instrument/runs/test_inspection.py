@@ -69,7 +69,7 @@ AWAY, AGAIN = "moves the images beyond the plan's away", "makes its files again"
         ({"is_recording": True, "without_a_line": (7,)}, "keeps the images without a line"),
         (
             {"is_recording": True, "without_a_line": (7,), "damaged": BAD[:1], "files": (PLAN_GONE,)},
-            f"{AGAIN}, marks frames 1 as lost, keeps the images without a line",
+            f"{AGAIN}, marks frame 1 as lost, keeps the images without a line",
         ),
     ],
 )
