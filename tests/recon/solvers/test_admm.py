@@ -10,7 +10,7 @@ from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.priors import L1, Box, Differences, HaarTotalVariation, NonNegativity, TotalVariation, Zero
 from recon.solvers import Admm, Fista, Penalties, StoppingRules, StopReason
-from recon.solvers.admm import _energy
+from recon.solvers.admm import DataSplit, _energy
 from recon.solvers.prior_splits import split_prior
 from tests.recon.solvers.literal_admm import LiteralAdmm, circular
 
@@ -224,3 +224,18 @@ def test_zero_data_gives_zero():
     out = Admm(operator, 0 * data, PRIORS["tv"]).run()
     assert out.stop_reason is StopReason.CONVERGED
     assert not out.solution.any()
+
+
+@pytest.mark.parametrize("relax", [1.0, 1.6])
+def test_the_sums_of_the_datas_split_are_those_of_the_whole_grid(relax):
+    """Beyond the sensor, too, where nothing is transformed back: residual, what the prox leaves and takes."""
+    camera, data = problem()
+    rng = np.random.default_rng(5)
+    split = DataSplit(camera, data, np.ones_like(data), 0.7, rng.random(camera.domain_shape), relax)
+    y = rng.random(camera.grid_shape)
+    split.solve(0, y, 0.3, 0.2)
+    seen = np.fft.irfft2(np.fft.rfft2(y) * camera.spectrum[0, 0], camera.grid_shape)
+    state, taken = (np.fft.irfft2(part[0], camera.grid_shape) for part in (split.T, split.Q))
+    np.testing.assert_allclose(
+        split.sums[0, [1, 3, 4]], [np.sum(a**2) for a in (seen - state + taken, state - taken, taken)]
+    )

@@ -95,6 +95,14 @@ def solver(data=None, **options):
     return OperatorAdmm(camera, central, clean if data is None else data, prior, **options)
 
 
+def test_the_preconditioner_weighs_differences_along_rows_and_columns_each_by_its_own_weight():
+    some = solver()
+    height, width = some.operator.grid_shape
+    along = [np.abs(np.exp(2j * np.pi * np.arange(n) / n) - 1) ** 2 for n in (height, width)]
+    expected = 4 * along[0][:, None] + 9 * along[1][: width // 2 + 1] + some._pixels
+    np.testing.assert_allclose(some._lateral_eigenvalues(np.array([7.0, 2.0, 3.0])), expected, atol=1e-12)
+
+
 def test_goes_on_from_a_checkpoint():
     whole, first, second = solver(), solver(), solver()
     whole.run(StoppingRules(iterations=12, tolerance=0))
