@@ -14,7 +14,7 @@ from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, read_stack
 from instrument.files.volumes import numbers
-from instrument.reconstruction.defects import mended_psf
+from instrument.reconstruction.defects import mended_stack
 from instrument.reconstruction.forecast import Forecast, forecast
 from instrument.reconstruction.job import (
     Job,
@@ -218,11 +218,7 @@ def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOpt
             return job_from_calibration(psfs, image, inputs)
         own = image.path if isinstance(image, ImageFile) else image
         psfs = read_stack(psfs, leave_out=own)
-    stack, n_mended = psfs.pixels, 0
-    if inputs.erasures != "none":
-        mended = [mended_psf(p) for p in stack]
-        n_mended = sum(count for _, count in mended)
-        stack = np.stack([p for p, _ in mended]) if n_mended else stack
+    stack, n_mended = mended_stack(psfs.pixels) if inputs.erasures != "none" else (psfs.pixels, 0)
     pixels = stack.astype(np.float32)
     if stack.dtype.kind == "u":
         pixels = np.maximum(pixels - min(darkest_block(p) for p in pixels), 0)

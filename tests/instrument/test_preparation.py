@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, write_image
-from instrument.reconstruction.defects import defective_pixels, mended_psf
+from instrument.reconstruction.defects import defective_pixels, mended_psf, mended_stack
 from instrument.reconstruction.job import find_calibration, job_from_calibration, job_from_files
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import (
@@ -309,6 +309,23 @@ def test_hot_and_dead_pixels_of_a_psf_are_filled_unless_they_are_its_spots() -> 
     spots = np.zeros(psf.shape, np.uint16)
     spots[rng.integers(0, 120, 30), rng.integers(0, 160, 30)] = 60_000
     assert mended_psf(spots)[1] == 0
+    for seed in range(4):  # what is left of a pinhole's PSF is noise, spread out and of any sum
+        pinhole = np.random.default_rng(seed).normal(100, 5, psf.shape)
+        pinhole[60, 80] = 30_000
+        assert mended_psf(pinhole)[1] == 0
+
+
+def test_a_defect_stays_where_it_is_at_all_depths_and_a_focus_is_at_one() -> None:
+    rng = np.random.default_rng(6)
+    stack = np.stack([100 * gaussian_filter(rng.random((60, 80)), 2.0) for _ in range(5)])
+    stack[2, 20, 30] += 90
+    assert mended_stack(stack)[0] is stack
+    hot = stack.copy()
+    hot[:, 40, 50] += 90
+    mended, count = mended_stack(hot)
+    assert count == 5
+    np.testing.assert_array_equal((mended != hot).sum(axis=(1, 2)), 1)
+    assert mended_psf(stack[2])[1] == 1, "which one depth alone cannot tell"
 
 
 def test_a_share_is_erased_at_random_and_the_same_every_time() -> None:
