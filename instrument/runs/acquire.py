@@ -95,7 +95,9 @@ def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
 
 
 def time_scale(bench: Bench) -> float:
-    """Return the real seconds that a simulated second of a bench takes."""
+    """Return the real seconds that a second of exposures and motion takes: 1 unless all is simulated."""
+    if len(bench.simulated_kinds) < len(bench.devices):
+        return 1.0
     return max((getattr(s.options, "time_scale", 1.0) for s in bench.config.shared.values()), default=1.0)
 
 

@@ -127,6 +127,14 @@ def test_a_bench_without_stage_and_lights_is_read_too() -> None:
     assert (abilities.n_leds, abilities.stage_target) == (0, None)
 
 
+def test_a_real_camera_beside_a_simulated_stage_takes_its_time() -> None:
+    world = SimpleNamespace(options=SimpleNamespace(time_scale=0.0))
+    for simulated, expected in ((("stage",), 1.0), (("camera", "stage"), 0.0)):
+        config = SimpleNamespace(shared={"simulated": world})
+        bench: Any = MagicMock(config=config, devices={"camera": 1, "stage": 2}, simulated_kinds=simulated)
+        assert acquire.time_scale(bench) == expected
+
+
 @pytest.mark.parametrize(
     ("damaged", "there", "todo", "refused"),
     [
