@@ -178,11 +178,12 @@ def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
     middle = min(n_z // 2, n_z - 2)
     across = float(grid.pitch_um[order][n_z // 2]) if voxel_um is None else voxel_um
     deep = float(steps[middle]) if voxel_um is None else voxel_um
-    span = z[-1] - z[0] + (steps[0] + steps[-1]) / 2
+    near = _nearer(z)
+    span = z[-1] - z[0] + near + steps[-1] / 2
     # A voxel lies on the nearest plane, none of the planes outside, and half a step beyond the outermost is
-    # filled: by voxels of which half or more lies there.
+    # filled: by voxels of which half or more lies there, and none of them in the diffuser.
     last = (z[-1] - z[0]) / deep
-    above = int(steps[0] / 2 / deep + HALF)
+    above = max(0, min(int(near / deep + HALF), int(z[0] / deep - HALF)))
     below = max(int(np.ceil(last - SAME)), int(last + steps[-1] / 2 / deep + HALF))
     places = z[0] + np.arange(-above, below + 1) * deep
     count = len(places)
@@ -288,6 +289,11 @@ def _places(metric: Grid) -> tuple[Floats, Floats]:
     return rows, columns
 
 
+def _nearer(nodes: Floats) -> float:
+    """Return how far the volume goes on before its nearest plane: half a step, or to the diffuser."""
+    return float(min((nodes[1] - nodes[0]) / 2, nodes[0]))
+
+
 def _shares(nodes: Floats, places: Floats, step: float) -> Floats:
     """Return which share of each plane's light goes to each place, (n_places, n_nodes).
 
@@ -296,8 +302,9 @@ def _shares(nodes: Floats, places: Floats, step: float) -> Floats:
     both sides would be deeper than it is, and its light, which lies along an oblique ray, beside it.
     """
     steps = np.diff(nodes)
-    first, last = nodes[0] - steps[0] / 2, nodes[-1] + steps[-1] / 2
-    thickness = (np.append(steps[0], steps) + np.append(steps, steps[-1])) / 2
+    halves = np.concatenate([[_nearer(nodes)], steps / 2, steps[-1:] / 2])
+    first, last = nodes[0] - halves[0], nodes[-1] + halves[-1]
+    thickness = halves[:-1] + halves[1:]
     # Of a voxel at either end the part counts that is in the volume.
     inside = np.minimum(places + step / 2, last) - np.maximum(places - step / 2, first)
     shares: Floats = _between(nodes, places, step) * np.clip(inside, 0, step)[:, None] / thickness

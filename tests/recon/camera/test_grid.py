@@ -116,6 +116,20 @@ def test_the_light_of_a_plane_stays_where_steps_differ(plane):
     assert made.sum(dtype=float) == pytest.approx(volume.sum(), rel=0.02)
 
 
+@pytest.mark.parametrize(("z_mm", "voxel_um"), [((5, 20), 1000.0), ((5, 20), 700.0), ((1, 10, 12, 14), None)])
+def test_a_metric_grid_ends_before_the_diffuser(z_mm, voxel_um):
+    """Half a step before the nearest plane may lie behind it, where no ray of a scene comes from."""
+    z_um = 1e3 * np.array(z_mm, float)
+    grid = Grid((len(z_um), 60, 80), (30, 40), z_um, 0.05 * z_um)
+    for plane in range(len(z_um)):
+        volume = np.zeros(grid.shape, np.float32)
+        volume[plane, 20:40, 20:60] = 1
+        made, placed = metric_volume(volume, grid, voxel_um)
+        assert placed.z_um[0] >= 0.499 * placed.spacing_um[0]
+        assert made.min() >= 0
+        assert made.sum(dtype=float) == pytest.approx(volume.sum(), rel=0.05)
+
+
 def test_a_deep_voxel_is_the_mean_of_what_lies_about_it():
     """Light that grows evenly with depth does so on voxels five planes deep, too, and is centred on them."""
     z = np.arange(40) * 10.0 + 1e5
