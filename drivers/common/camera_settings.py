@@ -247,14 +247,12 @@ class KeptSettings(Camera):
 
     def _bring_back(self) -> None:
         """Make all settings again; where one fails, all stay remembered."""
-        remembered = dict(self._remembered)  # bringing one back may forget another
+        remembered = dict(self._remembered)  # bringing one back may forget another, or rename it meanwhile
         try:
             own = [name for name in remembered if name.startswith(_OWN)]
             for name in (*own, *_ORDER):
-                if (
-                    name in remembered
-                ):  # what one before it has forgotten, and as one before it has renamed it
-                    self._remembered.get(name, remembered[name])()
+                if name in remembered:
+                    remembered[name]()
         except BaseException:
             self._remembered = remembered
             raise

@@ -224,13 +224,11 @@ class V4l2Camera(RunningCamera):
 
     def _look_at_images(self) -> None:
         """Take over what a control has made of format and region: one that turns them moves the mosaic."""
-        before, roi, whole = self._images.format.name, self._roi, self._images.whole
+        roi, whole = self._roi, self._images.whole
         self._images.look_again()
         self._roi = self._images.whole
         if roi != whole and self._roi == whole:
             self._roi = self._images.cut(roi)
-        if (now := self._images.format.name) != before and "pixel_format" in self._remembered:
-            self._remember("pixel_format", lambda: self.set_pixel_format(now))
 
     def own_settings(self) -> Mapping[str, OwnSetting]:
         """Return the controls that can be set, but for what the driver looks after."""
@@ -255,8 +253,11 @@ class V4l2Camera(RunningCamera):
             raise LimitError(
                 self.name, f"control {name} does not take {value!r}.", f"It takes {known.takes}."
             ) from None
+        before = self._images.format.name
         self.set_control(name, number)
         self._remember_own(name, value)
+        if (now := self._images.format.name) != before and "pixel_format" in self._remembered:
+            self._remember("pixel_format", lambda: self.set_pixel_format(now))
         return self._controls.text(self._controls.named(name))
 
     # Exposure, gain, black level -------------------------------------------------------------------

@@ -117,7 +117,8 @@ class Turning(Table):
     def _write_switch(self, name: str, value: bool) -> None:
         super()._write_switch(name, value)
         if name == "ReverseX":
-            self.of["PixelFormat"] = ["BayerGR12", "BayerGR12"] if value else ["BayerRG12", "BayerRG12"]
+            old, new = ("RG", "GR") if value else ("GR", "RG")
+            self.of["PixelFormat"] = [entry.replace(old, new) for entry in self.of["PixelFormat"]]
             self.of["Gain"][0] = 6.0
 
 
@@ -162,6 +163,21 @@ def test_a_feature_that_changes_the_images_is_known_to_have() -> None:
     camera._features.of["PixelFormat"] = ["YUV422", "YUV422", "BayerRG12"]  # type: ignore[attr-defined]
     with pytest.raises(DeviceError, match=r"sends YUV422, which cannot be read\. Readable: BayerRG12"):
         camera._look_again()
+
+
+def test_the_format_that_was_set_comes_back_with_what_turned_its_mosaic() -> None:
+    def fresh() -> Turning:
+        return table(PixelFormat=["BayerRG12", "BayerRG12", "BayerRG8"])
+
+    camera = OfTable(fresh(), features={"ReverseX": False})  # type: ignore[abstract]
+    camera.set_pixel_format("BayerRG8")
+    camera.set_own("ReverseX", "true")
+    for _ in range(2):
+        assert camera.pixel_format == "BayerGR8"
+        camera._features = fresh()  # lost, and opened again
+        camera._prepare()
+        camera._bring_back()
+    assert camera.pixel_format == "BayerGR8"
 
 
 def test_no_frame_rate_holds_triggers_back() -> None:

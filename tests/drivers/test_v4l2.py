@@ -113,15 +113,17 @@ def test_a_control_that_turns_the_pixels_turns_the_mosaic() -> None:
         camera.set_own("horizontal_flip", "0")
         assert (camera.pixel_format, camera.roi) == ("BayerRG8", Roi(4, 8, 20, 30))
         assert camera.snap().metadata.pixel_format == "BayerRG8"
-        camera.start_sequence()
-        with pytest.raises(DeviceError, match="streams: no new horizontal_flip now"):
-            camera.set_own("horizontal_flip", "1")
-        kernel.unplugged = True
-        with pytest.raises(DeviceLostError):
-            [camera.next_frame(1.0) for _ in range(20)]
-        kernel.unplugged = False
-        camera.open()  # as bench.toml has it, then as it was set since
-        assert (camera.pixel_format, camera.roi) == ("BayerRG8", Roi(4, 8, 20, 30))
+        for chosen in ("BayerRG8", "Mono8 (YUYV)"):
+            camera.set_pixel_format(chosen)
+            camera.start_sequence()
+            with pytest.raises(DeviceError, match="streams: no new horizontal_flip now"):
+                camera.set_own("horizontal_flip", "1")
+            kernel.unplugged = True
+            with pytest.raises(DeviceLostError):
+                [camera.next_frame(1.0) for _ in range(20)]
+            kernel.unplugged = False
+            camera.open()  # as bench.toml has it, then as it was set since
+            assert (camera.pixel_format, camera.roi) == (chosen, Roi(4, 8, 20, 30))
 
 
 @pytest.mark.parametrize("crop_step", [0, 8])
