@@ -21,6 +21,7 @@ from drivers.genicam.features import (
     STEADY,
     SWITCHED,
     Features,
+    FeatureValue,
 )
 from drivers.genicam.images import TRIGGER_EDGES, Images, set_trigger, trigger_lines
 
@@ -154,15 +155,28 @@ class GenicamCamera(BufferedCamera):
             number = float(value) if kind == "number" else 0.0
         except ValueError:
             raise LimitError(self.name, f"takes no {name} {value!r}.", f"It takes {known.takes}.") from None
+        was = self._features.number(name) if kind == "number" else self._features.text(name)
+        before = self._images.format_name
         self._features.set_any(
             name, number if kind == "number" else value == "true" if kind == "switch" else value
         )
+        try:
+            self._look_again()
+        except BaseException as error:  # images that cannot be read, say: it stays as it was
+            self._set_back(name, was, error)
+            raise
         self._remember_own(name, value)
-        before = self._images.format_name
-        self._look_again()
         if (now := self._images.format_name) != before and "pixel_format" in self._remembered:
             self._remember("pixel_format", lambda: self.set_pixel_format(now))
         return self._features.text(name)
+
+    def _set_back(self, name: str, was: FeatureValue, error: BaseException) -> None:
+        """Undo a feature whose change led to an error; that this fails too becomes a note."""
+        try:
+            self._features.set_any(name, was)
+            self._look_again()
+        except DeviceError as another:
+            error.add_note(f"Nor could {name} be set back: {another}")
 
     # Exposure, gain, black level -------------------------------------------------------------------
     @property

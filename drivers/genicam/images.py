@@ -59,21 +59,21 @@ class Images:
         return dict(best)
 
     def look_again(self) -> None:
-        """Read format, region and binning, which another feature may have changed.
+        """Read format, region and binning, which another feature may have changed; where it raises, all stay.
 
         Raises DeviceError when the format is none that can be read; LimitError when it bins differently along
         the two axes.
         """
-        features = self._features
-        self.formats = self._read_formats()
-        if (now := features.text("PixelFormat")) not in self.formats:
+        features, binning = self._features, self.binning
+        formats = self._read_formats()
+        if (now := features.text("PixelFormat")) not in formats:
             raise DeviceError(
-                features.name, f"sends {now}, which cannot be read.", f"Readable: {', '.join(self.formats)}."
+                features.name, f"sends {now}, which cannot be read.", f"Readable: {', '.join(formats)}."
             )
-        self.format_name = now
-        compile_kernels(self.format.packing)
         if features.find("BinningHorizontal"):
-            self.binning = self._same_along([features.number(f"Binning{axis}") for axis in _AXES])
+            binning = self._same_along([features.number(f"Binning{axis}") for axis in _AXES])
+        self.formats, self.format_name, self.binning = formats, now, binning
+        compile_kernels(self.format.packing)
         self.roi = self._read_roi()
 
     def _same_along(self, made: list[float]) -> int:

@@ -180,6 +180,26 @@ def test_the_format_that_was_set_comes_back_with_what_turned_its_mosaic() -> Non
     assert camera.pixel_format == "BayerGR8"
 
 
+class Blinding(Turning):
+    """Turned, it sends what cannot be read."""
+
+    def _write_switch(self, name: str, value: bool) -> None:
+        super()._write_switch(name, value)
+        self.of["PixelFormat"] = ["YUV422", "YUV422", "BayerGR8"] if value else ["BayerRG12", "BayerRG12"]
+
+
+def test_a_feature_that_makes_the_images_unreadable_is_set_back_and_not_remembered() -> None:
+    camera = OfTable(Blinding(**table().of), features={"ReverseX": False})  # type: ignore[abstract]
+    with pytest.raises(DeviceError, match="sends YUV422, which cannot be read"):
+        camera.set_own("ReverseX", "true")
+    assert (camera._features.text("ReverseX"), camera._remembered) == ("false", {})
+    assert (camera.pixel_format, camera.significant_bits) == ("BayerRG12", 12)
+    camera._features.of["PixelFormat"] = ["YUV422", "YUV422", "Mono8"]  # type: ignore[attr-defined]
+    with pytest.raises(DeviceError, match="cannot be read"):
+        camera._look_again()
+    assert (camera.pixel_formats, camera.significant_bits) == (("BayerRG12",), 12)
+
+
 def test_no_frame_rate_holds_triggers_back() -> None:
     rate = {"AcquisitionFrameRate": [5.0, 1.0, 100.0, 0], "AcquisitionFrameRateEnable": True}
     lines = {"TriggerMode": ["Off", "On", "Off"], "TriggerSource": ["Line1", "Line1", "Software"]}
