@@ -165,8 +165,10 @@ class ProcedurePanel(Panel):
         self._started: set[str] = set()
         self._said_at_end = ""
         """How the last procedure ended, as long as that is shown."""
-        self._doubted = False
-        """Whether it left doubts about the bench, with what was lost still lost."""
+        self._doubted: frozenset[str] = frozenset()
+        """The devices that it left doubts about, until all were lost and are there again."""
+        self._lost: set[str] = set()
+        """Which of them were lost: one that answered with an error was not, and the doubt about it stays."""
         self._check_job: Job | None = None
         self._again = False
         self._unchecked = False
@@ -317,7 +319,7 @@ class ProcedurePanel(Panel):
         self.other_button.hide()
         self.way_on.offer(None)
         self._left.forget()
-        self._said_at_end, self._doubted = "", False
+        self._said_at_end, self._doubted = "", frozenset()
         self._say(f"{title} has begun.", wrong=False)
         self.run_bar.set_running(True)
         self.views.setEnabled(False)
@@ -468,14 +470,20 @@ class ProcedurePanel(Panel):
         self._said_at_end = ""
         self._say(words, wrong=wrong)
         self._said_at_end = words
-        self._doubted = _is_doubted(words)
+        devices = self.session.bench.devices.items() if _is_doubted(words) else ()
+        self._doubted = frozenset(kind for kind, device in devices if device.name in words)
+        self._lost = {kind for kind in self._doubted if self.session.state(kind).condition == "failed"}
 
     def _reconnected(self, kind: str) -> None:
-        """Let go of a doubt about the bench once what was lost is there again; STOP settles it."""
-        states = [self.session.state(kind).condition for kind in self.session.kinds]
-        if self._doubted and self.session.is_open(kind) and "failed" not in states:
-            self._doubted = False
-            self.run_bar.words.setText("Failed; connected again since. STOP makes sure that it is safe")
+        """Let go of a doubt about devices once all were lost and are there again; STOP settles it."""
+        if kind not in self._doubted:
+            return
+        if self.session.state(kind).condition == "failed":
+            self._lost.add(kind)
+        elif self._lost == self._doubted and all(map(self.session.is_open, self._doubted)):
+            self._doubted = frozenset()
+            how, _, _ = self.run_bar.words.text().partition(";")
+            self.run_bar.words.setText(f"{how}; connected again since. STOP makes sure that it is safe")
             mark(self.verdict, "refused", False)
 
     def _over(self) -> None:

@@ -160,6 +160,7 @@ class TaskRun(QObject):
         self._desk: WindowDesk | None = None
         self._held = False
         """Whether it is to wait, also where its job has not begun yet."""
+        self._holding = threading.Lock()
         self._timer = every(self, _LOOK_MS, self._look)
         self._timer.stop()
 
@@ -174,9 +175,10 @@ class TaskRun(QObject):
         """Carry out a task, in a job; ``seen``: how pictures are turned now."""
 
         def work(context: JobContext) -> Done:
-            self._desk = desk = WindowDesk(context, seen or {})
-            if self._held:
-                desk.pause(True)
+            desk = WindowDesk(context, seen or {})
+            with self._holding:
+                self._desk = desk
+                desk.pause(self._held)
             return do(desk)
 
         self._desk, self._held = None, False
@@ -190,15 +192,17 @@ class TaskRun(QObject):
 
     def pause(self) -> None:
         """Let it wait where it next tells how far it is."""
-        self._held = True
-        if self._desk is not None:
-            self._desk.pause(True)
+        self._hold(True)
 
     def resume(self) -> None:
         """Go on."""
-        self._held = False
-        if self._desk is not None:
-            self._desk.pause(False)
+        self._hold(False)
+
+    def _hold(self, on: bool) -> None:
+        with self._holding:
+            self._held = on
+            if self._desk is not None:
+                self._desk.pause(on)
 
     def abort(self) -> None:
         """End it as soon as it can; what can be kept is kept."""

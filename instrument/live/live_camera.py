@@ -69,13 +69,14 @@ class LiveCamera:
     def stop(self) -> None:
         """End the sequence; does nothing without one."""
         with self._changing:
-            stream, self._stream = self._stream, None
+            stream = self._stream
             self._coarse_first(False)
             if stream is not None:
                 try:
                     stream.close()
                 finally:
-                    with self._counting:
+                    with self._counting:  # each frame is counted once: by its stream, then here
+                        self._stream = None
                         self._acquired_before += stream.acquired
                         self._dropped_before += stream.dropped
                         self._history.clear()

@@ -270,14 +270,17 @@ def test_after_a_fault_the_way_on_is_a_button_where_it_happened(
     assert (run.path / "calibration" / "calibration.json").is_file()
     panel._failed(Ended("The stage was lost."))
     assert "nothing moves" in panel.run_bar.words.text()
-    panel._failed(Ended(f"{MOTION_DOUBT}: look."))
-    assert "may not be safe" in panel.run_bar.words.text()
-    session.note_failure(DeviceError(session.bench.camera.name, "was lost."), surely=True)
-    assert "may not be safe" in panel.run_bar.words.text()
-    qtbot.waitUntil(again.isVisible, timeout=WAIT_MS)
-    press(qtbot, again)
-    qtbot.waitUntil(lambda: "connected again" in panel.run_bar.words.text(), timeout=WAIT_MS)
-    assert not panel.verdict.property("refused")
+    camera, light = session.bench.camera.name, session.bench.led_array.name
+    for doubted, settled in ((camera, True), (f"{camera}, {light}", False)):  # the light only refused
+        panel._failed(Ended(f"{MOTION_DOUBT}: {doubted} did not answer."))
+        assert "may not be safe" in panel.run_bar.words.text()
+        session.note_failure(DeviceError(camera, "was lost."), surely=True)
+        assert "may not be safe" in panel.run_bar.words.text()
+        qtbot.waitUntil(again.isVisible, timeout=WAIT_MS)
+        press(qtbot, again)
+        qtbot.waitUntil(lambda: session.is_open("camera"), timeout=WAIT_MS)
+        assert ("Failed; connected again" in panel.run_bar.words.text()) is settled
+        assert panel.verdict.property("refused") is not settled
 
 
 def answer(question: QMessageBox | None, words: str) -> Any:

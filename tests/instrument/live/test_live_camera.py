@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from drivers.common.stream import FrameStream
 from drivers.errors import DeviceError, DeviceLostError
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
@@ -46,6 +47,36 @@ def test_a_pause_goes_on_and_hides_no_error_where_the_camera_does_not(
         assert not live.is_running
         paused(live, lambda: running.append(live.is_running))  # did not run before: is not started
         live.stop()
+
+
+def test_frames_are_counted_once_while_their_stream_ends_in_another_thread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    closing, go_on = threading.Event(), threading.Event()
+    close = FrameStream.close
+
+    def slowly(stream: FrameStream) -> None:
+        close(stream)
+        closing.set()
+        go_on.wait(20)
+
+    monkeypatch.setattr(FrameStream, "close", slowly)
+    with open_bench(parse_config(BENCH, None)) as bench:
+        live = LiveCamera(bench.camera)
+        live.start()
+        while not live.status().acquired:
+            pass
+        ending = threading.Thread(target=live.stop)
+        ending.start()
+        assert closing.wait(20)
+        during = live.status()
+        go_on.set()
+        ending.join()
+        after = live.status()
+    assert during.acquired == after.acquired > 0
+    assert during.frames_per_s >= 0
+    assert not during.running
+    assert after.frames_per_s == 0
 
 
 def test_an_end_in_another_thread_does_not_disturb_who_counts() -> None:
