@@ -305,6 +305,9 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
             for place, field in enumerate(fields):
                 fields[place] = two_part(field, response, points=options.points)
                 advance(place + 1)
+    provenance = {**fields[0].provenance, "refocused_from": str(folder.resolve())}
+    if beyond := [one.warning for one in made if one.extrapolated]:
+        provenance["extrapolated"] = " ".join(filter(None, (provenance.get("extrapolated"), *beyond)))
     new = replace(
         fields[0],
         psfs=np.concatenate([field.psfs for field in fields]),
@@ -321,7 +324,7 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
                 for one in made
             ]
         },
-        provenance={**fields[0].provenance, "refocused_from": str(folder.resolve())},
+        provenance=provenance,
     )
     path = save_calibration(new, options.out, overwrite=options.force)
     if measured.provenance.get("simulated"):

@@ -66,6 +66,20 @@ def test_a_psf_at_another_depth_is_a_calibration(
     assert main([*words, "--force"]) == 0
 
 
+def test_a_psf_beyond_the_calibrated_depths_is_warned_of_wherever_it_is_used(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    depths = ["--z-mm", "75", "--z-mm", "150", "--z-mm", "200"]
+    assert main(["refocus", str(folder / "calibration"), *depths, "--out", str(tmp_path / "far")]) == 0
+    capsys.readouterr()
+    words = ["--calibration", str(tmp_path / "far"), "--image", str(folder / "photo.tif"), "--dark", "0"]
+    words += ["--z-mm", "150", "--method", "wiener", "--tau", "0.01", "--out", str(tmp_path / "picture.tif")]
+    assert main(["reconstruct", *words]) == 0
+    told = " ".join(capsys.readouterr().err.split())
+    assert "150 mm lies outside the calibrated 60 to 100 mm" in told
+    assert "200 mm lies outside" in told
+
+
 def test_the_angular_response_makes_a_field_of_one_psf(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
