@@ -235,6 +235,22 @@ class CompositeStage(Stage):
         self._require()
         return any(moving for _, moving in self._asked(lambda part: part.is_moving))
 
+    @property
+    def needs_unlocking(self) -> bool:
+        """Whether an alarm holds any part that only ``unlock`` ends."""
+        return any(part.needs_unlocking for part in self._parts.values())
+
+    def unlock(self) -> None:
+        """Unlock the parts that need it, each even if another fails; the others keep their positions.
+
+        Raises DeviceError where none needs it.
+        """
+        self._require()
+        locked = {name: part.unlock for name, part in self._parts.items() if part.needs_unlocking}
+        if not locked:
+            super().unlock()
+        self._all_at_once(locked)
+
     def home(self) -> None:
         """Home part after part, in the order of ``bench.toml``; blocks until done."""
         self._require()

@@ -125,6 +125,26 @@ def test_a_part_that_fails_stops_the_others(stage: CompositeStage, chain: ZaberC
     assert stage.position()["x_um"] != pytest.approx(middle(stage)["x_um"], abs=1.0)
 
 
+def test_a_part_that_an_alarm_locks_is_unlocked_alone(board: GrblController, chain: ZaberChain) -> None:
+    board.settings |= {20: 0, 21: 1, 22: 0}  # no homing switches
+    here = {"homing": "here", "axes": {"x_um": {"lower_limit": -9e3, "upper_limit": 9e3}}}
+    parts = {
+        "xyz": {"driver": "grbl", "port": str(board.link), **here},
+        "tilt": {"driver": "zaber", "port": str(chain.port.link), "axes": ROTATIONS},
+    }
+    with CompositeStage(CompositeOptions.model_validate({"parts": parts})) as stage:
+        board.press_reset()
+        stage._parts["xyz"].home()
+        with pytest.raises(DeviceError, match="has no lock"):
+            stage.unlock()
+        board.hit_limit_switch()
+        while not stage.needs_unlocking:
+            stage.position()
+        stage.unlock()
+        stage.position()
+        assert not stage.needs_unlocking
+
+
 def test_a_part_that_is_unplugged_stops_the_others_and_comes_back(
     stage: CompositeStage, chain: ZaberChain
 ) -> None:
