@@ -190,10 +190,7 @@ class GenicamCamera(BufferedCamera):
         """
         features, wanted = self._features, self.options.frames_per_s
         is_free = self._trigger_mode == "free_run"
-        if (enable := features.find(*FRAME_RATE_ENABLE)) and features.kind(enable) == "switch":
-            limited = is_free and (self._found_limited or wanted is not None)
-            if SWITCHED.get(features.text(enable).lower()) != limited:
-                features.set_any(enable, limited)
+        self._limit_rate(is_free and (self._found_limited or wanted is not None))
         if wanted is not None and is_free:
             if self._rate_name is None:
                 raise DeviceError(self.name, "its frame rate cannot be set.", "Leave frames_per_s out.")
@@ -206,6 +203,15 @@ class GenicamCamera(BufferedCamera):
                 )
             features.set_number(self._rate_name, wanted)
         self._rate = features.number(self._rate_name) if self._rate_name else 0.0
+
+    def _limit_rate(self, limited: bool) -> None:
+        """Let the frame rate be held to its number, or not, where the camera has a switch for that."""
+        features = self._features
+        enable = features.find(*FRAME_RATE_ENABLE)
+        if enable is None or features.kind(enable) != "switch":
+            return
+        if SWITCHED.get(features.text(enable).lower()) != limited:
+            features.set_any(enable, limited)
 
     @property
     def exposure_limits_ms(self) -> tuple[float, float]:
@@ -354,6 +360,9 @@ class GenicamCamera(BufferedCamera):
         return 1e3 / fastest if fastest > 0 else super().readout_ms
 
     def _write_trigger(self, mode: TriggerMode) -> None:
+        if mode != "free_run":  # some cameras lock the switch of their rate while TriggerMode is On
+            set_trigger(self._features, "free_run", self._trigger_line, self._trigger_edge)
+            self._limit_rate(False)
         set_trigger(self._features, mode, self._trigger_line, self._trigger_edge)
 
     def _fire(self) -> None:

@@ -200,11 +200,20 @@ def test_a_feature_that_makes_the_images_unreadable_is_set_back_and_not_remember
     assert (camera.pixel_formats, camera.significant_bits) == (("BayerRG12",), 12)
 
 
+class Locking(Table):
+    """Locks the switch of its frame rate while it waits for triggers."""
+
+    def _write_switch(self, name: str, value: bool) -> None:
+        if name == "AcquisitionFrameRateEnable" and self.text("TriggerMode") == "On":
+            raise ValueError("it is not writable")
+        super()._write_switch(name, value)
+
+
 def test_no_frame_rate_holds_triggers_back() -> None:
-    rate = {"AcquisitionFrameRate": [5.0, 1.0, 100.0, 0], "AcquisitionFrameRateEnable": True}
     lines = {"TriggerMode": ["Off", "On", "Off"], "TriggerSource": ["Line1", "Line1", "Software"]}
     for options in ({}, {"frames_per_s": 20.0}):
-        features = table(**{name: list(value) if value is not True else True for name, value in rate.items()})
+        rate = {"AcquisitionFrameRate": [5.0, 1.0, 100.0, 0], "AcquisitionFrameRateEnable": True}
+        features = Locking(**table(**rate).of)
         features.of |= {name: list(value) for name, value in lines.items()}
         camera = OfTable(features, **options)  # type: ignore[abstract]
         for mode, limited in (
