@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
+
 from instrument.files.errors import FileError, size
 
 _SLACK_BYTES = 1 << 20
@@ -89,7 +91,8 @@ def lzf_place(stored: Any) -> int | None:
 def require_lzf_pieces(path: Path, stored: Any, holds_bytes: int) -> None:
     """Refuse an HDF5 dataset with an LZF chunk that becomes far more than a chunk holds; as `require_pieces`.
 
-    Chunks that cannot become more than 256 MB are not walked through: that is slower than to inflate them.
+    Chunks that cannot become more than 256 MB, by their size or :func:`_lzf_most`, are not walked through:
+    that is slower than to inflate them.
     """
     place, most = lzf_place(stored), max(2 * holds_bytes + _SLACK_BYTES, _UNTOLD_BYTES)
     chunks: list[Any] = []
@@ -97,8 +100,25 @@ def require_lzf_pieces(path: Path, stored: Any, holds_bytes: int) -> None:
         stored.chunk_iter(chunks.append)
     for chunk in chunks:
         could = not chunk.filter_mask >> place & 1 and chunk.size * _LZF_SHRINKS > most
-        if could and _lzf_beyond(stored.read_direct_chunk(chunk.chunk_offset)[1], most):
+        if not could:
+            continue
+        data = stored.read_direct_chunk(chunk.chunk_offset)[1]
+        if _lzf_most(data) > most and _lzf_beyond(data, most):
             raise _beyond(path, most, holds_bytes, FileError)
+
+
+def _lzf_most(data: bytes) -> int:
+    """Return what LZF data become at most, wherever in them runs and copies begin: of two bytes at one.
+
+    A run is shorter than it is stored. A copy of two bytes is longer by its first byte's upper bits, one of
+    three by 6 and its second byte.
+    """
+    n_bytes = len(data)
+    for start in range(0, len(data), _BLOCK_BYTES):
+        block = np.frombuffer(data[start : start + _BLOCK_BYTES + 1].ljust(_BLOCK_BYTES + 1, b"\0"), "u1")
+        longer = np.where(block[:-1] < 224, block[:-1] >> 5, block[1:].astype(np.uint16) + 6)
+        n_bytes += int(np.maximum(longer[::2], longer[1::2]).sum())
+    return n_bytes
 
 
 def _lzf_beyond(data: bytes, most: int) -> bool:

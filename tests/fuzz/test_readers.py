@@ -137,6 +137,22 @@ def test_what_lzf_shrinks_to_nothing_is_refused_by_its_size(tmp_path: Path, what
         read_image(path)
 
 
+@pytest.mark.parametrize("shuffle", [False, True])
+def test_frames_by_lzf_are_read_without_a_walk_through_their_pieces(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, shuffle: bool
+) -> None:
+    """Which takes ten times as long as to inflate them."""
+    h5py = pytest.importorskip("h5py")
+    path, frame = tmp_path / "lzf.h5", np.random.default_rng(0).poisson(900, (1600, 2000)).astype(np.uint16)
+    with h5py.File(path, "w") as file:
+        stored = file.create_dataset(
+            "image", data=frame, chunks=frame.shape, compression="lzf", shuffle=shuffle
+        )
+        assert 88 * stored.id.get_storage_size() > 1 << 28, "its size alone does not clear it"
+    monkeypatch.setattr("instrument.files.pieces._lzf_beyond", lambda *_: pytest.fail("walked"))
+    np.testing.assert_array_equal(read_image(path).pixels, frame)
+
+
 @pytest.mark.parametrize("compression", [8, 34925])
 def test_a_tiffs_strip_is_inflated_as_far_as_it_holds(tmp_path: Path, compression: int) -> None:
     whole, zeros = np.arange(6144, dtype=np.uint16).tobytes(), bytes(60 << 20)
