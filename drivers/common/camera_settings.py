@@ -61,6 +61,8 @@ _ORDER = (
 )
 """The order in which settings are brought back: each may change the limits of those after it."""
 _OWN = "own "
+OFF, ONCE = "Off", "Once"
+"""Of automatics: what is set by itself now, after which the feature reads "Off" (SFNC)."""
 
 
 class KeptSettings(Camera):
@@ -236,9 +238,16 @@ class KeptSettings(Camera):
         """Keep how a setting is made again after a reconnection; the latest counts."""
         self._remembered[name] = again
 
-    def _remember_own(self, name: str, value: str) -> None:
-        """Keep one of the device's own settings, too; they come back first, in the order they were set in."""
+    def _remember_own(self, name: str, value: str, choices: tuple[str, ...] = ()) -> None:
+        """Keep one of the device's own settings, too; they come back first, in the order they were set in.
+
+        What is done once, now, is not done again: of it comes back that it is off, where it can be.
+        """
         self._forget(key := f"{_OWN}{name}")
+        if value == ONCE in choices:
+            if OFF not in choices:
+                return
+            value = OFF
         self._remember(key, lambda: self.set_own(name, value))
 
     def _forget(self, name: str) -> None:

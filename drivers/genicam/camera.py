@@ -165,7 +165,7 @@ class GenicamCamera(BufferedCamera):
         except BaseException as error:  # images that cannot be read, say: it stays as it was
             self._set_back(name, was, error)
             raise
-        self._remember_own(name, value)
+        self._remember_own(name, value, known.choices)
         if (now := self._images.format_name) != before and "pixel_format" in self._remembered:
             self._remember("pixel_format", lambda: self.set_pixel_format(now))
         return self._features.text(name)

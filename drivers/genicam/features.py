@@ -6,10 +6,9 @@ from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager
 from typing import Literal
 
+from drivers.common.camera_settings import OFF, ONCE
 from drivers.errors import DeviceError, LimitError
 
-_ONCE = "Once"
-"""Of automatics: what is set by itself now, after which the feature reads "Off" (SFNC)."""
 SWITCHED = {"true": True, "false": False, "1": True, "0": False}
 FeatureValue = str | bool | int | float
 FeatureKind = Literal["number", "choice", "switch", "command", "text"]
@@ -24,7 +23,7 @@ FRAME_TRIGGERS = ("FrameStart", "FrameTrigger", "AcquisitionStart")
 FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
 AUTOMATICS = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto")
 STEADY = (
-    *((name, "Off") for name in AUTOMATICS),
+    *((name, OFF) for name in AUTOMATICS),
     ("AcquisitionMode", "Continuous"),
     ("ExposureMode", "Timed"),
 )
@@ -130,7 +129,7 @@ class Features(ABC):
             )
         with self.words(f"take {entry} for its {name}"):
             self._write_text(name, entry)
-        if (said := self.text(name)) != entry and entry != _ONCE:
+        if (said := self.text(name)) != entry and entry != ONCE:
             raise DeviceError(self.name, f"was told {name} = {entry} and has {said}.", "See its firmware.")
         return said
 

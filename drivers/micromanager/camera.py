@@ -175,10 +175,11 @@ class MicroManagerCamera(MicroManagerDevice, BufferedCamera):
 
     def set_own(self, name: str, value: str) -> Setting:
         """Set a property of the adapter; errors as :meth:`Part.set`, and LimitError for the driver's own."""
-        if name not in self.own_settings():
+        known = self.own_settings().get(name)
+        if known is None:
             return super().set_own(name, value)
         made = self._camera.set(name, value)
-        self._remember_own(name, value)
+        self._remember_own(name, value, known.choices)
         return made
 
     # Exposure, gain, black level -------------------------------------------------------------------

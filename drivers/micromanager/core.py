@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from drivers.common.camera_settings import ONCE
 from drivers.device import Device, DeviceIdentity, DriverOptions, FoundDevice, OwnSetting, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceNotOpenError, LimitError
 
@@ -305,7 +306,7 @@ class Part:
             )
         self.call(f"set {name!r} to {wanted!r}", "setProperty", name, wanted)
         said = self.text(name)
-        if choices and not _same(said, wanted):
+        if choices and wanted != ONCE and not _same(said, wanted):
             raise DeviceError(self.name, f"was told {name} = {wanted} and has {said}.", "See its adapter.")
         return said
 

@@ -200,6 +200,24 @@ def test_a_feature_that_makes_the_images_unreadable_is_set_back_and_not_remember
     assert (camera.pixel_formats, camera.significant_bits) == (("BayerRG12",), 12)
 
 
+class Balancing(Table):
+    """Has done at once what it is to do once."""
+
+    def _write_text(self, name: str, value: str) -> None:
+        super()._write_text(name, "Off" if value == "Once" else value)
+        self.of["Times"][0] += value == "Once"
+
+
+def test_what_was_done_once_is_not_done_again_when_a_lost_camera_is_back() -> None:
+    features = Balancing(**table(TintAuto=["Off", "Off", "Once", "Continuous"], Times=[0, 0, 9, 1]).of)
+    camera = OfTable(features, features={"TintAuto": "Continuous"})  # type: ignore[abstract]
+    for value in ("Continuous", "Once"):
+        camera.set_own("TintAuto", value)
+    camera._prepare()  # lost, and opened again
+    camera._bring_back()
+    assert (features.text("TintAuto"), features.number("Times")) == ("Off", 1)
+
+
 class Locking(Table):
     """Locks the switch of its frame rate while it waits for triggers."""
 

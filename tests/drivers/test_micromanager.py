@@ -429,6 +429,30 @@ def test_own_settings_are_the_properties_that_the_driver_leaves_alone(adapters: 
             camera.set_own("Exposure", "7")
 
 
+def test_what_was_done_once_may_read_off_afterwards_and_is_not_done_again(
+    adapters: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[object] = []
+    call = Part.call
+
+    def tinting(part: Part, doing: str, function: str, *values: object) -> object:
+        if function == "setProperty":
+            calls.append(values)
+        elif function == "getAllowedPropertyValues" and values == ("FastImage",):
+            return ("0", "1", "Off", "Once")
+        elif function == "getProperty" and calls and values == ("FastImage",):
+            return "Off"
+        else:
+            return call(part, doing, function, *values)
+        return None
+
+    with camera_on(manager_of(adapters, "Cam")) as camera:
+        monkeypatch.setattr(Part, "call", tinting)
+        assert camera.set_own("FastImage", "Once") == "Off"
+        camera._bring_back()
+        assert calls == [("FastImage", "Once"), ("FastImage", "Off")]
+
+
 def test_looking_for_an_installation_leaves_the_log_as_quiet_as_it_was() -> None:
     lines = (
         "import logging",
