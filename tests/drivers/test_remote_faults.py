@@ -426,13 +426,29 @@ def _said_to_be(descr: str, *shape: int) -> str:
 def test_an_operator_who_is_long_in_leaving_does_not_end_the_next_ones_frames(
     server: BenchServer, options: RemoteOptions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(serving, "_CLOSING_S", 0.3)
+    monkeypatch.setattr(serving, "_CLOSING_S", 0.1)
+    filming, left = threading.Event(), threading.Event()
+    part, after = serving._part, server._after
+
+    async def once_another_films(*args: Any) -> None:
+        await asyncio.to_thread(filming.wait, 30)
+        await part(*args)
+
+    async def told(*args: Any) -> None:
+        left.set()  # of the hold that is ended, its camera's frames too
+        await after(*args)
+
+    monkeypatch.setattr(serving, "_part", once_another_films)
+    monkeypatch.setattr(server, "_after", told)
 
     def film() -> None:
         with RemoteCamera(options) as camera:
             camera.start_sequence(4)
-            until_s = time.monotonic() + 3 * 0.3
-            while time.monotonic() < until_s:
+            camera.next_frame(10.0)
+            filming.set()
+            while not left.is_set():
+                camera.next_frame(10.0)
+            for _ in range(30):  # more than are under way
                 camera.next_frame(2.0)
 
     async def stopped_and_silent() -> None:
