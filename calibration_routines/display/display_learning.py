@@ -125,7 +125,8 @@ class LearningProcedure(SeenAgain, Checked, Procedure):
             seen = HologramCamera.registered(io, place.of(nominal))
             looks = photograph_looks(seen, self.patterns)
             bench.stop()
-            listener.step("learning")  # who interrupts it is told how to go on with the frames
+            kept.finish()
+            listener.step("learning")  # who interrupts it is told how to see the frames again
             lesson = learn_display(seen.display, looks, aside=ASIDE, on_progress=progress)
         found = learned_alignment(place, nominal, lesson, corrected=self.slm_calibration is not None)
         facts = {

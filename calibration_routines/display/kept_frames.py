@@ -88,7 +88,7 @@ class KeptFrames:
         self._run = None if again is None else Run.open(again)
         self._questions: list[str] = []
         self._writer: RunWriter | None = None
-        self._next = 0
+        self._next, self._complete = 0, False
         if self._run is not None:
             if (made := kept_by(self._run)) != command:
                 what = f"is of {made}" if made else "holds no frames of such a routine"
@@ -102,10 +102,11 @@ class KeptFrames:
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
     ) -> None:
         if error is not None and self.path is not None:
-            error.add_note(
-                f"{self._next} frames are kept. To go on with them: {_typed_again(self._typed, self.path)}"
-            )
-        if self._writer is not None:
+            kept, what = f"{self._next} frames are kept", "go on with them"
+            if self._complete:
+                kept, what = f"All {kept}", "see them again"
+            error.add_note(f"{kept}. To {what}: {_typed_again(self._typed, self.path)}")
+        if self._writer is not None and not self._complete:
             reason = FinishReason.COMPLETED
             if isinstance(error, EndedEarlyError):
                 reason = error.reason
@@ -114,6 +115,12 @@ class KeptFrames:
             elif error is not None:
                 reason = FinishReason.FAILED if isinstance(error, Exception) else FinishReason.ABORTED
             self._writer.finish(reason, "" if error is None else str(error) or type(error).__name__)
+
+    def finish(self) -> None:
+        """End the run: all frames are there, whatever becomes of what is computed from them."""
+        self._complete = True
+        if self._writer is not None:
+            self._writer.finish(FinishReason.COMPLETED)
 
     @property
     def path(self) -> Path | None:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
+from calibration_routines.display import display_learning
+from calibration_routines.display.display_learning import LearningProcedure
+from calibration_routines.display.hologram_photograph import HologramCamera
 from calibration_routines.display.mask_alignment import (
     AlignmentFailedError,
     AlignmentProcedure,
@@ -22,6 +26,7 @@ from instrument.files.errors import BenchError
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import EndedEarlyError, RunControl
+from recon.errors import InputError
 from tests.calibration_routines.display.test_mask_alignment import BENT, small
 
 TEXT = small(shape="[120, 160]").replace("settle_ms = 30.0", BENT)
@@ -103,6 +108,21 @@ def test_an_alignment_that_was_interrupted_says_where_the_stage_is_and_goes_on(t
     run = Run.open(path)
     assert len(run.records) == 10
     assert run.metadata(kept - 1).host_time_ns == began  # seen again, not taken again
+
+
+def test_frames_that_are_all_there_are_a_complete_run_whatever_becomes_of_the_learning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(display_learning, "learn_display", Mock(side_effect=InputError("too little")))
+    monkeypatch.setattr(HologramCamera, "registered", lambda io, _: Mock(io=io))
+    monkeypatch.setattr(display_learning, "photograph_looks", lambda seen, _: [seen.io.photograph(10.0)])
+    learning = LearningProcedure(out=tmp_path / "d.json")
+    with Bench(parse_config(small(), None)).open() as bench, pytest.raises(InputError) as ended:
+        learning.carry_out(bench, tmp_path)
+    (path,) = (p for p in tmp_path.iterdir() if p.is_dir())
+    run = Run.open(path)
+    assert (run.condition, len(run.records)) == (RunCondition.COMPLETED, 2)
+    assert "All 2 frames are kept. To see them again: " in " ".join(ended.value.__notes__)
 
 
 def test_a_run_of_something_else_is_refused(tmp_path: Path) -> None:
