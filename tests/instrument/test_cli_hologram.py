@@ -7,6 +7,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ from calibration_routines.display.hologram_photograph import (
 from calibration_routines.display.spot_photograph import photograph_spots
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
+from instrument.display import limit
 from instrument.display.hologram import (
     Alignment,
     CaptureOptions,
@@ -326,7 +328,7 @@ def test_the_limit_is_said_before_anything_is_computed(capsys):
 
 def test_the_time_of_a_limit_is_that_of_all_its_searches(monkeypatch: pytest.MonkeyPatch) -> None:
     now = iter((100.0, 100.0, 101.0, 109.0, 120.0, 130.0))
-    monkeypatch.setattr("time.perf_counter", lambda: next(now))
+    monkeypatch.setattr(limit, "time", SimpleNamespace(perf_counter=lambda: next(now)))
     asked = HologramOptions(time_s=10.0)
     shared = SharedTime(asked, 4)
     assert [shared.next(asked).time_s for _ in range(4)] == pytest.approx([2.5, 3.0, 0.5, 1e-3])
