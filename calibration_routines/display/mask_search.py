@@ -66,7 +66,8 @@ class AlignmentSettings(SeenAgain, Checked):
         label="Frames",
         metavar="N",
         help="Frames at most: gives up rather than take more.",
-        default_words=f"{FRAMES}, or {AFTER_SEARCH} beyond those of the search",
+        default_words=f"{FRAMES}, or {AFTER_SEARCH} beyond those of the search; more where its last pictures "
+        "are more",
     )
     division: Size = option(
         Size(3, 5),
@@ -132,7 +133,8 @@ class AlignmentSettings(SeenAgain, Checked):
         """Return how many frames may be taken."""
         if self.max_frames is not None:
             return self.max_frames
-        return max(FRAMES, self.search_pictures(display) + AFTER_SEARCH)
+        more = max(0, self.last_frames - AlignmentSettings().last_frames)
+        return max(FRAMES, self.search_pictures(display) + AFTER_SEARCH) + more
 
     def require(self, display: Display) -> None:
         """Refuse before anything moves what could only fail: no mask, sections, a search without end.

@@ -83,8 +83,8 @@ def test_it_says_so_when_it_fails_and_puts_the_stage_back() -> None:
     [
         ({"expansion": "1"}, {}, "has no mask"),
         ({}, {"division": Size(60, 5)}, "cannot be divided into"),
-        ({}, {"reach": 1e6}, "may be taken. Search less"),
-        ({}, {"depth_um": 1e9}, "may be taken. Search less"),
+        ({}, {"reach": 1e6, "max_frames": 80}, "may be taken. Search less"),
+        ({}, {"depth_um": 1e9, "max_frames": 80}, "may be taken. Search less"),
     ],
 )
 def test_what_can_only_fail_is_refused_before_anything_moves(changes, settings, words) -> None:
@@ -132,6 +132,9 @@ def test_as_many_frames_may_be_taken_as_the_search_of_the_bench_at_hand_needs() 
         display = bench_display(config, ((1080, 1920), 8.0), expansion=expansion)
         AlignmentSettings().require(display)
         assert AlignmentSettings().most_frames(display) == frames
+        many = AlignmentSettings(refinements=80, section_pictures=6)  # 76 and 2 more than by default
+        many.require(display)
+        assert many.most_frames(display) == frames + 78
     with pytest.raises(BenchError, match=r"takes 84 pictures .* 90 may be taken"):
         AlignmentSettings(max_frames=90).require(display)
 
