@@ -292,6 +292,8 @@ class StagePanel(DevicePanel):
     def _ask(
         self, title: str, text: str, answers: tuple[str, str], answered: Callable[[bool], object]
     ) -> None:
+        if self.question is not None and self.question.text() != text:  # of the other button
+            self.question.reject()
         if self.question is None:
             self.question = Question(self, title, text, answers, answered)
             self.session.stop_pressed.connect(self.question.reject)

@@ -10,6 +10,7 @@ from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
 from gui.panels.stage import StagePanel
+from gui.widgets.dialogues import Question
 
 WAIT_MS = 60_000
 LEFT = Qt.MouseButton.LeftButton
@@ -55,6 +56,11 @@ def test_an_alarm_that_homing_does_not_end_is_unlocked_after_a_question(
     monkeypatch.setattr(type(device), "unlock", lambda _: locked.clear(), raising=False)
     qtbot.waitUntil(stage.unlock_button.isVisible, timeout=WAIT_MS)
     assert stage.state.text().startswith("Locked by an alarm")
+    for asks, answer in ((stage.unlock_button, "Unlock"), (stage.home_button, "Home")):
+        qtbot.mouseClick(asks, LEFT)  # another question than the one that is open withdraws that one
+        assert stage.question is not None
+        assert answer in [b.text() for b in stage.question.buttons()]
+        assert [box.isVisible() for box in stage.findChildren(Question)].count(True) == 1
     for answer in ("Leave it locked", "Unlock"):
         assert locked
         qtbot.mouseClick(stage.unlock_button, LEFT)
