@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import BenchError
-from instrument.files.images import ImageFile, read_stack
+from instrument.files.images import ImageFile, read_image, read_stack
 from instrument.files.volumes import numbers
 from instrument.reconstruction.defects import mended_stack
 from instrument.reconstruction.forecast import Forecast, forecast
@@ -23,6 +23,7 @@ from instrument.reconstruction.job import (
     job_with,
     mended_note,
 )
+from instrument.reconstruction.mosaic import pattern_of
 from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.run_files import STATE
@@ -218,7 +219,9 @@ def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOpt
             return job_from_calibration(psfs, image, inputs)
         own = image.path if isinstance(image, ImageFile) else image
         psfs = read_stack(psfs, leave_out=own)
-    stack, n_mended = mended_stack(psfs.pixels) if inputs.erasures != "none" else (psfs.pixels, 0)
+    image = read_image(image, holes=True)
+    mends = pattern_of(inputs.mosaic, image) is None and inputs.erasures != "none"
+    stack, n_mended = mended_stack(psfs.pixels) if mends else (psfs.pixels, 0)
     pixels = stack.astype(np.float32)
     if stack.dtype.kind == "u":
         pixels = np.maximum(pixels - min(darkest_block(p) for p in pixels), 0)

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import tifffile
+from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
 from instrument.cli import main
@@ -216,6 +217,19 @@ def test_depths_that_are_no_distances_from_the_diffuser_are_not_taken(volume_fil
     job = volume_job(stack, volume_files["image"], InputOptions(distance_mm=6.0))
     assert np.isnan(job.calibration.source_positions_um).all()
     assert "taken for no distances" in job.notes["PSFs"]
+
+
+@pytest.mark.parametrize(("mosaic", "filled"), [(None, True), ("RGGB", False)])
+def test_psfs_under_a_mosaic_are_not_looked_through_for_hot_pixels(tmp_path, mosaic, filled):
+    """Its neighbours in a raw frame saw other colours (decision 0259)."""
+    rng = np.random.default_rng(6)
+    stack = np.stack([100 * gaussian_filter(rng.random((60, 80)), 2.0) for _ in range(5)])
+    stack[:, 40, 50] += 90
+    tifffile.imwrite(tmp_path / "psfs.tif", stack.astype(np.float32))
+    tifffile.imwrite(tmp_path / "raw.tif", rng.poisson(500, (60, 80)).astype(np.uint16))
+    inputs = InputOptions(mosaic=mosaic)
+    job = volume_job(tmp_path / "psfs.tif", tmp_path / "raw.tif", inputs)
+    assert ("filled" in job.notes.get("PSFs", "")) == filled
 
 
 def test_a_calibration_says_its_own_optics(tmp_path, psf, photograph):
