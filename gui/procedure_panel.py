@@ -297,8 +297,8 @@ class ProcedurePanel(Panel):
             free = "" if outlook.free_bytes is None else f" of {size(outlook.free_bytes)} free"
             lines.insert(
                 0,
-                f"{count(cost.frames, 'frame')}, {size(cost.total_bytes)}{free}, {cost.time} of "
-                f"exposure and motion, {count(cost.moves, 'move')}",
+                f"{count(cost.frames, 'frame')}, {size(cost.total_bytes)}{free}, "
+                f"{cost.time_of_motion}, {count(cost.moves, 'move')}",
             )
         self._say("\n".join(lines), wrong=False)
 

@@ -148,7 +148,7 @@ def plan_lines(bench: Bench, sweep: PointSweep, plan: Plan, folder: Path | None)
     lines.append(
         f"Plan: {what} x {count(sweep.average, 'frame')}{revisits} + {count(dark, 'dark frame')} "
         f"= {count(cost.frames, 'frame')}, {cost.total_bytes / 1e6:.0f} MB at most, "
-        f"{cost.time} of exposure and motion."
+        f"{cost.time_of_motion}."
     )
     if cost.approaches:
         axes = ", ".join(f"{name[0]} {play:g} um" for name, play in bench.play.items())

@@ -236,7 +236,7 @@ def _first_time(outlook: Outlook, bench: Bench) -> list[str]:
 def _plan_lines(outlook: Outlook) -> list[str]:
     if outlook.cost is None:
         return []
-    return [f"Plan: {outlook.cost.frames} frames, {outlook.cost.time} of exposure and motion."]
+    return [f"Plan: {outlook.cost.frames} frames, {outlook.cost.time_of_motion}."]
 
 
 def print_outcome(console: Console, done: Outcome) -> None:

@@ -95,10 +95,22 @@ class PlanEstimate:
     @property
     def time(self) -> str:
         """The seconds in words, and what of them goes by on the clock where that is another time."""
-        words = duration(self.seconds) if self.seconds >= _SHOWN_S else f"less than {duration(_SHOWN_S)}"
+        return self._time("")
+
+    @property
+    def time_of_motion(self) -> str:
+        """The same with what they are of: "23.0 s of exposure and motion"."""
+        return self._time(" of exposure and motion")
+
+    def _time(self, noun: str) -> str:
+        words = f"{_shown(self.seconds)}{noun}"
         if self.waited_s == self.seconds:
             return words
-        return f"{words} (simulated: {duration(self.waited_s)} by the clock)"
+        return f"{words} (simulated: {_shown(self.waited_s)} by the clock)"
+
+
+def _shown(seconds: float) -> str:
+    return duration(seconds) if seconds >= _SHOWN_S else f"less than {duration(_SHOWN_S)}"
 
 
 def estimate(

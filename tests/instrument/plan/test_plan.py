@@ -234,9 +234,10 @@ def test_the_estimate_counts_frames_bytes_moves_and_seconds() -> None:
     assert (found.seconds, found.waited_s) == pytest.approx((120 + 0.1, 120))
     short = Plan(label="x", parts=(Part(label="a", exposures_ms=(2,)),))
     assert estimate(short, abilities()).time == "less than 0.1 s"
-    assert (
-        estimate(short, abilities(time_scale=0.0)).time == "less than 0.1 s (simulated: 0.0 s by the clock)"
-    )
+    long = Plan(label="x", parts=(Part(label="a", average=10, exposures_ms=(200,)),))
+    found = estimate(long, abilities(time_scale=0.0))
+    assert found.time == "2.0 s (simulated: less than 0.1 s by the clock)"
+    assert found.time_of_motion == ("2.0 s of exposure and motion (simulated: less than 0.1 s by the clock)")
 
 
 def test_a_key_that_stands_twice_in_a_plan_is_a_mistake(tmp_path: Path) -> None:
