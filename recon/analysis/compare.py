@@ -19,6 +19,7 @@ from recon.analysis.what_moved import Explanation, Seen, moved_across, moved_alo
 from recon.base.blocks import block_mean
 from recon.base.checks import require_calibration
 from recon.camera.depth_mixture import central_psfs
+from recon.camera.grid import depth_in_words
 from recon.camera.refocus import psf_at
 from recon.errors import InputError
 from recon.types import Calibration, Geometry
@@ -220,7 +221,7 @@ def _verdict(changes: list[Change], geometry: Geometry) -> tuple[bool, tuple[str
         reasons.append(f"With the old PSFs, spots come out {spot:.2f} times as wide as they could be.")
     if edge.edge_px > min(EDGE_PX, _seen_edge_px(edge)):
         due = due or edge.edge_px > EDGE_PX
-        reasons.append(_edge(edge, along, distance_um))
+        reasons.append(_edge(edge, changes, along, distance_um))
     least = min(c.aligned for c in changes)
     if least < FRESH:
         due = due or spot > WIDER or least < FRESH - 0.08
@@ -256,17 +257,32 @@ def _seen_edge_px(change: Change) -> float:
     return seen_px(change.scale_error * change.extent_px)
 
 
-def _edge(change: Change, along: Explanation | None, distance_um: float | None) -> str:
-    """Return what became of a pattern's size and turn, whichever is seen, and what explains the size."""
+def _grown_px(change: Change) -> float:
+    return abs(change.scale - 1) * change.extent_px
+
+
+def _edge(change: Change, changes: list[Change], along: Explanation | None, distance_um: float | None) -> str:
+    """Return what became of a pattern's size and turn, whichever is seen, and what explains the size.
+
+    ``change`` is the one of ``changes`` to tell; where it is turned alone, another depth's size is told too.
+    """
     least_px = _seen_edge_px(change)
     turned = abs(math.radians(change.rotation_deg or 0.0)) * change.extent_px > least_px
-    grown = abs(change.scale - 1) * change.extent_px > least_px
+    grown = _grown_px(change) > least_px
     found = [f"{change.scale - 1:+.2%} in size"] if grown or not turned else []
     found += [f"turned by {change.rotation_deg:+.2f} degrees"] if turned else []
     words = f"The pattern is {' and '.join(found)}, {change.edge_px:.2g} pixels at its edge."
+    if not grown:
+        change = max(changes, key=lambda c: _grown_px(c) / _seen_edge_px(c))
+        if _grown_px(change) <= _seen_edge_px(change):
+            return words
+        words += (
+            f" At {depth_in_words(change.z_um)} it is {change.scale - 1:+.2%} in size, "
+            f"{_grown_px(change):.2g} pixels at its edge."
+        )
     if along is not None:
         words += f" {along.sentence}"
-    if not grown or distance_um is None:
+    if distance_um is None:
         return words
     if along is None:
         return words + _either(change, distance_um)

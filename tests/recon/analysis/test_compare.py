@@ -220,6 +220,14 @@ def change(
             for depths in ((90,), (60, 90, 150))
         ),
         pytest.param(
+            [change(60, turned_deg=0.4), change(90, grown_px=0.3)],
+            FINE,
+            r"turned by \+0\.40 degrees, 1\.4 pixels at its edge\. At 90 mm it is \+0\.15% in size, "
+            r"0\.3 pixels at its edge\. No single part",
+            "60 mm it is",
+            id="turned at one depth, grown at the other",
+        ),
+        pytest.param(
             [change(90, 0.9, errors_px=(np.inf, np.inf))],
             FINE,
             "not see what moves the pattern by less than 1 pixel, nor what moved along the axis or turned",
