@@ -100,7 +100,7 @@ class Measurement:
 
         Raises InputError when they are no patterns.
         """
-        light = real_array(self.patterns, "patterns")
+        light = real_array(self.patterns, "The patterns")
         if light.ndim != 3 or not np.isfinite(light).all():
             raise InputError(f"Patterns are finite numbers, (n, height, width); got {light.shape}.")
         if light.min() < 0 or not light.any():

@@ -94,6 +94,7 @@ def test_more_patterns_of_the_same_light_give_a_better_picture() -> None:
         (np.ones((2, *SHAPE)), np.ones((3, *SHAPE)), "One pattern a frame"),
         (np.ones((1, 5, 5)), np.ones((1, 5, 5)), "24 x 30 pixels"),
         (np.ones((1, *SHAPE)), -np.ones((1, *SHAPE)), "negative"),
+        (np.ones((1, *SHAPE)), 1j * np.ones((1, *SHAPE)), "^The patterns must hold real numbers"),
         (np.full((1, *SHAPE), np.nan), np.ones((1, *SHAPE)), "finite"),
     ],
 )
