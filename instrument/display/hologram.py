@@ -241,9 +241,9 @@ def field_picture(
     Stretched, it keeps its own number of pixels. Its greatest value is 1: phases dim nothing, a dark picture
     is shown as a bright one.
 
-    Raises BenchError for a picture with values below 0, which are no intensities.
+    Raises BenchError for a picture with values below 0 or that are not finite, which are no intensities.
     """
-    if words := _below_zero(pixels):
+    if words := _no_intensities(pixels):
         raise BenchError(f"The picture {words}")
     image = np.asarray(pixels, np.float64)
     height, width = image.shape[:2]
@@ -264,7 +264,7 @@ def field_picture(
 def unshowable(pixels: npt.NDArray[Any], options: HologramOptions | None = None) -> str:
     """Say, after a picture's name, why no hologram can show it; empty where one can."""
     options = options or HologramOptions()
-    if words := _below_zero(pixels):
+    if words := _no_intensities(pixels):
         return words
     if options.lift or field_picture(pixels, fit=options.fit).any():
         return ""
@@ -272,7 +272,14 @@ def unshowable(pixels: npt.NDArray[Any], options: HologramOptions | None = None)
     return f"is black {where}, and a hologram sends its light somewhere."
 
 
-def _below_zero(pixels: npt.NDArray[Any]) -> str:
+def _no_intensities(pixels: npt.NDArray[Any]) -> str:
+    finite = np.isfinite(pixels)
+    if not finite.all():
+        count = np.count_nonzero(~finite)
+        return (
+            f"holds values that are no finite numbers (NaN, infinite or masked: {count}). "
+            "Replace them, e.g. by the mean of their neighbours."
+        )
     if (least := float(np.min(pixels))) >= 0:
         return ""
     return (

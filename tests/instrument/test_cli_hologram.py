@@ -124,6 +124,9 @@ def test_colours_that_are_averaged_are_told_and_light_below_zero_is_refused(caps
         np.save("below.npy", np.linspace(-1, 1, side * side, dtype=np.float32).reshape(side, side))
         assert main(["hologram", "below.npy"]) == 2
         assert "values below 0 (the least is -1)" in capsys.readouterr().err
+    holes = np.where(grey > grey.mean(), np.nan, grey.astype(float))
+    with pytest.raises(BenchError, match=f"no finite numbers .*: {np.count_nonzero(np.isnan(holes))}"):
+        field_picture(holes, fit="cover")
 
 
 @pytest.mark.usefixtures("here")
