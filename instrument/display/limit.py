@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -35,19 +34,25 @@ def lifts_of(options: HologramOptions) -> tuple[float, ...]:
 
 
 class SharedTime:
-    """Seconds that several searches share: each may take an equal part of what is left."""
+    """Seconds that several searches share: each may take an equal part of what those before left.
+
+    What is computed beside them, bounds and what frames gain, has no part in it.
+    """
 
     def __init__(self, options: HologramOptions, searches: int) -> None:
-        self._left, self._began_s = searches, time.perf_counter()
-        self._time_s = options.time_s
+        self._left, self._time_s = searches, options.time_s
 
     def next(self, options: HologramOptions) -> HologramOptions:
         """Return a search's options with the time that it may take."""
         if self._time_s is not None:
-            left_s = max(self._time_s - (time.perf_counter() - self._began_s), 1e-3)
-            options = replace(options, time_s=left_s / max(self._left, 1))
+            options = replace(options, time_s=max(self._time_s, 1e-3) / max(self._left, 1))
         self._left -= 1
         return options
+
+    def took(self, seconds: float) -> None:
+        """Take off what a search has taken."""
+        if self._time_s is not None:
+            self._time_s -= seconds
 
 
 def limits_of_lifts(
@@ -76,6 +81,7 @@ def limits_of_lifts(
         before = found[-1].columns if found else None
         timed = shared.next(options)
         found.append(hologram_limit(display, target, timed, initial=before, callback=show, cancel=cancel))
+        shared.took(found[-1].seconds)
         if found[-1].stop_reason is HologramStop.CANCELLED:
             break
     return found
@@ -105,8 +111,9 @@ def limit_lines(found: Sequence[Limit], display: Display, options: HologramOptio
             f"(a bound; {here.reached_db:.2f} dB is reached by what need not be frames of phases)"
         ]
     else:
+        none = "none is in sight" if _is_told(here) else "not known after so short a search"
         lines = [
-            f"limit: none is in sight {behind}; {here.reached_db:.2f} dB is reached by what need not be "
+            f"limit: {none} {behind}; {here.reached_db:.2f} dB is reached by what need not be "
             "frames of phases"
         ]
     cutoff = band_of(display).cutoff
@@ -131,7 +138,15 @@ def limit_lines(found: Sequence[Limit], display: Display, options: HologramOptio
 
 def at_most(limit: Limit) -> str:
     """Return a bound in words."""
+    if not _is_told(limit):
+        return "not known after so short a search"
     return f"at most {limit.bound_db:.2f} dB" if limit.bound_db < _NO_LIMIT_DB else "no limit in sight"
+
+
+def _is_told(limit: Limit) -> bool:
+    """Return whether there is a bound, or a search that was not cut short found none."""
+    short = (HologramStop.TIME, HologramStop.CANCELLED)
+    return limit.bound_db < _NO_LIMIT_DB or limit.stop_reason not in short
 
 
 def frames_line(gain_db: float) -> str:

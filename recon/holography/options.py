@@ -192,7 +192,8 @@ class HologramOptions:
     )
     time_s: float | None = option(
         None,
-        help="At most so many seconds; of a limit, all of its searches together.",
+        help="At most so many seconds; of a limit, its searches together (bounds and what frames gain on "
+        "top).",
         default_words="no limit",
         unit="s",
         above=0,

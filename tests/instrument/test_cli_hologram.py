@@ -7,7 +7,6 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -23,7 +22,6 @@ from calibration_routines.display.hologram_photograph import (
 from calibration_routines.display.spot_photograph import photograph_spots
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
-from instrument.display import limit
 from instrument.display.hologram import (
     Alignment,
     CaptureOptions,
@@ -32,7 +30,7 @@ from instrument.display.hologram import (
     field_words,
     prepare_target,
 )
-from instrument.display.limit import SharedTime, coarser_mask, limit_lines
+from instrument.display.limit import SharedTime, at_most, coarser_mask, limit_lines
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image, write_image
 from instrument.files.sample_images import SAMPLES, load_sample
@@ -329,13 +327,23 @@ def test_the_limit_is_said_before_anything_is_computed(capsys):
     assert prepare_target(read_image("picture.png").pixels, bench(), lifted).image.min() >= 0.2
 
 
-def test_the_time_of_a_limit_is_that_of_all_its_searches(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = iter((100.0, 100.0, 101.0, 109.0, 120.0, 130.0))
-    monkeypatch.setattr(limit, "time", SimpleNamespace(perf_counter=lambda: next(now)))
+def test_the_time_of_a_limit_is_that_of_all_its_searches() -> None:
     asked = HologramOptions(time_s=10.0)
-    shared = SharedTime(asked, 4)
-    assert [shared.next(asked).time_s for _ in range(4)] == pytest.approx([2.5, 3.0, 0.5, 1e-3])
+    shared, given = SharedTime(asked, 4), []
+    for took_s in (1.0, 8.0, 3.0, 0.0):
+        given.append(shared.next(asked).time_s)
+        shared.took(took_s)
+    assert given == pytest.approx([2.5, 3.0, 0.5, 1e-3])
     assert SharedTime(HologramOptions(), 4).next(HologramOptions()).time_s is None
+
+
+def test_a_search_without_time_is_no_advice() -> None:
+    told = Limit(
+        np.inf, 20.0, np.ones(4), np.ones(4), HologramStop.TIME, 0.1, np.ones((1, 4, 4), np.complex64)
+    )
+    assert at_most(told) == "not known after so short a search"
+    assert at_most(replace(told, stop_reason=HologramStop.QUALITY)) == "no limit in sight"
+    assert at_most(replace(told, bound_db=21.0)) == "at most 21.00 dB"
 
 
 def test_the_limit_says_why_coarse_contrast_is_not_reached_behind_a_lens_and_near():
