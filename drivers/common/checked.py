@@ -49,7 +49,7 @@ _D = TypeVar("_D", bound=type[Device])
 _T = TypeVar("_T")
 _TRAVELS = 100
 _ASKS = {"settings", "own_settings", "position", "commanded_position"}
-_SHORT = {*_ASKS, "display", "snap", "trigger", "off", "blank"}
+_SHORT = {*_ASKS, "display", "snap", "trigger", "off", "blank", "unlock"}
 """Calls that are waited for as long as their device says, as are all that set something."""
 _MOVES = {"home": 20, "move_to": 20, "move_by": 20, "wait": 20}
 _LONG = {"open": 4, "arm": 20, **_MOVES}

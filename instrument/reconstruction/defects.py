@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -104,6 +103,8 @@ def _defective(pixels: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
 
 def _alikeness(plane: FloatImage) -> float:
     """Return the correlation of neighbouring pixels, of rows or of columns, whichever is less."""
+    from scipy.ndimage import gaussian_filter  # commands' helps do without it
+
     fine = plane - gaussian_filter(plane, FINE_PX)
     most = float(np.percentile(np.abs(fine), 99))
     fine = np.clip(fine, -most, most)  # defects that were missed
