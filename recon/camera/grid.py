@@ -181,7 +181,7 @@ def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
     near = _nearer(z)
     span = z[-1] - z[0] + near + steps[-1] / 2
     # A voxel lies on the nearest plane, none of the planes outside, and half a step beyond the outermost is
-    # filled: by voxels of which half or more lies there, and none of them in the diffuser.
+    # filled: by voxels that reach into it, each by its part there; none has its middle behind the diffuser.
     last = (z[-1] - z[0]) / deep
     above = max(0, min(int(near / deep + HALF), int(z[0] / deep - HALF)))
     below = max(int(np.ceil(last - SAME)), int(last + steps[-1] / 2 / deep + HALF))
