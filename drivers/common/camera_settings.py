@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 
 from drivers.camera import Camera, Roi, TriggerEdge, TriggerMode
 from drivers.device import DeviceIdentity
-from drivers.errors import LimitError
+from drivers.errors import DeviceError, DeviceLostError, LimitError
 
 GainUnit = Literal["dB", "factor", "steps"]
 
@@ -190,7 +190,7 @@ class KeptSettings(Camera):
         """Choose what starts an exposure."""
         self._require_idle("trigger mode")
         self._require_offered("trigger mode", mode, self.trigger_modes)
-        self._write_trigger(mode)
+        self._make_trigger(mode)
         self._trigger_mode = mode
         self._remember("trigger_mode", lambda: self.set_trigger_mode(mode))
         return mode
@@ -225,12 +225,23 @@ class KeptSettings(Camera):
 
     def _trigger_again(self, back: Callable[[], object]) -> None:
         """Make the hardware trigger again with another line or edge, where it is in force."""
-        if self._trigger_mode != "hardware":
-            return
+        if self._trigger_mode == "hardware":
+            self._make_trigger("hardware", back)
+
+    def _make_trigger(self, mode: TriggerMode, back: Callable[[], object] = lambda: None) -> None:
+        """Write a trigger; where that fails ``back`` undoes what it had, and the last one is made.
+
+        That this fails too becomes a note.
+        """
         try:
-            self._write_trigger("hardware")
-        except BaseException:
+            self._write_trigger(mode)
+        except BaseException as error:
             back()
+            try:
+                self._write_trigger(self._trigger_mode)
+            except DeviceError as another:
+                if not isinstance(error, DeviceLostError):
+                    error.add_note(f"Nor could trigger mode {self._trigger_mode} be made again: {another}")
             raise
 
     # A device that was lost -----------------------------------------------------------------------

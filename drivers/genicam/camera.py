@@ -10,7 +10,7 @@ from drivers.camera import Roi, TriggerEdge, TriggerMode
 from drivers.common.buffered_camera import BufferedCamera
 from drivers.common.camera_settings import GainScale, GainUnit
 from drivers.device import DriverOptions, OwnSetting, Setting
-from drivers.errors import DeviceError, LimitError
+from drivers.errors import DeviceError, DeviceLostError, LimitError
 from drivers.genicam.features import (
     BLACK_LEVEL,
     DRIVERS_OWN,
@@ -155,13 +155,14 @@ class GenicamCamera(BufferedCamera):
             number = float(value) if kind == "number" else 0.0
         except ValueError:
             raise LimitError(self.name, f"takes no {name} {value!r}.", f"It takes {known.takes}.") from None
-        was = self._features.number(name) if kind == "number" else self._features.text(name)
-        before = self._images.format_name
-        self._features.set_any(
-            name, number if kind == "number" else value == "true" if kind == "switch" else value
-        )
+        was, before = self._value(name), self._images.format_name
         try:
+            self._features.set_any(
+                name, number if kind == "number" else value == "true" if kind == "switch" else value
+            )
             self._look_again()
+        except DeviceLostError:
+            raise
         except BaseException as error:  # images that cannot be read, say: it stays as it was
             self._set_back(name, was, error)
             raise
@@ -170,11 +171,16 @@ class GenicamCamera(BufferedCamera):
             self._remember("pixel_format", lambda: self.set_pixel_format(now))
         return self._features.text(name)
 
+    def _value(self, name: str) -> FeatureValue:
+        features = self._features
+        return features.number(name) if features.kind(name) == "number" else features.text(name)
+
     def _set_back(self, name: str, was: FeatureValue, error: BaseException) -> None:
         """Undo a feature whose change led to an error; that this fails too becomes a note."""
         try:
-            self._features.set_any(name, was)
-            self._look_again()
+            if self._value(name) != was:
+                self._features.set_any(name, was)
+                self._look_again()
         except DeviceError as another:
             error.add_note(f"Nor could {name} be set back: {another}")
 

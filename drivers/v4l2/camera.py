@@ -253,12 +253,26 @@ class V4l2Camera(RunningCamera):
             raise LimitError(
                 self.name, f"control {name} does not take {value!r}.", f"It takes {known.takes}."
             ) from None
-        before = self._images.format.name
-        self.set_control(name, number)
+        before, was = self._images.format.name, self._controls.get(self._controls.named(name))
+        try:
+            self.set_control(name, number)
+        except DeviceLostError:
+            raise
+        except BaseException as error:  # images that cannot be read, say: it stays as it was
+            self._set_back(name, was, error)
+            raise
         self._remember_own(name, value)
         if (now := self._images.format.name) != before and "pixel_format" in self._remembered:
             self._remember("pixel_format", lambda: self.set_pixel_format(now))
         return self._controls.text(self._controls.named(name))
+
+    def _set_back(self, name: str, was: int, error: BaseException) -> None:
+        """Undo a control whose change led to an error; that this fails too becomes a note."""
+        try:
+            if self._controls.get(self._controls.named(name)) != was:
+                self.set_control(name, was)
+        except DeviceError as another:
+            error.add_note(f"Nor could {name} be set back: {another}")
 
     # Exposure, gain, black level -------------------------------------------------------------------
     def _read_exposure(self) -> float:

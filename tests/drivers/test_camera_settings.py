@@ -211,11 +211,27 @@ def test_line_and_edge_are_as_before_where_the_trigger_cannot_be_made_again(sett
     line, edge = camera.trigger_line, camera.trigger_edge
     assert camera.written[-1] == ("trigger", "hardware", line, edge)
     camera.refused = {("trigger", "hardware", "1", edge), ("trigger", "hardware", line, "rising")}
+    camera.refused.discard(camera.written[-1])
     remembered = dict(camera._remembered)
     with pytest.raises(DeviceError, match="refuses"):
         getattr(camera, setter)({"2": "1", "falling": "rising"}[value])
     assert (camera.trigger_line, camera.trigger_edge) == (line, edge)
+    assert camera.written[-2:] == [("trigger", "hardware", line, edge)] * 2, "a part may have been written"
     assert camera._remembered == remembered
+
+
+def test_a_trigger_mode_that_cannot_be_made_leaves_the_one_before_it_made_again() -> None:
+    camera = told()
+    camera.set_trigger_mode("software")
+    camera.refused = {("trigger", "hardware", "", "rising")}
+    with pytest.raises(DeviceError, match="hardware") as failed:
+        camera.set_trigger_mode("hardware")
+    assert (camera.trigger_mode, getattr(failed.value, "__notes__", [])) == ("software", [])
+    assert camera.written == [("trigger", "software", "", "rising")] * 2
+    camera.refused |= {("trigger", "software", "", "rising")}
+    with pytest.raises(DeviceError, match="hardware") as failed:
+        camera.set_trigger_mode("hardware")
+    assert "Nor could trigger mode software be made again" in " ".join(failed.value.__notes__)
 
 
 @pytest.mark.parametrize(

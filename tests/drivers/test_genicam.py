@@ -227,6 +227,21 @@ class Locking(Table):
         super()._write_switch(name, value)
 
 
+class Deaf(Table):
+    """Has another entry than it was told."""
+
+    def _write_text(self, name: str, value: str) -> None:
+        super()._write_text(name, "C" if value == "B" else value)
+
+
+def test_a_feature_that_is_another_than_was_told_is_set_back() -> None:
+    features = Deaf(**table(Look=["A", "A", "B", "C"]).of)
+    camera = OfTable(features, features={"Look": "A"})  # type: ignore[abstract]
+    with pytest.raises(DeviceError, match="was told Look = B and has C"):
+        camera.set_own("Look", "B")
+    assert (features.text("Look"), camera._remembered) == ("A", {})
+
+
 def test_no_frame_rate_holds_triggers_back() -> None:
     lines = {"TriggerMode": ["Off", "On", "Off"], "TriggerSource": ["Line1", "Line1", "Software"]}
     for options in ({}, {"frames_per_s": 20.0}):

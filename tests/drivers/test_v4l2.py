@@ -126,6 +126,25 @@ def test_a_control_that_turns_the_pixels_turns_the_mosaic() -> None:
             assert (camera.pixel_format, camera.roi) == (chosen, Roi(4, 8, 20, 30))
 
 
+def test_a_control_that_makes_the_images_unreadable_is_set_back_and_not_remembered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    kernel = FakeKernel(formats=("RGGB",))
+    turns = kernel.controls[0x980914] = fake.FakeControl("Horizontal Flip", 2, 0, 1, 1, 0, 0, flags=0x400)
+    with camera_on(kernel) as camera:
+        look_again = camera._images.look_again
+
+        def unreadable() -> None:
+            if turns.value:
+                raise DeviceError(camera.name, "offers no pixel format that can be read here.")
+            look_again()
+
+        monkeypatch.setattr(camera._images, "look_again", unreadable)
+        with pytest.raises(DeviceError, match="no pixel format that can be read"):
+            camera.set_own("horizontal_flip", "1")
+        assert (turns.value, camera._remembered, camera.pixel_format) == (0, {}, "BayerRG8")
+
+
 @pytest.mark.parametrize("crop_step", [0, 8])
 def test_a_region_shows_the_same_pixels_whoever_cuts_it(crop_step: int) -> None:
     kernel = FakeKernel(formats=("GREY",))
