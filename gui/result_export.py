@@ -16,8 +16,8 @@ from instrument.files.atomic import protecting
 from instrument.files.errors import BenchError
 from instrument.files.images import write_image
 from instrument.files.orientation import Orientation
-from instrument.files.volumes import uneven_steps
 from instrument.reconstruction.stored_result import StoredResult, export_result
+from instrument.volumes.grid_facts import uneven_steps
 
 Pixels = npt.NDArray[np.uint8]
 """In the colours that they show, (height, width, 3)."""

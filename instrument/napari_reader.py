@@ -16,11 +16,13 @@ import numpy as np
 from instrument.files.calibration_file import is_calibration, load_calibration
 from instrument.files.errors import FileError
 from instrument.files.images import image_metadata
+from instrument.files.ome_tiff import tiff_facts
+from instrument.files.ome_zarr import is_zarr_name, stem_of
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
 from instrument.files.tiff_pages import open_tiff
-from instrument.files.volumes import is_zarr_name, middle_step_um, stem_of, tiff_facts
 from instrument.runs.run_files import FRAMES, is_run
+from instrument.volumes.grid_facts import middle_step_um
 
 Layer = tuple[Any, dict[str, Any], str]
 """napari's: what is shown, the arguments of its layer, and the layer's kind."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from instrument.files.volumes import VolumeSource, metric_source, volume_in_memory
+from instrument.volumes.source import VolumeSource, metric_source, volume_in_memory
 from recon.camera.grid import Grid, metric_grid
 
 MOST_BYTES = 1 << 30

@@ -17,8 +17,8 @@ from gui.widgets.building import button, every, fill, in_row, label, share_bar
 from gui.widgets.entry import quantity
 from gui.widgets.image_view import ArrowKeys
 from gui.widgets.measure import round_length
-from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.rendering import Pose, Renderer, depth_shades
+from instrument.volumes.source import VolumeSource
 
 _DRAG_DEG = 0.4
 """Turned for each pixel of the mouse."""

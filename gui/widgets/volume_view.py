@@ -22,8 +22,8 @@ from gui.widgets.plots import LevelsBar, curve_pen, plot_widget
 from gui.widgets.proportions import MOST_BYTES, bytes_in_proportion, in_proportion
 from gui.widgets.turning_view import Planes, TurningView, middle_pitch_um
 from gui.widgets.volume_tools import Mode, PlaneSlider, VolumeTools
-from instrument.files.volumes import Plane, VolumeSource
 from instrument.reconstruction.result_figures import Projections, grey, in_colour_of_depth, project
+from instrument.volumes.source import Plane, VolumeSource
 from recon.camera.grid import Grid, metric_grid
 
 Axis = Literal["z", "y", "x"]

@@ -24,10 +24,10 @@ import numpy.typing as npt
 
 from instrument.files.atomic import DOUBTFUL, whole_folder
 from instrument.files.errors import FileError
+from instrument.files.ome_zarr import ome_attributes
 from instrument.files.pieces import piece_bytes
 from instrument.files.reading import folder_bytes, require_plausible
 from instrument.files.record import RecordFormat
-from instrument.files.volumes import ome_attributes
 from recon.types import Calibration, Geometry
 
 _JSON = "calibration.json"

@@ -8,13 +8,16 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
 import numpy.typing as npt
 
 from instrument.files import reading
+
+if TYPE_CHECKING:
+    import tifffile
 
 SUFFIXES = (".ome.tif", ".ome.tiff")
 """Names that ask for OME-TIFF."""
@@ -61,6 +64,14 @@ def facts_of(description: str) -> dict[str, Any]:
         if told.get("Namespace") == NAMESPACE:
             return {str(one.get("K")): _value(one.text or "") for one in _parts(told, "M")}
     return {}
+
+
+def tiff_facts(tiff: tifffile.TiffFile) -> dict[str, Any]:
+    """Return what this program annotated in an OME-TIFF; empty where it did not."""
+    try:
+        return {} if tiff.ome_metadata is None else facts_of(tiff.ome_metadata)
+    except ValueError:
+        return {}
 
 
 def photograph_fields(facts: Mapping[str, Any], planes: int = 1) -> dict[str, Any]:

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from instrument.files.atomic import require_new, whole_file, write_text
 from instrument.files.errors import FileError
 from instrument.files.films import as_shown, write_mp4
+from instrument.files.ome_zarr import is_zarr_name
 from instrument.files.orientation import AS_IT_IS, Kind, Orientation
-from instrument.files.volumes import grid_of, is_zarr_name
 from instrument.reconstruction.video_files import (
     DEFAULT_FPS,
     VideoPictures,
@@ -26,6 +26,7 @@ from instrument.reconstruction.video_files import (
     samples_of,
 )
 from instrument.runs.run import Run
+from instrument.volumes.grid_facts import grid_of
 
 if TYPE_CHECKING:
     from recon.camera.grid import Grid

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.result_figures import grey
+from instrument.volumes.source import VolumeSource
 from recon.base.blocks import block_mean
 from recon.base.threads import in_blocks
 

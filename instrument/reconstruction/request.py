@@ -13,7 +13,6 @@ import numpy.typing as npt
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, read_image, read_stack
-from instrument.files.volumes import numbers
 from instrument.reconstruction.defects import mended_stack
 from instrument.reconstruction.forecast import Forecast, forecast
 from instrument.reconstruction.job import (
@@ -27,6 +26,7 @@ from instrument.reconstruction.mosaic import pattern_of
 from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.run_files import STATE
+from instrument.volumes.grid_facts import numbers
 from recon.base.checks import require_noise, select_psf
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.camera.grid import depth_in_words

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
 from instrument.files.seen import as_seen, srgb
-from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.job import Job
+from instrument.volumes.source import VolumeSource
 from recon.base.blocks import block_sum
 from recon.reconstruction.result import Reconstruction
 

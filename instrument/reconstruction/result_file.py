@@ -14,17 +14,12 @@ from instrument.files.atomic import check_writable, write_json, write_text
 from instrument.files.errors import FileError
 from instrument.files.figures import check_figure, save_figure
 from instrument.files.images import write_image
+from instrument.files.ome_zarr import is_zarr_name, stem_of
 from instrument.files.record import plain
 from instrument.files.seen import as_seen, levels_of
-from instrument.files.volumes import (
-    grid_facts,
-    is_zarr_name,
-    stem_of,
-    uneven_steps,
-    write_volume_tiff,
-    write_volume_zarr,
-)
 from instrument.reconstruction.job import Job
+from instrument.volumes.grid_facts import grid_facts, uneven_steps
+from instrument.volumes.writing import write_volume_tiff, write_volume_zarr
 from recon.camera.grid import Grid
 from recon.reconstruction.point_errors import PointErrors
 from recon.reconstruction.result import Reconstruction

@@ -18,21 +18,16 @@ from instrument.files.calibration_file import load_calibration, save_calibration
 from instrument.files.decoding import require_npy
 from instrument.files.errors import FileError, size
 from instrument.files.images import read_image, write_image
+from instrument.files.ome_zarr import is_zarr_name, stem_of
 from instrument.files.orientation import AS_IT_IS, Orientation
 from instrument.files.reading import parse_json, read_bytes, require_file
 from instrument.files.seen import as_seen
 from instrument.files.tiff_pages import open_tiff
-from instrument.files.volumes import (
-    VolumeSource,
-    grid_of,
-    is_zarr_name,
-    metric_source,
-    open_volume,
-    stem_of,
-    write_volume_tiff,
-    write_volume_zarr,
-)
 from instrument.reconstruction.job import find_calibration
+from instrument.volumes.grid_facts import grid_of
+from instrument.volumes.opening import open_volume
+from instrument.volumes.source import VolumeSource, metric_source
+from instrument.volumes.writing import write_volume_tiff, write_volume_zarr
 from recon.camera.grid import Grid
 from recon.errors import InputError
 from recon.reconstruction.psf_refinement import as_refined

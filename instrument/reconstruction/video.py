@@ -17,8 +17,8 @@ from instrument.files.atomic import refuse_input, write_json
 from instrument.files.errors import BenchError, FileError
 from instrument.files.films import as_shown, write_mp4
 from instrument.files.images import ImageFile
+from instrument.files.ome_zarr import is_zarr_name, stem_of
 from instrument.files.record import plain
-from instrument.files.volumes import is_zarr_name, stem_of
 from instrument.reconstruction.job import Job, Reduction
 from instrument.reconstruction.options import InputOptions, VideoOptions
 from instrument.reconstruction.preparation import Crop

@@ -14,8 +14,9 @@ from drivers.frame import FrameMetadata
 from instrument.files.atomic import whole_folder
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import FileError
-from instrument.files.volumes import grid_facts, ome_attributes, ome_channels, voxel_um
+from instrument.files.ome_zarr import ome_attributes, ome_channels
 from instrument.runs.run import Run
+from instrument.volumes.grid_facts import grid_facts, voxel_um
 
 STILL = {"um": 0.5, "mrad": 0.02}
 """How far readings of a stage that stands may lie apart, by the unit that an axis' name ends in.
@@ -102,7 +103,7 @@ def create_output(
         From frame to frame.
     grid : Grid, optional
         Where the pixels lie in the object. One voxel size holds for all planes: the middle one's, as of a
-        volume; what :func:`~instrument.files.volumes.grid_facts` says stands in
+        volume; what :func:`~instrument.volumes.grid_facts.grid_facts` says stands in
         the attribute ``diffuserbench``.
     attributes : dict
         JSON-compatible, for the attribute ``diffuserbench``.

@@ -27,8 +27,8 @@ import numpy.typing as npt
 
 from instrument.files.atomic import sync_folder, whole_file
 from instrument.files.errors import FileError
+from instrument.files.ome_zarr import stem_of
 from instrument.files.record import RecordFormat, plain
-from instrument.files.volumes import stem_of
 from instrument.reconstruction.job import Reduction
 from instrument.reconstruction.mosaic import mosaic_named
 from instrument.reconstruction.preparation import Crop

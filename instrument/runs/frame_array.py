@@ -24,8 +24,8 @@ import numpy.typing as npt
 
 from instrument.files.atomic import make_folder, sync_folder, write_json
 from instrument.files.errors import FileError
+from instrument.files.ome_zarr import ome_attributes
 from instrument.files.reading import parse_json, read_bytes, require_file
-from instrument.files.volumes import ome_attributes
 from instrument.runs.log import GONE
 
 Image = npt.NDArray[Any]

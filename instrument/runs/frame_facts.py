@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
-from instrument.files.volumes import EVEN, ome_channels
+from instrument.files.ome_zarr import ome_channels
 from instrument.runs.frame_array import description_of, group_of
 from instrument.runs.run import Run
 from instrument.runs.run_files import PROVENANCE, RunError
+from instrument.volumes.grid_facts import EVEN
 
 TOLD = ("pixel_format", "significant_bits", "black_level", "exposure_ms", "gain", "binning", "roi")
 """Of the camera: as one value where it is that of all frames."""

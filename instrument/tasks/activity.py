@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from instrument.files.errors import BenchError, FileError
-from instrument.files.volumes import is_zarr_name
+from instrument.files.ome_zarr import is_zarr_name
 from instrument.reconstruction.activity import ActivitySettings, find_activity, require_frames, write_activity
 from instrument.reconstruction.film import open_video
 from instrument.reconstruction.options import InputOptions, SourceOptions, VideoOptions

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_stack
-from instrument.files.volumes import is_zarr_name, uneven_steps
+from instrument.files.ome_zarr import is_zarr_name
 from instrument.reconstruction.film import Film, Window, open_video, slowed, write_film
 from instrument.runs.export import export as export_run
 from instrument.runs.imported import FilmFacts
@@ -16,6 +16,7 @@ from instrument.runs.imported import import_film as write_recording
 from instrument.runs.inspection import verify as verify_run
 from instrument.runs.run import Run
 from instrument.tasks.task import Desk, Done, Given, task
+from instrument.volumes.grid_facts import uneven_steps
 from recon.base.declare import option
 
 

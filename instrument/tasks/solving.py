@@ -8,7 +8,6 @@ from typing import Annotated
 
 from instrument.files.errors import BenchError
 from instrument.files.orientation import AS_IT_IS
-from instrument.files.volumes import uneven_steps
 from instrument.reconstruction.checkpointing import checkpoint_for, settle_checkpoint
 from instrument.reconstruction.foretold import Foretold, Like
 from instrument.reconstruction.job import Job
@@ -17,6 +16,7 @@ from instrument.reconstruction.patterned import PatternedRequest, prepare_patter
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
 from instrument.tasks.task import Desk, Done, Only, saying_what_is_left, task
+from instrument.volumes.grid_facts import uneven_steps
 from recon.base.declare import option
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.options import ReconstructionOptions

@@ -18,11 +18,11 @@ from instrument.files.calibration_file import calibrated_depths_um, load_calibra
 from instrument.files.images import read_image, read_stack
 from instrument.files.slm_image import load_slm_correction
 from instrument.files.stability_file import read_stability
-from instrument.files.volumes import open_volume
 from instrument.plan.model import load_plan
 from instrument.reconstruction.stored_result import open_result
 from instrument.runs.inspection import verify
 from instrument.runs.run import Run
+from instrument.volumes.opening import open_volume
 from recon.types import Calibration
 
 FIXTURES = Path(__file__).parents[1] / "fixtures" / "v813d646"

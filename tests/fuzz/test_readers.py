@@ -20,9 +20,10 @@ from instrument.bench.config_file import load_config
 from instrument.files import reading
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image, write_image
-from instrument.files.volumes import ome_attributes, open_volume
+from instrument.files.ome_zarr import ome_attributes
 from instrument.plan.model import load_plan
 from instrument.reconstruction.stored_result import open_result
+from instrument.volumes.opening import open_volume
 from tests.fuzz.__main__ import CORPUS, fuzz
 from tests.fuzz.readers import READERS
 

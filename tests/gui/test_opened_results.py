@@ -19,8 +19,8 @@ from gui.theme import TURN, apply_theme, change_theme
 from gui.widgets.dialogues import Question
 from gui.widgets.entry import Refusing
 from instrument.files.images import read_image, write_image
-from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.stored_result import open_result
+from instrument.volumes.source import VolumeSource
 
 WAIT_MS = 60_000
 

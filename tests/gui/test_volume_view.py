@@ -13,7 +13,7 @@ from pytestqt.qtbot import QtBot
 from gui.jobs import JobRunner
 from gui.panel import whole
 from gui.widgets.volume_view import VolumeView
-from instrument.files.volumes import volume_in_memory
+from instrument.volumes.source import volume_in_memory
 from recon.camera.grid import Grid, metric_volume
 from tests.gui.conftest import WAIT_MS
 

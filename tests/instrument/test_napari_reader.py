@@ -13,9 +13,9 @@ from instrument.files.atomic import write_json
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
-from instrument.files.volumes import write_volume_tiff, write_volume_zarr
 from instrument.napari_reader import get_reader, read
 from instrument.reconstruction.video_files import VideoPictures, create_output
+from instrument.volumes.writing import write_volume_tiff, write_volume_zarr
 from recon.camera.grid import Grid
 from recon.types import Calibration, Geometry
 from tests.mocks.recordings import write_recording

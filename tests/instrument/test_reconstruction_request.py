@@ -13,10 +13,10 @@ from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError
 from instrument.files.images import read_stack
-from instrument.files.volumes import write_volume_tiff, write_volume_zarr
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import PictureRequest, VolumeRequest, volume_job
 from instrument.reconstruction.stored_result import open_result
+from instrument.volumes.writing import write_volume_tiff, write_volume_zarr
 from recon.camera.grid import Grid
 from recon.errors import InputError
 from recon.reconstruction.options import Overrides, ReconstructionOptions

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from instrument.files.volumes import volume_in_memory
 from instrument.reconstruction import rendering
 from instrument.reconstruction.rendering import Pose, Renderer, depth_shades
+from instrument.volumes.source import volume_in_memory
 
 GREY = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
 

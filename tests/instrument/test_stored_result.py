@@ -13,9 +13,11 @@ from instrument.cli import main
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
 from instrument.files.results import find_results, free_result
-from instrument.files.volumes import open_volume, volume_in_memory, write_volume_zarr
 from instrument.reconstruction.result_figures import in_colour_of_depth, project
 from instrument.reconstruction.stored_result import open_result, record_file
+from instrument.volumes.opening import open_volume
+from instrument.volumes.source import volume_in_memory
+from instrument.volumes.writing import write_volume_zarr
 from recon.camera.grid import Grid
 
 SHAPE = (5, 40, 30)
@@ -65,7 +67,7 @@ def test_a_tiff_in_one_piece_is_mapped_not_read(tmp_path, volume, monkeypatch):
 
 
 def test_side_views_of_large_planes_come_from_a_coarser_level(tmp_path, monkeypatch):
-    monkeypatch.setattr("instrument.files.volumes._SIDE_PIXELS", 128 * 128)
+    monkeypatch.setattr("instrument.volumes.source._SIDE_PIXELS", 128 * 128)
     voxels = np.random.default_rng(1).random((2, 256, 256), np.float32)
     write_volume_zarr(tmp_path / "v.ome.zarr", voxels, voxels.shape, UNKNOWN, {})
     source = open_volume(tmp_path / "v.ome.zarr")

@@ -15,7 +15,7 @@ from instrument.files.errors import FileError
 from instrument.files.images import image_metadata, read_image, read_stack
 from instrument.files.ome_tiff import depths_um
 from instrument.files.tiff_pages import open_tiff
-from instrument.files.volumes import open_volume
+from instrument.volumes.opening import open_volume
 
 PAGES = np.arange(3 * 8 * 8, dtype=np.uint16).reshape(3, 8, 8)
 

@@ -7,9 +7,11 @@ import pytest
 import zarr
 from ome_zarr_models.v05 import Image
 
-from instrument.files.volumes import grid_facts, open_volume, write_volume_tiff, write_volume_zarr
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.result_file import Outputs, write_reconstruction
+from instrument.volumes.grid_facts import grid_facts
+from instrument.volumes.opening import open_volume
+from instrument.volumes.writing import write_volume_tiff, write_volume_zarr
 from recon import Calibration, Options, Problem, solve
 from recon.camera.grid import Grid
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from instrument.files.volumes import middle_step_um, uneven_steps
+from instrument.volumes.grid_facts import middle_step_um, uneven_steps
 
 
 @pytest.mark.parametrize(

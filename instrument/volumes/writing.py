@@ -1,0 +1,136 @@
+"""Volumes written as OME-Zarr 0.5 and OME-TIFF, whole or not at all, with one plane in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.atomic import whole_file, whole_folder
+from instrument.files.ome_tiff import annotation, resolution
+from instrument.files.ome_zarr import ome_attributes, ome_channels
+from instrument.volumes.grid_facts import grid_facts, origin_um, scale_in_words, voxel_um
+
+if TYPE_CHECKING:
+    from recon.camera.grid import Grid
+
+_BIG_TIFF_BYTES = 4_000_000_000
+_SMALLEST_LEVEL = 128
+"""Levels are halved laterally until the longer side is at most this many pixels."""
+
+
+def write_volume_zarr(
+    path: Path,
+    planes: Iterable[npt.NDArray[np.float32]],
+    shape: tuple[int, ...],
+    grid: Grid,
+    attributes: dict[str, Any],
+) -> None:
+    """Write a volume as OME-Zarr 0.5, whole or not at all, with one plane in memory.
+
+    A folder of that name is replaced.
+
+    Raises OSError when the disk is full or not writable; what was there before stays as it was.
+
+    Parameters
+    ----------
+    path : Path
+        The folder to be.
+    planes : iterable of ndarray, float32
+        (height, width) or (height, width, n_channels).
+    shape : tuple of int
+        That of all, with n_z in front. Stored as ``z, y, x`` or, in OME-Zarr's order, ``c, z, y, x``.
+    grid : Grid
+        OME-Zarr knows one voxel size for all planes: that of the middle one is written where it is known, and
+        what :func:`grid_facts` says beside it in the group's attribute ``diffuserbench``.
+    attributes : dict
+        JSON-compatible; what else shall stand in the attribute ``diffuserbench``.
+    """
+    import zarr
+
+    colour = len(shape) == 4
+    channels = shape[3:]
+    with whole_folder(path) as draft:
+        group = zarr.open_group(draft, mode="w", zarr_format=3)
+        names = ["c", "z", "y", "x"] if colour else ["z", "y", "x"]
+        levels = [1]
+        arrays: list[Any] = []
+        height, width = shape[1:3]
+        while True:
+            array = group.create_array(
+                str(len(arrays)),
+                shape=(*channels, shape[0], height, width),
+                dtype=np.float32,
+                chunks=(1,) * (1 + len(channels)) + (height, width),
+                dimension_names=names,
+            )
+            arrays.append(array)
+            if max(height, width) <= _SMALLEST_LEVEL or min(height, width) < 2:
+                break
+            height, width = height // 2, width // 2
+            levels.append(2 * levels[-1])
+        white = 0.0
+        for z, plane in enumerate(planes):
+            pixels = np.moveaxis(plane, -1, 0) if colour else plane
+            white = max(white, float(np.nanmax(plane, initial=0.0)))
+            for array in arrays:
+                array[..., z, :, :] = pixels
+                pixels = _halved(pixels)
+        told = ome_attributes(
+            path.name,
+            names,
+            voxel_um(grid),
+            levels=levels,
+            origin=origin_um(grid),
+            more={"type": "local mean"},
+        )
+        if channels == (3,):
+            told["omero"] = ome_channels(white or 1.0, colour=True)
+        group.attrs["ome"] = told
+        group.attrs["diffuserbench"] = attributes | {"words": scale_in_words(grid)} | grid_facts(grid)
+
+
+def _halved(pixels: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Return the mean of 2 x 2 pixels."""
+    height, width = (n // 2 for n in pixels.shape[-2:])
+    blocks = pixels[..., : 2 * height, : 2 * width].reshape(*pixels.shape[:-2], height, 2, width, 2)
+    means: npt.NDArray[np.float32] = blocks.mean(axis=(-3, -1), dtype=np.float32)
+    return means
+
+
+def write_volume_tiff(
+    path: Path, planes: Iterable[npt.NDArray[np.float32]], shape: tuple[int, ...], grid: Grid
+) -> None:
+    """Write a volume as OME-TIFF, ``ZYX`` or ``ZCYX``, whole or not at all, with one plane in memory.
+
+    ``planes`` are (height, width) or (height, width, n_channels), ``shape`` is that of all with n_z in front.
+    The voxel size is that of the middle plane, where it is known; what :func:`grid_facts` says is annotated.
+
+    Raises FileError or OSError when it cannot be written.
+    """
+    import tifffile
+
+    colour = len(shape) == 4
+    pages = (page for plane in planes for page in (np.moveaxis(plane, -1, 0) if colour else plane[None]))
+    sizes = {f"PhysicalSize{axis.upper()}": size for axis, size in voxel_um(grid).items()}
+    metadata: dict[str, Any] = {"axes": "ZCYX" if colour else "ZYX", **sizes}
+    metadata |= {f"{name}Unit": "µm" for name in sizes}
+    n_pages = shape[0] * (shape[3] if colour else 1)
+    if origin := origin_um(grid):
+        places = {
+            axis.upper(): np.repeat(grid.z_um, n_pages // shape[0])
+            if axis == "z"
+            else np.full(n_pages, place)
+            for axis, place in origin.items()
+        }
+        metadata["Plane"] = {f"Position{axis}": list(map(float, where)) for axis, where in places.items()}
+        metadata["Plane"] |= {f"Position{axis}Unit": ["µm"] * n_pages for axis in places}
+    metadata["MapAnnotation"] = annotation({"words": scale_in_words(grid), **grid_facts(grid)})
+    stored = (shape[0], shape[3], *shape[1:3]) if colour else shape
+    big = 4 * int(np.prod(shape)) > _BIG_TIFF_BYTES
+    with whole_file(path) as temporary, tifffile.TiffWriter(temporary, ome=True, bigtiff=big) as tiff:
+        size = resolution(sizes.get("PhysicalSizeX"))
+        tiff.write(pages, shape=stored, dtype=np.float32, photometric="minisblack", metadata=metadata, **size)
