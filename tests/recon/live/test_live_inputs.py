@@ -1,0 +1,135 @@
+"""Frames, settings and depths that live pictures take, and refuse; starting again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon import Calibration, InputError
+from recon.base.metrics import psnr
+from recon.streams.live import LiveReconstructor
+from recon.streams.live_picture import Level
+from recon.streams.stillness import SceneState, SceneWatch
+from tests.recon.live.streams import AMPLE_MS, NOISE, SHAPE, iterated, live, photograph, spots_psf
+
+
+def test_colour_and_frames_finer_than_the_psf() -> None:
+    psf = np.stack([spots_psf()] * 3, axis=2)
+    frame = np.stack([photograph(0, seed) for seed in range(3)], axis=2)
+    picture = LiveReconstructor(psf, background=20.0, budget_ms=25.0, coarsest=1).feed(frame)
+    assert picture.image.shape == (*SHAPE, 3)
+    assert picture.image.flags.c_contiguous
+    fine = np.kron(photograph(0, 0), np.ones((2, 2), np.uint16))
+    coarse = live().feed(photograph(0, 0))
+    assert psnr(live().feed(fine).image, coarse.image) > 60
+
+
+@pytest.mark.parametrize(
+    ("frame", "says"),
+    [
+        (np.zeros((10, 10), np.uint16), "10 x 10 pixels and the PSF 64 x 96"),
+        (np.zeros((128, 96), np.uint16), "whole factor"),
+        (np.full(SHAPE, np.nan, np.float32), "not finite .* nothing else in it"),
+        (np.where(np.eye(*SHAPE) > 0, np.nan, 1), "not finite .* Put the mean of their neighbours there"),
+        (np.full(SHAPE, 1e39), "frame must hold real numbers up to"),
+        (np.zeros(5, np.uint16), "must be"),
+    ],
+)
+def test_unusable_frames_are_refused(frame: np.ndarray, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        live().feed(frame)
+
+
+def test_a_frame_that_is_not_finite_spoils_none_of_those_after_it() -> None:
+    reconstructor = live()
+    frame = photograph(0, 0).astype(np.float32)
+    reconstructor.feed(frame)
+    spoilt = frame.copy()
+    spoilt[3, 4] = np.nan
+    with pytest.raises(InputError, match="not finite"):
+        reconstructor.feed(spoilt)
+    assert np.isfinite(reconstructor.feed(photograph(0, 1).astype(np.float32)).image).all()
+
+
+def test_the_watch_begins_anew_after_what_is_not_finite() -> None:
+    watch = SceneWatch()
+    frames = np.random.default_rng(0).normal(100, 3, (4, 1, *SHAPE)).astype(np.float32)
+    watch.see(frames[0])
+    spoilt = frames[1].copy()
+    spoilt[0, 3, 4] = np.nan
+    assert watch.see(spoilt) is SceneState.NEW
+    assert watch.see(frames[2]) is SceneState.NEW
+    assert watch.see(frames[3]) is SceneState.STILL
+    assert np.isfinite(watch.mean).all()
+
+
+@pytest.mark.parametrize("settings", [{"budget_ms": 0}, {"finest": 3, "coarsest": 2}, {"average": 0}])
+def test_unusable_settings_are_refused(settings: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=next(iter(settings))):
+        live(**settings)
+
+
+def test_what_has_seen_nothing_can_be_restarted() -> None:
+    reconstructor = live()
+    reconstructor.restart()
+    assert iterated(reconstructor, photograph(0, 1)).iterations > 0
+
+
+def test_a_change_of_format_needs_a_restart() -> None:
+    reconstructor = live()
+    reconstructor.feed(photograph(0, 0))
+    fine = np.kron(photograph(0, 0), np.ones((2, 2), np.uint16))
+    with pytest.raises(InputError, match="restart"):
+        reconstructor.feed(fine)
+    reconstructor.restart()
+    assert reconstructor.feed(fine).scene is SceneState.NEW
+
+
+def test_a_restart_gives_up_what_solvers_hold_and_before_the_first_frame_does_nothing() -> None:
+    reconstructor = live(budget_ms=AMPLE_MS)
+    reconstructor.restart()
+    iterated(reconstructor, photograph(0, 0))
+    assert reconstructor._level is not None
+    solver = reconstructor._level.solver
+    assert solver is not None
+    assert solver.solvers != [None]
+    reconstructor.restart()
+    assert solver.solvers == [None]
+
+
+def test_a_depth_that_there_is_not_is_refused() -> None:
+    live(plane=0)
+    with pytest.raises(InputError, match="plane 1 is none of the 1 depths, counted from 0"):
+        live(plane=1)
+
+
+def test_a_known_background_is_taken_off() -> None:
+    frame = photograph(0, 0).astype(np.float32)
+    less = live(background=None).feed(frame - 20)
+    np.testing.assert_allclose(live().feed(frame).image, less.image, atol=1e-5 * float(less.image.max()))
+
+
+def test_the_options_of_live_pictures_are_settled_before_the_first_frame() -> None:
+    with pytest.raises(InputError, match="no iterations"):
+        live(solver="wiener")
+    assert live()._options.estimate_background is False, "a known background is not estimated"
+    assert live(estimate_background=True)._options.estimate_background is True
+    psfs = spots_psf()[None, None] * np.ones((2, 1, 1, 1), np.float32)
+    places = np.array([[0.0, 0, 1e4], [0, 0, 2e4]], np.float32)
+    for at, many in ((places, False), (places[[0, 0]] + [[0, 0, 0], [50, 0, 0]], True)):
+        calibration = Calibration(psfs, at)
+        assert LiveReconstructor(calibration, noise=NOISE)._one_of_many == many
+
+
+def test_a_frame_that_no_level_takes_settles_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    reconstructor = live()
+
+    def refuses(*_: object) -> Level:
+        raise InputError("no way")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LiveReconstructor, "_level_of", refuses)
+        with pytest.raises(InputError, match="no way"):
+            reconstructor.feed(photograph(0, 0))
+    assert reconstructor._shape == ()
+    assert reconstructor.feed(photograph(0, 0)).method == "wiener"
