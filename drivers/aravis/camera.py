@@ -23,7 +23,6 @@ from drivers.aravis.features import (
 )
 from drivers.common.buffered_camera import RawFrame
 from drivers.common.drops import FrameNumberCounter
-from drivers.common.pixels import Bytes, Pixels, unpack
 from drivers.device import DriverOptions, FoundDevice, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceLostError
 from drivers.genicam.camera import GIGE_BLOCK_IDS, GenicamCamera, GenicamOptions
@@ -71,8 +70,6 @@ class AravisCamera(GenicamCamera):
         self._stream: Any = None
         self._woken = threading.Event()
         self._statistics: dict[str, int] = {}
-        self._line_bytes: int | None = None
-        """Bytes from line to line where the camera pads lines."""
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
@@ -189,9 +186,7 @@ class AravisCamera(GenicamCamera):
         complete = buffer.get_status() == self._aravis.BufferStatus.SUCCESS
         if complete:
             width, height = buffer.get_image_width(), buffer.get_image_height()
-            padding, _ = buffer.get_image_padding()
-            pixels = self._images.format
-            self._line_bytes = pixels.line_bytes(width) + padding if padding else None
+            self._note_padding(buffer.get_image_padding()[0])
             complete = (height, width) == self.image_shape
         data = np.frombuffer(buffer.get_data() if complete else b"", np.uint8)
         return RawFrame(
@@ -215,6 +210,3 @@ class AravisCamera(GenicamCamera):
         with contextlib.suppress(library_error()):  # of a camera that is gone
             self._camera.stop_acquisition()
         self._statistics = stream_statistics(stream)
-
-    def _decode(self, data: Bytes, out: Pixels) -> bool:
-        return unpack(data, self._images.format.packing, out, self._line_bytes)

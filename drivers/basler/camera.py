@@ -20,7 +20,6 @@ from drivers.basler.features import (
 )
 from drivers.common.buffered_camera import RawFrame
 from drivers.common.drops import FrameNumberCounter
-from drivers.common.pixels import Bytes, Pixels, unpack
 from drivers.device import DriverOptions, FoundDevice, SharedPart
 from drivers.genicam.camera import GIGE_BLOCK_IDS, GenicamCamera, GenicamOptions
 
@@ -122,6 +121,8 @@ class BaslerCamera(GenicamCamera):
 
     def _raw(self, result: Any) -> RawFrame:
         complete = result.GrabSucceeded() and (result.Height, result.Width) == self.image_shape
+        if complete:
+            self._note_padding(int(result.PaddingX))
         data = np.frombuffer(result.GetBuffer() if complete else b"", np.uint8)
         time_ns = int(result.TimeStamp) * _NS_PER_S // self._ticks_per_s
         return RawFrame(data, int(result.BlockID), time_ns or None, bool(complete), result)
@@ -136,6 +137,3 @@ class BaslerCamera(GenicamCamera):
         if self._camera is not None:
             with contextlib.suppress(Exception):  # of a camera that is gone
                 self._camera.StopGrabbing()
-
-    def _decode(self, data: Bytes, out: Pixels) -> bool:
-        return unpack(data, self._images.format.packing, out)

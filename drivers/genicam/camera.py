@@ -9,6 +9,7 @@ from pydantic import Field
 from drivers.camera import Roi, TriggerEdge, TriggerMode
 from drivers.common.buffered_camera import BufferedCamera
 from drivers.common.camera_settings import GainScale, GainUnit
+from drivers.common.pixels import Bytes, Pixels, unpack
 from drivers.device import DriverOptions, OwnSetting, Setting
 from drivers.errors import DeviceError, DeviceLostError, LimitError
 from drivers.genicam.features import (
@@ -60,6 +61,8 @@ class GenicamCamera(BufferedCamera):
     options: GenicamOptions
     _features: Features
     _images: Images
+    _line_bytes: int | None = None
+    """None where a frame's lines follow each other without padding, even inside a byte."""
 
     def _prepare(self) -> None:
         """Bring the camera to a state in which nothing happens by itself, and read what it is."""
@@ -373,3 +376,12 @@ class GenicamCamera(BufferedCamera):
 
     def _fire(self) -> None:
         self._features.execute("TriggerSoftware")
+
+    # Frames ----------------------------------------------------------------------------------------
+    def _note_padding(self, n_bytes: int) -> None:
+        """Take note of how many bytes follow each line of the frame that comes next."""
+        line_bytes = self._images.format.line_bytes(self.image_shape[1])
+        self._line_bytes = line_bytes + n_bytes if n_bytes else None
+
+    def _decode(self, data: Bytes, out: Pixels) -> bool:
+        return unpack(data, self._images.format.packing, out, self._line_bytes)

@@ -88,8 +88,28 @@ def test_a_gige_cameras_ticks_are_told_as_nanoseconds(
         GetBuffer=lambda: b"",
         BlockID=7,
         TimeStamp=(1 << 60) + 1,
+        PaddingX=0,
     )
     assert camera._raw(result).device_time_ns == 8 * ((1 << 60) + 1)
+
+
+@pytest.mark.parametrize(("pixel_format", "dtype"), [("Mono8", "u1"), ("Mono12", "u2")])
+def test_bytes_that_pad_each_line_are_left_out(camera: BaslerCamera, pixel_format: str, dtype: str) -> None:
+    camera.set_pixel_format(pixel_format)
+    image = (np.arange(256 * 512).reshape(256, 512) % 251).astype(dtype)
+    padded = np.pad(image.view("u1"), ((0, 0), (0, 6)), constant_values=77)
+    result = SimpleNamespace(
+        GrabSucceeded=lambda: True,
+        Height=256,
+        Width=512,
+        GetBuffer=lambda: padded.tobytes(),
+        BlockID=7,
+        TimeStamp=1,
+        PaddingX=6,
+    )
+    out = np.zeros_like(image)
+    assert camera._decode(camera._raw(result).data, out)
+    np.testing.assert_array_equal(out, image)
 
 
 def test_a_picture_from_its_file_arrives_whole(camera: BaslerCamera) -> None:
