@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from instrument.files import reading
 from instrument.files.errors import FileError, os_reason, size
-from instrument.files.named_arrays import is_hdf5, is_matlab, read_hdf5, read_matlab
+from instrument.files.named_arrays import Expect, is_hdf5, is_matlab, outline, read_hdf5, read_matlab
 from instrument.files.pictures import MAGIC, READABLE, Decoded, decode_picture
 from instrument.files.tiffs import RAW, decode_tiff
 
@@ -43,10 +43,11 @@ def _unreadable(path: Path) -> str:
     return f"is no image that can be read, or is damaged. Readable: {READABLE}."
 
 
-def decode(path: Path, inside: str = "") -> Decoded:
+def decode(path: Path, inside: str, expect: Expect) -> Decoded:
     """Return a file's array; its content, not its name, tells the format.
 
-    ``inside`` names one of several arrays of an HDF5, MATLAB or .npz file.
+    ``inside`` names one of several arrays of an HDF5, MATLAB or .npz file. ``expect`` refuses what is not
+    wanted, before it is read: it is given an array of its shape that takes no memory.
 
     Raises FileError.
     """
@@ -61,11 +62,11 @@ def decode(path: Path, inside: str = "") -> Decoded:
     if not n_bytes:
         raise FileError(path, "is empty (0 bytes).")
     if is_hdf5(beginning):
-        return read_hdf5(path, inside, of_matlab=beginning.startswith(b"MATLAB"))
+        return read_hdf5(path, inside, of_matlab=beginning.startswith(b"MATLAB"), expect=expect)
     if is_matlab(beginning):
-        return read_matlab(path, inside)
+        return read_matlab(path, inside, expect=expect)
     if beginning.startswith(b"PK"):
-        return _decode_npz(path, inside)
+        return _decode_npz(path, inside, expect)
     if inside:
         raise FileError(path, f"is no HDF5, MATLAB or .npz file, so that nothing in it is called {inside}.")
     known = (b"\x93NUMPY", *_TIFF_MAGIC, *MAGIC)
@@ -76,9 +77,9 @@ def decode(path: Path, inside: str = "") -> Decoded:
     if beginning.startswith(b"\x93NUMPY"):
         require_npy(path)
         with path.open("rb") as file:
-            return _decode_npy(path, file, n_bytes)
+            return _decode_npy(path, file, n_bytes, expect)
     if beginning[:4] in _TIFF_MAGIC:
-        return decode_tiff(path)
+        return decode_tiff(path, expect)
     return decode_picture(path)
 
 
@@ -89,12 +90,12 @@ def require_npy(path: Path) -> None:
     """
     n_bytes = reading.require_file(path)
     with path.open("rb") as file:
-        promised = _npy_bytes(path, file, n_bytes)
+        promised = _npy_outline(path, file, n_bytes).nbytes
     reading.require_plausible(path, promised, reading.stored_bytes(path))
 
 
-def _npy_bytes(path: Path, file: IO[bytes], n_bytes: int) -> int:
-    """Read a .npy header; return the bytes of the numbers that it says follow in the file's ``n_bytes``."""
+def _npy_outline(path: Path, file: IO[bytes], n_bytes: int) -> npt.NDArray[Any]:
+    """Read a .npy header; return the outline of what it says follows in the file's ``n_bytes``."""
     try:
         version = np.lib.format.read_magic(file)
         length = file.read(2 if version == (1, 0) else 4)
@@ -108,13 +109,16 @@ def _npy_bytes(path: Path, file: IO[bytes], n_bytes: int) -> int:
         promised = int(math.prod(shape) * dtype.itemsize)
         if promised > n_bytes - 8 - header.tell():
             raise ValueError(f"it says {dtype} {shape}, which are more bytes than it has")
+        if dtype.hasobject:
+            raise ValueError("it holds objects of Python's")
+        told = outline(shape, dtype)
     except Exception as error:  # noqa: BLE001 - the header is Python text, whose parser raises nearly anything
         raise FileError(path, f"is damaged or no plain .npy array: {error!s:.200}.") from None
-    return promised
+    return told
 
 
-def _decode_npy(path: Path, file: IO[bytes], n_bytes: int) -> Decoded:
-    _npy_bytes(path, file, n_bytes)
+def _decode_npy(path: Path, file: IO[bytes], n_bytes: int, expect: Expect) -> Decoded:
+    expect(_npy_outline(path, file, n_bytes))
     file.seek(0)
     try:
         array: npt.NDArray[Any] = np.load(file, allow_pickle=False)
@@ -135,7 +139,7 @@ def _require_listing(path: Path) -> None:
             raise FileError(path, f"is a damaged .npz: its list of members has {size(listed)}.")
 
 
-def _decode_npz(path: Path, inside: str) -> Decoded:
+def _decode_npz(path: Path, inside: str, expect: Expect) -> Decoded:
     _require_listing(path)
     try:
         with zipfile.ZipFile(path) as archive:
@@ -153,13 +157,15 @@ def _decode_npz(path: Path, inside: str) -> Decoded:
             said = members[0].file_size
             reading.require_plausible(path, said, reading.stored_bytes(path))
             with archive.open(members[0]) as member:
-                if _npy_bytes(path, member, said) + _MOST_HEADER < said:
-                    raise FileError(path, f"is damaged: its array has not the {size(said)} that it says.")
+                told = _npy_outline(path, member, said)
+            if told.nbytes + _MOST_HEADER < said:
+                raise FileError(path, f"is damaged: its array has not the {size(said)} that it says.")
+            expect(told)
             with archive.open(members[0]) as member:
                 content = member.read(said + 1)
             if len(content) > said:
                 raise FileError(path, "is damaged: it holds more than it says.")
-            return _decode_npy(path, io.BytesIO(content), said)
+            return _decode_npy(path, io.BytesIO(content), said, expect)
     except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise FileError(path, f"is no .npz with one plain array: {error}.") from None
     except (NotImplementedError, RuntimeError) as error:  # another compression, a password

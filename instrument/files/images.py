@@ -7,8 +7,9 @@ axis in front. The dtype is the file's own (uint8, uint16 or float32) and pixel 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -116,7 +117,7 @@ def read_image(path: Path | str | ImageFile, *, holes: bool = False) -> ImageFil
             raise _several(path.path, len(path.pixels))
         _refuse_non_finite(path.path, path.pixels, holes=holes)
         return path
-    path, array, notes = _decoded(_only_image(Path(path)))
+    path, array, notes = _decoded(_only_image(Path(path)), _one_image)
     array, more = _one_image(path, array)
     pixels, converted = _standard_dtype(path, array, holes=holes)
     return ImageFile(path, pixels, (*notes, *more, *converted), image_metadata(path))
@@ -325,15 +326,20 @@ def _as_stack(path: Path, array: npt.NDArray[Any], notes: tuple[str, ...]) -> Im
     return ImageFile(path, pixels, (*notes, *more, *converted, *words), told)
 
 
-def _decoded(path: Path) -> tuple[Path, npt.NDArray[Any], tuple[str, ...]]:
-    """Decode a file, a Zarr folder, or an array of a file (``FILE::NAME``); returns the file with it."""
+def _decoded(
+    path: Path, expect: Callable[[Path, npt.NDArray[Any]], object] = lambda *_: None
+) -> tuple[Path, npt.NDArray[Any], tuple[str, ...]]:
+    """Decode a file, a Zarr folder, or an array of a file (``FILE::NAME``); returns the file with it.
+
+    ``expect`` refuses, before it is read, what is not wanted: it is given the file and zeros of its shape.
+    """
     if is_zarr(path):
-        return path, *read_zarr(path)
+        return path, *read_zarr(path, expect=partial(expect, path))
     file, _, inside = str(path).partition("::")
     if not inside or path.exists():
         file = str(path)
         inside = ""
-    return Path(file), *decode(Path(file), inside)
+    return Path(file), *decode(Path(file), inside, partial(expect, Path(file)))
 
 
 # Shapes and dtypes ---------------------------------------------------------------------------------

@@ -21,9 +21,12 @@ from instrument.files.pieces import (
     piece_bytes,
     require_lzf_pieces,
     require_pieces,
+    require_szip_pieces,
 )
 
 Read = tuple[npt.NDArray[Any], tuple[str, ...]]
+Expect = Callable[[npt.NDArray[Any]], object]
+"""Given zeros of the shape that will be read, which take no memory; raises where it is refused."""
 _AXES = ("t", "c", "z", "y", "x", "s")
 _COLOURS = {"S": (1, 2, 3, 4), "C": (3,)}
 """How many samples a pixel may have, or channels an image, to be colours; one may be alpha."""
@@ -66,6 +69,15 @@ def ordered(path: Path, array: npt.NDArray[Any], axes: str) -> Read:
     return array, tuple(notes)
 
 
+def outline(shape: Sequence[int], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """Return zeros of a shape, which take no memory."""
+    return np.broadcast_to(np.zeros((), dtype), tuple(map(int, shape)))
+
+
+def _anything(_array: npt.NDArray[Any]) -> None:
+    """Expect nothing."""
+
+
 # Files of several arrays ---------------------------------------------------------------------------
 def is_hdf5(beginning: bytes) -> bool:
     """Whether a file that begins so is HDF5; MATLAB's, since 7.3, have a header of their own before."""
@@ -77,10 +89,10 @@ def is_matlab(beginning: bytes) -> bool:
     return beginning.startswith(b"MATLAB 5.0 MAT-file") and beginning[126:128] in (b"IM", b"MI")
 
 
-def read_hdf5(path: Path, inside: str, *, of_matlab: bool = False) -> Read:
+def read_hdf5(path: Path, inside: str, *, of_matlab: bool = False, expect: Expect = _anything) -> Read:
     """Read an array of an HDF5 file: the only one with two axes or more, or the one called ``inside``.
 
-    ``of_matlab``: its axes are in MATLAB's order, the last first.
+    ``of_matlab``: its axes are in MATLAB's order, the last first. ``expect`` is asked before it is read.
 
     Raises FileError when it is damaged, none or several arrays could be meant, its numbers are elsewhere, or
     h5py is not installed.
@@ -98,32 +110,35 @@ def read_hdf5(path: Path, inside: str, *, of_matlab: bool = False) -> Read:
         if is_array and entry.dtype.kind in "biuf" and not name.startswith("#"):
             found[name] = entry.shape
 
+    def brought(name: str, array: npt.NDArray[Any]) -> Read:
+        if of_matlab:
+            return _of_matlab(name, array.T)
+        array, said = ordered(path, array, _letters([str(axis.label) for axis in file[name].dims]))
+        return array, (f"the array {name} taken", *said)
+
     def read(name: str) -> npt.NDArray[Any]:
         if file[name].external or file[name].is_virtual:
             raise FileError(
                 path, f"keeps the numbers of {name} in other files.", "Copy them into one file (h5repack)."
             )
         stored = file[name].id
+        expect(brought(name, outline(file[name].shape, file[name].dtype))[0])
         most = reading.MOST_EXPANSION if lzf_place(stored) is None else MOST_LZF_EXPANSION
         reading.require_plausible(path, file[name].nbytes, reading.stored_bytes(path), most=most)
         if file[name].chunks is not None and stored.get_create_plist().get_nfilters():
             require_lzf_pieces(path, stored, piece_bytes(file[name]))
+            require_szip_pieces(path, stored, piece_bytes(file[name]))
             require_pieces(path, hdf5_pieces(stored), piece_bytes(file[name]))
         return np.asarray(file[name][()])
 
     try:
         with h5py.File(path, "r") as file:
             file.visititems(note)
-            name, array = _chosen(path, found, inside, read)
-            labels = [str(axis.label) for axis in file[name].dims]
+            return brought(*_chosen(path, found, inside, read))
     except FileError:
         raise
     except Exception as error:  # noqa: BLE001 - a damaged file raises nearly anything
         raise FileError(path, f"is a damaged or unusual HDF5 file: {error!s:.200}.") from None
-    if of_matlab:
-        return _of_matlab(name, array.T)
-    array, said = ordered(path, array, _letters(labels))
-    return array, (f"the array {name} taken", *said)
 
 
 def _letters(names: Sequence[Any]) -> str:
@@ -132,12 +147,16 @@ def _letters(names: Sequence[Any]) -> str:
     return "".join(str(name) for name in names) if known else ""
 
 
-def read_matlab(path: Path, inside: str) -> Read:
+def read_matlab(path: Path, inside: str, *, expect: Expect = _anything) -> Read:
     """Read an array of a MATLAB file of version 5 to 7; as :func:`read_hdf5`."""
+
+    def read(name: str) -> npt.NDArray[Any]:
+        expect(_of_matlab(name, outline(found[name].shape, np.uint8))[0])
+        return matlab.read_array(path, found[name])
+
     try:
         found = matlab.arrays_in(path)
-        shapes = {name: array.shape for name, array in found.items()}
-        name, array = _chosen(path, shapes, inside, lambda name: matlab.read_array(path, found[name]))
+        name, array = _chosen(path, {name: array.shape for name, array in found.items()}, inside, read)
     except FileError:
         raise
     except (OSError, ValueError, EOFError, MemoryError, struct.error, zlib.error) as error:
@@ -193,8 +212,8 @@ def _only_series(folder: Path, group: Any) -> tuple[Any, str]:
     return group[series[0]], f"its image series {series[0]} taken"
 
 
-def read_zarr(folder: Path) -> Read:
-    """Read an OME-Zarr image (0.4 or 0.5) at its finest level, or a Zarr array.
+def read_zarr(folder: Path, *, expect: Expect = _anything) -> Read:
+    """Read an OME-Zarr image (0.4 or 0.5) at its finest level, or a Zarr array; as :func:`read_hdf5`.
 
     Raises FileError when it is none, is damaged, or has several stack axes.
     """
@@ -214,6 +233,7 @@ def read_zarr(folder: Path) -> Read:
             names = [axis["name"] if isinstance(axis, dict) else axis for axis in image.get("axes", "tczyx")]
             axes = "".join(map(str, names))
             group = group[image["datasets"][0]["path"]]
+        expect(ordered(folder, outline(group.shape, group.dtype), axes)[0])
         held = reading.folder_bytes(folder, group.nbytes, [(folder / group.path, piece_bytes(group))])
         reading.require_plausible(folder, group.nbytes, held)
         array = np.asarray(group[...])

@@ -27,6 +27,7 @@ _DEFLATES = 1040
 """By how much deflate shrinks zeros, at most (1032)."""
 _LZF = 32000
 """HDF5's number of h5py's own filter."""
+_SZIP, _FLETCHER32 = 4, 3
 _LZF_SHRINKS = 88
 """By how much LZF shrinks zeros, at most: 264 bytes in three."""
 MOST_LZF_EXPANSION = 40
@@ -83,9 +84,32 @@ def _beyond(path: Path, most: int, holds_bytes: int, error: type[FileError]) -> 
 
 def lzf_place(stored: Any) -> int | None:
     """Return which of an HDF5 dataset's filters is LZF; None where none is."""
-    plist = stored.get_create_plist()
-    numbers = [plist.get_filter(n)[0] for n in range(plist.get_nfilters())]
+    numbers = _filters(stored)
     return numbers.index(_LZF) if _LZF in numbers else None
+
+
+def _filters(stored: Any) -> list[int]:
+    """Return HDF5's numbers of a dataset's filters, in the order in which they were applied."""
+    plist = stored.get_create_plist()
+    return [int(plist.get_filter(n)[0]) for n in range(plist.get_nfilters())]
+
+
+def require_szip_pieces(path: Path, stored: Any, holds_bytes: int) -> None:
+    """Refuse an HDF5 dataset with a szip chunk that becomes far more than a chunk holds; as `require_pieces`.
+
+    Its first four bytes tell what becomes of it, and it becomes no more (HDF5, H5Zszip.c).
+    """
+    numbers, most = [n for n in _filters(stored) if n != _FLETCHER32], 2 * holds_bytes + _SLACK_BYTES
+    if numbers[-1:] != [_SZIP]:
+        return
+    place = _filters(stored).index(_SZIP)
+    chunks: list[Any] = []
+    stored.chunk_iter(chunks.append)
+    for chunk in chunks:
+        if not chunk.filter_mask >> place & 1:
+            data = stored.read_direct_chunk(chunk.chunk_offset)[1]
+            if int.from_bytes(data[:4], "little") > most:
+                raise _beyond(path, most, holds_bytes, FileError)
 
 
 def require_lzf_pieces(path: Path, stored: Any, holds_bytes: int) -> None:

@@ -16,7 +16,7 @@ import tifffile
 
 from instrument.files import reading
 from instrument.files.errors import FileError
-from instrument.files.named_arrays import ordered
+from instrument.files.named_arrays import Expect, ordered, outline
 from instrument.files.pictures import (
     LOSSY,
     MOST_BYTES,
@@ -56,14 +56,14 @@ _LIGHT = {
 _WHOLE_BYTES = (1, 8, 16, 32, 64)
 
 
-def decode_tiff(path: Path) -> Decoded:
-    """Return the array of a TIFF's first image or stack that is no thumbnail.
+def decode_tiff(path: Path, expect: Expect) -> Decoded:
+    """Return the array of a TIFF's first image or stack that is no thumbnail; ``expect`` is asked before.
 
     Raises FileError when it is damaged, parts of it are missing, or it is of a kind that is not read.
     """
     try:
         with _quiet_tifffile(), open_tiff(path) as tiff:
-            return _decode(path, tiff)
+            return _decode(path, tiff, expect)
     except FileError:
         raise
     except Exception as error:  # noqa: BLE001 - a damaged TIFF raises nearly anything
@@ -116,9 +116,10 @@ def _main_series(path: Path, tiff: tifffile.TiffFile) -> Any:
     return series
 
 
-def _decode(path: Path, tiff: tifffile.TiffFile) -> Decoded:
+def _decode(path: Path, tiff: tifffile.TiffFile, expect: Expect) -> Decoded:
     series = _main_series(path, tiff)
     page = series.keyframe
+    expect(ordered(path, outline(series.shape, series.dtype), series.axes)[0])
     notes = []
     if page.photometric == _PHOTOMETRIC.PALETTE and not tiff.is_imagej:
         return _with_opencv(path, tiff, series)

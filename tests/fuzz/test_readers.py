@@ -138,6 +138,23 @@ def test_what_lzf_shrinks_to_nothing_is_refused_by_its_size(tmp_path: Path, what
         read_image(path)
 
 
+def test_what_szip_says_to_become_far_more_is_refused(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    if not h5py.h5z.filter_avail(h5py.h5z.FILTER_SZIP):
+        pytest.skip("this HDF5 is made without szip")
+    path, whole = tmp_path / "szip.h5", np.arange(6144, dtype=np.uint16).reshape(64, 96)
+    with h5py.File(path, "w") as file:
+        options = {"chunks": (64, 96), "compression": "szip", "fletcher32": True}
+        stored = file.create_dataset("image", data=whole, **options).id
+    np.testing.assert_array_equal(read_image(path).pixels, whole)
+    with h5py.File(path, "r+") as file:
+        stored = file["image"].id
+        data = stored.read_direct_chunk((0, 0))[1]
+        stored.write_direct_chunk((0, 0), (3 << 30).to_bytes(4, "little") + data[4:])
+    with pytest.raises(BenchError, match=r"inflates to over 1.07 MB, for 12.3 kB of numbers"):
+        read_image(path)
+
+
 @pytest.mark.parametrize("shuffle", [False, True])
 def test_frames_by_lzf_are_read_without_a_walk_through_their_pieces(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, shuffle: bool

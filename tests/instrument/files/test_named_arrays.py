@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+import tifffile
 import zarr
 
 from instrument.files.errors import FileError
@@ -137,3 +138,29 @@ def test_labels_beside_an_image_may_have_larger_chunks(tmp_path: Path) -> None:
     cells = RNG.integers(0, 1 << 31, (1024, 1024)).astype(np.uint32) // (1 << 24)
     group.create_array("labels/cells", data=cells, chunks=(1024, 1024), compressors=zarr.codecs.GzipCodec())
     np.testing.assert_array_equal(read_image(tmp_path / "a.zarr").pixels, image)
+
+
+@pytest.mark.parametrize("name", ["s.tif", "s.npy", "s.npz", "s.h5", "s.mat", "s.zarr"])
+def test_a_stack_where_one_picture_is_wanted_is_refused_before_its_pixels_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    path, stack = tmp_path / name, np.zeros((5, 30, 40), np.uint16)
+    match path.suffix:
+        case ".tif":
+            tifffile.imwrite(path, stack)
+            monkeypatch.setattr(tifffile.TiffPageSeries, "asarray", lambda *_: pytest.fail("read"))
+        case ".npy" | ".npz":
+            np.save(path, stack) if path.suffix == ".npy" else np.savez(path, stack)
+            monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("read"))
+        case ".h5":
+            with h5py.File(path, "w") as file:
+                file["image"] = stack
+            monkeypatch.setattr(h5py.Dataset, "__getitem__", lambda *_: pytest.fail("read"))
+        case ".mat":
+            scipy.io.savemat(path, {"image": np.moveaxis(stack, 0, -1)})
+            monkeypatch.setattr("instrument.files.matlab.read_array", lambda *_: pytest.fail("read"))
+        case _:
+            zarr.save_array(path, stack)
+            monkeypatch.setattr(zarr.Array, "__getitem__", lambda *_: pytest.fail("read"))
+    with pytest.raises(FileError, match=rf"{name}: holds 5 images; a single one is expected"):
+        read_image(path)
