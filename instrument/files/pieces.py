@@ -12,7 +12,8 @@ import lzma
 import math
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import IO, Any
 
@@ -115,8 +116,8 @@ def require_szip_pieces(path: Path, stored: Any, holds_bytes: int) -> None:
 def require_lzf_pieces(path: Path, stored: Any, holds_bytes: int) -> None:
     """Refuse an HDF5 dataset with an LZF chunk that becomes far more than a chunk holds; as `require_pieces`.
 
-    Chunks that cannot become more than 256 MB, by their size or :func:`_lzf_most`, are not walked through:
-    that is slower than to inflate them.
+    Chunks that cannot become more than 256 MB, by their size or :func:`_lzf_most`, are not walked through,
+    and others as far as what follows could make that much: it is slower than to inflate them.
     """
     place, most = lzf_place(stored), max(2 * holds_bytes + _SLACK_BYTES, _UNTOLD_BYTES)
     chunks: list[Any] = []
@@ -127,37 +128,45 @@ def require_lzf_pieces(path: Path, stored: Any, holds_bytes: int) -> None:
         if not could:
             continue
         data = stored.read_direct_chunk(chunk.chunk_offset)[1]
-        if _lzf_most(data) > most and _lzf_beyond(data, most):
+        left = _lzf_most(data)
+        if left[0] > most and _lzf_beyond(data, most, left):
             raise _beyond(path, most, holds_bytes, FileError)
 
 
-def _lzf_most(data: bytes) -> int:
-    """Return what LZF data become at most, wherever in them runs and copies begin: of two bytes at one.
+def _lzf_most(data: bytes) -> list[int]:
+    """Return what LZF data become at most from each block on, wherever in them runs and copies begin.
 
-    A run is shorter than it is stored. A copy of two bytes is longer by its first byte's upper bits, one of
-    three by 6 and its second byte.
+    Of two bytes at one. A run is shorter than it is stored. A copy of two bytes is longer by its first byte's
+    upper bits, one of three by 6 and its second byte.
     """
-    n_bytes = len(data)
+    each = []
     for start in range(0, len(data), _BLOCK_BYTES):
         block = np.frombuffer(data[start : start + _BLOCK_BYTES + 1].ljust(_BLOCK_BYTES + 1, b"\0"), "u1")
         longer = np.where(block[:-1] < 224, block[:-1] >> 5, block[1:].astype(np.uint16) + 6)
-        n_bytes += int(np.maximum(longer[::2], longer[1::2]).sum())
-    return n_bytes
+        each.append(min(_BLOCK_BYTES, len(data) - start) + int(np.maximum(longer[::2], longer[1::2]).sum()))
+    return list(accumulate(reversed(each)))[::-1]
 
 
-def _lzf_beyond(data: bytes, most: int) -> bool:
-    """Add up what the runs and copies of LZF data say of their lengths (liblzf, lzf_d.c)."""
+def _lzf_beyond(data: bytes, most: int, left: Sequence[int]) -> bool:
+    """Add up what the runs and copies of LZF data say of their lengths (liblzf, lzf_d.c).
+
+    ``left``: what they become at most from each block on (:func:`_lzf_most`).
+    """
     at = n_bytes = 0
-    while at < len(data) and n_bytes <= most:
-        if data[at] < 32:  # so many bytes as they are, and one
-            n_bytes += data[at] + 1
-            at += data[at] + 2
-        elif data[at] < 224:
-            n_bytes += (data[at] >> 5) + 2
-            at += 2
-        else:
-            n_bytes += 9 + (data[at + 1] if at + 1 < len(data) else 0)
-            at += 3
+    for block, rest in enumerate(left):
+        if n_bytes + rest <= most:
+            return False
+        end = min(len(data), (block + 1) * _BLOCK_BYTES)
+        while at < end and n_bytes <= most:
+            if data[at] < 32:  # so many bytes as they are, and one
+                n_bytes += data[at] + 1
+                at += data[at] + 2
+            elif data[at] < 224:
+                n_bytes += (data[at] >> 5) + 2
+                at += 2
+            else:
+                n_bytes += 9 + (data[at + 1] if at + 1 < len(data) else 0)
+                at += 3
     return n_bytes > most
 
 

@@ -9,7 +9,9 @@ import struct
 import tracemalloc
 import zipfile
 import zlib
+from bisect import bisect
 from pathlib import Path
+from typing import Any
 
 import numcodecs
 import numpy as np
@@ -17,7 +19,7 @@ import pytest
 import zarr
 
 from instrument.bench.config_file import load_config
-from instrument.files import reading
+from instrument.files import pieces, reading
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image, write_image
 from instrument.files.ome_zarr import ome_attributes
@@ -169,6 +171,29 @@ def test_frames_by_lzf_are_read_without_a_walk_through_their_pieces(
         assert 88 * stored.id.get_storage_size() > 1 << 28, "its size alone does not clear it"
     monkeypatch.setattr("instrument.files.pieces._lzf_beyond", lambda *_: pytest.fail("walked"))
     np.testing.assert_array_equal(read_image(path).pixels, frame)
+
+
+def test_a_walk_through_lzf_ends_where_what_follows_cannot_make_it_too_much(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pieces, "_BLOCK_BYTES", 64)
+    looked: list[int] = []
+
+    class Watched(bytes):
+        def __getitem__(self, at: Any) -> Any:
+            looked.append(at if isinstance(at, int) else 0)
+            return super().__getitem__(at)
+
+    data = Watched(np.random.default_rng(0).integers(0, 256, 2000).astype(np.uint8).tobytes())
+    left = pieces._lzf_most(data)
+    whole = [1 << 40] * len(left)
+    becomes = bisect(range(left[0]), 0, key=lambda most: not pieces._lzf_beyond(data, most, whole))
+    assert 2000 < becomes < left[0] / 2
+    for most in (becomes - 1, becomes):
+        assert pieces._lzf_beyond(data, most, left) == (most < becomes)
+    looked.clear()
+    assert not pieces._lzf_beyond(data, int(0.8 * left[0]), left)
+    assert max(looked) < 1000
 
 
 @pytest.mark.parametrize("compression", [8, 34925])
