@@ -276,7 +276,7 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
     from instrument.files.calibration_file import load_calibration, save_calibration
     from instrument.reconstruction.job import find_calibration
     from recon.camera.refocus import refocus as refocused
-    from recon.camera.refocus_field import refocus_field
+    from recon.camera.refocus_field import extrapolations, refocus_field
     from recon.camera.two_part import is_cut, two_part
 
     if len(set(options.z_um)) < len(options.z_um):
@@ -305,9 +305,6 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
             for place, field in enumerate(fields):
                 fields[place] = two_part(field, response, points=options.points)
                 advance(place + 1)
-    provenance = {**fields[0].provenance, "refocused_from": str(folder.resolve())}
-    if beyond := [one.warning for one in made if one.extrapolated]:
-        provenance["extrapolated"] = " ".join(filter(None, (provenance.get("extrapolated"), *beyond)))
     new = replace(
         fields[0],
         psfs=np.concatenate([field.psfs for field in fields]),
@@ -324,7 +321,11 @@ def refocus(desk: Desk, options: RefocusOptions, given: Given) -> Done:
                 for one in made
             ]
         },
-        provenance=provenance,
+        provenance={
+            **fields[0].provenance,
+            "refocused_from": str(folder.resolve()),
+            "extrapolated": extrapolations(measured, made),
+        },
     )
     path = save_calibration(new, options.out, overwrite=options.force)
     if measured.provenance.get("simulated"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,6 +30,30 @@ Floats = npt.NDArray[np.float32]
 
 SAME_PLACE = 0.02
 """Places of two depths that differ by no more of the field were meant to be the same."""
+
+
+def extrapolations(calibration: Calibration, made: Sequence[Refocused]) -> list[dict[str, Any]]:
+    """Return what is doubtful about depths made of a calibration's, for a provenance: depth and warning each.
+
+    Of depths beyond the calibrated ones, and of those made of such.
+    """
+    found = []
+    for one in made:
+        warnings = [*_warnings(calibration, one.from_z_um), *([one.warning] if one.extrapolated else [])]
+        found += [{"z_um": one.z_um, "warning": warning} for warning in warnings]
+    return found
+
+
+def beyond_calibrated(calibration: Calibration) -> list[str]:
+    """Return the warnings of those depths of a calibration that were made beyond the calibrated ones."""
+    return _warnings(calibration, calibration.source_positions_um[:, 2].tolist())
+
+
+def _warnings(calibration: Calibration, depths_um: Sequence[float]) -> list[str]:
+    said = calibration.provenance.get("extrapolated") or []
+    if isinstance(said, str):  # as it was written once: of all depths
+        return [said]
+    return [one["warning"] for one in said if np.isclose(one["z_um"], depths_um).any()]
 
 
 def refocus_field(calibration: Calibration, z_um: float) -> Calibration:
@@ -187,6 +212,5 @@ def at_depth(calibration: Calibration, z_um: float) -> tuple[Calibration, Refocu
         return calibration, None
     made = refocus(calibration, z_um)
     provenance = {**calibration.provenance, "refocused": made.to_json()}
-    if made.extrapolated:
-        provenance["extrapolated"] = made.warning
+    provenance["extrapolated"] = extrapolations(calibration, [made])
     return replace(refocus_field(calibration, z_um), provenance=provenance), made

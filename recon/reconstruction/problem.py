@@ -14,7 +14,7 @@ from recon.base.checks import as_channels, check_psf
 from recon.base.declare import settled
 from recon.camera.camera_model import Depths, Extent, ModelName, choose_model, energies, levelled
 from recon.camera.grid import Grid
-from recon.camera.refocus_field import at_depth
+from recon.camera.refocus_field import at_depth, beyond_calibrated
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (
@@ -164,7 +164,7 @@ class Problem:
                 reason = "patterned light takes one PSF a depth where no other model is asked for"
         asked = True if options.positive_background else options.estimate_background
         unmoved = calibration.provenance.get("not_refocused")
-        said = (holes, unmoved and f"The PSF was {unmoved}.", calibration.provenance.get("extrapolated"))
+        said = (holes, unmoved and f"The PSF was {unmoved}.", *beyond_calibrated(calibration))
         deviation = measurement.deviations(counts).astype(np.float32)
         problem = cls(
             measurement,
