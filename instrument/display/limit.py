@@ -111,7 +111,7 @@ def limit_lines(found: Sequence[Limit], display: Display, options: HologramOptio
             f"(a bound; {here.reached_db:.2f} dB is reached by what need not be frames of phases)"
         ]
     else:
-        none = "none is in sight" if _is_told(here) else "not known after so short a search"
+        none = "none is in sight" if is_told(here) else "not known after so short a search"
         lines = [
             f"limit: {none} {behind}; {here.reached_db:.2f} dB is reached by what need not be "
             "frames of phases"
@@ -138,14 +138,14 @@ def limit_lines(found: Sequence[Limit], display: Display, options: HologramOptio
 
 def at_most(limit: Limit) -> str:
     """Return a bound in words."""
-    if not _is_told(limit):
+    if not is_told(limit):
         return "not known after so short a search"
     return f"at most {limit.bound_db:.2f} dB" if limit.bound_db < _NO_LIMIT_DB else "no limit in sight"
 
 
-def _is_told(limit: Limit) -> bool:
+def is_told(limit: Limit) -> bool:
     """Return whether there is a bound, or a search that was not cut short found none."""
-    short = (HologramStop.TIME, HologramStop.CANCELLED)
+    short = (HologramStop.TIME, HologramStop.CANCELLED, HologramStop.ITERATIONS)
     return limit.bound_db < _NO_LIMIT_DB or limit.stop_reason not in short
 
 

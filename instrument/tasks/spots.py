@@ -22,6 +22,7 @@ from instrument.display.limit import (
     at_most,
     coarser_mask,
     frames_line,
+    is_told,
     lifts_of,
     limit_lines,
     limits_of_lifts,
@@ -174,7 +175,12 @@ def tell_limit(desk: Desk, picture: Pixels, display: Display, options: HologramO
             better = at_most(hologram_limit(coarser, target, shared.next(options), cancel=cancel))
             lines.append(f"  half of the field, along each axis (--expansion {coarser.expansion}): {better}")
     if cancel.is_set():
-        desk.warn("Interrupted: this is a bound all the same, less sharp than it could be.")
+        sharp = (
+            "this is a bound all the same, less sharp than it could be"
+            if is_told(found[0])
+            else "no bound yet"
+        )
+        desk.warn(f"Interrupted: {sharp}.")
     for line in filter(None, lines):
         desk.say(line)
     return Done()

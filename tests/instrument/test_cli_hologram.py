@@ -341,7 +341,8 @@ def test_a_search_without_time_is_no_advice() -> None:
     told = Limit(
         np.inf, 20.0, np.ones(4), np.ones(4), HologramStop.TIME, 0.1, np.ones((1, 4, 4), np.complex64)
     )
-    assert at_most(told) == "not known after so short a search"
+    for stop in (HologramStop.TIME, HologramStop.CANCELLED, HologramStop.ITERATIONS):
+        assert at_most(replace(told, stop_reason=stop)) == "not known after so short a search"
     assert at_most(replace(told, stop_reason=HologramStop.QUALITY)) == "no limit in sight"
     assert at_most(replace(told, bound_db=21.0)) == "at most 21.00 dB"
 
