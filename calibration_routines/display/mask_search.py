@@ -37,6 +37,9 @@ FRAMES, AFTER_SEARCH = 80, 58
 """Frames at most where no number is given: at 16x, 22 of them search as far as the defaults go. At 4x it is
 84 behind SLM pixels of 16 um."""
 
+MOST_SEARCHED = 400
+"""Pictures of a search that is carried out without being asked for by a number of frames: some minutes."""
+
 STEADY_FRAMES = 5
 """Pictures of the blank SLM at the end, by which flicker and motion are told."""
 
@@ -66,8 +69,8 @@ class AlignmentSettings(SeenAgain, Checked):
         label="Frames",
         metavar="N",
         help="Frames at most: gives up rather than take more.",
-        default_words=f"{FRAMES}, or {AFTER_SEARCH} beyond those of the search; more where its last pictures "
-        "are more",
+        default_words=f"{FRAMES}, or {AFTER_SEARCH} beyond those of a search of at most {MOST_SEARCHED}; more "
+        "where its last pictures are more",
     )
     division: Size = option(
         Size(3, 5),
@@ -134,7 +137,7 @@ class AlignmentSettings(SeenAgain, Checked):
         if self.max_frames is not None:
             return self.max_frames
         more = max(0, self.last_frames - AlignmentSettings().last_frames)
-        return max(FRAMES, self.search_pictures(display) + AFTER_SEARCH) + more
+        return max(FRAMES, min(self.search_pictures(display), MOST_SEARCHED) + AFTER_SEARCH) + more
 
     def require(self, display: Display) -> None:
         """Refuse before anything moves what could only fail: no mask, sections, a search without end.

@@ -85,6 +85,7 @@ def test_it_says_so_when_it_fails_and_puts_the_stage_back() -> None:
         ({}, {"division": Size(60, 5)}, "cannot be divided into"),
         ({}, {"reach": 1e6, "max_frames": 80}, "may be taken. Search less"),
         ({}, {"depth_um": 1e9, "max_frames": 80}, "may be taken. Search less"),
+        ({}, {"depth_um": 1e9}, "458 may be taken. Search less"),
     ],
 )
 def test_what_can_only_fail_is_refused_before_anything_moves(changes, settings, words) -> None:
