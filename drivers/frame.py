@@ -33,7 +33,12 @@ class FrameMetadata:
     frame_id: int
     """Running number given by the device (or by the driver where the device has none), from 0."""
     device_time_ns: int | None
-    """The device's own clock at the end of the exposure, or None where it has none."""
+    """The device's own clock at the end of the exposure, or None where it has none.
+
+    GenICam cameras (``aravis``, ``basler``) stamp as their makers chose, many as an exposure begins: SFNC
+    says it of chunk data alone (``ChunkTimestamp``: FrameStart). Of theirs what lies between two frames
+    counts, the exposure being the same.
+    """
     host_time_ns: int
     """``time.monotonic_ns()`` when the frame reached the host."""
     utc: datetime

@@ -69,8 +69,8 @@ class AlignmentSettings(SeenAgain, Checked):
         label="Frames",
         metavar="N",
         help="Frames at most: gives up rather than take more.",
-        default_words=f"{FRAMES}, or {AFTER_SEARCH} beyond those of a search of at most {MOST_SEARCHED}; more "
-        "where its last pictures are more",
+        default_words=f"{FRAMES}, or {AFTER_SEARCH} beyond those of a search of at most {MOST_SEARCHED}; "
+        "more where its last pictures are more",
     )
     division: Size = option(
         Size(3, 5),
