@@ -1,10 +1,11 @@
 """What ``calibrate ... --dry-run`` tells of the time, held against what the routine then takes.
 
-    python benchmarks/dry_runs.py [--only axial angular beads stage]
+    python benchmarks/dry_runs.py [--only axial angular beads stage screen] [--compiled]
 
 Each on the preset ``tiny`` in real time, told and then taken in two processes, in a folder of its own without
-what other runs took, and without kernels that others compiled. The time that the program takes to start is in
-neither: taken is what goes by from its first words on.
+what other runs took, and without kernels that others compiled (``--compiled``: with those that are there).
+The time that the program takes to start is in neither: taken is what goes by from its first words on. The
+screen is that of ``diffuserbench new --screen``, by default and smaller and larger.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from instrument.bench.config_file import template
+
 ROOT = Path(__file__).resolve().parents[1]
 BENCH = """
 camera.driver = "simulated"
@@ -30,23 +33,32 @@ preset = "tiny"
 """
 BEADS = 'scene = "beads"\nbeads = 20\n'
 ROUTINES = {
-    "axial": "--z-min 60 --z-max 150 --planes 6",
-    "angular": "",
-    "stage": "",
-    "beads": "--binning 4",
+    "axial": ("--z-min 60 --z-max 150 --planes 6",),
+    "angular": ("",),
+    "stage": ("",),
+    "beads": ("--binning 4",),
+    "screen": ("", "--binning 2 --pictures 8", "--pictures 30 --judged 5"),
 }
 TYPED = "import sys; from instrument.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
-def carried_out(routine: str, words: list[str], folder: Path) -> tuple[float, str]:
+def bench_of(routine: str) -> str:
+    """Return the bench that a routine is told and taken on."""
+    if routine == "screen":
+        return template("screen").replace("time_scale = 0.0", "time_scale = 1.0")
+    return BENCH + (BEADS if routine == "beads" else "")
+
+
+def carried_out(routine: str, words: list[str], folder: Path, *, compiled: bool) -> tuple[float, str]:
     """Return the seconds by the clock that a routine took, from its first words on, and what it said."""
     environment = {
         **os.environ,
         "PYTHONPATH": str(ROOT),
         "PYTHONUNBUFFERED": "1",
         "XDG_CACHE_HOME": str(folder / "cache"),
-        "NUMBA_CACHE_DIR": str(folder / "kernels"),
     }
+    if not compiled:
+        environment["NUMBA_CACHE_DIR"] = str(folder / "kernels")
     said, began_s = [], 0.0
     with subprocess.Popen(
         [sys.executable, "-c", TYPED, "calibrate", routine, *words],
@@ -75,16 +87,17 @@ def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--only", nargs="+", choices=list(ROUTINES), default=list(ROUTINES))
+    parser.add_argument("--compiled", action="store_true", help="with the kernels that are there")
     asked = parser.parse_args()
     print("| `calibrate` | told | took, s | load |\n|---|---|---|---|", flush=True)
-    for routine in asked.only:
+    for routine, typed in ((name, typed) for name in asked.only for typed in ROUTINES[name]):
         with tempfile.TemporaryDirectory() as made:
             folder = Path(made)
-            (folder / "bench.toml").write_text(BENCH + (BEADS if routine == "beads" else ""))
-            words = ROUTINES[routine].split()
+            (folder / "bench.toml").write_text(bench_of(routine))
+            words = typed.split()
             before = os.getloadavg()[0]
-            _, said = carried_out(routine, [*words, "--dry-run"], folder)
-            took_s, _ = carried_out(routine, words, folder)
+            _, said = carried_out(routine, [*words, "--dry-run"], folder, compiled=asked.compiled)
+            took_s, _ = carried_out(routine, words, folder, compiled=asked.compiled)
             print(
                 f"| {' '.join((f'`{routine}`', *words))} | {told_by(said)} | {took_s:.1f} | "
                 f"{before:.0f} to {os.getloadavg()[0]:.0f} |",

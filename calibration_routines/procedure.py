@@ -17,7 +17,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from calibration_routines.times import took, took_before
+from calibration_routines.times import first_guess, took, took_before
 from instrument.bench.bench import Bench
 from instrument.files.atomic import DOUBTFUL, named_by_worth, write_text
 from instrument.files.errors import BenchError, FileError, SettingsError
@@ -130,6 +130,11 @@ class Outlook:
     plan_lines: tuple[str, ...] = ()
     """The plan in words where more is to be said than frames and seconds; exposures are only found at the
     start (:meth:`Listener.planned`)."""
+    beside_s: float = 0.0
+    """What frames that are not kept take by the clock, of a search, where the cost has none of them."""
+    work: tuple[tuple[str, float], ...] = ()
+    """What steps compute, in their order: a step's name, and so many transforms of 1024 x 1024 there and
+    back. All that follows the first of them is there, or nothing."""
     path: tuple[dict[str, float], ...] = ()
     """Where the source (``x_um``, ``y_um``, ``z_um``) or the stage goes, in the order of the visits."""
 
@@ -214,9 +219,10 @@ class Procedure(ABC):
         """
 
     def foretold(self, bench: Bench, folder: Path | None = None) -> Outlook:
-        """Return the outlook with how long it takes in all, where it was done on this bench before."""
+        """Return the outlook with how long it takes in all, by what it took before or by its work."""
         outlook = self.outlook(bench, folder)
-        return replace(outlook, reasons=(*outlook.reasons, *took_before(self, bench, outlook)))
+        told = took_before(self, bench, outlook) or first_guess(bench, outlook)
+        return replace(outlook, reasons=(*outlook.reasons, *told))
 
     def carry_out(
         self,

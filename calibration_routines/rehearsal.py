@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from statistics import median
@@ -30,13 +30,18 @@ _OF_SEVERAL = re.compile(r"\s*(\d+) of (\d+)$")
 
 
 def rehearse_whole(
-    routine: Routine, options: Any, bench: Bench, on_progress: Callable[[float, float], object]
+    routine: Routine,
+    options: Any,
+    bench: Bench,
+    on_progress: Callable[[float, float], object],
+    work: Sequence[tuple[str, float]] = (),
 ) -> tuple[str, ...]:
     """Say how long a routine takes on a simulated bench: homing, exposures, frames, analysis, files.
 
     All of it is done on a bench like the open one that waits for nothing; what waiting would take is added,
     and what kernels took to compile, which are there from then on, is taken off. A long one is ended on the
-    way, and told by how far it came. ``on_progress`` gets the seconds that it has gone on and
+    way, and told by how far it came; what follows by its ``work`` (:class:`Outlook`), as quickly as the work
+    went that was done or told up to there. ``on_progress`` gets the seconds that it has gone on and
     :data:`ENOUGH_S`. Nothing where a device is not simulated, where frames that were kept are seen again, and
     where it cannot be done there.
     """
@@ -49,7 +54,7 @@ def rehearse_whole(
         if getattr(options, "out", None) is not None:
             options = replace(options, out=folder / options.out.name)
         procedure, control = routine.procedure(options), RunControl()
-        watch = _Watch(control, lambda: time_scale(bench) * not_waited_s(twin), on_progress)
+        watch = _Watch(control, lambda: time_scale(bench) * not_waited_s(twin), on_progress, work)
         try:
             with watch.compiling(), control.procedure(twin):
                 procedure.perform(twin, folder, control, watch)
@@ -68,8 +73,10 @@ class _Watch(Listener):
         control: RunControl,
         waiting_s: Callable[[], float],
         on_progress: Callable[[float, float], object],
+        work: Sequence[tuple[str, float]],
     ) -> None:
         self._control, self._waiting_s, self._on_progress = control, waiting_s, on_progress
+        self._work, self._works_since_s = list(work), 0.0
         self._began_s = time.perf_counter()
         self._step = ""
         self._done, self._total, self._at_most, self._several = 0.0, 0.0, False, False
@@ -109,6 +116,8 @@ class _Watch(Listener):
             self._step = name
             self._done = self._total = 0.0
             self._paces_s = []
+            if self._work and name == self._work[0][0]:
+                self._works_since_s = self._now_s()
         self._several = several is not None
         if several is not None:
             self._see(int(several[1]) - 1, int(several[2]), at_most=False)
@@ -142,7 +151,17 @@ class _Watch(Listener):
         if self._control.ending is None:
             return f"{IN_ALL}by a rehearsal on a simulated bench of its own: about {duration(self._now_s())}."
         most = "at most " if self._at_most else "about "
-        return (
-            f'Up to the end of "{self._step}", by a rehearsal up to {self._done / self._total:.0%} of it: '
-            f"{most}{duration(self._seen_s + self._left_s())}. What follows it comes on top."
-        )
+        end_s = self._seen_s + self._left_s()
+        by = f'by a rehearsal up to {self._done / self._total:.0%} of "{self._step}"'
+        if (following_s := self._following_s(end_s)) is not None:
+            return f"{IN_ALL}{by} and the sizes of what follows: {most}{duration(end_s + following_s)}."
+        return f"Up to the end of that step, {by}: {most}{duration(end_s)}. What follows it comes on top."
+
+    def _following_s(self, end_s: float) -> float | None:
+        """Return what follows a step that ends at ``end_s``, as quick as work was so far; None: not known."""
+        steps = [step for step, _ in self._work]
+        if self._step not in steps:
+            return None
+        following = steps.index(self._step) + 1
+        done, left = (sum(w for _, w in part) for part in (self._work[:following], self._work[following:]))
+        return (end_s - self._works_since_s) * left / done

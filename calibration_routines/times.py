@@ -37,6 +37,21 @@ def took_before(procedure: Procedure, bench: Bench, outlook: Outlook) -> tuple[s
     return (f"{IN_ALL}by what it took last time: about {duration(expected_s)}.",)
 
 
+def first_guess(bench: Bench, outlook: Outlook) -> tuple[str, ...]:
+    """Say how long it takes by its exposures and by what it computes; nothing where that is not known.
+
+    Nor on a simulated bench, whose light is computed, too: that is rehearsed.
+    """
+    if not outlook.work or outlook.cost is None or bench.simulated_kinds:
+        return ()
+    computing_s = kept_times.computing_s(sum(transforms for _, transforms in outlook.work))
+    waiting_s = outlook.cost.waited_s + outlook.beside_s
+    return (
+        f"{IN_ALL}by a first guess: about {duration(waiting_s + computing_s)}, {duration(waiting_s)} of it "
+        "frames at the present exposure, the rest computing.",
+    )
+
+
 def took(procedure: Procedure, bench: Bench, outlook: Outlook, seconds: float) -> None:
     """Remember how long all of it took, and what was planned, unless nobody sees what is foretold."""
     planned_s = 0.0 if outlook.cost is None else outlook.cost.waited_s

@@ -18,17 +18,19 @@ import numpy as np
 from calibration_routines.display.display_io import require_slm
 from calibration_routines.optics.screen_pairs import PairFiles, look_at_pairs, solve_pairs
 from calibration_routines.optics.screen_pictures import Levels, ScreenMap, dead_leaves, random_cells
-from calibration_routines.optics.screen_search import SEARCH, ScreenView, find_screen
+from calibration_routines.optics.screen_search import FINDING, SEARCH, ScreenView, find_screen
 from calibration_routines.optics.screen_solve import (
     AGAIN,
     JUDGED,
     PICTURE,
     SCREEN,
+    SOLVING,
     TONE,
     TONES,
     ScreenOptions,
     ScreenRecord,
     finish_screen,
+    solving_work,
 )
 from calibration_routines.procedure import (
     FromFiles,
@@ -39,14 +41,22 @@ from calibration_routines.procedure import (
     Routine,
     completed,
 )
+from calibration_routines.psf.analysis import channels_first
 from calibration_routines.psf.sweep_plan import DARK
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError
-from instrument.plan import Part, Plan
+from instrument.plan import Part, Plan, estimate
 from instrument.plan.model import Loop
+from instrument.reconstruction.mosaic import in_colours
+from instrument.runs.acquire import abilities_of
 from instrument.runs.run_control import RunControl
 
 _MOST_CELLS = 256  # rows of a picture
+_EXPOSING = 12  # photographs until the exposure of the search is found, twice
+_FIRST_LIGHT, _LIGHT, _FRAME = 700.0, 365.0, 11.0
+"""Transforms of 1024 x 1024 a megapixel that a simulated bench takes for a screen: before its first picture,
+for each one, for each frame of it."""
+SHOWING = "showing pictures"
 _ORDER: tuple[Loop, ...] = ("position", "slm", "light", "exposure", "repeat")
 
 
@@ -94,6 +104,29 @@ def draw_pictures(
     return {label: pictures for label, pictures in levels.items() if pictures}
 
 
+def _unmade(count: int) -> list[Path]:
+    """Return files of so many pictures, for a plan that is only estimated."""
+    return [Path(f"{number}.png") for number in range(count)]
+
+
+def screen_work(
+    bench: Bench, asked: ScreenOptions, frames: int, pictures: int
+) -> tuple[tuple[str, float], ...]:
+    """Return what the steps compute, in transforms of 1024 x 1024 (:class:`Outlook`).
+
+    A simulated bench computes what each picture lights, too, and what all of them need before the first.
+    """
+    camera = bench.camera
+    seen = in_colours(np.zeros(camera.frame_shape, np.float32), camera.pixel_format)
+    solving = solving_work(asked, channels_first(seen).shape)
+    finding, showing = 0.0, 0.0
+    if bench.simulated_kinds:
+        megapixels = 1e-6 * seen.shape[0] * seen.shape[1]
+        finding = megapixels * (_FIRST_LIGHT + _LIGHT * (SEARCH + _EXPOSING))
+        showing = megapixels * (_LIGHT * (pictures + _EXPOSING / 2) + _FRAME * frames)
+    return (FINDING, finding), (SHOWING, showing), (SOLVING, sum(solving))
+
+
 def _written(levels: dict[str, list[Levels]], folder: Path) -> dict[str, Sequence[Path]]:
     import cv2
 
@@ -118,14 +151,24 @@ class ScreenProcedure(Procedure):
         height, width = screen.shape
         if screen.identity.simulated and screen.identity.model != "screen":
             raise BenchError(f"The SLM of {bench.label} is no screen: it does not glow.")
-        frames = asked.dark_frames + asked.average * (len(TONES) + asked.pictures + asked.judged + 1)
+        shown = {DARK: 1, TONE: len(TONES), PICTURE: asked.pictures, JUDGED: asked.judged, AGAIN: 1}
+        plan = screen_plan({label: _unmade(count) for label, count in shown.items() if count}, asked)
+        search = Plan(
+            label=FINDING, parts=(Part(label=FINDING, slm_images=tuple(_unmade(SEARCH + _EXPOSING))),)
+        )
+        abilities = abilities_of(bench, folder or bench.config.data_folder)
+        cost = estimate(plan, abilities)
         return Outlook(
             (
                 f"A screen of {height} x {width} pixels; {SEARCH} photographs to find it, then "
                 f"{asked.pictures} random pictures, {asked.judged} to judge by and {len(TONES)} grey levels: "
-                f"{frames} frames are kept.",
+                f"{cost.frames} frames are kept.",
                 "Nothing else may shine: darken the room, and let the screen warm up.",
-            )
+            ),
+            cost=cost,
+            free_bytes=abilities.free_bytes,
+            beside_s=estimate(search, abilities).waited_s,
+            work=screen_work(bench, asked, cost.frames, sum(shown.values())),
         )
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
@@ -138,7 +181,7 @@ class ScreenProcedure(Procedure):
         found = find_screen(bench, control, listener)
         height, width = bench.camera.frame_shape[:2]
         levels = draw_pictures(asked, found, (height, width), require_slm(bench).shape)
-        listener.step("showing pictures")
+        listener.step(SHOWING)
         exposure_ms = ScreenView(bench, control).expose(levels[AGAIN][0], 0.7)
         record = ScreenRecord(asked, found, bench.geometry, bench.label, bool(bench.simulated_kinds))
         with TemporaryDirectory() as drawn:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.optics.beads import MANY_PX
-from calibration_routines.optics.screen_solve import DRIFT, ScreenOptions, psf_lines, saved
+from calibration_routines.optics.screen_solve import DRIFT, SOLVING, ScreenOptions, psf_lines, saved
 from calibration_routines.procedure import Checked, Listener, Outcome
 from calibration_routines.psf.analysis import channels_first
 from instrument.files.atomic import require_new
@@ -185,7 +185,7 @@ def solve_pairs(
     listener.step("reading the pairs")
     pairs = read_pairs(options.pairs, options.dark)
     settings = PictureSettings(one_psf=not asked.channels, beyond=options.beyond, gamma=options.gamma)
-    listener.step("solving for the PSF")
+    listener.step(SOLVING)
     solved = psf_from_pictures(
         pairs.photographs,
         pairs.pictures,

@@ -17,6 +17,7 @@ from recon.camera.registration import register
 
 Floats = npt.NDArray[np.float32]
 
+FINDING = "finding the screen"
 _BARS = (9, 16)  # rows, columns
 _MARKS = 5  # along each side of the part that is seen
 _MARKS_WITHIN = 0.8  # of it
@@ -78,7 +79,7 @@ def find_screen(bench: Bench, control: RunControl, listener: Listener) -> Screen
     """
     screen = ScreenView(bench, control)
     height, width = shape = screen.slm.shape
-    listener.step("finding the screen")
+    listener.step(FINDING)
     screen.expose(np.full(shape, 255, np.uint8), 0.5)
     total, done = SEARCH, 0
     seen = []

@@ -25,7 +25,7 @@ from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from recon.base.blocks import block_mean
 from recon.base.declare import RARE, option
-from recon.blind.known_pictures import PicturePsf, PictureSettings, psf_from_pictures
+from recon.blind.known_pictures import PicturePsf, PictureSettings, psf_from_pictures, psf_work
 from recon.blind.left_out import POOR_DB, LeftOut, judged_by
 from recon.types import Calibration, Geometry
 
@@ -40,7 +40,8 @@ FLICKER, DRIFT = 0.01, 0.02
 on it is told of."""
 _SOLVER = PictureSettings(beyond=0.0, saturated=None, gamma=1.0, foreign=False, rounds=1, psf_iterations=300)
 """Nothing is unknown but the PSF: black is taken off, the tone is measured, and nothing else shines."""
-_SOLVING = 0.8  # of the work; the rest is judging
+SOLVING = "solving for the PSF"
+_JUDGING = 2300.0  # transforms of 1024 x 1024 a megapixel and channel that a picture to judge by takes
 _JUDGED_ROWS = 256  # of the images that are reconstructed to judge by
 _HOT_SHARE = 1e-3  # of pixels that may be at full scale: hot ones
 
@@ -122,7 +123,7 @@ def finish_screen(run: Run, _bench: Bench | None, control: RunControl, listener:
     Raises CalibrationError when the record is damaged, or the screen's light does not rise with its level.
     """
     record = SCREEN.read(run.path)
-    listener.step("solving for the PSF")
+    listener.step(SOLVING)
 
     def solving(_words: str, done: float) -> None:
         control.check()
@@ -187,6 +188,22 @@ class _Frames:
         )
 
 
+def solving_work(asked: ScreenOptions, image: tuple[int, ...]) -> tuple[float, float]:
+    """Return what solving and judging compute, in transforms of 1024 x 1024 there and back.
+
+    ``image``: (n_channels, height, width) of a frame.
+    """
+    channels, height, width = image[0], *(n // asked.binning for n in image[1:])
+    factor = max(1, height // _JUDGED_ROWS)
+    judged_px = asked.judged * channels * (height // factor) * (width // factor)
+    solver = _solver(asked)
+    return psf_work((asked.pictures, channels, height, width), solver), 1e-6 * _JUDGING * judged_px
+
+
+def _solver(asked: ScreenOptions) -> PictureSettings:
+    return replace(_SOLVER, one_psf=not asked.channels)
+
+
 def solve_screen(
     run: Run, record: ScreenRecord, on_progress: Callable[[str, float], object] | None = None
 ) -> ScreenCalibration:
@@ -203,16 +220,18 @@ def solve_screen(
             f"{', '.join(map(str, TONES))}): switch off dynamic contrast and night modes, and check that the "
             "camera sees the pictures."
         ) from None
-    settings = replace(_SOLVER, one_psf=not asked.channels)
+    taken, shown = frames.pairs(PICTURE, tone)
+    work = solving_work(replace(asked, binning=1), taken.shape[1:])
+    part = work[0] / sum(work)
     solved = psf_from_pictures(
-        *frames.pairs(PICTURE, tone), settings, on_progress=lambda what, done: report(what, _SOLVING * done)
+        taken, shown, _solver(asked), on_progress=lambda what, done: report(what, part * done)
     )
     judged: list[LeftOut] = []
     if asked.judged:
         photographs, pictures = frames.pairs(JUDGED, tone)
         factor = max(1, photographs.shape[2] // _JUDGED_ROWS)
         for photograph, picture in zip(photographs, pictures, strict=True):
-            report("judging", _SOLVING + (1 - _SOLVING) * len(judged) / asked.judged)
+            report("judging", part + (1 - part) * len(judged) / asked.judged)
             name = f"shapes {len(judged) + 1}"
             judged.append(judged_by(solved.psf, photograph, picture, name, factor))
     quality = {

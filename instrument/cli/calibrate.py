@@ -215,7 +215,7 @@ def _rehearsed(routine: Routine, options: Any, outlook: Outlook, bench: Bench) -
     if any(IN_ALL in words for words in outlook.reasons) or not bench.simulated_kinds:
         return []
     with one_task("Rehearsing all of it on a simulated bench of its own") as advance:
-        return rehearse_whole(routine, options, bench, advance)
+        return rehearse_whole(routine, options, bench, advance, outlook.work)
 
 
 def _first_time(outlook: Outlook, bench: Bench) -> list[str]:

@@ -123,7 +123,15 @@ def expected(what: str, count: float = 1.0) -> Expected | None:
         shared = step != _ALONE_IN_IT
         if transforms < _FEW or not seen():
             return None
-        return Expected(transforms * transform_s() * _waiting(shared=shared), "a first guess")
+        return Expected(computing_s(transforms, shared=shared), "a first guess")
+
+
+def computing_s(transforms: float, *, shared: bool = True) -> float:
+    """Return how long so many transforms take by the clock, as quick and as busy as this machine is now.
+
+    ``shared``: among the threads.
+    """
+    return transforms * transform_s() * _waiting(shared=shared)
 
 
 def transform_s() -> float:

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.base.blocks import block_mean, enlarged
+from recon.base.fft import fast_shape
 from recon.blind.psf_step import BeadMixer
 from recon.camera.base import Array, Composition, Projection, estimate_norm
 from recon.camera.convolution import Convolution, field_of
@@ -24,12 +26,14 @@ from recon.camera.varying_psfs import bounding_window
 from recon.errors import InputError
 from recon.priors import NonNegativity
 from recon.solvers import Fista, StoppingRules
+from recon.solvers.base import IterationRecord, Solver
 
 Floats = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]
 
 _COARSE_PX = 64  # rows of the coarsest images
-_NORM_MARGIN = 1.1  # the power iteration's norm is a lower bound
+_OF_A_ROUND = 0.7  # of its work is the PSF's, where light beyond the pictures is solved after it
+_NORM_MARGIN, _NORM_ITERATIONS = 1.1, 15  # the power iteration's norm is a lower bound
 _WORTH = 0.1  # of the misfit, that another exponent than 1 has to take away
 _LARGEST_STEP, _GAMMAS = 0.3, (0.3, 4.0)  # of the exponent
 _FOREIGN, _FEW = 0.03, 3.0
@@ -142,12 +146,9 @@ def psf_from_pictures(
     foreign = foreign_photographs(data, known, settings) if settings.foreign else ()
     kept = np.setdiff1d(np.arange(len(data)), foreign)
     data, known = data[kept], known[kept]
-    factors = [1]
-    while data.shape[2] // (2 * factors[-1]) >= _COARSE_PX:
-        factors.append(2 * factors[-1])
-    costs = np.array([1 / f**2 for f in reversed(factors)])
+    costs = np.array([one.iterations / one.factor**2 for one in scales(data.shape[2], settings)])
     found: _Estimate | None = None
-    for number, factor in enumerate(reversed(factors)):
+    for number, (factor, rounds, psf_iterations) in enumerate(scales(data.shape[2], settings)):
         begin, part = costs[:number].sum() / costs.sum(), costs[number] / costs.sum()
         taken, shown = (block_mean(stack, factor, about_axis=True) for stack in (data, known))
 
@@ -159,12 +160,7 @@ def psf_from_pictures(
         scale = _Estimate(taken, shown, settings)
         if found is not None:
             scale.start_from(found)
-            if factor == 1:
-                scale.settings = replace(
-                    settings,
-                    rounds=(settings.rounds + 1) // 2,
-                    psf_iterations=1 + settings.psf_iterations * 3 // 5,
-                )
+            scale.settings = replace(settings, rounds=rounds, psf_iterations=psf_iterations)
         scale.solve(share)
         found = scale
     assert found is not None
@@ -179,6 +175,49 @@ def psf_from_pictures(
     for every, own in ((brightness, result.brightness), (stray, result.stray), (light, result.light)):
         every[kept] = own
     return replace(result, brightness=brightness, stray=stray, light=light, foreign=foreign)
+
+
+class Scale(NamedTuple):
+    """Images of a size that are solved: by how much they are binned, how often, how long each time."""
+
+    factor: int
+    rounds: int
+    psf_iterations: int
+
+    @property
+    def iterations(self) -> int:
+        """Of the PSF, of all rounds."""
+        return self.rounds * self.psf_iterations
+
+
+def scales(rows: int, settings: PictureSettings) -> list[Scale]:
+    """Return what is solved one after the other, from coarse to fine, for photographs of so many rows."""
+    found = [Scale(1, settings.rounds, settings.psf_iterations)]
+    if rows // 2 >= _COARSE_PX:  # at the finest, with a good start
+        iterations = 1 + settings.psf_iterations * 3 // 5
+        found = [Scale(1, (settings.rounds + 1) // 2, iterations)]
+    while rows // (2 * found[-1].factor) >= _COARSE_PX:
+        found.append(Scale(2 * found[-1].factor, settings.rounds, settings.psf_iterations))
+    return found[::-1]
+
+
+def psf_work(shape: tuple[int, int, int, int], settings: PictureSettings) -> float:
+    """Return what solving for the PSF computes, in transforms of 1024 x 1024 there and back.
+
+    Parameters
+    ----------
+    shape : (int, int, int, int)
+        Photographs, channels, height, width.
+    settings : PictureSettings
+        Of pictures that say all: without light beyond them, exponent and foreign ones.
+    """
+    count, channels, *sensor = shape
+    work = 0.0
+    for factor, rounds, psf_iterations in scales(sensor[0], settings):
+        rows, columns = fast_shape([2 * (n // factor) for n in sensor])
+        passes = rounds * (psf_iterations + _NORM_ITERATIONS)
+        work += passes * count * channels * rows * columns / 1024**2
+    return work
 
 
 def foreign_photographs(data: Floats, known: Floats, settings: PictureSettings) -> tuple[int, ...]:
@@ -279,14 +318,21 @@ class _Estimate:
 
     def solve(self, report: Progress) -> None:
         """Solve PSF, brightness and unknown light in turn; ends with the PSF."""
-        for number in range(self.settings.rounds):
-            report("PSF", number / self.settings.rounds)
-            self.solve_psf()
+        rounds = self.settings.rounds
+        for number in range(rounds):
+            light_too = number < rounds - 1 and bool(self.unknown.any())
+            part = _OF_A_ROUND if light_too else 1.0
+
+            def share(done: float, number: int = number, part: float = part) -> None:
+                report("PSF", (number + part * done) / rounds)
+
+            share(0.0)
+            self.solve_psf(share)
             self.solve_brightness()
             if self.settings.gamma is None:
                 self.solve_gamma()
-            if number < self.settings.rounds - 1 and self.unknown.any():
-                report("light beyond the pictures", (number + 0.7) / self.settings.rounds)
+            if light_too:
+                report("light beyond the pictures", (number + part) / rounds)
                 self.solve_light()
 
     def scene(self) -> Floats:
@@ -294,17 +340,22 @@ class _Estimate:
         lit = self.brightness[:, None, None, None].astype(np.float32) * self.known + self.light
         return np.asarray(lit * self.gains[:, None, None].astype(np.float32), np.float32)
 
-    def solve_psf(self) -> None:
-        scene = self.scene()
+    def solve_psf(self, share: Callable[[float], object]) -> None:
+        """Solve for the PSF by the present brightness and light; ``share`` gets how much of it is done."""
+        scene, iterations = self.scene(), self.settings.psf_iterations
         for k in range(len(self.psf)):
             part = slice(None) if len(self.psf) == 1 else slice(k, k + 1)
             light = scene[:, part].reshape(-1, *self.field)
             seen = BeadMixer(np.ones((1, *self.field), np.float32), light, self.sensor, self.sensor)
             camera = Composition(EvenRemoved(seen.range_shape, seen.range_shape, np.float32), seen)
             target = camera.outer.forward(self.data[:, part].reshape(seen.range_shape))
-            step = 1 / (_NORM_MARGIN * estimate_norm(camera, 15)) ** 2
+            step = 1 / (_NORM_MARGIN * estimate_norm(camera, _NORM_ITERATIONS)) ** 2
             solver = Fista(camera, target, NonNegativity(), initial=self.psf[k : k + 1], step=step)
-            self.psf[k] = solver.run(StoppingRules(iterations=self.settings.psf_iterations)).solution[0]
+
+            def iterated(_solver: Solver, record: IterationRecord, k: int = k) -> None:
+                share((k + record.iteration / iterations) / len(self.psf))
+
+            self.psf[k] = solver.run(StoppingRules(iterations=iterations), callback=iterated).solution[0]
 
     def solve_brightness(self) -> None:
         """Fit each channel's and each photograph's brightness to the data, in turn."""

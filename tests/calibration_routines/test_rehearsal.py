@@ -16,6 +16,7 @@ from calibration_routines.rehearsal import ENOUGH_S, rehearse_whole
 from drivers.errors import DeviceError
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
+from instrument.files.errors import duration
 from instrument.runs.rehearsal import twin_of
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import RunState, RunStatus
@@ -82,8 +83,11 @@ def routine(deed: Deed) -> Routine:
     return Routine(name="deed", title="Deed", help="Do.", options=Asked, procedure=Doing)
 
 
-def told(deed: Deed, bench: Bench, asked: Asked | None = None) -> tuple[str, ...]:
-    return rehearse_whole(routine(deed), asked or Asked(), bench, lambda done, total: None)
+Work = tuple[tuple[str, float], ...]
+
+
+def told(deed: Deed, bench: Bench, asked: Asked | None = None, work: Work = ()) -> tuple[str, ...]:
+    return rehearse_whole(routine(deed), asked or Asked(), bench, lambda done, total: None, work)
 
 
 def test_all_of_it_is_told_with_the_waiting_that_was_left_out(
@@ -129,6 +133,30 @@ def test_a_long_one_is_ended_and_told_by_how_far_it_came(bench: Bench, hands: Ha
     assert f"about {(4 + 20 * ENOUGH_S) / 60:.0f} min" in words
     assert "comes on top" in words
     assert hands.now_s < 13 * ENOUGH_S
+
+
+def test_what_follows_a_step_in_which_a_rehearsal_ends_is_told_by_its_work(
+    bench: Bench, hands: Hands
+) -> None:
+    """As quick as the work of the steps before it; what is no such work, as homing, does not count for it."""
+
+    def deed(_twin: Bench, control: RunControl, listener: Listener, _asked: Asked) -> None:
+        listener.step("homing the stage")
+        hands.now_s += 5.0
+        for step in ("finding", "showing", "solving"):
+            listener.step(step)
+            for done in range(1, 101):
+                hands.now_s += 0.1 if step == "finding" else 0.5
+                listener.share(done, 100)
+                control.check()
+
+    work = (("finding", 20.0), ("showing", 100.0), ("solving", 60.0))
+    (words,) = told(deed, bench, work=work)
+    assert words.startswith("In all, by a rehearsal up to")
+    assert 'of "showing" and the sizes of what follows' in words
+    assert f"about {duration(5 + 10 + 50 + 60 * 60 / 120)}." in words
+    (words,) = told(deed, bench, work=work[:1])  # this step is none whose work is known
+    assert words.startswith("Up to the end of")
 
 
 def test_one_slow_part_is_not_taken_for_all(bench: Bench, hands: Hands) -> None:

@@ -26,6 +26,7 @@ from calibration_routines.optics.screen_solve import (
     findings_of,
 )
 from calibration_routines.procedure import CalibrationError
+from calibration_routines.times import first_guess
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config, template
@@ -92,6 +93,28 @@ def test_a_run_that_was_cut_off_is_resumed_to_its_calibration(
     assert main(["resume", str(run)]) == 0
     assert "PSF: leaves" in capsys.readouterr().out
     assert (run / "calibration" / "calibration.json").is_file()
+
+
+def test_the_outlook_tells_frames_and_what_each_step_computes(monkeypatch: pytest.MonkeyPatch) -> None:
+    with small_bench() as bench:
+        outlook, binned = (
+            ScreenProcedure(replace(ASKED, binning=binning)).outlook(bench) for binning in (1, 2)
+        )
+        monkeypatch.setattr(Bench, "simulated_kinds", ())
+        real = ScreenProcedure(ASKED).outlook(bench)
+        (words,) = first_guess(bench, real)
+    assert outlook.cost is not None
+    assert outlook.cost.frames == 2 + 2 * (9 + 6 + 1)
+    assert outlook.beside_s == 0  # a simulated bench that waits for nothing
+    assert [step for step, _ in outlook.work] == [
+        "finding the screen",
+        "showing pictures",
+        "solving for the PSF",
+    ]
+    work, less, computed = (dict(one.work) for one in (outlook, binned, real))
+    assert work["solving for the PSF"] > 2 * less["solving for the PSF"]
+    assert work["finding the screen"] > work["showing pictures"] > computed["showing pictures"] == 0
+    assert words.startswith("In all, by a first guess: about")
 
 
 def test_a_bench_without_a_screen_and_a_dark_screen_are_said_in_words(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage, signal
 
-from recon.blind.known_pictures import PicturePsf, PictureSettings, psf_from_pictures
+from recon.blind.known_pictures import PicturePsf, PictureSettings, psf_from_pictures, psf_work
 from recon.errors import InputError
 
 SHAPE = (48, 56)
@@ -68,6 +68,24 @@ def test_light_beyond_the_pictures_and_above_their_peak_is_told_from_the_psf(
     ignorant = psf_from_pictures(data, pictures, replace(QUICK, beyond=0))
     assert ignorant.misfit > 2 * result.misfit
     assert 1 - _alike(ignorant.psf[0], truth) > 2 * (1 - _alike(result.psf[0], truth))
+
+
+def test_progress_is_told_after_each_iteration_and_goes_with_the_work() -> None:
+    """At two scales, of which the coarse one takes a fourth for each of more iterations."""
+    data = np.random.default_rng(0).random((2, 1, 128, 8)).astype(np.float32)
+    told: list[float] = []
+    settings = PictureSettings(beyond=0, saturated=None, foreign=False, rounds=1, psf_iterations=10)
+    psf_from_pictures(data, data, settings, on_progress=lambda _, done: told.append(done))
+    assert told == sorted(told)
+    assert told[0] == 0.0
+    assert told[-1] == pytest.approx(1.0)
+    coarse = (10 / 4) / (10 / 4 + 7)
+    assert told[10] == pytest.approx(coarse)
+    assert np.diff(told[1:11]) == pytest.approx(coarse / 10)
+    assert np.diff(told[12:]) == pytest.approx((1 - coarse) / 7)
+    shape = (16, 1, 240, 320)
+    assert psf_work(shape, QUICK) == pytest.approx(2 * psf_work((8, *shape[1:]), QUICK))
+    assert psf_work((16, 1, 480, 640), QUICK) > 4 * psf_work(shape, QUICK)
 
 
 def test_black_borders_of_all_pictures_may_have_been_lit() -> None:
