@@ -23,6 +23,8 @@ EXPOSE = "expose"
 """What the live view is asked to do: to find an exposure for what is lit."""
 EXPOSING = "Auto exposure"
 """The job that does it, and the button that asks for it."""
+AGAIN = "again"
+"""What the live view is asked to do: to start."""
 _STRIDE = 4
 """Of the pixels that are looked at, along both sides: the state of the light shows in a sixteenth."""
 
@@ -56,6 +58,8 @@ class Facts:
     light : str
         Of the newest frame: ``"unknown"`` (none yet), ``"held"`` (none comes), ``"dark"``, ``"saturated"`` or
         ``"good"``.
+    stuck : str
+        Why the live view does not start; empty: it does.
     shown : bool
         Whether a pattern is on the SLM.
     made : Made
@@ -64,6 +68,7 @@ class Facts:
     failed: tuple[str, ...] = ()
     opening: bool = False
     light: str = "unknown"
+    stuck: str = ""
     shown: bool = False
     made: Made = Made()
 
@@ -131,7 +136,8 @@ def light_of(frame: Frame | None) -> str:
 
 def _light_now(session: BenchSession) -> str:
     newest = session.live.newest()
-    return "held" if newest is None and not session.live.is_running else light_of(newest)
+    is_held = newest is None and not session.live.is_running and not session.live_wanted
+    return "held" if is_held else light_of(newest)
 
 
 def facts_of(session: BenchSession, made: Made) -> Facts:
@@ -142,6 +148,7 @@ def facts_of(session: BenchSession, made: Made) -> Facts:
         failed=tuple(kind for kind, state in states.items() if state == "failed"),
         opening="opening" in states.values() or (bool(states) and set(states.values()) == {"closed"}),
         light=_light_now(session),
+        stuck=session.live_failure,
         shown=slm is not None and session.is_open("slm") and bool(slm.displayed.any()),
         made=made,
     )
@@ -153,6 +160,9 @@ def steps_of(config: BenchConfig, facts: Facts) -> tuple[Step, ...]:
     if not config.devices:
         return steps
     failed = facts.failed
+    if facts.stuck and not failed:
+        words = f"The live view does not start, and is tried again by itself: {facts.stuck.splitlines()[0]}"
+        return (Step("Connect", False, words, "Try again now", "live", AGAIN), *steps)
     whose = "its chip says" if len(failed) == 1 else "their chips say"
     words = f"The {names_of(failed)} failed; {whose} why." if failed else "The devices are being opened."
     answer = "Reconnect all" if len(failed) > 1 else "Reconnect"

@@ -35,6 +35,9 @@ _STOP_REPEAT_S = 0.05
 _STOP_WAIT_S = 10.0
 """A job that has not ended by then is named; STOP goes on, for the job may be about to start a move."""
 _WATCH_MS = 500
+_AGAIN_S = 1.0
+"""After which a live view that did not start is tried again; doubled each time it does not, up to:"""
+_LONGEST_AGAIN_S = 30.0
 
 
 class BenchSession(QObject):
@@ -106,6 +109,12 @@ class BenchSession(QObject):
         self.live_wanted = True
         """Whether the live view is to run whenever nothing else needs the camera."""
         self._live_job: Job | None = None
+        self.live_failure = ""
+        """Why the live view does not start although the camera is open; empty: it does, or was not tried."""
+        self._live_again = QTimer(self)
+        self._live_again.setSingleShot(True)
+        self._live_again.timeout.connect(self.start_live)
+        self._live_again_s = _AGAIN_S
         self._requests: list[OperatorRequest] = []
         self._from_thread.connect(self._do, Qt.ConnectionType.QueuedConnection)
         self._handler = LogBridge(lambda *line: self._in_window(self.log, *line))
@@ -233,6 +242,7 @@ class BenchSession(QObject):
     def stop_live(self) -> None:
         """End the live view until it is started again."""
         self.live_wanted = False
+        self._forget_live_failure()
         if self.live.is_running:
             with contextlib.suppress(BusyError):  # a run has ended it already
                 self.jobs.device("Ending the live view", lambda _: self.live.stop(), {"camera"}, quiet=True)
@@ -284,21 +294,38 @@ class BenchSession(QObject):
         ]
         return ", ".join([*words, "SIMULATED"] if self.state("camera").simulated else words)
 
+    def _forget_live_failure(self) -> None:
+        self.live_failure, self._live_again_s = "", _AGAIN_S
+        self._live_again.stop()
+
+    def _live_tried(self, job: Job) -> None:
+        """Try again later where the live view did not start: the camera may only have been busy."""
+        self._live_job = None
+        if job.error is None or not self.is_open("camera"):
+            self._forget_live_failure()
+        elif job.state.value != "cancelled" and self.live_wanted and not self.is_closing:
+            if not isinstance(job.error, StoppedError):
+                self.live_failure = words_for(job.error)
+            self._live_again.start(round(1e3 * self._live_again_s))
+            self._live_again_s = min(2 * self._live_again_s, _LONGEST_AGAIN_S)
+
     def _job_ended(self, job: Job) -> None:
         self.lights.note()
-        if job.error is not None:
+        again = job is self._live_job and job.error is not None and self.live_failure == words_for(job.error)
+        if job.error is not None and not again:  # told when it came first
             self._note_error(job)
         elif job.lanes and not job.quiet:
             self.log("debug", f"{job.title}: done.")
         if job is self._live_job:
-            self._live_job = None
+            self._live_tried(job)
         elif job.lanes and self.live_wanted and not self.live.is_running and not self._stopping:
             self.start_live()
 
     def _note_error(self, job: Job) -> None:
         error = job.error
         assert error is not None
-        if job.quiet and isinstance(error, StoppedError | LimitError):
+        expected = StoppedError if job is self._live_job else (StoppedError, LimitError)
+        if job.quiet and isinstance(error, expected):
             return
         if job.state.value == "cancelled":
             self.log("info", f"{job.title}: stopped. " + " ".join(getattr(error, "__notes__", ())))
@@ -402,6 +429,7 @@ class BenchSession(QObject):
         self.is_closing = True
         self._watch.stop()
         self.live_wanted = False
+        self._forget_live_failure()
         for job in self.jobs.jobs:
             job.cancel()
         self.stop()

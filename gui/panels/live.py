@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QButtonGroup, QWidget
 
 from drivers.frame import Frame
 from gui.jobs import BusyError, Job, JobContext
-from gui.journey import EXPOSE
+from gui.journey import AGAIN, EXPOSE
 from gui.panel import Panel, on_bench
 from gui.session import BenchSession
 from gui.way_on import ReconnectButton
@@ -120,6 +120,10 @@ class LivePanel(Panel):
         session.device_changed.connect(self._device_changed)
         session.stop_pressed.connect(self._leave_dark)
         self.put_below(ReconnectButton(session, ("camera",), self))
+        tip = "It is tried again by itself, too, after a while"
+        self.again_button = button("Start the live view again", tip, session.start_live)
+        self.again_button.hide()
+        self.put_below(self.again_button)
         every(self, _LOOK_MS, self.look).setTimerType(Qt.TimerType.PreciseTimer)
         every(self, _STATISTICS_MS, self.count)
 
@@ -182,9 +186,11 @@ class LivePanel(Panel):
         return on_bench(self.session.config.path, lines, imports)
 
     def take(self, what: str) -> None:
-        """Find an exposure: the step to a picture that can be used."""
+        """Find an exposure, the step to a picture that can be used, or start the view that did not start."""
         if what == EXPOSE:
             self.form.expose()
+        elif what == AGAIN:
+            self.session.start_live()
 
     # Frames --------------------------------------------------------------------------------------
     def look(self) -> None:
@@ -270,7 +276,12 @@ class LivePanel(Panel):
         self.picture.view.caution_against(f"{since} for {duration(age_s)}", old=self.session.live_wanted)
 
     def _waits(self) -> bool:
-        """Tell where no frame comes although the camera runs, and for how long; return whether it is so."""
+        """Tell where no frame comes although one is wanted, and why; return whether it is so."""
+        stuck = "" if self.session.jobs.exclusive_job is not None else self.session.live_failure
+        self.again_button.setVisible(bool(stuck))
+        if stuck:
+            self.status.setText(f"The live view does not start: {stuck}")
+            return True
         frame = self.picture.frame
         exposure_s = 0.0 if frame is None else frame.metadata.exposure_ms / 1e3
         seconds = time.monotonic() - self._came_s

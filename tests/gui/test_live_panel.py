@@ -136,6 +136,37 @@ def test_the_picture_says_when_it_was_taken_in_what_light_and_when_it_is_old(
     qtbot.waitUntil(lambda: not view.caution and view.item.opacity() == 1.0, timeout=WAIT_MS)
 
 
+def test_a_view_that_did_not_start_says_why_and_is_tried_again(
+    qtbot: QtBot, window: MainWindow, live: LivePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, camera = live.session, live.session.bench.camera
+    with qtbot.waitSignal(session.jobs.job_ended, timeout=WAIT_MS):
+        session.stop_live()
+
+    def busy(_: int = 8) -> None:
+        raise LimitError(camera.name, "is busy.", "Wait for its other user.")
+
+    logged: list[str] = []
+    session.logged.connect(lambda _, text: logged.append(text))
+    start = camera.start_sequence
+    monkeypatch.setattr("gui.session._AGAIN_S", 0.02)
+    monkeypatch.setattr(camera, "start_sequence", busy)
+    session.start_live()
+    qtbot.waitUntil(lambda: session._live_again_s >= 0.08, timeout=WAIT_MS)  # tried three times
+    qtbot.waitUntil(live.again_button.isVisible, timeout=WAIT_MS)
+    assert "is busy" in live.status.text()
+    assert sum("is busy" in text for text in logged) == 1, "told once"
+    window.strip.look()
+    assert "is busy" in window.strip.words.text()
+    assert window.strip.button.text() == "Try again now"
+    session._live_again.stop()
+    monkeypatch.setattr(camera, "start_sequence", start)
+    qtbot.mouseClick(window.strip.button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: session.live.is_running, timeout=WAIT_MS)
+    qtbot.waitUntil(live.again_button.isHidden, timeout=WAIT_MS)
+    assert not session.live_failure
+
+
 def test_what_comes_is_shown_coarsely_first_and_says_so(
     qtbot: QtBot, live: LivePanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
