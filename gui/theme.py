@@ -292,6 +292,7 @@ QLineEdit:focus, QPlainTextEdit:focus, QListView:focus, QTableView:focus, QCombo
 QLineEdit {{ placeholder-text-color: {c.dim}; }}
 QLineEdit:read-only {{ background: {c.panel}; }}
 QLineEdit:disabled, QComboBox:disabled {{ color: {unused}; border-color: {c.line}; }}
+QLineEdit:disabled {{ placeholder-text-color: {unused}; }}
 QComboBox::drop-down {{ border: none; width: 16px; }}
 QComboBox::down-arrow {{ {arrow} border-top: 5px solid {c.dim}; }}
 QComboBox::down-arrow:disabled {{ border-top-color: {c.line}; }}

@@ -315,7 +315,7 @@ def test_a_pictures_transparency_is_left_out_of_arrays_as_of_files_and_true_is_l
 def test_a_chart_of_a_result_is_drawn(
     scene: tuple[np.ndarray, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def at_once(problem: Any, setting: Any, _limit_s: float) -> Any:
+    def at_once(problem: Any, setting: Any, *_: Any) -> Any:
         return problem.run(setting, counts=(2,)) if setting.name.startswith("wiener") else "left out"
 
     monkeypatch.setattr("instrument.evaluation.chart.in_own_process", at_once)

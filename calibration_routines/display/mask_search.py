@@ -68,9 +68,9 @@ class AlignmentSettings(SeenAgain, Checked):
         least=1,
         label="Frames",
         metavar="N",
-        help="Frames at most: gives up rather than take more.",
-        default_words=f"{FRAMES}, or {AFTER_SEARCH} beyond those of a search of at most {MOST_SEARCHED}; "
-        "more where its last pictures are more",
+        help="Frames at most: gives up rather than take more. By itself, more where its last pictures are, "
+        f"and at most {MOST_SEARCHED} for the search.",
+        default_words=f"{FRAMES}, or {AFTER_SEARCH} after the search",
     )
     division: Size = option(
         Size(3, 5),

@@ -79,8 +79,8 @@ class BeadSlides(Checked):
         flags=("--z",),
         above=0,
         label="Depth",
-        help="Depth of the slide, from the diffuser.",
-        default_words="where the simulated bench has it; else it must be given",
+        help="Depth of the slide, from the diffuser; only a simulated bench knows it.",
+        default_words="the simulated bench's",
     )
     images: int = option(
         9, least=2, label="Photographs", help="Photographs to take, the slide moved by any amount in between."

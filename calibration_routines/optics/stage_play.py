@@ -74,15 +74,15 @@ class StageCheck(Checked):
         flags=("--z",),
         above=0,
         label="Distance",
-        help="Of the place that the axes move about, from the diffuser.",
-        default_words="three times the diffuser's distance from the sensor, as the stage reaches it",
+        help="Of the place that the axes move about, from the diffuser; as near to that as the stage gets.",
+        default_words="three times the sensor's distance",
     )
     reach_um: float | None = option(
         None,
         unit="um",
         above=0,
         help="How far each axis goes to both sides; more than its play.",
-        default_words="a twentieth of the travel, at most what moves the pattern by 30 pixels",
+        default_words="a twentieth of travel, 30 pixels",
     )
     turns: int = option(4, least=2, help="Times that each axis goes to and fro.")
     average: int = option(2, least=1, label="Frames a place", help="Frames a place, averaged.")

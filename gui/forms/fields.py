@@ -71,6 +71,11 @@ class Behaviour:
     worded: Callable[[str], str] = str
 
 
+def _here(words: str) -> str:
+    """Return what a default is in the window, of words that tell it for the terminal, too."""
+    return words.rpartition("; in the window ")[2]
+
+
 def bare_label(option: Option) -> str:
     """Return an option's label without its unit."""
     said = option.declaration
@@ -137,7 +142,7 @@ class OptionField(QObject):
             unit = f" {self.unit}" if self.unit else ""
             lines.append(f"{', '.join(limits)}{unit}".capitalize() + ".")
         if default := self.option.declaration.default_words:
-            lines.append(f"Default: {default}.")
+            lines.append(f"Default: {_here(default)}.")
         return self.behaviour.worded("\n".join(lines))
 
     @property
@@ -180,7 +185,7 @@ class NumberField(OptionField):
         empty = ""
         if option.default is None:  # an empty field shows no unit by itself
             said = option.declaration
-            empty = behaviour.worded(said.default_words or said.none_word or "none")
+            empty = behaviour.worded(_here(said.default_words) or said.none_word or "none")
             empty += f" ({self.unit})" if self.unit else ""
         self.widget: NumberEdit = NumberEdit(self.unit, integer=option.is_whole, tip=self.tip, empty=empty)
         self.widget.check = lambda number: self.problem(self._in_own_unit(number))
@@ -306,7 +311,7 @@ class EntryField(OptionField):
         super().__init__(option, behaviour)
         optional = option.default is None and not behaviour.needed
         empty = default_shown(option) or ("none" if optional else "")
-        self.widget: Entry = Entry(self._understood, self.tip, behaviour.worded(empty))
+        self.widget: Entry = Entry(self._understood, self.tip, behaviour.worded(_here(empty)))
         self.whole = self.widget
         if Path in (option.item, *option.kinds[:1]) and len(option.kinds) == 1:
             browse = "folder" if option.declaration.metavar == "FOLDER" else behaviour.browse

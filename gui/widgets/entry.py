@@ -9,9 +9,9 @@ from typing import Any
 
 from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QFocusEvent, QKeyEvent
-from PySide6.QtWidgets import QLineEdit, QToolButton, QWidget
+from PySide6.QtWidgets import QLineEdit, QWidget
 
-from gui.widgets.building import fill, mark
+from gui.widgets.building import button, fill, mark
 from gui.widgets.dialogues import Browse, choose_path
 from instrument.files.errors import BenchError
 
@@ -124,11 +124,8 @@ class PathEntry(QWidget):
         self.entry = entry
         self._browse: Browse = browse
         self._filters = filters
-        self.button = QToolButton()
-        self.button.setText("…")
-        self.button.setToolTip("Choose")
+        self.button = button("…", "Choose", self._choose)
         self.button.setAccessibleName("Choose")
-        self.button.clicked.connect(self._choose)
         fill(self, (entry, 1), self.button, across=True, spacing=3)
 
     def _choose(self) -> None:

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, SpawnContext
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
 COLOURS = ("#00798c", "#d1495b", "#d98e04", "#4f8a5b", "#5b6ee1", "#b04fc4", "#7a5c3e", "#e0559a")
 """Told apart on white and on black."""
 SCHEMA = 2
+_TELL_S = 0.25
+"""Between two looks whether a setting that runs is to be ended."""
 _PRELOADED = [
     "instrument.evaluation.chart",
     "recon.evaluation.chart_reconstruction",
@@ -217,17 +220,23 @@ def _renamed(setting: str) -> str:
 
 
 # Making -----------------------------------------------------------------------------------------------
-def in_own_process(problem: Subject[Any], setting: Named, limit_s: float) -> Curve | str:
+def in_own_process(
+    problem: Subject[Any], setting: Named, limit_s: float, tell: Callable[[float], object] = lambda _: None
+) -> Curve | str:
     """Run one setting by itself; the reason where it cannot be run.
 
-    The process ends when this one is interrupted or killed.
+    The process ends when this one is interrupted or killed, and when ``tell``, called a few times a second
+    with the seconds that are left, raises.
     """
     context = _context()
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(theirs, problem, setting, limit_s), daemon=True)
     process.start()
     theirs.close()
+    ends_s = time.monotonic() + limit_s
     try:
+        while not ours.poll(_TELL_S):
+            tell(max(0.0, ends_s - time.monotonic()))
         found: Curve | str = ours.recv()
         process.join(5)
         return found
@@ -317,7 +326,7 @@ def make_chart(
         if left <= 0:
             break
         on_progress(place, len(waiting), setting, left)
-        found = in_own_process(problem, setting, left)
+        found = in_own_process(problem, setting, left, partial(on_progress, place, len(waiting), setting))
         if isinstance(found, str):
             failed[setting.name] = found
             missing.remove(setting.name)

@@ -75,7 +75,7 @@ class ImportOptions:
     exposure_ms: float | None = option(
         None,
         help="Exposure time.",
-        default_words="what the file tells (OME), else the time from frame to frame",
+        default_words="the file's (OME), else from frame to frame",
         unit="ms",
         above=0,
     )
@@ -172,7 +172,7 @@ class ExportOptions:
     voxel_um: float | None = option(
         None,
         help="Edge of the voxels, cubes, with --metric.",
-        default_words="the middle plane's pixels and the step beside it",
+        default_words="the middle plane's pixels and its step",
         unit="um",
         above=0,
         applies=("volume",),

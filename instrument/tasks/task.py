@@ -167,7 +167,7 @@ class BenchFile:
     bench: Path | None = option(
         None,
         help="Bench configuration.",
-        default_words="bench.toml in this folder, else the built-in simulated bench",
+        default_words="bench.toml here, else the built-in one",
         flags=("--bench", "-b"),
         group="Bench",
     )

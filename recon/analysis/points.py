@@ -70,14 +70,14 @@ class AskedNoise:
     electrons: float | None = option(
         None,
         help="Electrons at the brightest pixel of the tests' images.",
-        default_words="as in one of the calibration's frames, 10000 where they do not tell",
+        default_words="as the frames tell, else 10000",
         least=1,
         group="Point tests",
     )
     read_e: float | None = option(
         None,
         help="Read noise of the tests' images, electrons.",
-        default_words="that of the calibration's frames, 2 where they do not tell",
+        default_words="as the frames tell, else 2",
         least=0,
         flags=("--read-noise",),
         metavar="E",

@@ -50,7 +50,7 @@ class AnalysisSettings:
         None,
         help="Depth to analyse.",
         label="Depth",
-        default_words="the calibrated one nearest to the middle in 1/z",
+        default_words="the middle one in 1/z",
         unit="um",
         shown_unit="mm",
         shown_factor=1000.0,

@@ -28,6 +28,8 @@ from gui.widgets.tab_order import stops_of
 SIZES = {"1366x768": QSize(1350, 690), "1920x1080": QSize(1904, 1000)}
 """Screens, and what they have for a window's inside beside a task bar and the window's frame."""
 _SLACK_PX = 1
+_BESIDE_PX = 7
+"""Of a field, on each side of its words."""
 _WITH_KEYS = (QAbstractButton, QComboBox, QLineEdit, QListView, QPlainTextEdit, QSlider, QTableView)
 
 
@@ -47,6 +49,11 @@ def cut_off(root: QWidget) -> Iterator[str]:
         inner = isinstance(part.parentWidget(), QComboBox) or isinstance(part, QCommandLinkButton)
         if not inner and part.height() < part.sizeHint().height() - _SLACK_PX:
             yield f"{_where(part)}: {part.height()} px high, and needs {part.sizeHint().height()}"
+    for part in _visible(root, QLineEdit):
+        words, inner = part.placeholderText(), part.parentWidget()
+        needed = part.fontMetrics().horizontalAdvance(words) + 2 * _BESIDE_PX
+        if words and not part.text() and needed > part.width() and not isinstance(inner, QComboBox):
+            yield f"{_where(part)}: {words!r} needs {needed} px and has {part.width()}"
     for part in _visible(root, QAbstractButton, QLabel, QComboBox, QTabBar):
         if isinstance(part, QTabBar):
             if part.usesScrollButtons() and part.sizeHint().width() > part.width() + _SLACK_PX:

@@ -74,13 +74,21 @@ def test_faults_of_looks_are_found(qtbot: QtBot) -> None:
     page = QWidget()
     qtbot.addWidget(page)
     inside = scrolled(fill(QWidget(), QPushButton("A button with many words"), QLineEdit(), 900))
-    fill(page, scrolled(fill(QWidget(), inside, 900)), label("words " * 40, wraps=True))
+    said = QLineEdit()
+    said.setPlaceholderText("a default in many words " * 3)
+    fill(page, scrolled(fill(QWidget(), inside, 900)), label("words " * 40, wraps=True), said)
     inside.setFixedSize(80, 120)
     inside.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAsNeeded)
     page.resize(300, 200)
     page.show()
     found = "\n".join(faults(page))
-    for words in ("many words", "has no name", "scrolls up and down within", "sideways"):
+    for words in (
+        "many words'",
+        "default in many words",
+        "has no name",
+        "scrolls up and down within",
+        "sideways",
+    ):
         assert words in found
 
 

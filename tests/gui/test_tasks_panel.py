@@ -26,6 +26,7 @@ from instrument.tasks import TASKS
 from instrument.tasks.task import Desk, Done
 from recon.types import Calibration, Geometry
 from tests.gui.conftest import BENCH, WAIT_MS
+from tests.gui.looks import SIZES, cut_off
 
 
 @pytest.fixture
@@ -50,6 +51,8 @@ def calibration(folder: Path, seed: int) -> Path:
 
 
 def test_every_task_has_a_form_of_its_own_declarations(qtbot: QtBot, panel: TasksPanel) -> None:
+    panel.resize(SIZES["1366x768"].width() - 480, 600)  # beside the live reconstruction
+    panel.show()
     for name in TASKS:
         shown(qtbot, panel, name)
         panel._pages[name].form.set_values({"bench": None})
@@ -57,6 +60,7 @@ def test_every_task_has_a_form_of_its_own_declarations(qtbot: QtBot, panel: Task
         offered = {o.name for _, options in panel._pages[name].task.parts.values() for o in options}
         assert {n for n in offered if n in form.fields} == set(form.fields)
         assert all(field.tip for field in form.fields.values())
+        assert not list(cut_off(form)), name
         told = [
             form.widgets[n].toolTip() + getattr(form.widgets[n], "placeholderText", str)()
             for n in form.fields

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import subprocess
 import sys
 from dataclasses import replace
@@ -34,7 +35,7 @@ def quick(monkeypatch):
     )
     ran = []
 
-    def here(problem, setting, limit_s):
+    def here(problem, setting, limit_s, *_):
         assert limit_s > 0
         ran.append(setting.name)
         return problem.run(setting, counts=(2, 5))
@@ -77,7 +78,7 @@ def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_
 
     whole = job.in_own_process
 
-    def cut(problem, setting, limit_s):
+    def cut(problem, setting, limit_s, *_):
         curve = whole(problem, setting, limit_s)
         shorter = setting.solver != "wiener"
         return Curve(curve.points[:1], False) if shorter else curve
@@ -171,6 +172,22 @@ def test_a_setting_runs_in_a_process_of_its_own():
     assert isinstance(refused, str)
 
 
+def test_a_setting_that_takes_its_time_can_be_ended(monkeypatch):
+    import instrument.evaluation.chart as job
+    from instrument.evaluation.chart_problems import problem_of_scene
+
+    def ended(left_s):
+        assert 0 < left_s <= 3600
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(job, "_TELL_S", 0.0)
+    before = set(multiprocessing.active_children())
+    problem, _ = problem_of_scene("sparse-picture", 32, 0)
+    with pytest.raises(KeyboardInterrupt):
+        job.in_own_process(problem, Setting("admm", "convolution", "tv"), 3600.0, ended)
+    assert set(multiprocessing.active_children()) <= before
+
+
 def test_memory_taken_aside_does_not_count():
     # In a process of its own: what this one has freed before would be taken again, and not count as taken.
     program = """
@@ -193,7 +210,7 @@ print(meter.peak_mib())
 def test_holograms_are_charted(monkeypatch, tmp_path):
     import instrument.evaluation.chart as job
 
-    def here(problem, setting, limit_s):
+    def here(problem, setting, limit_s, *_):
         if setting.frames == 2:
             return "no second frame"
         return problem.run(setting, limit_s=limit_s, counts=(1, 2))
@@ -389,7 +406,7 @@ def test_own_calibrations_are_compared(own, monkeypatch, tmp_path):
     import recon.evaluation.own_calibrations as module
 
     monkeypatch.setattr(module, "ITERATIONS", 3)
-    monkeypatch.setattr(job, "in_own_process", lambda problem, setting, limit_s: problem.run(setting))
+    monkeypatch.setattr(job, "in_own_process", lambda problem, setting, *_: problem.run(setting))
     out = tmp_path / "chart"
     result = run("calibrations", own / "fine", own / "one", "--image", own / "photo.tif", "--out", out)
     assert result.exit_code == 0, result.output
