@@ -130,6 +130,7 @@ class SweepsPanel(ProcedurePanel):
         self.views["plan"].settled.connect(lambda name: self._read_plan() if name == "file" else None)
         self._reader = NewestOnly(self.jobs, "Reading")
         self._plan_file: Path | None = None
+        self.choice.currentIndexChanged.connect(lambda _: self.began())  # of another routine nothing stays
 
     def take(self, what: str | Plan) -> None:
         """Choose a routine, by its name, or put a plan into the form."""

@@ -30,7 +30,8 @@ _PAN = 0.05
 def usual_levels(image: Image) -> tuple[float, float]:
     """Return the values that an image is shown with: nearly the least and largest of every fourth pixel."""
     low, high = np.percentile(image[::4, ::4], (0.1, 99.9))
-    return float(low), float(max(high, low + 1))
+    counts = np.issubdtype(image.dtype, np.integer)  # a PSF's sum may be 1, and all of it below a hundredth
+    return float(low), float(max(high, low + 1) if counts or high <= low else high)
 
 
 class _TurnedGraphics(pg.GraphicsView):  # type: ignore[misc]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pytestqt.qtbot import QtBot
 
+from gui.widgets.image_view import usual_levels
 from gui.widgets.sweep_views import PsfPictures, PsfTable, small
 
 
@@ -56,3 +57,11 @@ def test_a_small_picture_shows_the_same_spot() -> None:
     assert np.unravel_index(found.image.argmax(), found.image.shape) == (100, 25)
     assert found.image[100, 25] == 255
     assert small(np.ones((1, 3000), np.float32)).image.shape == (1, 250)
+
+
+def test_a_psf_is_shown_by_its_own_values_and_counts_by_no_less_than_one() -> None:
+    psf = np.random.default_rng(0).random((40, 60), np.float32)
+    low, high = usual_levels(psf / psf.sum())
+    assert 0 <= low < high <= psf.max() / psf.sum(), "not black: its sum is 1"
+    assert usual_levels(np.full((8, 8), 3, np.uint16)) == (3, 4)
+    assert usual_levels(np.zeros((8, 8), np.float32)) == (0, 1)

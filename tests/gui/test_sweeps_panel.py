@@ -161,6 +161,8 @@ def test_a_sweep_with_pause_quality_as_it_arrives_and_its_run_in_the_list(
     panel.take("lateral")
     assert not panel.use_button.isVisible(), "that was the axial sweep's"
     assert not panel.run_bar.words.text()
+    assert panel.frame.isHidden(), "its picture, too"
+    assert not panel.psfs.qualities
     runs = window.show_panel("runs")
     assert isinstance(runs, RunsPanel)
     qtbot.waitUntil(lambda: runs.table.rowCount() == 1, timeout=WAIT_MS)
