@@ -18,9 +18,10 @@ from gui.panel import Panel, on_bench
 from gui.session import BenchSession
 from gui.way_on import ReconnectButton
 from gui.widgets.building import button, every, fill, in_row, label, split
-from gui.widgets.camera_controls import CameraForm, RecordBar
+from gui.widgets.camera_controls import CameraForm
 from gui.widgets.entry import NumberEdit
 from gui.widgets.live_picture import LivePicture
+from gui.widgets.record_bar import RecordBar
 from instrument.bench.photograph import (
     PHOTOGRAPHS,
     LightState,

@@ -16,7 +16,7 @@ from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
 from gui.panels.live import LivePanel
-from gui.widgets import camera_controls
+from gui.widgets import record_bar
 from instrument.files.atomic import free_bytes
 from instrument.files.errors import FileError
 from instrument.runs.run import Run
@@ -207,7 +207,7 @@ def test_a_server_that_is_silent_holds_up_nothing_but_the_gauge(
         return _Usage(100, 50, 50)
 
     monkeypatch.setattr(shutil, "disk_usage", usage)
-    monkeypatch.setattr(camera_controls, "_SILENT_S", 0.0)
+    monkeypatch.setattr(record_bar, "_SILENT_S", 0.0)
     bar._look_at_disk()
     qtbot.waitUntil(lambda: bool(asked), timeout=WAIT_MS)
     bar._look_at_disk()  # the timer's next turn: asks no second time

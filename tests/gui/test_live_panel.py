@@ -472,6 +472,27 @@ def test_stop_during_a_recording_leaves_it_dark(qtbot: QtBot, window: MainWindow
     qtbot.waitUntil(lambda: runs.opened is not None and runs.opened.path == folder, timeout=WAIT_MS)
 
 
+def test_a_recording_that_was_stopped_goes_on_in_its_light_to_its_end(
+    qtbot: QtBot, window: MainWindow, live: LivePanel
+) -> None:
+    bar = live.record_bar
+    qtbot.waitUntil(lambda: live.session.bench.scene_lit, timeout=WAIT_MS)
+    bar.seconds.set_value(60.0)
+    live.record()
+    qtbot.waitUntil(lambda: "frames" in bar.note.text(), timeout=WAIT_MS)
+    qtbot.keyClick(window, Qt.Key.Key_Escape)
+    qtbot.waitUntil(bar.rest_button.isVisible, timeout=WAIT_MS)
+    assert bar._left is not None
+    assert 0 < bar._left.seconds < 60
+    assert not live.session.bench.scene_lit
+    bar._left = replace(bar._left, seconds=0.2)  # a minute is long
+    qtbot.mouseClick(bar.rest_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: bar.job is None and " in " in bar.note.text(), timeout=WAIT_MS)
+    assert live.session.bench.scene_lit
+    assert bar.rest_button.isHidden()
+    assert len(list(live.session.runs_folder.glob("*recording*"))) == 2
+
+
 def test_profile_and_cross_hair_follow_the_frame(qtbot: QtBot, live: LivePanel) -> None:
     qtbot.mouseClick(live.picture.profile_button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: live.picture._profile_curve.getData()[0] is not None, timeout=WAIT_MS)

@@ -1,0 +1,228 @@
+"""Recordings of the live view: begun, ended, gone on with; how full the disk is."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtWidgets import QLineEdit, QProgressBar, QWidget
+
+from gui.background import NewestOnly
+from gui.jobs import Job, JobContext
+from gui.panel import Panel
+from gui.widgets.building import button, every, fill, label
+from gui.widgets.entry import NumberEdit
+from instrument.bench.photograph import Lit
+from instrument.files.atomic import SPARE_BYTES, free_bytes, there_now
+from instrument.files.errors import FileError, duration, size
+
+if TYPE_CHECKING:
+    from instrument.runs.recorder import Recorder, RecordingStatus
+    from instrument.runs.run import Run
+
+_DISK_MS = 5000
+_LEAST_REST_S = 0.1
+"""Less than that is not worth a film of its own."""
+_SILENT_S = 4.0
+"""A disk that takes longer is called silent."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Left:
+    """What is to be recorded: how long, under what name, in which light; None: in the one that is on."""
+
+    seconds: float
+    label: str
+    lit: Lit | None = None
+
+
+class RecordBar(QWidget):
+    """Record button, length, label, disk gauge.
+
+    Parameters
+    ----------
+    panel : Panel
+        The live view.
+    """
+
+    def __init__(self, panel: Panel) -> None:
+        super().__init__(panel)
+        self._panel = panel
+        self._session = panel.session
+        self._recorder: Recorder | None = None
+        self.job: Job | None = None
+        self._reader = NewestOnly(panel.jobs, "Looking at the disk", self._not_known)
+        self._asked_s = 0.0
+        tip = "Record every frame to the disk; again ends it (Ctrl+R)"
+        self.button = button("● Record", tip, self.toggle)
+        self.seconds = NumberEdit("s", 10.0, minimum=0.01, tip="How long to record, seconds")
+        self.seconds.setFixedWidth(80)
+        panel.heed(self.seconds)
+        self.label = QLineEdit("recording")
+        self.label.setAccessibleName("Name of the recording")
+        self.label.setToolTip("Becomes part of the run folder's name")
+        self.label.setFixedWidth(120)
+        self.gauge = QProgressBar()
+        self.gauge.setToolTip("How full the disk is")
+        self.gauge.setFixedWidth(150)
+        self.gauge.setRange(0, 1000)
+        self.gauge.setFormat("…")
+        self.note = label(yields=True)
+        self._taken: Path | None = None
+        self.look_button = button("Look at it…", "Show the recording, as far as it came", self._look_at_it)
+        self.look_button.hide()
+        self.rest_button = button("Go on with it", clicked=self._go_on)
+        self.rest_button.hide()
+        self._left: _Left | None = None
+        """Of the recording that runs, or was broken off."""
+        parts = (self.button, self.seconds, self.label, self.gauge, (self.note, 1))
+        fill(self, *parts, self.rest_button, self.look_button, across=True)
+        every(self, _DISK_MS, self._look_at_disk)
+        self._look_at_disk()
+
+    def toggle(self) -> None:
+        """Start a recording, or end the one that runs."""
+        if self.job is not None:
+            if self._recorder is not None:
+                self._recorder.stop()
+            else:  # it waits for the camera, or has just begun
+                self.job.cancel()
+            return
+        if not self._session.is_open("camera"):
+            self._panel.refused(self.button, "The camera is not connected.")
+            return
+        if not self.seconds.submit():
+            self.seconds.setFocus()
+            return
+        self._begin(_Left(self.seconds.value or 0.0, self.label.text().strip() or "recording"))
+
+    def _go_on(self) -> None:
+        """Record what a recording that was broken off lacks, in the light that it had."""
+        if self._left is not None and self.job is None:
+            self._begin(self._left)
+
+    def _begin(self, asked: _Left) -> None:
+        session = self._session
+        seconds, label = asked.seconds, asked.label
+
+        def work(context: JobContext) -> Run:
+            from instrument.runs.recorder import prepare_recording
+
+            if asked.lit is not None:
+                asked.lit.put_back(session.bench)
+            lit = Lit.now(session.bench)
+            self._left = replace(asked, lit=lit)
+            recorder = prepare_recording(
+                session.bench, session.runs_folder, label=label, seconds=seconds, on_progress=context.report
+            )
+            self._recorder, self._taken = recorder, recorder.path
+            with session.live.watching(recorder.newest):
+                run = recorder.execute()
+            context.check()
+            lit.put_back(session.bench)
+            return run
+
+        job = self._panel.begin(lambda: session.exclusive_job("Recording", work), self.button)
+        if job is None:
+            return
+        self._came_s = 0.0
+        self.job, self._taken, self._left = job, None, None
+        self.note.clear()
+        self.look_button.hide()
+        self.rest_button.hide()
+        self.button.setText("■ End")
+        job.progressed.connect(self._show)
+        job.succeeded.connect(self._done)
+        job.failed.connect(lambda _: self._ended_early("by a fault"))
+        job.cancelled.connect(lambda _: self._ended_early("before its time"))
+        job.ended.connect(self._ended)
+
+    def _show(self, status: RecordingStatus) -> None:
+        self._came_s = status.seconds
+        left_s = max(0, status.free_bytes - SPARE_BYTES) / max(status.bytes_per_s, 1.0)
+        words = [
+            f"{status.written} frames",
+            f"{status.frames_per_s:.1f}/s",
+            f"{status.bytes_per_s / 1e6:.0f} MB/s",
+            f"disk lasts {duration(left_s)}",
+        ]
+        if status.dropped_by_device:
+            words.append(f"{status.dropped_by_device} dropped by the camera")
+        if status.not_written:
+            words.append(f"{status.not_written} lost: the disk is too slow")
+        self.note.setText(" · ".join(words))
+
+    def _done(self, run: Run) -> None:
+        count = len(run.records)
+        frames = f"{count} frame{'' if count == 1 else 's'}"
+        self.note.setText(f"{frames} in {run.path.name}")
+        self._session.log("info", f"Recorded {frames}: {run.path}")
+        self._session.run_finished.emit(run.path)
+
+    def _ended_early(self, how: str) -> None:
+        """Say what is kept of a recording that was broken off."""
+        if self._taken is not None:
+            kept = self.note.text().partition(" · ")[0] or "no frame yet"
+            self.note.setText(f"Ended {how} ({kept}); what was taken is kept in {self._taken.name}")
+            self._session.run_finished.emit(self._taken)
+            self._offer_rest()
+
+    def _offer_rest(self) -> None:
+        """Offer to record the time that is left."""
+        left = self._left
+        if left is None or (seconds := left.seconds - self._came_s) < _LEAST_REST_S:
+            return
+        self._left = replace(left, seconds=seconds)
+        tip = f"Record the {duration(seconds)} that it lacks, lit as it was, as a film of its own"
+        self.rest_button.setToolTip(tip)
+        self.rest_button.show()
+
+    def _look_at_it(self) -> None:
+        self._session.handed_on.emit("runs", self._taken)
+
+    def _ended(self) -> None:
+        self.job, self._recorder = None, None
+        self.button.setText("● Record")
+        self.look_button.setVisible(self._taken is not None)
+        self._look_at_disk()
+
+    def _look_at_disk(self) -> None:
+        """Ask how full the disk is, in a job: one of a server that is silent would hold the window up."""
+        if self._reader.is_reading:
+            if time.monotonic() - self._asked_s > _SILENT_S:
+                self._not_known(f"{self._session.runs_folder}: its disk has not answered yet.")
+            return
+        folder = self._session.runs_folder
+        self._asked_s = time.monotonic()
+        self._reader.ask(lambda: _disk_of(folder), self._show_disk)
+
+    def _show_disk(self, disk: tuple[float, int] | str) -> None:
+        if isinstance(disk, str):
+            self._not_known(disk)
+            return
+        full, free = disk
+        self.gauge.setValue(round(1000 * full))
+        self.gauge.setFormat(f"{size(free)} free")
+        self.gauge.setToolTip(f"How full the disk is that holds {self._session.runs_folder}")
+
+    def _not_known(self, why: str) -> None:
+        self.gauge.setValue(0)
+        self.gauge.setFormat("disk not known")
+        self.gauge.setToolTip(why)
+
+
+def _disk_of(folder: Path) -> tuple[float, int] | str:
+    """Return a disk's full share and its free bytes, or why they are not known."""
+    try:
+        free = free_bytes(folder)
+        total = shutil.disk_usage(there_now(folder)).total
+    except OSError as error:  # no such place, a drive taken away
+        return f"{folder}: {error.strerror or error}"
+    except FileError as error:
+        return str(error)
+    if not total:  # as some file systems of servers and user space have it
+        return f"{folder}: its file system gives no size."
+    return 1 - free / total, free
