@@ -6,7 +6,7 @@ import shutil
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from PySide6.QtWidgets import QLineEdit, QProgressBar, QWidget
 
@@ -15,6 +15,7 @@ from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.widgets.building import button, every, fill, label
 from gui.widgets.entry import NumberEdit
+from instrument.bench.camera_settings import camera_settings, restore_camera
 from instrument.bench.photograph import Lit
 from instrument.files.atomic import SPARE_BYTES, free_bytes, there_now
 from instrument.files.errors import FileError, duration, size
@@ -32,11 +33,11 @@ _SILENT_S = 4.0
 
 @dataclass(frozen=True, slots=True)
 class _Left:
-    """What is to be recorded: how long, under what name, in which light; None: in the one that is on."""
+    """What is to be recorded: how long, under what name; its light and camera's settings once it began."""
 
     seconds: float
     label: str
-    lit: Lit | None = None
+    began: tuple[Lit, dict[str, Any]] | None = None
 
 
 class RecordBar(QWidget):
@@ -111,14 +112,15 @@ class RecordBar(QWidget):
         def work(context: JobContext) -> Run:
             from instrument.runs.recorder import prepare_recording
 
-            if asked.lit is not None:
-                asked.lit.put_back(session.bench)
+            if asked.began is not None:
+                restore_camera(session.bench.camera, asked.began[1])
+                asked.began[0].put_back(session.bench)
             lit = Lit.now(session.bench)
-            self._left = replace(asked, lit=lit)
             recorder = prepare_recording(
                 session.bench, session.runs_folder, label=label, seconds=seconds, on_progress=context.report
             )
             self._recorder, self._taken = recorder, recorder.path
+            self._left = replace(asked, began=(lit, camera_settings(session.bench.camera)))
             with session.live.watching(recorder.newest):
                 run = recorder.execute()
             context.check()
@@ -129,7 +131,7 @@ class RecordBar(QWidget):
         if job is None:
             return
         self._came_s = 0.0
-        self.job, self._taken, self._left = job, None, None
+        self.job, self._taken, self._left = job, None, asked
         self.note.clear()
         self.look_button.hide()
         self.rest_button.hide()
@@ -168,15 +170,15 @@ class RecordBar(QWidget):
             kept = self.note.text().partition(" · ")[0] or "no frame yet"
             self.note.setText(f"Ended {how} ({kept}); what was taken is kept in {self._taken.name}")
             self._session.run_finished.emit(self._taken)
-            self._offer_rest()
+        self._offer_rest()
 
     def _offer_rest(self) -> None:
         """Offer to record the time that is left."""
         left = self._left
-        if left is None or (seconds := left.seconds - self._came_s) < _LEAST_REST_S:
+        if left is None or left.began is None or (seconds := left.seconds - self._came_s) < _LEAST_REST_S:
             return
         self._left = replace(left, seconds=seconds)
-        tip = f"Record the {duration(seconds)} that it lacks, lit as it was, as a film of its own"
+        tip = f"Record the {duration(seconds)} that it lacks, in its light and settings, as a film of its own"
         self.rest_button.setToolTip(tip)
         self.rest_button.show()
 

@@ -26,6 +26,7 @@ from gui.session import BenchSession
 from gui.widgets.device_settings import DeviceSettings
 from gui.widgets.image_view import ImageView
 from instrument.bench.photograph import LightState
+from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.live.frame_view import FrameFigures, not_stretched
 from instrument.plan.led_shapes import BrightField
@@ -472,8 +473,12 @@ def test_stop_during_a_recording_leaves_it_dark(qtbot: QtBot, window: MainWindow
     qtbot.waitUntil(lambda: runs.opened is not None and runs.opened.path == folder, timeout=WAIT_MS)
 
 
+def _disk_full(*_: object, **__: object) -> None:
+    raise BenchError("The disk is full.")
+
+
 def test_a_recording_that_was_stopped_goes_on_in_its_light_to_its_end(
-    qtbot: QtBot, window: MainWindow, live: LivePanel
+    qtbot: QtBot, window: MainWindow, live: LivePanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bar = live.record_bar
     qtbot.waitUntil(lambda: live.session.bench.scene_lit, timeout=WAIT_MS)
@@ -486,10 +491,19 @@ def test_a_recording_that_was_stopped_goes_on_in_its_light_to_its_end(
     assert 0 < bar._left.seconds < 60
     assert not live.session.bench.scene_lit
     bar._left = replace(bar._left, seconds=0.2)  # a minute is long
+    camera = live.session.bench.camera
+    exposure_ms = camera.exposure_ms
+    camera.set_exposure_ms(2 * exposure_ms)  # as a camera that was connected again
+    qtbot.waitUntil(lambda: not live.session.jobs.is_busy("camera"), timeout=WAIT_MS)
+    with monkeypatch.context() as full:
+        full.setattr("instrument.runs.recorder.prepare_recording", _disk_full)
+        qtbot.mouseClick(bar.rest_button, Qt.MouseButton.LeftButton)
+        qtbot.waitUntil(lambda: bar.job is None and bar.rest_button.isVisible(), timeout=WAIT_MS)
     qtbot.mouseClick(bar.rest_button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: bar.job is None and " in " in bar.note.text(), timeout=WAIT_MS)
     assert live.session.bench.scene_lit
     assert bar.rest_button.isHidden()
+    assert camera.exposure_ms == pytest.approx(exposure_ms)
     assert len(list(live.session.runs_folder.glob("*recording*"))) == 2
 
 
