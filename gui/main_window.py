@@ -35,6 +35,7 @@ from gui.widgets.device_chips import DeviceChips
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.step_strip import StepStrip
+from gui.words import in_the_window
 from instrument.bench.config import BenchConfig, Kind
 
 _AREAS = {
@@ -388,7 +389,9 @@ class MainWindow(QMainWindow):
     def _forget_problem(self, kind: str) -> None:
         """Take a device's failure away that is over; the log keeps it."""
         device = self.session.bench.devices.get(cast(Kind, kind))
-        mended = device is not None and self.session.is_open(kind) and device.name in self._problem
+        mended = (
+            device is not None and self.session.is_open(kind) and in_the_window(device.name) in self._problem
+        )
         if mended and self.job_label.text() == self._problem.splitlines()[0][:200]:
             self.job_label.setText("Ready")
 

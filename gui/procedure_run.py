@@ -387,6 +387,8 @@ class RunBar(QWidget):
             words.append("ENDING as soon as it can")
         elif now.paused:
             words.append(f"PAUSED{self._when_paused}")
+        elif self.pause_button.isChecked():
+            words.append("WILL PAUSE as soon as it can")
         elif now.seconds_left is not None:
             words.append(f"{'at most ' if now.at_most else ''}{duration(now.seconds_left)} left")
         self.words.setText(", ".join(filter(None, words)))

@@ -7,6 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -490,6 +491,7 @@ class BenchSession(QObject):
         self.asked.emit(request)
 
     def _set_state(self, kind: str, state: DeviceState) -> None:
+        state = replace(state, text=in_the_window(state.text))
         if self._states[kind] != state:
             self._states[kind] = state
             self.device_changed.emit(kind)

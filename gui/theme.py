@@ -293,10 +293,12 @@ QLineEdit {{ placeholder-text-color: {c.dim}; }}
 QLineEdit:read-only {{ background: {c.panel}; }}
 QLineEdit:disabled, QComboBox:disabled {{ color: {unused}; border-color: {c.line}; }}
 QLineEdit:disabled {{ placeholder-text-color: {unused}; }}
+QComboBox {{ combobox-popup: 0; }}
 QComboBox::drop-down {{ border: none; width: 16px; }}
 QComboBox::down-arrow {{ {arrow} border-top: 5px solid {c.dim}; }}
 QComboBox::down-arrow:disabled {{ border-top-color: {c.line}; }}
 QComboBox QAbstractItemView {{ border: 1px solid {c.border}; padding: 0; }}
+QComboBox QAbstractItemView::item {{ min-height: 22px; padding: 0 4px; }}
 QGraphicsView {{ border: 1px solid transparent; }}
 QGraphicsView:focus {{ border: 1px solid {c.accent}; }}
 *[refused="true"] {{ border: 2px solid {c.error}; color: {c.error}; font-weight: 700; }}

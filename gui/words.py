@@ -31,7 +31,12 @@ _REST = r"(?:\s+(?:--[a-z][a-z-]*|[A-Z]{3,}|mask|slm|illumination|(?:/|[A-Za-z]:
 
 _FORCE = re.compile(r"--force(?![\w-])")
 """The same field in every form that has it."""
-_SIGNS = ((re.compile(r"(?<=\d) um\b(?![/\\])"), " µm"), (re.compile(r"\+-(?=[ \d])"), "±"))
+_SIGNS = (
+    (re.compile(r"(?<=\d) um\b(?![/\\])"), " µm"),
+    (re.compile(r"\+-(?=[ \d])"), "±"),
+    (re.compile(r"\bled_array(?= \(| opened|:)"), "LED array"),
+    (re.compile(r"\bslm(?= \()"), "SLM"),
+)
 """Units and signs as the window's own figures have them; a terminal may lack the letters."""
 
 
@@ -43,7 +48,7 @@ def in_the_window(text: str) -> str:
 
 
 def with_signs(text: str) -> str:
-    """Return a text with units and signs as the window's own figures have them."""
+    """Return a text with units, signs and kinds of devices as the window has them elsewhere."""
     for pattern, sign in _SIGNS:
         text = pattern.sub(sign, text)
     return text

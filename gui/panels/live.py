@@ -294,7 +294,10 @@ class LivePanel(Panel):
             by = f"pulse on {state.trigger_line}" if state.trigger_mode == "hardware" else "program's trigger"
             words += f" Trigger is “{state.trigger_mode}”: each {by} takes one; “free_run” needs none."
         elif self.session.state("camera").simulated:
-            words += " The simulated scene is computed once for each new light, at 5 megapixels some 5 s."
+            words += (
+                " The simulated scene is computed once for each new light, at 5 megapixels some 5 s; "
+                "what computes it is compiled before the very first, some 10 s where nothing else runs."
+            )
         self.status.setText(words)
         return True
 

@@ -238,11 +238,16 @@ def hint(words: str) -> QLabel:
     return made
 
 
+_MOST_ENTRIES = 25
+"""Of a list box that is open, before it is scrolled."""
+
+
 def choice(
     words: Iterable[str] = (), tip: str = "", chosen: Callable[[int], object] | None = None
 ) -> QComboBox:
     """Return a box of words; ``chosen`` is called with the number of the one that is chosen."""
     made = QComboBox()
+    made.setMaxVisibleItems(_MOST_ENTRIES)
     made.addItems(list(words))
     made.setToolTip(tip)
     made.setAccessibleName(tip)

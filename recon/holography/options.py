@@ -130,7 +130,7 @@ class HologramOptions:
         None,
         help="Without a Fourier lens: the picture is so far behind the mask, or the SLM where there is none; "
         "planes are counted from there.",
-        default_words="behind the bench's Fourier lens",
+        default_words="behind the Fourier lens",
         unit="mm",
         above=0,
         metavar="MM",
@@ -168,7 +168,7 @@ class HologramOptions:
         None,
         help="How much of the light that falls on it goes into the picture. Of a complex SLM: the less, the "
         "better the picture. Of mirrors: at most 0.1. A phase SLM always sends all of it.",
-        default_words="0.1 with a complex SLM, 0.08 with mirrors",
+        default_words="0.1 complex, 0.08 mirrors",
         above=0,
         most=1,
         metavar="SHARE",

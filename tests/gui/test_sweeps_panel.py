@@ -17,7 +17,7 @@ from drivers.errors import DeviceError
 from gui.main_window import MainWindow
 from gui.panels.runs import RunsPanel
 from gui.panels.sweeps import SweepsPanel
-from gui.procedure_run import Ended
+from gui.procedure_run import Ended, Situation
 from gui.widgets.tab_order import stops_of
 from instrument.bench.safety import MOTION_DOUBT
 from instrument.runs.run import Run, RunCondition
@@ -370,6 +370,17 @@ def test_a_sweep_that_waits_says_for_what_and_can_be_aborted(
     gate.set()
     wait_for_check(qtbot, panel)
     assert panel.run_bar.start_button.isEnabled()
+
+
+def test_a_pause_that_is_not_yet_says_so(panel: SweepsPanel) -> None:
+    bar = panel.run_bar
+    bar.set_running(True)
+    bar.pause_button.setChecked(True)
+    bar.show_situation(Situation(step="finding exposures"))
+    assert bar.words.text() == "Finding exposures, WILL PAUSE as soon as it can"
+    bar.show_situation(Situation(step="sweeping", paused=True))
+    assert "WILL" not in bar.words.text()
+    bar.set_running(False)
 
 
 def test_a_form_is_checked_again_after_somebody_elses_run(

@@ -33,6 +33,10 @@ _IN_WINDOW = ("recon", "instrument", "calibration_routines")
         ("with 6 ('reconstruct --video --warm').", "with 6 (“Reconstruct a recording” in Files)."),
         ("is no video of 'reconstruct --video'.", "is no video of “Reconstruct a recording” in Files."),
         ("install diffuserbench again", "install diffuserbench again"),
+        (
+            "led_array (simulated): was unplugged; slm (simulated) too",
+            "LED array (simulated): was unplugged; SLM (simulated) too",
+        ),
         ("3 settings: run the same command again to go on.", "3 settings: “Start” again to go on."),
         ("The same command goes on with the rest.", "“Start” goes on with the rest."),
         (
