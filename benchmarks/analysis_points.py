@@ -29,7 +29,9 @@ from drivers.simulated.world import SimulatedWorld
 from recon import reconstruct
 from recon.analysis import Analysis, analyse
 from recon.analysis.gram import WindowProblem
-from recon.analysis.points import DIP, HALF_WINDOW, Noise, PointGrid, planes_about, smallest_dip, try_points
+from recon.analysis.point_images import HALF_WINDOW, planes_about
+from recon.analysis.point_noise import Noise
+from recon.analysis.points import DIP, PointGrid, smallest_dip, try_points
 from recon.camera.refocus import psf_at
 from recon.evaluation.points_in_volumes import in_volumes
 from recon.evaluation.two_points import cells, reached

@@ -21,7 +21,7 @@ import numpy as np
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.correlation import field_of_view
-from recon.analysis.points import PointTests, point_tests
+from recon.analysis.point_tests import PointTests, point_tests
 from recon.analysis.resolution import (
     axial_resolution,
     axial_spacing_per_um,

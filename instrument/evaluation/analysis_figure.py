@@ -10,7 +10,8 @@ import numpy as np
 from instrument.files.figures import ACCENT, INK, mark_simulated, style
 from recon.analysis import Analysis
 from recon.analysis.gram import ConditionCurve
-from recon.analysis.points import InVolumes, PointTrial, Reached
+from recon.analysis.points import PointTrial
+from recon.analysis.stated_distance import InVolumes, Reached
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.analysis.points import Noise
+from recon.analysis.point_noise import Noise
 from recon.analysis.resolution import axial_resolution
 from recon.camera.depth_mixture import central_psfs
 from recon.camera.refocus import psf_at

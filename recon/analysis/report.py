@@ -24,16 +24,9 @@ from recon.analysis.correlation import (
 )
 from recon.analysis.gram import ConditionCurve, Direction, condition_curve
 from recon.analysis.middle import RIM_PX, Middle
-from recon.analysis.points import (
-    AT_NEARER,
-    PLANES,
-    InVolumes,
-    Noise,
-    PointTests,
-    Reached,
-    planes_about,
-    point_tests,
-)
+from recon.analysis.point_images import PLANES, planes_about
+from recon.analysis.point_noise import Noise
+from recon.analysis.point_tests import PointTests, point_tests
 from recon.analysis.resolution import (
     AxialResolution,
     DepthSimilarity,
@@ -45,6 +38,7 @@ from recon.analysis.resolution import (
     voxel_grid,
 )
 from recon.analysis.settings import AnalysisSettings, axial_spacing, lateral_spacing, response_of
+from recon.analysis.stated_distance import AT_NEARER, InVolumes, Reached
 from recon.base.brief import brief
 from recon.base.checks import require_calibration
 from recon.base.threads import linear_algebra_on_one_thread

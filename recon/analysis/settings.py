@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.analysis.points import AskedNoise
+from recon.analysis.point_noise import AskedNoise
 from recon.analysis.resolution import axial_spacing_per_um, gaussian_response, lateral_spacing_um
 from recon.base.declare import option
 from recon.optics.fall_off import FallOff

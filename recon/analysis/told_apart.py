@@ -22,7 +22,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from recon.analysis.points import AT_NEARER, DIP, FARTHEST, NEARER, PROMISED, TriedPair
+from recon.analysis.points import DIP
+from recon.analysis.stated_distance import AT_NEARER, FARTHEST, NEARER, PROMISED, TriedPair
 
 Floats = npt.NDArray[np.float64]
 

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.gram import WindowProblem, condition_number
-from recon.analysis.points import DIP, Noise, PointGrid, try_points
+from recon.analysis.point_noise import Noise
+from recon.analysis.points import DIP, PointGrid, try_points
 from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution
 from recon.evaluation.lenslets import LensletCamera, build_camera

@@ -13,17 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.middle import Middle
-from recon.analysis.points import (
-    DIP,
-    PLANES,
-    InVolumes,
-    Noise,
-    PointGrid,
-    TriedPair,
-    planes_about,
-    smallest_dip,
-    stated_px,
-)
+from recon.analysis.point_images import PLANES, planes_about
+from recon.analysis.point_noise import Noise
+from recon.analysis.points import DIP, PointGrid, smallest_dip
+from recon.analysis.stated_distance import InVolumes, TriedPair, stated_px
 from recon.evaluation.two_points import cells, shifted
 from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration

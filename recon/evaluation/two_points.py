@@ -1,11 +1,11 @@
 """Two points told apart by the default reconstruction: the resolution that a calibration's pictures reach.
 
-The tests of :mod:`recon.analysis.points` solve for points alone, in a window, without a prior. Here pairs of
-points of equal light stand in a picture, each pair at another distance and other places between pixels, far
-from the others, with the noise that one pair alone would have; the whole is reconstructed as pictures are by
-default. A pair is told apart where the picture dips by 20 % between its points. What was told apart gives the
-share at each distance, over all places between pixels (:mod:`recon.analysis.told_apart`), and that the stated
-distance.
+The tests of :mod:`recon.analysis.point_tests` solve for points alone, in a window, without a prior. Here
+pairs of points of equal light stand in a picture, each pair at another distance and other places between
+pixels, far from the others, with the noise that one pair alone would have; the whole is reconstructed as
+pictures are by default. A pair is told apart where the picture dips by 20 % between its points. What was told
+apart gives the share at each distance, over all places between pixels (:mod:`recon.analysis.told_apart`), and
+that the stated distance.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ import numpy.typing as npt
 
 from recon.analysis.correlation import lit_extent
 from recon.analysis.middle import Middle
-from recon.analysis.points import DIP, NEARER, Noise, Reached, TriedPair, smallest_dip
+from recon.analysis.point_noise import Noise
+from recon.analysis.points import DIP, smallest_dip
+from recon.analysis.stated_distance import NEARER, Reached, TriedPair
 from recon.analysis.told_apart import Told, stated_apart
 from recon.base import fft
 from recon.camera.depth_mixture import central_psfs

@@ -8,7 +8,8 @@ import pytest
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.gram import WindowProblem
-from recon.analysis.points import AskedNoise, Noise, PointGrid, try_points
+from recon.analysis.point_noise import AskedNoise, Noise
+from recon.analysis.points import PointGrid, try_points
 
 WORLD = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0, aperture_mm=(1.0, 1.0)))
 Z_UM = 60e3

@@ -14,7 +14,8 @@ import pytest
 from scipy.interpolate import griddata
 
 from recon.analysis.gram import WindowProblem
-from recon.analysis.points import DIP, Noise, PointGrid, try_points
+from recon.analysis.point_noise import Noise
+from recon.analysis.points import DIP, PointGrid, try_points
 from recon.analysis.resolution import axial_resolution
 from recon.evaluation.lenslets import build_camera
 from recon.evaluation.map_trials import local_condition

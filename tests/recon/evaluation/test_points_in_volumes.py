@@ -10,7 +10,8 @@ from scipy import ndimage
 
 from instrument.evaluation.analysis_figure import facts
 from recon.analysis import AnalysisSettings, analyse
-from recon.analysis.points import InVolumes, PointGrid
+from recon.analysis.points import PointGrid
+from recon.analysis.stated_distance import InVolumes
 from recon.evaluation import points_in_volumes
 from recon.evaluation.points_in_volumes import in_volumes
 from recon.types import Calibration, Geometry

@@ -12,8 +12,10 @@ from instrument.evaluation.analysis_figure import draw_analysis, facts
 from recon.analysis import analyse, middle, told_apart
 from recon.analysis.correlation import half_light_deg
 from recon.analysis.middle import Middle
-from recon.analysis.points import Noise, Reached, TriedPair, smallest_dip, stated_px
+from recon.analysis.point_noise import Noise
+from recon.analysis.points import smallest_dip
 from recon.analysis.resolution import axial_resolution
+from recon.analysis.stated_distance import Reached, TriedPair, stated_px
 from recon.analysis.told_apart import Told, stated_apart
 from recon.camera.camera_model import one_depth
 from recon.evaluation import two_points
