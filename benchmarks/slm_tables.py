@@ -17,8 +17,8 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display import slm_calibration
-from calibration_routines.display.slm_calibration import MAX_PHASE_ERROR_RAD, steady_phases
+from calibration_routines.display import slm_phases
+from calibration_routines.display.slm_phases import MAX_PHASE_ERROR_RAD, steady_phases
 from calibration_routines.procedure import CalibrationError
 from recon.errors import InputError
 
@@ -45,7 +45,7 @@ def flickering(flicker: float, seed: int) -> Callable[[], tuple[Array, npt.NDArr
 
 def off_rad(flicker: float, seed: int, limit_rad: float, most: int) -> tuple[float | None, int]:
     """Return how far the worst level of a table is off, None of none, and the series that were taken."""
-    slm_calibration.MAX_PHASE_ERROR_RAD, slm_calibration.MOST_SERIES = limit_rad, most
+    slm_phases.MAX_PHASE_ERROR_RAD, slm_phases.MOST_SERIES = limit_rad, most
     try:
         phases, error, scatter = steady_phases(flickering(flicker, seed), BEFORE)
     except (InputError, CalibrationError):
@@ -60,7 +60,7 @@ def main() -> None:
     parser.add_argument("--flicker", nargs="+", type=float, default=[0.005, 0.01, 0.015, 0.02, 0.03, 0.2])
     asked = parser.parse_args()
     ways = {"one series, 0.004 rad": (ONE_SERIES_RAD, 1)}
-    ways["the program"] = (MAX_PHASE_ERROR_RAD, slm_calibration.MOST_SERIES)
+    ways["the program"] = (MAX_PHASE_ERROR_RAD, slm_phases.MOST_SERIES)
     print(
         "| flicker | by | written | worst level off, rad | beyond 0.02 | series: tables |\n"
         + "|---" * 6

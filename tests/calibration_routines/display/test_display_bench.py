@@ -14,7 +14,7 @@ from calibration_routines.display.hologram_photograph import (
     Photographed,
     write_capture,
 )
-from calibration_routines.display.slm_calibration import measure_look_up_table
+from calibration_routines.display.slm_table import measure_look_up_table
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from recon.holography import Scores

@@ -17,13 +17,10 @@ from calibration_routines.display.mask_alignment import (
     MaskAlignment,
 )
 from calibration_routines.display.mask_stage import PlacementCost
-from calibration_routines.display.slm_calibration import (
-    MAX_PHASE_ERROR_RAD,
-    SlmProcedure,
-    measure_flatness,
-    measure_look_up_table,
-    steady_phases,
-)
+from calibration_routines.display.slm_calibration import SlmProcedure
+from calibration_routines.display.slm_flatness import measure_flatness
+from calibration_routines.display.slm_phases import MAX_PHASE_ERROR_RAD, steady_phases
+from calibration_routines.display.slm_table import measure_look_up_table
 from calibration_routines.procedure import CalibrationError, Size
 from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import Bench
