@@ -103,6 +103,7 @@ class ProxSplit:
     def restart(self) -> None:
         """Begin anew from zero."""
         self.prior.memory = None
+        self.mu = 1.0
         self.state = self.state * 0
         self.split = self._prox()
         self.sums = (0.0, 0.0, 0.0, 0.0)
@@ -283,9 +284,10 @@ class PriorSplits:
             other.move(rows, columns)
 
     def restart(self) -> None:
-        """Begin anew from zero; penalties are to be set again."""
+        """Begin anew from zero; penalties are to be set again, as those of new splits are."""
         for array in (self.y, self.tx, self.ty, self.t_w):
             array[...] = 0
+        self.mu[...] = 1
         for other in self.others:
             other.restart()
 

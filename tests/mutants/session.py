@@ -115,7 +115,7 @@ class Trials:
         began_s = time.monotonic()
         for module in self._modules:  # what is imported when it is used, too
             importlib.import_module(module.removesuffix(".py").replace("/", "."))
-        _load_kernels({Path(module).parent for module in self._modules})
+        _load_kernels({Path("recon/base"), *(Path(module).parent for module in self._modules)})
         gc.collect()
         self._functions = defaultdict(list)
         for function in gc.get_objects():
