@@ -44,6 +44,8 @@ from recon.types import Calibration
 
 _LOOK_MS = 50
 _BUDGET_MS = 80.0
+_PATIENCE_S = 1.5
+"""Without a frame for longer than this and three exposures, the picture is called old."""
 """A picture's time: twelve a second leave half of a two-core machine to the camera and the window."""
 _NO_CALIBRATION = "Choose a calibration; the Sweeps panel makes one."
 _ALL_DEPTHS = "all depths"
@@ -315,12 +317,14 @@ class LiveReconstructionPanel(Panel):
             elided(self.status, self.follower.problem)
             self._call_old("the preview has ended, see below")
             return
-        if self._shown is not None and self.session.live.stream is None:
-            age_s = (time.monotonic_ns() - self._shown.metadata.host_time_ns) / 1e9
-            self._call_old(f"no frame has come for {duration(age_s)}")
+        silent = self._silence()
+        if silent and self.session.live.stream is None:
+            self._call_old(silent)
             return
         result = self.follower.newest()
         if result is None or result is self._shown:
+            if silent:
+                self._call_old(silent)
             return
         self._shown = result
         self._show_picture(result.picture.image)
@@ -328,7 +332,10 @@ class LiveReconstructionPanel(Panel):
         self._log_new(() if how is None else how.warnings)
         rate = "" if how is None or not how.pictures_per_s > 0 else f", {how.pictures_per_s:.1f} pictures/s"
         passed = "" if how is None else f", {count(how.passed_over, 'frame')} passed over"
-        self.view.caution_against(self._doubt(result))
+        if silent:  # the old frame's picture goes on to be refined
+            self._call_old(silent)
+        else:
+            self.view.caution_against(self._doubt(result))
         self.view.set_caption(self._caption(result.metadata))
         # What is doubted stands over the picture.
         worth = result.picture.quality.removeprefix(result.picture.doubt).removeprefix(": ")
@@ -337,6 +344,18 @@ class LiveReconstructionPanel(Panel):
         )
         latency = f"latency {late}{rate}{passed}"
         self.status.setText("\n".join(filter(None, (latency, worth))))
+
+    def _silence(self) -> str:
+        """Say for how long no frame has come, where one should have; of the picture's own with no stream."""
+        shown, stream = self._shown, self.session.live.stream
+        if shown is None:
+            return ""
+        newest = None if stream is None else stream.newest()
+        metadata = shown.metadata if newest is None else newest.metadata
+        age_s = (time.monotonic_ns() - metadata.host_time_ns) / 1e9
+        if stream is not None and age_s < _PATIENCE_S + 3e-3 * metadata.exposure_ms:
+            return ""
+        return f"no frame has come for {duration(age_s)}"
 
     def _call_old(self, why: str) -> None:
         """Say over the picture that it stays while no other comes: of frames, or of the preview."""

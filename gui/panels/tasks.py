@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -46,6 +47,8 @@ from recon.base.declare import Imports, Option, expression
 
 _FOLDERS = ("FOLDER", "RUN", "CALIBRATION", "OLD", "NEW", "VIDEO|RUN", "RUN|RESULT", "SHEET")
 """What an option is called that names a folder."""
+_FILMS = ("run", "video")
+"""Options that name what a calibration is needed for."""
 _PICTURES = (".png", ".jpg", ".svg")
 _ROW_PX = 26
 _CALIBRATION = "calibration"
@@ -201,6 +204,7 @@ class TasksPanel(Panel):
         if task.subject:
             form.show_for(task.subject)
         form.refused.connect(self.refused)
+        form.settled.connect(partial(self._settled, name))
         form.set_values({"bench": self.session.config.path})
         names = None
         if place is not None:
@@ -209,6 +213,10 @@ class TasksPanel(Panel):
             form.set_values({"out": None})
             names.suggest(place.name.partition(".")[0])
         return _Page(task, form, names)
+
+    def _settled(self, name: str, field: str) -> None:
+        if field in _FILMS and name in self._pages:
+            self._look_for_calibration(name)
 
     def _look_for_calibration(self, name: str) -> None:
         """Begin with the newest calibration where one is needed: to see a recording's scene, too."""

@@ -138,6 +138,11 @@ def test_forms_begin_with_the_newest_calibration_and_a_place_for_the_result(
     assert not activity.raw()
     panel.choose("activity", video=runs / "2026-11-25_21-40-00_recording")
     qtbot.waitUntil(lambda: activity.raw() == str(newest), timeout=WAIT_MS)
+    form = panel._pages["activity"].form
+    form.set_values({"calibration": None, "video": None})
+    qtbot.waitUntil(lambda: panel._newest._job is None, timeout=WAIT_MS)
+    form.set_values({"video": runs / "2026-11-25_21-40-00_recording"})  # typed in the form
+    qtbot.waitUntil(lambda: activity.raw() == str(newest), timeout=10_000)
 
 
 def test_a_hologram_of_spots_is_previewed_and_goes_on_to_the_slm(qtbot: QtBot, panel: TasksPanel) -> None:
