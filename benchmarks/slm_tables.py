@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from calibration_routines.display import slm_phases
 from calibration_routines.display.slm_phases import MAX_PHASE_ERROR_RAD, steady_phases
-from calibration_routines.procedure import CalibrationError
+from calibration_routines.purpose import CalibrationError
 from recon.errors import InputError
 
 Array = npt.NDArray[np.float64]

@@ -13,7 +13,7 @@ _HOMES = {
     "optics.angular_response": "AngularResponse load_response",
     "optics.dpc": "DiffuserSurface DpcProcedure DpcSetup",
     "optics.photograph": "FieldResponse Photograph measure_field_response photograph",
-    "procedure": "CalibrationError Listener",
+    "procedure": "Listener",
     "psf.exposure": "AutoExposure ExposureOutcome auto_expose expose_scene expose_source",
     "psf.sampling": "GridSweep Sampling axial_planes grid_sweep lateral_spacing",
     "psf.sweep": "SweepCalibration calibrate_sweep finish_sweep watch_sweep",
@@ -21,6 +21,7 @@ _HOMES = {
     "psf.sweep_plan": "SweepExposures check_sweep expose_sweep sweep_plan",
     "psf.sweep_procedure": "SweepProcedure",
     "psf.sweep_watch": "PointTaken SourceVisit SweepEvent",
+    "purpose": "CalibrationError",
 }
 
 

@@ -9,19 +9,11 @@ from itertools import pairwise
 from pathlib import Path
 
 from calibration_routines.display.kept_frames import going_on, kept_by
-from calibration_routines.procedure import (
-    REFUSED,
-    Listener,
-    Outcome,
-    Outlook,
-    Procedure,
-    Routine,
-    completed,
-    home_if_needed,
-    outlook_of,
-    routines,
-)
+from calibration_routines.planned import home_if_needed, outlook_of
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.psf.exposure import expose_patterns
+from calibration_routines.purpose import REFUSED, completed
+from calibration_routines.routine import Routine, routines
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import Snapshot
 from instrument.files.errors import BenchError
@@ -121,6 +113,8 @@ class ResumeProcedure(Procedure):
         if not looked.todo:
             return settled(self.run, looked, bench, control, listener)
         run, routine = Run.open(self.run), routine_of(self.run)
+        if routine is not None and routine.purpose is not None:
+            control.left = routine.purpose.left
         home_if_needed(bench, listener, run.plan)
         if routine is not None and routine.restore is not None:
             routine.restore(run, bench, looked.todo[0])

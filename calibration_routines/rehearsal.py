@@ -10,7 +10,8 @@ from dataclasses import replace
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from calibration_routines.procedure import Listener, Routine
+from calibration_routines.procedure import Listener
+from calibration_routines.routine import Routine
 from calibration_routines.times import IN_ALL
 from drivers.errors import DeviceError
 from instrument.files.errors import BenchError, duration

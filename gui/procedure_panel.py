@@ -11,7 +11,8 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QScrollArea, QStackedWidget, QWidget
 
 from calibration_routines.plan_procedures import ResumeProcedure, left_unfinished, routine_of
-from calibration_routines.procedure import Outcome, Outlook, Procedure, Routine
+from calibration_routines.procedure import Outcome, Outlook, Procedure
+from calibration_routines.routine import Routine
 from gui.background import NewestOnly
 from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobContext

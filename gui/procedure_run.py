@@ -14,10 +14,12 @@ from PySide6.QtWidgets import QWidget
 
 from calibration_routines.display.spot_camera import SpotLook
 from calibration_routines.plan_procedures import unfinished
-from calibration_routines.procedure import Listener, Outcome, Procedure, RunEndedError, place_of
+from calibration_routines.planned import place_of
+from calibration_routines.procedure import Listener, Outcome, Procedure
 from calibration_routines.psf.sweep_plan import SweepExposures
 from calibration_routines.psf.sweep_procedure import event_lines, exposure_lines
 from calibration_routines.psf.sweep_watch import SweepEvent
+from calibration_routines.purpose import RunEndedError
 from gui.jobs import Job, JobContext
 from gui.panel import on_bench
 from gui.session import BenchSession

@@ -12,7 +12,9 @@ import numpy.typing as npt
 from calibration_routines.display.display_io import DisplayBench, bring_mask, require_slm, writable
 from calibration_routines.display.hologram_photograph import HologramCamera
 from calibration_routines.display.kept_frames import KeptFrames, SeenAgain, kept_words
-from calibration_routines.procedure import Checked, Listener, Outcome, Outlook, Procedure, Routine
+from calibration_routines.options import Checked
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
+from calibration_routines.routine import Routine
 from instrument.bench.bench import Bench
 from instrument.display.hologram import Alignment, bench_display, load_alignment, save_alignment
 from instrument.files.atomic import require_new
@@ -208,4 +210,4 @@ ROUTINES = (
         file=DISPLAY_FILE,
     ),
 )
-"""Row of :data:`calibration_routines.procedure.routines`."""
+"""Row of :data:`calibration_routines.routine.routines`."""

@@ -48,7 +48,9 @@ from calibration_routines.display.mask_search import (
     search_pose,
 )
 from calibration_routines.display.mask_stage import MaskStage, PlacementCost
-from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine, home_if_needed
+from calibration_routines.planned import home_if_needed
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
+from calibration_routines.routine import Routine
 from calibration_routines.scatter import STEADY, Scatter
 from drivers.errors import StoppedError
 from instrument.bench.bench import Bench
@@ -472,4 +474,4 @@ ROUTINES = (
         command="align",
     ),
 )
-"""Row of :data:`calibration_routines.procedure.routines`."""
+"""Row of :data:`calibration_routines.routine.routines`."""

@@ -18,7 +18,8 @@ import numpy.typing as npt
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.kept_frames import SeenAgain
 from calibration_routines.display.spot_camera import SpotCamera
-from calibration_routines.procedure import Checked, Listener, Size
+from calibration_routines.options import Checked, Size
+from calibration_routines.procedure import Listener
 from calibration_routines.scatter import Scatter, scatter_of
 from instrument.files.errors import BenchError
 from recon.base.declare import RARE, option

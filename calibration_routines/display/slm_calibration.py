@@ -13,7 +13,9 @@ from calibration_routines.display.slm_flatness import FRAMES as FLATNESS_FRAMES
 from calibration_routines.display.slm_flatness import measure_flatness
 from calibration_routines.display.slm_phases import MOST_SERIES
 from calibration_routines.display.slm_table import REFERENCE_EVERY, SlmCalibration, measure_look_up_table
-from calibration_routines.procedure import Checked, Listener, Outcome, Outlook, Procedure, Routine
+from calibration_routines.options import Checked
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
+from calibration_routines.routine import Routine
 from instrument.bench.bench import Bench
 from instrument.display.hologram import bench_display, load_alignment
 from instrument.files.atomic import require_new
@@ -148,4 +150,4 @@ ROUTINES = (
         file=SLM_FILE,
     ),
 )
-"""Row of :data:`calibration_routines.procedure.routines`."""
+"""Row of :data:`calibration_routines.routine.routines`."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.procedure import CalibrationError
+from calibration_routines.purpose import CalibrationError
 from calibration_routines.scatter import NO_CHANGE, Scatter, compare, pooled, scatter_of
 from recon.errors import InputError
 from recon.holography.slm_response import phases_from_frames

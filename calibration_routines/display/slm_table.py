@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.slm_phases import MAX_PHASE_ERROR_RAD, steady_phases
-from calibration_routines.procedure import CalibrationError
+from calibration_routines.purpose import CalibrationError
 from calibration_routines.scatter import STEADY, Scatter
 from instrument.files.errors import BenchError
 from instrument.files.slm_image import SlmCorrection

@@ -22,23 +22,15 @@ from calibration_routines.optics.angular_response import (
     response_lines,
     save_response,
 )
-from calibration_routines.procedure import (
-    MM,
-    Checked,
-    Listener,
-    Outcome,
-    Outlook,
-    Procedure,
-    Purpose,
-    Routine,
-    completed,
-    home_if_needed,
-    outlook_of,
-)
+from calibration_routines.options import MM, Checked
+from calibration_routines.planned import home_if_needed, outlook_of
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.psf.analysis import ambient_findings, dark_model, drift_of, images_of
 from calibration_routines.psf.sampling import Position, known, source_limits
 from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import PSF, check_sweep, expose_sweep, sweep_plan
+from calibration_routines.purpose import Purpose, completed
+from calibration_routines.routine import Routine
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, SettingsError
 from instrument.files.figures import save_figure
@@ -360,4 +352,4 @@ ROUTINES = (
         ),
     ),
 )
-"""Row of :data:`calibration_routines.procedure.routines`."""
+"""Row of :data:`calibration_routines.routine.routines`."""

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from calibration_routines.procedure import CalibrationError
 from calibration_routines.psf.sampling import Position
+from calibration_routines.purpose import CalibrationError
 from calibration_routines.scatter import STEADY, Scatter
 from instrument.files.record import RecordFormat, plain, value_of
 from recon.camera.registration import Registration, aligned, expected_shift, register

@@ -20,16 +20,10 @@ from calibration_routines.optics.photograph import (
     photograph_of,
     photograph_plan,
 )
-from calibration_routines.procedure import (
-    MM,
-    CalibrationError,
-    Checked,
-    Listener,
-    Purpose,
-    Size,
-    completed,
-)
+from calibration_routines.options import MM, Checked, Size
+from calibration_routines.procedure import Listener
 from calibration_routines.psf.exposure import expose_scene
+from calibration_routines.purpose import CalibrationError, Purpose, completed
 from calibration_routines.scatter import STEADY, Scatter, pooled
 from instrument.bench.bench import Bench
 from instrument.files.atomic import named_by_worth, require_new

@@ -20,9 +20,11 @@ from calibration_routines.optics.bead_photographs import (
     show_slide_again,
     went_on,
 )
-from calibration_routines.procedure import CalibrationError, Listener, Outcome, Outlook, Procedure, Routine
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.psf.analysis import binned
 from calibration_routines.psf.sampling import known
+from calibration_routines.purpose import CalibrationError
+from calibration_routines.routine import Routine
 from instrument.bench.bench import Bench
 from instrument.bench.camera_settings import restore_camera
 from instrument.files.atomic import named_by_worth
@@ -297,4 +299,4 @@ ROUTINES = (
         file=BEADS_FOLDER,
     ),
 )
-"""Row of :data:`calibration_routines.procedure.routines`."""
+"""Row of :data:`calibration_routines.routine.routines`."""

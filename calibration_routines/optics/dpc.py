@@ -15,22 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.procedure import (
-    CalibrationError,
-    Checked,
-    Listener,
-    Outcome,
-    Outlook,
-    Procedure,
-    Purpose,
-    Routine,
-    completed,
-    outlook_of,
-)
+from calibration_routines.options import Checked
+from calibration_routines.planned import outlook_of
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.psf.analysis import DarkModel, ambient_findings, dark_model, full_scale, light_of
 from calibration_routines.psf.exposure import expose_light
 from calibration_routines.psf.stage_fit import MAX_PLACE_DRIFT_PX
 from calibration_routines.psf.sweep_plan import DARK
+from calibration_routines.purpose import CalibrationError, Purpose, completed
+from calibration_routines.routine import Routine
 from calibration_routines.scatter import Scatter, compare, pooled, scatter_of
 from drivers.led_array import LedArray
 from instrument.bench.bench import Bench
@@ -416,4 +409,4 @@ ROUTINES = (
         start=lambda _: {"objective_na": 0.1, "magnification": 4.0},
     ),
 )
-"""Row of :data:`calibration_routines.procedure.routines`."""
+"""Row of :data:`calibration_routines.routine.routines`."""

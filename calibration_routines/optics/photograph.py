@@ -15,18 +15,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.procedure import (
-    CalibrationError,
-    Checked,
-    Listener,
-    Outcome,
-    Outlook,
-    Procedure,
-    Purpose,
-    Routine,
-    completed,
-    outlook_of,
-)
+from calibration_routines.options import Checked
+from calibration_routines.planned import outlook_of
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.psf.analysis import (
     ambient_findings,
     channels_first,
@@ -41,6 +32,8 @@ from calibration_routines.psf.psf_quality import MAX_CLIPPED, measure_psf
 from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import DARK, sweep_plan
+from calibration_routines.purpose import CalibrationError, Purpose, completed
+from calibration_routines.routine import Routine
 from calibration_routines.scatter import STEADY, Scatter, pooled
 from instrument.bench.bench import Bench
 from instrument.files.errors import SettingsError
@@ -396,4 +389,4 @@ ROUTINES = (
         examples=("diffuserbench calibrate photograph", "diffuserbench calibrate photograph --binning 2"),
     ),
 )
-"""Row of :data:`calibration_routines.procedure.routines`."""
+"""Row of :data:`calibration_routines.routine.routines`."""

@@ -32,17 +32,11 @@ from calibration_routines.optics.screen_solve import (
     finish_screen,
     solving_work,
 )
-from calibration_routines.procedure import (
-    FromFiles,
-    Listener,
-    Outcome,
-    Outlook,
-    Procedure,
-    Routine,
-    completed,
-)
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.psf.analysis import channels_first
 from calibration_routines.psf.sweep_plan import DARK
+from calibration_routines.purpose import completed
+from calibration_routines.routine import FromFiles, Routine
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError
 from instrument.plan import Part, Plan, estimate
@@ -220,4 +214,4 @@ ROUTINES = (
         ),
     ),
 )
-"""Row of :data:`calibration_routines.procedure.routines`."""
+"""Row of :data:`calibration_routines.routine.routines`."""

@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from calibration_routines.optics.beads import MANY_PX
 from calibration_routines.optics.screen_solve import DRIFT, SOLVING, ScreenOptions, psf_lines, saved
-from calibration_routines.procedure import Checked, Listener, Outcome
+from calibration_routines.options import Checked
+from calibration_routines.procedure import Listener, Outcome
 from calibration_routines.psf.analysis import channels_first
 from instrument.files.atomic import require_new
 from instrument.files.errors import FileError

@@ -7,8 +7,9 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import require_slm
 from calibration_routines.optics.screen_pictures import LEAST_MARKS, Levels, ScreenMap, bars, field_along
-from calibration_routines.procedure import CalibrationError, Listener
+from calibration_routines.procedure import Listener
 from calibration_routines.psf.exposure import ExposureOutcome, TooDarkError, auto_expose, hot_pixels
+from calibration_routines.purpose import CalibrationError
 from instrument.bench.bench import Bench
 from instrument.reconstruction.mosaic import in_colours
 from instrument.runs.run_control import RunControl

@@ -13,8 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.optics.screen_pictures import ScreenMap, ScreenTone
-from calibration_routines.procedure import MM, CalibrationError, Checked, Listener, Outcome, Purpose
+from calibration_routines.options import MM, Checked
+from calibration_routines.procedure import Listener, Outcome
 from calibration_routines.psf.analysis import binned, channels_first, dark_model, replace_hot
+from calibration_routines.purpose import CalibrationError, Purpose
 from instrument.bench.bench import Bench
 from instrument.files.atomic import named_by_worth
 from instrument.files.calibration_file import save_calibration

@@ -17,24 +17,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from calibration_routines.procedure import (
-    MM,
-    CalibrationError,
-    Checked,
-    Listener,
-    Outcome,
-    Outlook,
-    Procedure,
-    Purpose,
-    Routine,
-    completed,
-    home_if_needed,
-    outlook_of,
-)
+from calibration_routines.options import MM, Checked
+from calibration_routines.planned import home_if_needed, outlook_of
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.psf.analysis import dark_model, light_of
 from calibration_routines.psf.exposure import expose_source
 from calibration_routines.psf.sampling import known, source_limits
 from calibration_routines.psf.sweep_plan import DARK
+from calibration_routines.purpose import CalibrationError, Purpose, completed
+from calibration_routines.routine import Routine
 from calibration_routines.scatter import Scatter, compare, growth, pooled
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, SettingsError
@@ -429,4 +420,4 @@ ROUTINES = (
         examples=("diffuserbench calibrate stage --dry-run", "diffuserbench calibrate stage --reach-um 500"),
     ),
 )
-"""Row of :data:`calibration_routines.procedure.routines`."""
+"""Row of :data:`calibration_routines.routine.routines`."""

@@ -20,7 +20,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.procedure import CalibrationError
+from calibration_routines.purpose import CalibrationError
 from drivers.camera import Camera
 from drivers.frame import Frame
 from drivers.led_array import LedPattern

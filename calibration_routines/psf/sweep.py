@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration_routines.procedure import CalibrationError, Listener, completed
+from calibration_routines.procedure import Listener
 from calibration_routines.psf.analysis import (
     PlaneFrames,
     SweepAnalysis,
@@ -52,6 +52,7 @@ from calibration_routines.psf.sweep_plan import (
     sweep_plan,
 )
 from calibration_routines.psf.sweep_watch import SweepWatch, TakeAgain, retake_dimming
+from calibration_routines.purpose import CalibrationError, completed
 from calibration_routines.scatter import STEADY, Scatter
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import Snapshot

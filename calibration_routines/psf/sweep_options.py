@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from calibration_routines.optics.angular_response import load_response
-from calibration_routines.procedure import MM, Checked
+from calibration_routines.options import MM, Checked
 from calibration_routines.psf.sampling import MOST_PLANES, Position, axial_planes, grid_sweep, require_reach
 from instrument.bench.bench import Bench
 from instrument.files.errors import SettingsError

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from calibration_routines.procedure import Purpose
 from calibration_routines.psf.exposure import AutoExposure, TooDarkError, expose_source
 from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.sweep_options import AxialSweep, PointSweep
+from calibration_routines.purpose import Purpose
 from instrument.bench.bench import Bench
 from instrument.files.errors import SettingsError, count, duration
 from instrument.files.record import RecordFormat, plain

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine, outlook_of
+from calibration_routines.planned import outlook_of
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.psf.mount_fit import off_middle
 from calibration_routines.psf.psf_quality import place_of
 from calibration_routines.psf.sampling import reachable_depths_um, standing_depth_um
@@ -22,6 +23,7 @@ from calibration_routines.psf.sweep_plan import (
     size_findings,
 )
 from calibration_routines.psf.sweep_watch import SourceVisit, SweepEvent
+from calibration_routines.routine import Routine
 from calibration_routines.scatter import TOLERATED, Scatter
 from instrument.bench.bench import Bench
 from instrument.files.errors import count
@@ -255,4 +257,4 @@ ROUTINES = (
         ),
     ),
 )
-"""Rows of :data:`calibration_routines.procedure.routines`."""
+"""Rows of :data:`calibration_routines.routine.routines`."""

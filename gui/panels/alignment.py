@@ -12,7 +12,8 @@ from PySide6.QtWidgets import QButtonGroup, QHeaderView, QWidget
 
 from calibration_routines.display.mask_alignment import AlignmentReport
 from calibration_routines.display.spot_camera import SpotLook
-from calibration_routines.procedure import Outcome, routines
+from calibration_routines.procedure import Outcome
+from calibration_routines.routine import routines
 from gui.procedure_panel import ProcedurePanel
 from gui.session import BenchSession
 from gui.theme import colours

@@ -17,9 +17,10 @@ from calibration_routines.optics.beads import BeadCalibration
 from calibration_routines.optics.photograph import Photograph
 from calibration_routines.optics.screen_solve import ScreenCalibration
 from calibration_routines.plan_procedures import IlluminationProcedure, PlanProcedure
-from calibration_routines.procedure import Outcome, Outlook, Routine, routines
+from calibration_routines.procedure import Outcome, Outlook
 from calibration_routines.psf.sweep import SweepCalibration
 from calibration_routines.psf.sweep_watch import PointTaken
+from calibration_routines.routine import Routine, routines
 from gui.background import NewestOnly
 from gui.procedure_panel import ProcedurePanel
 from gui.procedure_run import Situation

@@ -26,19 +26,13 @@ from calibration_routines.optics.beads import (
     save_beads,
 )
 from calibration_routines.plan_procedures import run_outcome
-from calibration_routines.procedure import (
-    Listener,
-    Outcome,
-    Outlook,
-    Procedure,
-    Routine,
-    RunEndedError,
-    routines,
-)
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.psf.sweep_plan import SweepExposures
 from calibration_routines.psf.sweep_procedure import event_lines, event_note, exposure_lines
 from calibration_routines.psf.sweep_watch import SweepEvent
+from calibration_routines.purpose import RunEndedError
 from calibration_routines.rehearsal import rehearse_whole
+from calibration_routines.routine import Routine, routines
 from calibration_routines.times import IN_ALL
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -35,6 +35,8 @@ class RunControl:
         self._condition = threading.Condition()
         self.run: Path | None = None
         """The run that goes on or went last; None before the first."""
+        self.left: Callable[[Path], str] | None = None
+        """Says what an interruption leaves of that run, and what makes its result of it."""
         self._runner: Runner | None = None
         self._bench: Bench | None = None
         self._idle = threading.Event()

@@ -18,9 +18,10 @@ from calibration_routines.optics import photograph
 from calibration_routines.optics.angular import AngularProcedure, AngularSweep
 from calibration_routines.optics.photograph import PhotographProcedure
 from calibration_routines.plan_procedures import PlanProcedure, ResumeProcedure, left_unfinished
-from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, RunEndedError
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.psf.sweep_options import AxialSweep, LateralSweep, VolumeSweep
 from calibration_routines.psf.sweep_procedure import SweepProcedure
+from calibration_routines.purpose import RunEndedError
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files import kept_times

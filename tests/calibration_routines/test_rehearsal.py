@@ -11,8 +11,9 @@ import pytest
 from numba.core import event
 
 from calibration_routines import rehearsal
-from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
 from calibration_routines.rehearsal import ENOUGH_S, rehearse_whole
+from calibration_routines.routine import Routine
 from drivers.errors import DeviceError
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from calibration_routines import PointSweep
-from calibration_routines.procedure import MM, Routine, routines
+from calibration_routines.options import MM
 from calibration_routines.psf.sweep_options import PlannedSweep, Taking
 from calibration_routines.psf.sweep_procedure import SweepProcedure
+from calibration_routines.routine import Routine, routines
 from instrument.bench.bench import Bench
 from instrument.cli import main
 from instrument.files.calibration_file import load_calibration

@@ -10,10 +10,12 @@ import pytest
 
 from calibration_routines.display.mask_alignment import AlignmentProcedure
 from calibration_routines.optics.beads import BeadProcedure
+from calibration_routines.options import Size
 from calibration_routines.plan_procedures import PlanProcedure
-from calibration_routines.procedure import Outcome, Outlook, Procedure, Routine, Size, routines
+from calibration_routines.procedure import Outcome, Outlook, Procedure
 from calibration_routines.psf.sweep_options import AxialSweep
 from calibration_routines.psf.sweep_procedure import SweepProcedure
+from calibration_routines.routine import Routine, routines
 from gui.panels.sweeps import ILLUMINATION, PLAN
 from gui.procedure_run import script
 from instrument.bench.bench import Bench

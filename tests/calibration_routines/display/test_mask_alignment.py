@@ -21,7 +21,8 @@ from calibration_routines.display.slm_calibration import SlmProcedure
 from calibration_routines.display.slm_flatness import measure_flatness
 from calibration_routines.display.slm_phases import MAX_PHASE_ERROR_RAD, steady_phases
 from calibration_routines.display.slm_table import measure_look_up_table
-from calibration_routines.procedure import CalibrationError, Size
+from calibration_routines.options import Size
+from calibration_routines.purpose import CalibrationError
 from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config, template

@@ -15,8 +15,9 @@ from calibration_routines import CalibrationError
 from calibration_routines.optics import bead_photographs as beads
 from calibration_routines.optics.bead_photographs import BEADS, BeadSlides, photograph_slides
 from calibration_routines.optics.beads import BeadProcedure
+from calibration_routines.options import Size
 from calibration_routines.plan_procedures import ResumeProcedure, goes_on_with_frames, left_unfinished
-from calibration_routines.procedure import Listener, Size
+from calibration_routines.procedure import Listener
 from calibration_routines.scatter import STEADY
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config

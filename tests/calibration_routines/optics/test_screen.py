@@ -25,7 +25,7 @@ from calibration_routines.optics.screen_solve import (
     ScreenOptions,
     findings_of,
 )
-from calibration_routines.procedure import CalibrationError
+from calibration_routines.purpose import CalibrationError
 from calibration_routines.times import first_guess
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench

@@ -18,9 +18,9 @@ from calibration_routines import (
     expose_sweep,
     sweep_plan,
 )
-from calibration_routines.procedure import routines
 from calibration_routines.psf.sweep_plan import SWEEP as SWEEP_RUN
 from calibration_routines.psf.sweep_procedure import sweep_outcome
+from calibration_routines.routine import routines
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration_routines.procedure import routines
 from calibration_routines.psf.mount_fit import MountFit, fit_mount, off_middle, with_pitch
 from calibration_routines.psf.psf_quality import PsfQuality
 from calibration_routines.psf.stage_fit import StageFit
 from calibration_routines.psf.structure import fit_structure
 from calibration_routines.psf.sweep_plan import size_findings
+from calibration_routines.routine import routines
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
 from recon.camera.depth_mixture import paraxial_scale
