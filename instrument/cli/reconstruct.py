@@ -98,7 +98,7 @@ def _photograph(asked: _Asked) -> None:
     if source.calibration is not None and (flags := given.flags("allow_saturated", "allow_mixed_depth")):
         raise BenchError(
             f"{' and '.join(flags)}: for a PSF image (--psf); a calibration's PSFs were judged when they "
-            "were measured. Leave it out."
+            f"were measured. Leave {'it' if len(flags) == 1 else 'them'} out."
         )
     outputs = Outputs.named(
         output.out or _PICTURE, output.figure, volume=is_volume, uncertainty=asked.options.uncertainty

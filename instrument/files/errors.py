@@ -175,6 +175,11 @@ def ranges(numbers: Sequence[int], most: int | None = None) -> str:
     return f"{text} and {left} more" if left else text
 
 
+def frames_in_words(numbers: Sequence[int]) -> str:
+    """Return frames by their ascending numbers: ``frame 2``, ``frames 0-7, 9``."""
+    return f"frame{'s' if len(numbers) > 1 else ''} {ranges(numbers, 8)}"
+
+
 def duration(seconds: float) -> str:
     """Return a time for people."""
     if seconds < 120:

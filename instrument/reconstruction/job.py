@@ -173,7 +173,12 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
             **noise_note(noise_of(image)),
         },
         valid,
-        (*warnings, *_converted(psf, image), *_saturation(image, erased), *_suspicion(inputs, image)),
+        (
+            *warnings,
+            *(_converted(psf, image) if inputs.dark == "auto" else ()),
+            *_saturation(image, erased),
+            *_suspicion(inputs, image),
+        ),
         {
             "psf": source_record(raw_psf) | ({"mended_pixels": n_mended} if n_mended else {}),
             "image": source_record(image),

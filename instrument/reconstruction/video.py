@@ -233,7 +233,7 @@ def _check(request: VideoRequest) -> None:
         )
     if wrong := inapplicable(given, "video"):
         names = ", ".join(o.name for o in wrong)
-        raise BenchError(f"{names}: not for a video. Leave it out.")
+        raise BenchError(f"{names}: not for a video. Leave {'it' if len(wrong) == 1 else 'them'} out.")
 
 
 def _recording(path: Path) -> Run:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from instrument.bench.photograph import PHOTOGRAPHS, Progress
-from instrument.files.errors import FileError, ranges
+from instrument.files.errors import FileError, frames_in_words, ranges
 from instrument.files.figures import save_figure
 from instrument.files.images import image_metadata
 from instrument.files.seen import as_seen
@@ -55,7 +55,7 @@ class Verification:
         """Return what is wrong, a line each."""
         found = [f"frame {frame.index}: {frame.problem}" for frame in self.damaged]
         if self.without_a_line:
-            found.append(f"images without their line in the log: frames {ranges(self.without_a_line, 8)}")
+            found.append(f"images without their line in the log: {frames_in_words(self.without_a_line)}")
         return [*found, *map(str, self.files), *self.problems]
 
     def remedy(self) -> str:
@@ -68,15 +68,14 @@ class Verification:
         done = list(dict.fromkeys(file.remedy for file in self.files if file.remedy))
         if self.is_recording:
             if self.damaged:
-                many = "s" if len(self.damaged) > 1 else ""
-                done.append(f"marks frame{many} {ranges([f.index for f in self.damaged], 8)} as lost")
+                done.append(f"marks {frames_in_words([f.index for f in self.damaged])} as lost")
             if self.without_a_line:
                 done.append("keeps the images without a line")
         else:
             if set(self.without_a_line) - set(self.todo):
                 done.append("moves the images beyond the plan's away")
             if self.todo:
-                done.append(f"takes frames {ranges(self.todo, 8)}")
+                done.append(f"takes {frames_in_words(self.todo)}")
         return f"diffuserbench resume {', '.join(done)}; what it replaces is kept beside." if done else ""
 
     def __str__(self) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 from zlib import crc32
 
 from instrument.files.atomic import json_text, sync_folder, write_bytes
-from instrument.files.errors import FileError, ranges
+from instrument.files.errors import FileError, frames_in_words, ranges
 from instrument.files.reading import parse_json, read_bytes
 from instrument.files.record import plain
 from instrument.runs.frame_array import DESCRIPTIONS, FrameArray
@@ -201,7 +201,7 @@ def settle_recording(run: Run, log: AppendOnlyLog, damaged: Mapping[int, str]) -
     kept = [line.index for line in lines if isinstance(line, Unlisted)]
     words = []
     if lost:
-        words.append(f"marked as lost: frames {ranges(lost, 8)}")
+        words.append(f"marked as lost: {frames_in_words(lost)}")
     if kept:
-        words.append(f"kept without their metadata: images of frames {ranges(kept, 8)}")
+        words.append(f"kept without their metadata: images of {frames_in_words(kept)}")
     return words

@@ -135,3 +135,5 @@ def test_a_float_photograph_with_a_raw_psf_is_doubted(
     words = ["--psf", "psf.tif", "--image", str(tmp_path / "float.tif"), "--out", str(tmp_path / "o.tif")]
     assert main(["reconstruct", *words, "--iterations", "1"]) == 0
     assert "it was converted" in capsys.readouterr().err
+    assert main(["reconstruct", *words, "--iterations", "1", "--dark", "0", "--force"]) == 0
+    assert "give --dark" not in capsys.readouterr().err

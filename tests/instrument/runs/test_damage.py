@@ -390,7 +390,7 @@ def test_a_recording_keeps_images_without_a_line_and_marks_the_rest_as_lost(tmp_
     said = "\n".join(settle(path))
     assert "marked as lost: frames 5-6" in said
     assert not (path / f".{FRAMES}.draft").exists()
-    assert "images of frames 3" in said
+    assert "images of frame 3" in said
     run = Run.open(path)
     assert verify(run).is_sound, verify(run).lines()
     assert run.condition is RunCondition.COMPLETED

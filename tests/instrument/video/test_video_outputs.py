@@ -37,7 +37,7 @@ def test_a_video_goes_on_without_a_frame_that_was_lost_meanwhile(
         block_module.solve_block(str(prepared.job.folder), str(wanted.out), block)
     stamps = [VideoPictures(wanted.out)._file(t).stat().st_mtime_ns for t in range(4)]
     os.truncate(run / "frames.ome.zarr/0/c/6/0/0", 1000)
-    assert "marked as lost: frames 6" in "\n".join(settle(run))
+    assert "marked as lost: frame 6" in "\n".join(settle(run))
     with pytest.raises(FileError, match=r"frames, warm_iterations"):
         prepare_video(request(run, tmp_path, warm_iterations=7))
     again = prepare_video(wanted)
