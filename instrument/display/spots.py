@@ -84,6 +84,19 @@ def spots_of_facts(pattern: Path, facts: Mapping[str, Any]) -> SpotList:
         raise FileError(side_car(pattern), f"does not say which spots: {error}.") from error
 
 
+def middle_line(display: Display, wanted: SpotList, scores: SpotScores) -> str:
+    """Say how bright the light is that is not modulated, where it is a spot of its own; else empty."""
+    cells = np.abs(wanted.places - 0.5) * display.slm_shape
+    is_spot = display.factor == 1 and not display.near and display.dc.power > 0
+    if not is_spot or scores.efficiency <= 0 or (cells.max(axis=1) < 1).any():
+        return ""
+    times = display.dc.power * len(wanted) / scores.efficiency
+    return (
+        f"  in the middle: a spot {times:.2g} times as bright as one of these, of the light that the SLM "
+        "does not modulate (dc_power of [display])"
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class SpotFiles:
     """Writes a hologram of spots: patterns, description with every spot, preview."""

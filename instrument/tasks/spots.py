@@ -27,7 +27,7 @@ from instrument.display.limit import (
     limit_lines,
     limits_of_lifts,
 )
-from instrument.display.spots import SpotFiles, spots_of
+from instrument.display.spots import SpotFiles, middle_line, spots_of
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels
 from instrument.tasks.task import BenchFile, Desk, Done, Only, bench_of, saying_what_is_left, task
@@ -235,6 +235,8 @@ def make_spots(
         f"deviation {scores.deviation:.2%} (computed)"
     )
     desk.say(f"  light: {scores.efficiency:.1%} of what falls on the SLM is in the spots")
+    if middle := middle_line(display, wanted, scores):
+        desk.say(middle)
     cancelled = found.stop_reason is HologramStop.CANCELLED
     kept = "Interrupted: this is the pattern so far." if cancelled else ""
     return Done(tuple(file for file in writer.files() if file.exists()), kept=kept)

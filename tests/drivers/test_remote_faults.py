@@ -96,6 +96,22 @@ def in_thread(call: Callable[[], Any]) -> tuple[threading.Thread, list[BaseExcep
     return thread, errors
 
 
+def test_an_alarm_that_locks_a_stage_afar_is_told_and_unlocked(
+    server: BenchServer, options: RemoteOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with RemoteStage(options) as stage:
+        assert not stage.needs_unlocking
+        with pytest.raises(DeviceError, match="has no lock"):
+            stage.unlock()
+        locked = ["by an alarm"]
+        served = type(served_bench(server).stage)
+        monkeypatch.setattr(served, "needs_unlocking", property(lambda _stage: bool(locked)))
+        monkeypatch.setattr(served, "unlock", lambda _stage: locked.clear())
+        assert stage.needs_unlocking
+        stage.unlock()
+        assert not stage.needs_unlocking
+
+
 @pytest.mark.parametrize("how", ["cut", "silent", "server ends"])
 def test_a_lost_operator_leaves_no_light_and_no_motion(
     how: str, server: BenchServer, network: BadNetwork, options: RemoteOptions, said: list[str]

@@ -31,6 +31,7 @@ from instrument.display.hologram import (
     prepare_target,
 )
 from instrument.display.limit import SharedTime, at_most, coarser_mask, limit_lines
+from instrument.display.spots import middle_line
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image, write_image
 from instrument.files.sample_images import SAMPLES, load_sample
@@ -42,10 +43,12 @@ from recon.holography import (
     HologramOptions,
     HologramStop,
     Limit,
+    SpotList,
     compute_hologram,
+    compute_spots,
     spot_array,
 )
-from recon.holography.display import no_mask
+from recon.holography.display import DcTerm, no_mask
 from recon.holography.learned import Learned
 from recon.holography.pose import Pose
 from recon.holography.scores import compare
@@ -310,6 +313,19 @@ def test_spots_without_a_mask_come_from_an_array_or_a_list(capsys):
     ):
         assert main(["hologram", *wrong, "--out", "other.png"]) == 2
         assert words in capsys.readouterr().err
+
+
+def test_light_that_no_slm_modulates_is_a_spot_in_the_middle_and_told():
+    flat = no_mask((96, 128), design_wavelength_nm=532.0)
+    display = Display((96, 128), flat, slm_pitch_um=8.0, wavelength_nm=532.0, dc=DcTerm(0.1))
+    wanted = spot_array(4, 4)
+    found, scores = compute_spots(display, wanted, HologramOptions(iterations=20))
+    middle = SpotList(np.array([[0.5, 0.5], *wanted.places]), np.ones(17), np.zeros(17))
+    relative = SpotField(display, middle).score(found.slm).relative
+    times = f"{relative[0] / relative[1:].mean():.2g}"
+    assert f"a spot {times} times as bright" in middle_line(display, wanted, scores)
+    assert middle_line(display, spot_array(5, 5), scores) == "", "there one was asked for"
+    assert middle_line(replace(display, dc=DcTerm(0.0)), wanted, scores) == ""
 
 
 @pytest.mark.usefixtures("here")
