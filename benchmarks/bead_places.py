@@ -1,97 +1,154 @@
-"""Where beads come out of a reconstructed volume, against how far apart its planes are.
+"""Where ``diffuserbench points`` finds beads in reconstructed volumes, against how far apart planes are.
 
-Beads stand between planes and pixels, at random places of 10 to 20 mm, planes evenly in 1/z. They are
-rendered lenslet by lenslet (``lenslet_scene``), reconstructed by l1 and looked for in the volume and in its
-metric copy (``export --metric``): by the brightest voxel, and the light's centre about it, within two planes
-and as far across as a ray from the pattern's edge goes in these, four pixels more. "Perfect" volumes are made
-of the places themselves, without photograph and solver: each bead's light shared by the eight voxels beside
-it, along its ray. What they miss is the resampling's; what the others miss beyond it is the reconstruction's.
+Beads stand between planes and pixels, at random, planes evenly in 1/z. ``tiny`` is the simulated bench:
+wave optics, every bead at its own place, smooth diffuser, 60 to 120 mm; ``lenslets`` casts a Gaussian spot a
+lenslet (``lenslet_scene``), 10 to 20 mm. Photographs (photon and read noise) are reconstructed from PSFs
+on the axis. Beads are looked for in the volume, in its metric copy (``export --metric``), and in a "perfect"
+volume made of the places themselves, without photograph and solver. Figures are in voxels of the metric copy:
+the middle plane's pixel across, the step beside it along. "Advised" is how many of the planes that the
+calibration's analysis advises there are: half an axial step (inner product 0.8) apart. "Edge" is by how many
+voxels x or y of a direction at the field's edge changes from one plane to the next: so much more exact than
+half a voxel must depth be known for x and y.
 
-    python benchmarks/bead_places.py --planes 4 7 13 25
+    python benchmarks/bead_places.py --bench tiny lenslets --planes 4 8 16
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from lenslet_scene import Camera, beads
-from scipy.ndimage import center_of_mass
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from lenslet_scene import Camera
+from lenslet_scene import beads as lenslet_beads
 
 import recon
-from recon.camera.grid import Grid, metric_volume
-from recon.types import Geometry
+from drivers.simulated.options import WorldOptions
+from drivers.simulated.world import SimulatedWorld
+from recon.analysis.point_places import point_places
+from recon.analysis.resolution import axial_resolution
+from recon.camera.grid import Grid, metric_grid, metric_volume
+from recon.optics.scene import bead_volume
+from recon.types import Calibration, Geometry
 
-SIZE, COUNT, DISTANCE_MM, PITCH_UM, REACH = 128, 40, 6.0, 6.5, 4
-PHOTONS = 3000.0
-"""In the brightest pixel."""
-
-
-def apart(points: np.ndarray, reach: float) -> np.ndarray:
-    """Return those beads that stand further from all before them than two windows reach."""
-    kept: list[np.ndarray] = []
-    for one in points:
-        if all(np.hypot(*(one[:2] - other[:2])) > 2.9 * reach for other in kept):
-            kept.append(one)
-    return np.array(kept)
+GREEN = (0.0, 1.0, 0.0)
+READ_NOISE = 2.0
 
 
-def found(volume: np.ndarray, at: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the brightest voxel and the centre of the light within ``reach`` of a place, in voxels."""
-    low = np.maximum(np.round(at - reach), 0).astype(int)
-    high = np.minimum(np.round(at + reach) + 1, volume.shape).astype(int)
-    window = volume[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
-    brightest = np.array(np.unravel_index(np.argmax(window), window.shape))
-    lit = np.where(window > 0.2 * window.max(), window, 0)
-    return low + brightest, low + np.array(center_of_mass(lit))
+@dataclass(frozen=True)
+class Scene:
+    """A photograph of beads, and what its camera makes of a source on the axis."""
+
+    photograph: np.ndarray
+    places_um: np.ndarray
+    psf: Callable[[float], np.ndarray]
+    geometry: Geometry
+    z_um: tuple[float, float]
+
+    def calibration(self, planes: int) -> Calibration:
+        """Return one of so many planes, evenly in 1/z."""
+        z_um = 1 / np.linspace(1 / self.z_um[0], 1 / self.z_um[1], planes)
+        psfs = np.stack([self.psf(float(z)) for z in z_um])[:, None].astype(np.float32)
+        return Calibration(psfs, np.stack([0 * z_um, 0 * z_um, z_um], 1), geometry=self.geometry)
+
+    @property
+    def advised(self) -> float:
+        """Planes that sample the axial step twice."""
+        near, far = self.z_um
+        middle = 2 / (1 / near + 1 / far)
+        distance_um = 1e3 * (self.geometry.diffuser_distance_mm or 0.0)
+        step = axial_resolution(self.psf(middle), middle, distance_um, 0.8).step_per_um
+        return 1 + (1 / near - 1 / far) / (step / 2)
 
 
-def perfect(shape: tuple[int, int, int], at: np.ndarray) -> np.ndarray:
-    """Return a volume with the light of one bead, 1, shared by the voxels beside its place."""
-    shares = [np.maximum(1 - np.abs(np.arange(n) - where), 0) for n, where in zip(shape, at, strict=True)]
-    return np.einsum("z,y,x->zyx", *shares).astype(np.float32)
-
-
-def offsets(planes: int, seed: int) -> tuple[float, dict[str, np.ndarray]]:
-    """Return by how many pixels the pattern's edge moves a plane, and how far beads are off (n, 3)."""
-    camera = Camera(SIZE, planes)
-    moved = 0.33 * SIZE * camera.span / (planes - 1)
-    across = REACH + 2 * moved
-    points = apart(beads(camera, COUNT, seed), across)
-    z_um = 1e3 * DISTANCE_MM / (camera.magnifications - 0.7)
-    geometry = Geometry(PITCH_UM, DISTANCE_MM)
-    calibration = recon.Calibration(camera.psfs(), np.stack([0 * z_um, 0 * z_um, z_um], 1), geometry=geometry)
-    light = camera.render(points)
+def noisy(light: np.ndarray, photons: float, seed: int) -> np.ndarray:
+    """Return a photograph with so many photons in its brightest pixel."""
     rng = np.random.default_rng(seed)
-    photograph = rng.poisson(light / light.max() * PHOTONS).astype(np.float32)
-    result = recon.reconstruct(
-        recon.Measurement(photograph), calibration, prior="l1", model="convolution", iterations=200
+    return (rng.poisson(light / light.max() * photons) + rng.normal(0, READ_NOISE, light.shape)).astype(
+        np.float32
     )
-    grid: Grid = result.grid
-    metric, placed = metric_volume(result.volume, grid)
-    off: dict[str, list[np.ndarray]] = {}
 
-    def note(name: str, volume: np.ndarray, there: np.ndarray, reach: np.ndarray) -> None:
-        for kind, voxel in zip(("brightest", "centre"), found(volume, there, reach), strict=True):
-            off.setdefault(f"{name}, {kind}", []).append(np.abs(voxel - there))
 
-    for y, x, m, _ in points:
-        z = 1e3 * DISTANCE_MM / (m - 0.7)
-        plane = (camera.magnifications[0] - m) / camera.span * (planes - 1)
-        at = np.array([plane, y + grid.centre[0], x + grid.centre[1]])
-        place = grid.place_um(0, at[1], at[2])
-        scale = z / z_um[0]  # along the ray
-        there = np.array([
-            (z - placed.z_um[0]) / placed.spacing_um[0],
-            *placed.pixel_of(0, place[0] * scale, place[1] * scale),
-        ])  # fmt: skip
-        deep = 2 * np.gradient(z_um)[round(plane)] / placed.spacing_um[0]
-        reach = np.array([abs(deep), across, across])
-        note("reconstructed, planes", result.volume, at, np.array([2, REACH, REACH]))
-        note("reconstructed, voxels", metric, there, reach)
-        linear = np.array([np.interp(z, z_um, np.arange(planes)), *at[1:]])
-        note("perfect, voxels", metric_volume(perfect(grid.shape, linear), grid)[0], there, reach)
-    return moved, {name: np.array(each) for name, each in off.items()}
+def tiny(seed: int, photons: float) -> Scene:
+    """Return 20 beads before the simulated bench ``tiny``, by wave optics."""
+    world = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
+    near, far = 60e3, 120e3
+    margin = 0.1 * (1 / near - 1 / far)
+    nearest, farthest = 1 / (1 / near - margin), 1 / (1 / far + margin)
+    pitch_um = world.geometry.pixel_pitch_um
+    per_pixel = pitch_um / (1e3 * (world.geometry.diffuser_distance_mm or 0.0))
+    scene = bead_volume(
+        20, (0.6 * 320 * per_pixel * nearest, 0.6 * 240 * per_pixel * nearest), (nearest, farthest), seed=seed
+    )
+    world.set_scene(scene)
+    world.scene_lit = True
+    light = world.photons_per_s(GREEN)
+    assert light is not None
+    return Scene(
+        noisy(np.asarray(light, np.float64), photons, seed),
+        scene.beads[0].positions_um,
+        lambda z: world.psf((0.0, 0.0, z), GREEN),
+        world.geometry,
+        (near, far),
+    )
+
+
+def lenslets(seed: int, photons: float) -> Scene:
+    """Return 20 beads before random lenslets in closed form."""
+    camera, geometry = Camera(128, 2), Geometry(6.5, 6.0)
+    points = lenslet_beads(camera, 20, seed)
+    z_um = 6000.0 / (points[:, 2] - 0.7)
+    across = -points[:, 1::-1] * 6.5 / 6000.0 * z_um[:, None]
+    return Scene(
+        noisy(camera.render(points), photons, seed),
+        np.column_stack([across, z_um]),
+        lambda z: camera.render(np.array([[0, 0, 0.7 + 6000.0 / z, 1.0]])),
+        geometry,
+        (10e3, 20e3),
+    )
+
+
+SCENES = {"tiny": tiny, "lenslets": lenslets}
+
+
+def perfect(grid: Grid, places_um: np.ndarray) -> np.ndarray:
+    """Return a volume with the light of each place shared by the voxels beside it, along its ray."""
+    volume = np.zeros(grid.shape, np.float32)
+    for x, y, z in places_um:
+        plane = np.interp(-1 / z, -1 / grid.z_um, np.arange(grid.shape[0]))
+        row, column = grid.pixel_of(0, x * grid.z_um[0] / z, y * grid.z_um[0] / z)
+        shares = [
+            np.maximum(1 - np.abs(np.arange(n) - at), 0)
+            for n, at in zip(grid.shape, (plane, row, column), strict=True)
+        ]
+        volume += np.einsum("z,y,x->zyx", *shares).astype(np.float32)
+    return volume
+
+
+def offsets(volume: np.ndarray, grid: Grid, truth_um: np.ndarray, voxel_um: np.ndarray) -> np.ndarray:
+    """Return by how many voxels beads are off, and by how many deviations, (n, 6); inf: not found."""
+    found = point_places(volume, grid)
+    rays = truth_um[:, :2] / truth_um[:, 2:]
+    seen = found.places_um[:, :2] / found.places_um[:, 2:]
+    per_pixel = float(voxel_um[0] / np.median(truth_um[:, 2]))
+    rows, free = [], np.ones(len(found), bool)
+    for place, ray in zip(truth_um, rays, strict=True):
+        beside = np.abs(seen - ray).max(axis=1) / per_pixel
+        deep = np.abs(found.places_um[:, 2] - place[2]) / voxel_um[2]
+        nearest = int(np.argmin(np.where(free, np.hypot(beside, deep), np.inf)))
+        if not (free[nearest] and beside[nearest] < 3 and deep[nearest] < 3):
+            rows.append(np.full(6, np.inf))
+            continue
+        free[nearest] = False
+        off = found.places_um[nearest] - place
+        rows.append(np.append(off / voxel_um, off / found.deviations_um[nearest]))
+    return np.array(rows)
 
 
 def main() -> None:
@@ -99,19 +156,46 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--planes", type=int, nargs="+", default=[4, 7, 13, 25])
+    parser.add_argument("--bench", nargs="+", choices=list(SCENES), default=list(SCENES))
+    parser.add_argument("--planes", type=int, nargs="+", default=[4, 8, 16])
+    parser.add_argument("--prior", nargs="+", default=["l1"])
+    parser.add_argument("--photons", type=float, default=4000.0, help="in the brightest pixel")
     parser.add_argument("--seeds", type=int, default=2)
-    arguments = parser.parse_args()
-    print("| planes | pixels a plane | beads | where | z, 90 %, most | x, y: 90 %, most | z within half |")
-    print("|---|---|---|---|---|---|---|")
-    for planes in arguments.planes:
-        runs = [offsets(planes, seed) for seed in range(1, 1 + arguments.seeds)]
-        for where in runs[0][1]:
-            off = np.concatenate([each[where] for _, each in runs])
-            z, across = off[:, 0], off[:, 1:].max(axis=1)
+    asked = parser.parse_args()
+    heads = "bench, prior | planes (advised) | edge | in | beads | z: 90 %, most | x, y: 90 %, most"
+    print(f"| {heads} | within half; off / deviation |\n|---|---|---|---|---|---|---|---|")
+    for name, prior, planes in ((n, p, k) for n in asked.bench for p in asked.prior for k in asked.planes):
+        scenes = [SCENES[name](seed, asked.photons) for seed in range(asked.seeds)]
+        off: dict[str, list[np.ndarray]] = {"volume": [], "metric": [], "perfect": []}
+        for scene in scenes:
+            result = recon.reconstruct(
+                recon.Measurement(scene.photograph),
+                scene.calibration(planes),
+                prior=prior,
+                model="convolution",
+                judged=False,
+                **({"iterations": 200} if prior == "l1" else {}),
+            )
+            grid = result.grid
+            metric = metric_grid(grid)
+            voxel_um = np.array([metric.pitch_um[0], metric.pitch_um[0], metric.spacing_um[0]])
+            for where, volume, on in (
+                ("volume", result.volume, grid),
+                ("metric", *metric_volume(result.volume, grid)),
+                ("perfect", perfect(grid, scene.places_um), grid),
+            ):
+                off[where].append(offsets(volume, on, scene.places_um, voxel_um))
+        edge = max(grid.shape[1:]) / 2 * metric.spacing_um[0] / metric.z_um[len(metric.z_um) // 2]
+        for where, each in off.items():
+            told = np.concatenate(each)
+            seen = told[np.isfinite(told[:, 0])]
+            z, across = np.abs(seen[:, 2]), np.abs(seen[:, :2]).max(axis=1)
             figures = [f"{np.percentile(one, 90):.2f}, {one.max():.2f}" for one in (z, across)]
-            told = [planes, f"{runs[0][0]:.2f}", len(off), where, *figures, f"{(z <= 0.5).mean():.0%}"]
-            print("| " + " | ".join(map(str, told)) + " |")
+            within = (np.maximum(z, across) <= 0.5).sum() / len(told)
+            sure = np.sqrt((seen[:, 3:] ** 2).mean())
+            row = [f"{name}, {prior}", f"{planes} ({scenes[0].advised:.1f})", f"{edge:.1f}", where]
+            row += [f"{len(seen)} of {len(told)}", *figures, f"{within:.0%}; {sure:.2f}"]
+            print("| " + " | ".join(row) + " |", flush=True)
 
 
 if __name__ == "__main__":

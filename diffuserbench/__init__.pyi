@@ -22,6 +22,9 @@ from instrument.notebook.result import show as show
 from instrument.notebook.result import show_figure as show_figure
 from instrument.notebook.words import open_result as open_result
 from recon.analysis.compare import compare as compare
+from recon.analysis.point_places import PointOptions as PointOptions
+from recon.analysis.point_places import PointPlaces as PointPlaces
+from recon.analysis.point_places import point_places as point_places
 from recon.analysis.report import analyse as analyse
 from recon.analysis.settings import AnalysisSettings as AnalysisSettings
 from recon.base import metrics as metrics

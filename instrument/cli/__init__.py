@@ -91,6 +91,7 @@ COMMANDS: Mapping[str, Command] = {
         RECONSTRUCTION, "reconstruct the scene from a PSF and a photograph", "reconstruct"
     ),
     "activity": _task(RECONSTRUCTION, "activity"),
+    "points": _task(RECONSTRUCTION, "points"),
     "analyze": _task(ANALYSIS, "analyze"),
     "compare": _task(ANALYSIS, "compare"),
     "optics": _task(ANALYSIS, "optics"),

@@ -55,6 +55,12 @@ TASKS: Mapping[str, TaskEntry] = {
     "activity": TaskEntry(
         VIDEOS, "Find activity", "fluorescence over time: dF/F, regions, traces", "activity:activity"
     ),
+    "points": TaskEntry(
+        RUNS,
+        "Find points in a volume",
+        "beads or cells in a volume: x, y, z in um, as a table",
+        "points:points",
+    ),
     "patterned": TaskEntry(
         VIDEOS,
         "Reconstruct patterned light",

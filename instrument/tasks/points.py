@@ -1,0 +1,101 @@
+"""Points of light in a volume, with their places in the scene: ``points``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from instrument.files.atomic import require_new, write_text
+from instrument.files.errors import FileError
+from instrument.tasks.task import Desk, Done, task
+from recon.analysis.point_places import PointOptions, PointPlaces
+from recon.base.declare import option
+
+_SHOWN = 20
+_COLUMNS = (
+    "x_um,y_um,z_um,x_deviation_um,y_deviation_um,z_deviation_um,light,plane,row,column,in_outermost_plane"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointFiles:
+    """In which volume, and where its points go."""
+
+    volume: Path = option(
+        help="A reconstructed volume (.ome.zarr, .tif, .npy), exported ones too.",
+        metavar="VOLUME",
+        positional=True,
+        group="Files",
+    )
+    out: Path = option(
+        Path("points.csv"),
+        help="Table of the points.",
+        metavar="FILE",
+        flags=("--out", "-o"),
+        label="Result",
+        group="Files",
+    )
+    force: bool = option(False, help="Overwrite a file that exists.", label="Overwrite", group="Files")
+
+
+@task("diffuserbench points volume.ome.zarr", "diffuserbench points volume.tif --least 0.3 --out beads.csv")
+def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
+    """Find points of light in a volume (beads, cells): x, y, z in micrometres, how well known, and light.
+
+    Places are between voxels and in the scene's coordinates: a point's light is followed along its ray
+    through the diffuser. The volume as it was reconstructed serves best, not one made metric. Deviations are
+    one standard deviation, as points of simulated photographs were off.
+    """
+    from instrument.reconstruction.stored_result import open_result
+    from recon.analysis.point_places import point_places
+
+    require_new(files.out, overwrite=files.force)
+    result = open_result(files.volume)
+    try:
+        grid = result.grid
+        if result.volume is None or grid is None:
+            raise FileError(
+                files.volume,
+                "is a picture; points in depth are found in a volume.",
+                "Of pictures reconstruct --prior l1 --uncertainty tells the points.",
+            )
+        with desk.step("looking for points", 1.0) as advance:
+            found = point_places(result.volume.plane, grid, options, advance)
+    finally:
+        result.close()
+    known = bool(np.isfinite(found.places_um).all())
+    write_text(files.out, _table(found))
+    desk.fact("Points", str(len(found)))
+    if not len(found):
+        desk.warn("Warning: the volume is black.")
+    elif known:
+        across, deep = np.median(found.deviations_um[:, :2].max(axis=1)), np.median(found.deviations_um[:, 2])
+        desk.fact("Known to", f"{across:.3g} um across, {deep:.3g} um in depth (medians)")
+        desk.table(
+            ("x (mm)", "y (mm)", "z (mm)", "light"),
+            [
+                (*(f"{at / 1e3:.5g}" for at in place), f"{light:.4g}")
+                for place, light in zip(found.places_um[:_SHOWN], found.light, strict=False)
+            ],
+            "" if len(found) <= _SHOWN else f"The brightest {_SHOWN}",
+        )
+    else:
+        desk.warn(
+            "Warning: the volume does not tell where its planes are: the table has planes, rows and columns "
+            "alone. Of PSFs from files --pixel-um and --distance-mm of reconstruct say them."
+        )
+    if ends := int(found.at_end.sum()):
+        desk.warn(f"Warning: {ends} are brightest in an outermost plane and may lie beyond it.")
+    return Done((files.out,))
+
+
+def _table(found: PointPlaces) -> str:
+    """Return points as CSV; what is not known is left empty."""
+    numbers = np.column_stack([found.places_um, found.deviations_um, found.light, found.voxels])
+    lines = [
+        ",".join([*(f"{value:.7g}" if np.isfinite(value) else "" for value in row), str(int(end))])
+        for row, end in zip(numbers, found.at_end, strict=True)
+    ]
+    return "\n".join([_COLUMNS, *lines, ""])

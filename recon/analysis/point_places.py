@@ -1,0 +1,240 @@
+"""Points of light in a volume: where they are in the scene, between voxels.
+
+A camera without a lens divides directions, not space (Kuo 2020, sec. 4.4): light of a point between two
+planes lies on both, along its ray through the diffuser. So the centre of its light is taken along that ray:
+its direction, and the mean of ``1 / z``, in which patterns grow evenly (Eq. 4.7). Looked for along the axis
+instead, dim ends of its light are missed, and what is missed in depth moves the centre sideways.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.declare import option
+from recon.camera.grid import Grid
+from recon.errors import InputError
+
+Floats = npt.NDArray[np.float64]
+Plane = npt.NDArray[np.float32]
+Whole = npt.NDArray[np.intp]
+Voxel = tuple[int, int, int]
+
+REACH = 2
+"""Voxels from its brightest one that a point's light is taken from, along its ray and across."""
+MOST = 10_000
+"""Points: where there are more, they are texture."""
+OFF_PLANES, OFF_PX = 0.1, 0.1
+"""Standard deviation of a point's place in planes and in pixels, at least: what points in photographs were
+off in volumes by l1 and by total variation (``benchmarks/bead_places.py``)."""
+WIDE = 0.5
+"""Voxels that light of one point between two has about its centre at most; wider, it is known less well."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointOptions:
+    """Which points are told."""
+
+    least: float = option(
+        0.1,
+        help="Brightest voxel of a point, relative to the brightest of all, from which it is told.",
+        above=0,
+        most=1,
+        label="Dimmest",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PointPlaces:
+    """Points of a volume, the brightest first.
+
+    Attributes
+    ----------
+    places_um : ndarray, float64, (n, 3)
+        ``(x, y, z)`` in the scene; NaN where a volume does not know where its voxels lie.
+    deviations_um : ndarray, float64, (n, 3)
+        Standard deviations of these; of x and y with what z is off along an oblique ray.
+    voxels : ndarray, float64, (n, 3)
+        ``(plane, row, column)``, counted from 0: whole numbers are the middle of voxels.
+    light : ndarray, float64, (n,)
+        Sum of the voxels that a point was found from, of all channels.
+    at_end : ndarray, bool, (n,)
+        Brightest in the first or the last plane: such a point may lie beyond it.
+    """
+
+    places_um: Floats
+    deviations_um: Floats
+    voxels: Floats
+    light: Floats
+    at_end: npt.NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.light)
+
+
+def point_places(
+    volume: npt.NDArray[Any] | Callable[[int], npt.NDArray[Any]],
+    grid: Grid,
+    options: PointOptions | None = None,
+    on_progress: Callable[[float], object] | None = None,
+) -> PointPlaces:
+    """Find points of light in a volume.
+
+    Parameters
+    ----------
+    volume : ndarray, (n_z, height, width[, n_channels]), or callable
+        Or what returns a plane of it by its number. Any grid: a reconstruction's own, or a metric one.
+    grid : Grid
+        Of the volume.
+    options : PointOptions, optional
+    on_progress : callable, optional
+        Called with the share done.
+
+    Raises InputError when there is one plane, or more points than are told apart.
+    """
+    if grid.shape[0] < 2:
+        raise InputError("Points in depth are found in volumes of two planes or more; this has one.")
+    read = volume if callable(volume) else volume.__getitem__
+    search = _Search(read, grid, on_progress or (lambda _share: None))
+    brightest = search.brightest((options or PointOptions()).least)
+    found = []
+    for number, voxel in enumerate(brightest):
+        found.append(search.point(voxel))
+        search.on_progress(0.5 + (number + 1) / (2 * len(brightest)))
+    order = np.argsort([-light for *_, light in found], kind="stable")
+    places, off, voxels = (
+        np.array([found[k][part] for k in order], np.float64).reshape(-1, 3) for part in range(3)
+    )
+    ends = np.array([brightest[k][0] in (0, grid.shape[0] - 1) for k in order], bool)
+    return PointPlaces(places, off, voxels, np.array([found[k][3] for k in order]), ends)
+
+
+class _Search:
+    """A volume's planes, without its channels and what is below 0."""
+
+    def __init__(
+        self,
+        read: Callable[[int], npt.NDArray[Any]],
+        grid: Grid,
+        on_progress: Callable[[float], object],
+    ) -> None:
+        def plane(z: int) -> Plane:
+            voxels = np.asarray(read(z), np.float32)
+            grey = voxels.sum(axis=2) if voxels.ndim == 3 else voxels
+            return np.maximum(np.nan_to_num(grey, nan=0.0, posinf=0.0, neginf=0.0), 0)
+
+        self.plane = lru_cache(maxsize=2 * REACH + 2)(plane)
+        self.grid, self.on_progress = grid, on_progress
+        self.found: dict[int, list[Voxel]] = {}
+        self.known = bool(np.isfinite(grid.z_um).all() and np.isfinite(grid.pitch_um).all())
+        self.steps_um = np.abs(np.gradient(grid.z_um)) if self.known else np.full(len(grid.z_um), np.nan)
+
+    def brightest(self, least: float) -> list[Voxel]:
+        """Return the brightest voxel of every point, from the first plane to the last."""
+        from scipy.ndimage import maximum_filter  # late: importing recon stays light
+
+        count, top = self.grid.shape[0], 0.0
+        candidates: list[tuple[float, Voxel]] = []
+        for z in range(count):
+            plane = self.plane(z)
+            top = max(top, float(plane.max()))
+            peaks = (plane == maximum_filter(plane, 2 * REACH + 1)) & (plane > 0) & (plane >= least * top)
+            rows, columns = np.nonzero(peaks)
+            candidates += zip(
+                plane[peaks].tolist(),
+                ((z, int(row), int(column)) for row, column in zip(rows, columns, strict=True)),
+                strict=True,
+            )
+            self.on_progress((z + 1) / (2 * count))
+        for light, voxel in sorted(candidates, reverse=True):
+            if light < least * top:
+                break
+            if not any(self._is_beside(other, voxel) for other in self._near(voxel, REACH)):
+                self.found.setdefault(voxel[0], []).append(voxel)
+            if sum(map(len, self.found.values())) > MOST:
+                raise InputError(
+                    f"There are more than {MOST} points as bright as {least:g} of the brightest: this is no "
+                    "volume of single points. Ask for brighter ones."
+                )
+        return [voxel for z in sorted(self.found) for voxel in self.found[z]]
+
+    def _near(self, voxel: Voxel, planes: int) -> Iterator[Voxel]:
+        """Give the points found so far in planes near a voxel's."""
+        for z in range(voxel[0] - planes, voxel[0] + planes + 1):
+            yield from self.found.get(z, ())
+
+    def _is_beside(self, point: Voxel, voxel: Voxel) -> bool:
+        """Whether a voxel is as near to the ray through a point as its light may be."""
+        row, column = self._on_ray(point, voxel[0])
+        return max(abs(voxel[1] - row), abs(voxel[2] - column)) < REACH + 0.5
+
+    def _on_ray(self, voxel: Voxel, z: int) -> tuple[float, float]:
+        """Return row and column at which the ray through a voxel and the diffuser's middle meets a plane."""
+        if not self.known or z == voxel[0]:
+            return float(voxel[1]), float(voxel[2])
+        x, y, depth = self.grid.place_um(*voxel)
+        further = self.grid.z_um[z] / depth
+        return self.grid.pixel_of(z, x * further, y * further)
+
+    def point(self, voxel: Voxel) -> tuple[Floats, Floats, Floats, float]:
+        """Return place, deviations, centre in voxels, and light, of the point that is brightest there."""
+        light, at = self._light_of(voxel)
+        total = float(light.sum())
+        place, centre, beside = self._centre(light / total, at)
+        wide = np.maximum(np.sqrt((light / total) @ beside**2) / WIDE, 1)
+        off_plane, off_row, off_column = wide * (OFF_PLANES, OFF_PX, OFF_PX)
+        off_z, pitch = off_plane * self.steps_um[voxel[0]], self.grid.pitch_um[voxel[0]]
+        slopes = np.abs(place[:2] / place[2])
+        across = np.hypot([off_column * pitch, off_row * pitch], slopes * off_z)
+        return place, np.append(across, off_z), centre, total
+
+    def _light_of(self, voxel: Voxel) -> tuple[Floats, Whole]:
+        """Return light and (plane, row, column) of the voxels about a ray that are nearest to this point."""
+        count, *size = self.grid.shape
+        others = [other for other in self._near(voxel, 2 * REACH) if other != voxel]
+        light, voxels = [], []
+        for z in range(max(voxel[0] - REACH, 0), min(voxel[0] + REACH + 1, count)):
+            down, across = (
+                np.arange(max(round(at) - REACH, 0), min(round(at) + REACH + 1, n))
+                for at, n in zip(self._on_ray(voxel, z), size, strict=True)
+            )
+            rows, columns = (each.ravel() for each in np.meshgrid(down, across, indexing="ij"))
+            own = self._distance(voxel, z, rows, columns)
+            nearest = np.ones(rows.size, bool)
+            for other in others:
+                nearest &= own <= self._distance(other, z, rows, columns)
+            light.append(self.plane(z)[rows, columns][nearest])
+            voxels.append(np.stack([np.full(rows.size, z), rows, columns], axis=1)[nearest])
+        return np.concatenate(light).astype(np.float64), np.concatenate(voxels)
+
+    def _distance(self, point: Voxel, z: int, rows: Whole, columns: Whole) -> Floats:
+        """Return how far voxels of a plane are from a point, in planes and pixels from its ray, squared."""
+        row, column = self._on_ray(point, z)
+        return np.asarray((z - point[0]) ** 2 + (rows - row) ** 2 + (columns - column) ** 2)
+
+    def _centre(self, share: Floats, at: Whole) -> tuple[Floats, Floats, Floats]:
+        """Return the centre of light in the scene and in voxels, and each voxel's distance from it in voxels.
+
+        ``share`` of the light has each voxel, (n,), of those ``at`` plane, row and column, (n, 3).
+        """
+        planes = np.arange(self.grid.shape[0], dtype=np.float64)
+        if not self.known:
+            centre = share @ at
+            return np.full(3, np.nan), centre, at - centre
+        z_um = self.grid.z_um[at[:, 0]]
+        x_um, y_um = np.array([self.grid.place_um(*one)[:2] for one in at]).T
+        depth = float(share @ z_um) if self.grid.is_metric else float(1 / (share @ (1 / z_um)))
+        place = np.array([share @ (x_um / z_um) * depth, share @ (y_um / z_um) * depth, depth])
+        order = np.argsort(1 / self.grid.z_um)
+        plane = float(np.interp(1 / depth, 1 / self.grid.z_um[order], planes[order]))
+        nearest = round(plane)
+        further = self.grid.z_um[nearest] / depth
+        centre = np.array([plane, *self.grid.pixel_of(nearest, place[0] * further, place[1] * further)])
+        rays = [self.grid.pixel_of(k, *place[:2] * self.grid.z_um[k] / depth) for k in at[:, 0]]
+        beside = np.column_stack([at[:, 0] - plane, at[:, 1:] - np.array(rays)])
+        return place, centre, beside
