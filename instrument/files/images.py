@@ -33,6 +33,7 @@ from instrument.files.ome_tiff import (
     facts_of,
     film_facts,
     is_ome_name,
+    ome_tiff_channels,
     photograph_fields,
     resolution,
 )
@@ -431,8 +432,10 @@ def _write_ome_tiff(path: Path, image: npt.NDArray[Any], facts: Mapping[str, Any
     colour = image.ndim == 3 and image.shape[-1] == 3
     if split := colour and image.dtype.kind == "f":
         image = np.moveaxis(image, -1, 0)
-    fields = {"axes": "CYX" if split else "YXS" if colour else "ZYX"[3 - image.ndim :]}
+    fields: dict[str, Any] = {"axes": "CYX" if split else "YXS" if colour else "ZYX"[3 - image.ndim :]}
     fields |= photograph_fields(facts, 3 if split else 1 if image.ndim == 2 or colour else len(image))
+    if split:
+        fields["Channel"] = ome_tiff_channels()
     tifffile.imwrite(
         path,
         np.ascontiguousarray(image),

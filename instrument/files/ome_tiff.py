@@ -99,6 +99,16 @@ def photograph_fields(facts: Mapping[str, Any], planes: int = 1) -> dict[str, An
     return fields
 
 
+def ome_tiff_channels() -> dict[str, list[Any]]:
+    """Return names and colours of the three channels of a picture in colour, as tifffile takes them.
+
+    OME writes a colour as the signed number of its four bytes: red, green, blue, opacity.
+    """
+    colours = {"red": 0xFF0000FF, "green": 0x00FF00FF, "blue": 0x0000FFFF}
+    signed = [value - (value >> 31 << 32) for value in colours.values()]
+    return {"Name": list(colours), "Color": signed}
+
+
 def resolution(pitch_um: float | None) -> dict[str, Any]:
     """Return the TIFF's own words for pixels of this size, for programs that know no OME."""
     if pitch_um is None or not (np.isfinite(pitch_um) and pitch_um > 0):

@@ -16,7 +16,7 @@ from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import FileError
 from instrument.files.ome_zarr import ome_attributes, ome_channels
 from instrument.runs.run import Run
-from instrument.volumes.grid_facts import grid_facts, voxel_um
+from instrument.volumes.grid_facts import grid_facts, origin_um, voxel_um
 
 STILL = {"um": 0.5, "mrad": 0.02}
 """How far readings of a stage that stands may lie apart, by the unit that an axis' name ends in.
@@ -129,7 +129,8 @@ def create_output(
             fill_value=np.nan,
             dimension_names=names,
         )
-        group.attrs["ome"] = ome_attributes(path.name, names, steps)
+        origin = origin_um(grid) if grid is not None and deep else None
+        group.attrs["ome"] = ome_attributes(path.name, names, steps, origin=origin)
         group.attrs["diffuserbench"] = attributes
 
 

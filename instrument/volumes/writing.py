@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.atomic import whole_file, whole_folder
-from instrument.files.ome_tiff import annotation, resolution
-from instrument.files.ome_zarr import ome_attributes, ome_channels
+from instrument.files.ome_tiff import annotation, ome_tiff_channels, resolution
+from instrument.files.ome_zarr import ome_attributes, ome_channels, stem_of
 from instrument.volumes.grid_facts import grid_facts, origin_um, scale_in_words, voxel_um
 
 if TYPE_CHECKING:
@@ -117,6 +117,9 @@ def write_volume_tiff(
     pages = (page for plane in planes for page in (np.moveaxis(plane, -1, 0) if colour else plane[None]))
     sizes = {f"PhysicalSize{axis.upper()}": size for axis, size in voxel_um(grid).items()}
     metadata: dict[str, Any] = {"axes": "ZCYX" if colour else "ZYX", **sizes}
+    metadata["Name"] = stem_of(path).removesuffix(".ome")
+    if shape[3:] == (3,):
+        metadata["Channel"] = ome_tiff_channels()
     metadata |= {f"{name}Unit": "µm" for name in sizes}
     n_pages = shape[0] * (shape[3] if colour else 1)
     if origin := origin_um(grid):

@@ -82,6 +82,15 @@ def test_colours_are_shown_in_themselves(tmp_path: Path) -> None:
     assert (layer["channel_axis"], layer["colormap"]) == (1, ["red", "green", "blue"])
 
 
+def test_a_film_of_volumes_has_its_place_as_a_volume_has(tmp_path: Path) -> None:
+    z_um = np.array([9e3, 10e3, 11e3])
+    grid = Grid((3, 8, 9), (4, 5), z_um, 1e-3 * z_um)
+    create_output(tmp_path / "film.ome.zarr", 2, grid.shape, period_s=0.5, grid=grid, attributes={})
+    [(_, layer, _)] = read(str(tmp_path / "film.ome.zarr"))
+    assert layer["scale"] == [0.5, 1e3, 10.0, 10.0]
+    assert layer["translate"] == [0.0, 9e3, -40.0, -50.0]
+
+
 def test_a_run_without_frames_is_refused_in_words(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no frames"):
         read(str(write_recording(tmp_path, {})))

@@ -169,6 +169,8 @@ def test_a_photograph_called_ome_tif_is_one(tmp_path: Path) -> None:
     write_image(path, colour, {"simulated": True})
     with tifffile.TiffFile(path) as tiff:
         assert tiff.series[0].axes == "CYX"
+    channels = ome_types.from_tiff(path).images[0].pixels.channels
+    assert [channel.name for channel in channels] == ["red", "green", "blue"]
     np.testing.assert_array_equal(read_image(path).pixels, colour)
     assert read_image(path).is_simulated
 

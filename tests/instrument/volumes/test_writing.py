@@ -60,6 +60,18 @@ def test_an_ome_tiff_says_where_its_planes_lie(tmp_path, volume):
         source.close()
 
 
+def test_an_ome_tiff_in_colour_says_which_channel_is_which(tmp_path, volume):
+    ome_types = pytest.importorskip("ome_types")
+    path = tmp_path / "fish.ome.tif"
+    write_volume_tiff(path, volume[..., None] * np.float32([1, 2, 3]), (*volume.shape, 3), GRID)
+    image = ome_types.from_tiff(path).images[0]
+    assert image.name == "fish"
+    channels = image.pixels.channels
+    assert [channel.name for channel in channels] == ["red", "green", "blue"]
+    colours = [channel.color.as_rgb_tuple(alpha=False) for channel in channels]
+    assert colours == [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
+
+
 def test_colour_goes_first_and_unknown_sizes_have_no_unit(tmp_path, volume):
     path = tmp_path / "v.ome.zarr"
     colour = np.stack([volume, 2 * volume, 3 * volume], -1)
