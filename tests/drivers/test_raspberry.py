@@ -98,7 +98,10 @@ def test_its_own_controls_can_be_set() -> None:
                 camera.set_own("LensPosition", wrong)
         with pytest.raises(LimitError, match="no setting 'ExposureTime'"):
             camera.set_own("ExposureTime", "100")
+        camera.close()
+        camera.open()  # what was set comes back
         assert camera.own_settings()["LensPosition"].value == 7.5
+        assert camera._camera._controls["LensPosition"] == 7.5
 
 
 def test_a_pulled_cable_is_said(library: type[Picamera2], monkeypatch: pytest.MonkeyPatch) -> None:
