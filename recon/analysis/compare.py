@@ -261,17 +261,28 @@ def _grown_px(change: Change) -> float:
     return abs(change.scale - 1) * change.extent_px
 
 
+def _turned_px(change: Change) -> float:
+    return abs(math.radians(change.rotation_deg or 0.0)) * change.extent_px
+
+
 def _edge(change: Change, changes: list[Change], along: Explanation | None, distance_um: float | None) -> str:
     """Return what became of a pattern's size and turn, whichever is seen, and what explains the size.
 
-    ``change`` is the one of ``changes`` to tell; where it is turned alone, another depth's size is told too.
+    ``change`` is the one of ``changes`` to tell; where it is turned alone, another depth's size is told too,
+    and where it is not turned, another depth's turn.
     """
     least_px = _seen_edge_px(change)
-    turned = abs(math.radians(change.rotation_deg or 0.0)) * change.extent_px > least_px
+    turned = _turned_px(change) > least_px
     grown = _grown_px(change) > least_px
     found = [f"{change.scale - 1:+.2%} in size"] if grown or not turned else []
     found += [f"turned by {change.rotation_deg:+.2f} degrees"] if turned else []
     words = f"The pattern is {' and '.join(found)}, {change.edge_px:.2g} pixels at its edge."
+    other = max(changes, key=lambda c: _turned_px(c) / _seen_edge_px(c))
+    if not turned and _turned_px(other) > _seen_edge_px(other):
+        words += (
+            f" At {depth_in_words(other.z_um)} it is turned by {other.rotation_deg:+.2f} degrees, "
+            f"{_turned_px(other):.2g} pixels at its edge."
+        )
     if not grown:
         change = max(changes, key=lambda c: _grown_px(c) / _seen_edge_px(c))
         if _grown_px(change) <= _seen_edge_px(change):

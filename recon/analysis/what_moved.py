@@ -89,6 +89,7 @@ def unseen(
     across = min(seen, key=lambda each: seen_px(each.place_error_px) * each.z_um)
     along = min(seen, key=lambda each: seen_px(each.edge_error_px) / each.extent_px * each.z_um)
     shift_px, edge_px = seen_px(across.place_error_px), seen_px(along.edge_error_px)
+    turn = math.degrees(min(seen_px(each.edge_error_px) / each.extent_px for each in seen))
     if not math.isfinite(shift_px):
         moved = (
             f"what moves the pattern by less than {told_px:.2g} pixel{'s' * (told_px != 1)}, nor what moved "
@@ -97,6 +98,7 @@ def unseen(
     elif distance_um is None or pitch_um is None:
         moved = (
             f"what moves the pattern by less than {shift_px:.2g} pixels, its edge by less than {edge_px:.2g}"
+            f", or turns it by less than {turn:.2g} degrees"
         )
     else:
         by_um, ratio = shift_px * pitch_um, distance_um / across.z_um
@@ -104,7 +106,8 @@ def unseen(
         moved = (
             f"a source that moved across by less than {_length(by_um / ratio)}, along the axis by less than "
             f"{_length(apart_um * along.z_um / distance_um)}; a diffuser that did by less than "
-            f"{_length(by_um / (1 + ratio))} and {_length(apart_um)}"
+            f"{_length(by_um / (1 + ratio))} and {_length(apart_um)}, or it or the sensor turned by less "
+            f"than {turn:.2g} degrees"
         )
     if len(seen) == 1:
         lamp = "any drift of the lamp during a sweep (one depth does not show it; several do)"

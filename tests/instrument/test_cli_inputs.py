@@ -201,7 +201,7 @@ _WHOLE = {"whole_file", "whole_folder", "draft_folder"}
 _GIVEN_A_DRAFT = """
 activity: write_activity_figure|atomic: clear_left|atomic: draft_folder|atomic: whole_file
 calibration_file: _write|calibration_file: _write_ome_zarr|export: _npy|export: _tiff|images: _write_png
-images: _write_ome_tiff|images: _write_tiff|volumes: _open_zarr|result: figure_png"""
+images: _write_ome_tiff|images: _write_tiff|opening: _open_zarr|result: figure_png"""
 _IN_A_FOLDER_OF_ITS_OWN = """
 checkpointing: CheckpointFolder.remove|demo_display: run_display_demo|frame_array: FrameArray._write_draft
 frame_array: FrameArray.remove_draft|frame_array: FrameArray.remove_half_written|frame_array: FrameArray.write
@@ -209,7 +209,7 @@ log: AppendOnlyLog.__init__|run_files: note_damage|screen_bench: _written
 stability_file: CellLog.add|video_files: VideoPictures.__init__|video_files: VideoPictures.remove
 video_files: VideoPictures.remove_litter|video_job: VideoJob.go_on_without|video_job: VideoJob.mark_done
 video_job: VideoJob.remove|writer: lock_run|serve: _token|video_files: VideoPictures.say_white
-procedure: Purpose.analysed|plan_procedures: ResumeProcedure.perform"""
+purpose: Purpose.analysed|plan_procedures: ResumeProcedure.perform"""
 _REFUSED_BEFORE = """
 film: _write_zarr|result_file: _take_away_others|video: _job"""
 _NOWHERE = "__init__: main"  # the null device

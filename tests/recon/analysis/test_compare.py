@@ -228,6 +228,21 @@ def change(
             id="turned at one depth, grown at the other",
         ),
         pytest.param(
+            [change(60, grown_px=0.9), change(90, turned_deg=0.2)],
+            FINE,
+            r"\+0\.45% in size, 0\.9 pixels at its edge\. At 90 mm it is turned by \+0\.20 degrees, "
+            r"0\.7 pixels at its edge\. No single part",
+            "60 mm it is",
+            id="grown at one depth, turned at the other",
+        ),
+        pytest.param(
+            [change(90, turned_deg=0.01)],
+            FINE,
+            r"still serves\. .* or it or the sensor turned by less than 0\.014 degrees; any drift",
+            "is turned",
+            id="a turn that is not seen",
+        ),
+        pytest.param(
             [change(90, 0.9, errors_px=(np.inf, np.inf))],
             FINE,
             "not see what moves the pattern by less than 1 pixel, nor what moved along the axis or turned",
