@@ -21,7 +21,7 @@ from drivers.frame import Frame, FrameMetadata
 from gui.background import NewestOnly
 from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, joined, words_for
 from gui.session_news import DeviceState, LogBridge, OperatorRequest, is_gone, name_of
-from gui.words import in_the_window
+from gui.words import in_the_log, in_the_window
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig, Kind
 from instrument.bench.kept import KeptWithBench
@@ -474,7 +474,7 @@ class BenchSession(QObject):
     # The log and the operator --------------------------------------------------------------------
     def log(self, level: Level, text: str) -> None:
         """Write a line into the log panel; for the window's thread."""
-        self.logged.emit(level, in_the_window(text.strip()))
+        self.logged.emit(level, in_the_log(text.strip()))
 
     def _ask(self, request: str) -> None:
         """Ask the operator, from a job's thread; returns when it is done."""

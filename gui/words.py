@@ -6,6 +6,8 @@ import functools
 import re
 from collections.abc import Mapping
 
+from recon.base.declare import in_other_words
+
 _ELSEWHERE = {
     "resume": "“Go on with it”, or “Resume” in Runs",
     "list": "Runs",
@@ -45,6 +47,11 @@ def in_the_window(text: str) -> str:
     ways, command = _ways()
     text = _FORCE.sub("“Overwrite”", command.sub(lambda found: ways[found[1] or found[2]], text))
     return with_signs(_AGAIN.sub("“Start”", text))
+
+
+def in_the_log(text: str) -> str:
+    """Return a message as ``in_the_window``, also without the terminal's options: no form is at hand."""
+    return in_other_words(in_the_window(text), (), str, lambda flag: f"“{flag[2:].replace('-', ' ')}”")
 
 
 def with_signs(text: str) -> str:

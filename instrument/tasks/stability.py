@@ -65,8 +65,8 @@ def stability(desk: Desk, options: StabilityOptions) -> Done:
     chosen = [map_named(name) for name in names or MAPS]
     if options.list_maps:
         for stress in chosen:
-            desk.say(f"{stress.name:<20}{stress.title}\n{'':<20}{stress.x.label} x {stress.y.label}")
-            desk.say(f"{'':<20}methods: {'; '.join(stress.methods)}")
+            desk.say(f"{stress.name}: {stress.title}\n  {stress.x.label} x {stress.y.label}")
+            desk.say(f"  methods: {'; '.join(stress.methods)}")
         return Done()
     if options.redraw:
         wanted_names = [s.name for s in chosen] if names else None

@@ -12,7 +12,7 @@ import pytest
 
 import instrument
 from gui.session_news import LogBridge
-from gui.words import in_the_window
+from gui.words import in_the_log, in_the_window
 
 ROOT = Path(instrument.__file__).parents[1]
 _IN_WINDOW = ("recon", "instrument", "calibration_routines")
@@ -75,3 +75,10 @@ def test_the_log_names_no_module_of_this_program() -> None:
     for name in ("instrument.bench.bench", "drivers.stage", "pypylon"):
         bridge.emit(logging.LogRecord(name, logging.INFO, "", 0, "opened", None, None))
     assert [text for _, text in lines] == ["opened", "opened", "pypylon: opened"]
+
+
+def test_the_log_names_no_options_of_the_terminal() -> None:
+    said = "Find activity: Give either --psf FILE or --calibration FOLDER; --dry-run tells all of it."
+    assert in_the_log(said) == (
+        "Find activity: Give either “psf” FILE or “calibration” FOLDER; “dry run” tells all of it."
+    )
