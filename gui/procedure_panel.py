@@ -214,7 +214,8 @@ class ProcedurePanel(Panel):
     def procedure(self) -> Procedure | None:
         """Return what the form asks for; None, and fields marked, where it makes no sense."""
         values = self.view.values()
-        if values is None:
+        if values is None:  # what was said of other values must not stay
+            self._say("A field is refused. What will be done is told once it is mended.", wrong=True)
             return None
         try:
             return self.routine.asked(values)

@@ -135,6 +135,8 @@ def test_wrong_entries_are_refused_at_the_field_with_the_reason(qtbot: QtBot, pa
         assert panel.view._reasons[name].isVisible()
         assert field.property("refused")
         assert not panel.run_bar.start_button.isEnabled()
+        told = panel.verdict.toPlainText()
+        assert "frames" not in told.partition(", ")[0], f"the plan of other values stays: {told}"
         enter(qtbot, panel, **{name: right})
         assert not panel.view.reason(name)
 
