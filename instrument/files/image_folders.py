@@ -11,7 +11,7 @@ from instrument.files import reading
 from instrument.files.errors import FileError
 
 SUFFIXES = {".tif", ".tiff", ".png", ".bmp", ".npy", ".jpg", ".jpeg"}
-_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_NUMBER, _COUNT = re.compile(r"\d+(?:\.\d+)?"), re.compile(r"\d+")
 _DEPTH = re.compile(
     r"(?<!\de)(?<!\de[-+])(?<!\d)(?:(?<=[a-zA-Z_=])-)?"
     r"(?:\d+(?:\.\d+)?|(?<![\d.,p])\d+[,p]\d{1,2})(?= ?_?(nm|um|µm|μm|mm|cm)(?![a-zA-Z]))"
@@ -27,21 +27,28 @@ _MICRO_MANAGERS = (
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Return a folder's image files as people count: numbers by their value, 2 before 10."""
+    """Return a folder's image files as people count: numbers by their value, 2 before 10.
+
+    A dot within a number is a decimal point, unless two names would be the same number so: 1.1 and 1.10 are
+    counted.
+    """
     found = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
-    plain = {_parts(path.name)[0] for path in found}
-    return sorted(found, key=lambda path: _natural(path.name, plain))
+    values = {(texts, tuple(numbers)) for texts, numbers in (_parts(path.name, _NUMBER) for path in found)}
+    number = _NUMBER if len(values) == len(found) else _COUNT
+    plain = {_parts(path.name, number)[0] for path in found}
+    return sorted(found, key=lambda path: _natural(path.name, plain, number))
 
 
 def in_order(folder: Path, paths: Sequence[Path]) -> tuple[list[Path], tuple[float, ...]]:
     """Return files in the order of their depths, and the depths in micrometres; none where none are told.
 
     Depths are what Micro-Manager's ``metadata.txt`` says, else the only length in each name (``z60.5mm``,
-    ``psf_-50um``). Without them the order stays.
+    ``psf_-50um``). Without them, and of a film of Micro-Manager's whose focus wanders, the order stays.
 
     Raises FileError where Micro-Manager's names tell that there are images along two axes.
     """
-    _require_one_axis(folder, paths)
+    if _only_axis(folder, paths) == "time":
+        return list(paths), ()
     depths = _micro_managers(folder, paths)
     if None in depths or not depths:  # none, or of other files
         depths = [_depth(path.name) for path in paths]
@@ -52,7 +59,11 @@ def in_order(folder: Path, paths: Sequence[Path]) -> tuple[list[Path], tuple[flo
     return [paths[number] for _, number in pairs], tuple(depth for depth, _ in pairs)
 
 
-def _require_one_axis(folder: Path, paths: Sequence[Path]) -> None:
+def _only_axis(folder: Path, paths: Sequence[Path]) -> str:
+    """Return the axis along which Micro-Manager's names tell images apart; empty for other names.
+
+    Raises FileError where they are told apart along two.
+    """
     for pattern in _MICRO_MANAGERS:
         named = [found for path in paths if (found := pattern.fullmatch(path.stem))]
         if len(named) < len(paths):
@@ -65,6 +76,8 @@ def _require_one_axis(folder: Path, paths: Sequence[Path]) -> None:
                 f"holds images in {' x '.join(several)}; one stack is expected.",
                 "Copy those of one stack to a folder of their own, with metadata.txt where there is one.",
             )
+        return next((axis for axis, count in counts.items() if count > 1), "")
+    return ""
 
 
 def order_in_words(paths: Sequence[Path], depths_um: Sequence[float]) -> str:
@@ -77,25 +90,27 @@ def order_in_words(paths: Sequence[Path], depths_um: Sequence[float]) -> str:
     return words
 
 
-def _parts(name: str) -> tuple[tuple[str, ...], list[float]]:
+def _parts(name: str, number: re.Pattern[str]) -> tuple[tuple[str, ...], list[float]]:
     """Return the texts before, between and after a name's numbers, and the numbers."""
-    texts = tuple(text.casefold() for text in _NUMBER.split(name))
-    return texts, [float(number) for number in _NUMBER.findall(name)]
+    texts = tuple(text.casefold() for text in number.split(name))
+    return texts, [float(found) for found in number.findall(name)]
 
 
-def _natural(name: str, plain: Container[tuple[str, ...]]) -> tuple[list[tuple[int, float, str]], str]:
+def _natural(
+    name: str, plain: Container[tuple[str, ...]], number: re.Pattern[str]
+) -> tuple[list[tuple[int, float, str]], str]:
     """Return what a name is sorted by.
 
     A dash before a number is a minus where another name, whose texts ``plain`` has, is the same but for it.
     """
-    texts, numbers = _parts(name)
+    texts, numbers = _parts(name, number)
     for i, text in enumerate(texts[:-1]):
         without = (*texts[:i], text[:-1], *texts[i + 1 :])
         if text.endswith("-") and without in plain:
             texts, numbers[i] = without, -numbers[i]
     parts: list[tuple[int, float, str]] = []
-    for text, number in zip(texts, numbers, strict=False):
-        parts += [(1, 0.0, text), (0, number, "")]
+    for text, value in zip(texts, numbers, strict=False):
+        parts += [(1, 0.0, text), (0, value, "")]
     return [*parts, (1, 0.0, texts[-1])], name
 
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from instrument.files import matlab, reading
 from instrument.files.errors import FileError
-from instrument.files.ome_tiff import MICROMETRES, MOST_PLANES
+from instrument.files.ome_tiff import MICROMETRES, MOST_PLANES, SECONDS
 from instrument.files.pieces import (
     MOST_LZF_EXPANSION,
     hdf5_pieces,
@@ -30,8 +30,6 @@ Expect = Callable[[npt.NDArray[Any]], object]
 _AXES = ("t", "c", "z", "y", "x", "s")
 _COLOURS = {"S": (1, 2, 3, 4), "C": (3,)}
 """How many samples a pixel may have, or channels an image, to be colours; one may be alpha."""
-_SECONDS = {"second": 1.0, "millisecond": 1e-3, "microsecond": 1e-6, "minute": 60.0, "hour": 3600.0}
-"""Units of time in OME-Zarr."""
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
@@ -276,7 +274,7 @@ def _places(image: Mapping[str, Any], shape: Sequence[int]) -> dict[str, npt.NDA
     level = image["datasets"][0]
     places = {}
     for number, axis in enumerate(image["axes"]):
-        unit = (_SECONDS if axis["name"] == "t" else MICROMETRES).get(axis.get("unit", "?"))
+        unit = (SECONDS if axis["name"] == "t" else MICROMETRES).get(axis.get("unit", "?"))
         at = np.arange(min(shape[number], MOST_PLANES), dtype=float)
         for transformed in (level, image):  # what is said of all levels follows
             for step in transformed.get("coordinateTransformations", ()):

@@ -30,6 +30,13 @@ MICROMETRES = {
     "centimeter": 1e4, "meter": 1e6,
 }  # fmt: skip
 """Units of length; none is a micrometre, which is what OME takes then."""
+SECONDS = {
+    "": 1.0, "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0,
+    "ms": 1e-3, "msec": 1e-3, "millisecond": 1e-3,
+    "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "microsecond": 1e-6, "min": 60.0, "minute": 60.0, "minutes": 60.0,
+    "h": 3600.0, "hour": 3600.0, "hours": 3600.0,
+}  # fmt: skip
+"""Units of time; none is a second, which is what OME and ImageJ take then."""
 
 
 def is_ome_name(path: Path) -> bool:
@@ -137,9 +144,6 @@ def depths_um(description: str) -> list[float]:
     return [] if unit is None or step is None else [unit * float(step) * z for z in range(n_z)]
 
 
-_SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "min": 60.0}
-
-
 def film_facts(description: str) -> dict[str, float]:
     """Return what an OME-TIFF says of its frames, by the names of a photograph's facts.
 
@@ -151,9 +155,9 @@ def film_facts(description: str) -> dict[str, float]:
         return {}
     plane = next(iter(_parts(pixels, "Plane")), None)
     fields = (
-        ("frame_period_s", pixels, "TimeIncrement", _SECONDS, 1.0),
+        ("frame_period_s", pixels, "TimeIncrement", SECONDS, 1.0),
         ("pixel_pitch_um", pixels, "PhysicalSizeX", MICROMETRES, 1.0),
-        ("exposure_ms", plane, "ExposureTime", _SECONDS, 1e3),
+        ("exposure_ms", plane, "ExposureTime", SECONDS, 1e3),
     )
     found = {}
     for name, where, field, units, scale in fields:

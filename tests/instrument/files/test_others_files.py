@@ -40,6 +40,8 @@ PICTURE = STACK[0]
         (["t=5,100um.tif", "t=4,300um.tif"], (100.0, 300.0)),
         (["pos1,2,5um.tif", "pos1,2,50um.tif", "step1p200um.tif"], (5.0, 50.0, 200.0)),
         (["10x_1mm.tif", "10x_2mm.tif", "10x_10mm.tif"], (1e3, 2e3, 1e4)),
+        ([f"day3.{n}.tif" for n in range(1, 12)], ()),
+        (["v1.125.tif", "v1.25.tif", "v1.5.tif"], ()),
     ],
 )  # fmt: skip
 def test_a_folder_is_read_in_the_order_that_people_mean(
@@ -63,6 +65,18 @@ def test_micro_managers_z_positions_give_the_order(tmp_path: Path) -> None:
     stack = read_stack(tmp_path)
     assert stack.pixels[:, 0, 0].tolist() == [2, 1, 0]
     assert stack.metadata["depths_um"] == [-10.0, 0.0, 10.0]
+
+
+def test_a_film_of_micro_manager_stays_in_time_though_its_focus_wanders(tmp_path: Path) -> None:
+    noted = {}
+    for number, z in enumerate((3.0, 1.0, 2.0)):
+        name = f"img_channel000_position000_time{number:09d}_z000.tif"
+        tifffile.imwrite(tmp_path / name, np.full((4, 4), number, np.uint16))
+        noted[f"Metadata-Default/{name}"] = {"ZPositionUm": z, "FileName": f"Default/{name}"}
+    (tmp_path / "metadata.txt").write_text(json.dumps(noted))
+    film = read_stack(tmp_path)
+    assert film.pixels[:, 0, 0].tolist() == [0, 1, 2]
+    assert film.metadata["depths_um"] == []
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,16 @@ def test_a_recording_goes_out_as_ome_tiff_and_comes_back(tmp_path: Path) -> None
             assert getattr(facts, name) == getattr(before, name), name
 
 
+@pytest.mark.parametrize(("unit", "written"), [("ms", 20.0), ("sec", 0.02), ("min", 0.02 / 60)])
+def test_imagejs_time_has_a_unit(tmp_path: Path, unit: str, written: float) -> None:
+    film = tmp_path / "film.tif"
+    told = {"axes": "TYX", "finterval": written, "tunit": unit}
+    tifffile.imwrite(film, FRAMES, imagej=True, metadata=told)
+    assert read_stack(film).metadata["frame_period_s"] == pytest.approx(0.02)
+    tifffile.imwrite(film, FRAMES, imagej=True, metadata=told | {"tunit": "generation"})
+    assert "frame_period_s" not in read_stack(film).metadata
+
+
 def test_what_a_file_does_not_tell_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     film = tmp_path / "film.tif"
     tifffile.imwrite(film, FRAMES, imagej=True, metadata={"axes": "TYX", "finterval": 0.02})
