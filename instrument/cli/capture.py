@@ -290,4 +290,10 @@ def _last_words(run: Run) -> None:
         typer.echo(f"Warning: the camera dropped {by_device} frames (by {counted}).", err=True)
     if not_written:
         typer.echo(f"Warning: the disk was too slow for {not_written} frames.", err=True)
+    if saturated := [f for r in run.records.values() if (f := r.metadata.saturated_fraction) > 0]:
+        typer.echo(
+            f"Warning: {len(saturated)} of {len(run.records)} frames have saturated pixels, up to "
+            f"{max(saturated):.3%} of them; shorten --exposure-ms.",
+            err=True,
+        )
     typer.echo(f"Run: {run.path}")

@@ -69,7 +69,7 @@ class Film:
         if self._video is not None:
             self.indices = tuple(i for i in range(len(self._video)) if self._video.is_written(i))
             self.period_s = self._video.period_s
-            self.simulated = bool(self._video.attributes.get("diffuserbench", {}).get("simulated"))
+            self.simulated = bool(self.facts.get("simulated"))
         else:
             assert self._run is not None
             require_video(self._run)
@@ -115,11 +115,16 @@ class Film:
         return self.read(place) if self._video is None else self._video.read(self.indices[place])
 
     @property
+    def facts(self) -> dict[str, Any]:
+        """What its file tells of how it was made; empty of a recording."""
+        return {} if self._video is None else dict(self._video.attributes.get("diffuserbench", {}))
+
+    @property
     def grid(self) -> Grid | None:
         """Where its pixels lie in the object; None where no file tells of it, as of a recording."""
         if self._video is None:
             return None
-        facts = self._video.attributes.get("diffuserbench", {})
+        facts = self.facts
         sizes = dict(zip(self._video.axes, self._video.array.shape, strict=True))
         if "pitch_um" not in facts and "z" not in sizes:
             return None
@@ -256,7 +261,7 @@ def _pictures(film: Film, advance: Advance | None) -> Iterator[npt.NDArray[Any]]
 
 def _write_zarr(film: Film, target: Path, advance: Advance | None) -> None:
     """Write all values, each picture at its own time: those that are not there are not in the copy either."""
-    about = {"of": str(film.path.resolve()), "simulated": film.simulated}
+    about = {**film.facts, "of": str(film.path.resolve()), "simulated": film.simulated}
     shape, count = film.whole(0).shape, film.indices[-1] + 1
     create_output(target, count, shape, period_s=film.period_s, grid=film.grid, attributes=about)
     try:

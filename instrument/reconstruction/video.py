@@ -26,6 +26,7 @@ from instrument.reconstruction.request import PictureRequest
 from instrument.reconstruction.video_files import (
     DEFAULT_FPS,
     VideoPictures,
+    changed_settings,
     create_output,
     levels_of,
     require_video,
@@ -155,6 +156,11 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
     warnings = list(dict.fromkeys((*picture.warnings, *problem.warnings)))
     if saturated:
         warnings.append(f"{saturated} of {len(frames)} frames have saturated pixels: expect halos there.")
+    if changed := changed_settings(run):
+        warnings.append(
+            f"The frames differ in {' and '.join(changed)}: what gets brighter or dimmer with it is not the "
+            "scene's doing."
+        )
     if not has_light(picture.measurement, problem.noise):
         warnings.append("The first frame holds nothing but noise: was the scene lit?")
     warnings += filter(None, (_doubt(problem),))

@@ -51,16 +51,20 @@ def require_video(run: Run) -> None:
         )
     if not planned:
         return
-    frames = [record.metadata for record in run.records.values()]
-    differing = [] if _stands([frame.stage_position for frame in frames]) else ["stage position"]
-    differing += [what for what, of in _SAME.items() if len({of(frame) for frame in frames}) > 1]
-    if differing:
+    stands = _stands([record.metadata.stage_position for record in run.records.values()])
+    if differing := [*([] if stands else ["stage position"]), *changed_settings(run)]:
         raise FileError(
             run.path,
             f"is the run of a plan, no video: its frames differ in {' and '.join(differing)}.",
             "Record a video with 'diffuserbench record'. Single frames: 'diffuserbench export' writes them, "
             "'reconstruct --image' takes each.",
         )
+
+
+def changed_settings(run: Run) -> list[str]:
+    """Return which settings of light, SLM and camera are not the same for all frames, in words."""
+    frames = [record.metadata for record in run.records.values()]
+    return [what for what, of in _SAME.items() if len({of(frame) for frame in frames}) > 1]
 
 
 def _stands(positions: Sequence[Mapping[str, float]]) -> bool:

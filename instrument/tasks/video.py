@@ -115,16 +115,22 @@ def _solve(desk: Desk, prepared: PreparedVideo) -> bool:
 
 @contextlib.contextmanager
 def _told_what_is_kept(prepared: PreparedVideo) -> Iterator[None]:
-    """Say with what the system refused (a full disk) how much of the video there is."""
+    """Say with what the system refused (a full disk), or a signal that ends it, how much of it there is."""
+
+    def there() -> str:
+        done, total = _frames_done(prepared), len(prepared.job.plan.frames)
+        return f"{done} of {total} frames are in {prepared.request.out}:"
+
+    remedy = "the same command goes on with the rest."
     try:
         yield
     except OSError as error:
-        done, total = _frames_done(prepared), len(prepared.job.plan.frames)
         raise FileError(
-            error.filename or prepared.request.out,
-            f"{os_reason(error)} {done} of {total} frames are in {prepared.request.out}:",
-            "the same command goes on with the rest.",
+            error.filename or prepared.request.out, f"{os_reason(error)} {there()}", remedy
         ) from error
+    except (KeyboardInterrupt, SystemExit) as ended:
+        ended.add_note(f"{there()} {remedy}")
+        raise
 
 
 def _frames_done(prepared: PreparedVideo) -> int:

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import zarr
 from PIL import Image, ImageSequence
 from PySide6.QtCore import QPointF
 from pytestqt.qtbot import QtBot
@@ -117,10 +118,18 @@ def test_a_video_of_volumes_is_copied_with_its_planes_and_their_places(tmp_path:
     grid = Grid((2, 4, 5), (2, 2), np.array([2e3, 3e3]), np.array([4.0, 6.0]))
     video, copy = tmp_path / "deep.ome.zarr", tmp_path / "copy.ome.zarr"
     assert "plays at 0.5 x" in slowed(tmp_path / "film.gif", 100.0)
-    create_output(video, 1, grid.shape, period_s=0.1, grid=grid, attributes={})
+    facts = {"calibrated_px": [0.0, 1.0, 3.0, 4.0], "model": "local"}
+    create_output(video, 1, grid.shape, period_s=0.1, grid=grid, attributes=facts)
     volume = np.arange(40, dtype=np.float32).reshape(grid.shape)
     VideoPictures(video, write=True).write(0, volume)
     assert main(["export", str(video), str(copy)]) == 0
     made = VideoPictures(copy)
     np.testing.assert_array_equal(made.read(0), volume)
     assert made.attributes["diffuserbench"]["pitch_um"] == [4.0, 6.0]
+    assert made.calibrated_px == (0.0, 1.0, 3.0, 4.0)  # activity asks for it
+    assert made.attributes["diffuserbench"]["model"] == "local"
+    for path in (video, copy):
+        (level,) = zarr.open_group(path, mode="r").attrs["ome"]["multiscales"][0]["datasets"]
+        scale, place = (level["coordinateTransformations"][i] for i in (0, 1))
+        assert scale["scale"] == [0.1, 1e3, 6.0, 6.0]
+        assert place["translation"] == [0.0, 2e3, -12.0, -12.0]

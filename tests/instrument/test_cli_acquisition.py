@@ -236,6 +236,18 @@ def test_a_recording_cut_off_is_closed(here: Path, capsys: pytest.CaptureFixture
     assert main(["verify", str(run.path)]) == 0
 
 
+def test_a_recording_that_saturates_says_so(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["record", "--as-is", "--scene", "--frames", "3", "--bench", str(here / "sim.toml")]
+    (here / "sim.toml").write_text(
+        '[camera]\ndriver = "simulated"\n[scene]\ncontrol = "simulated"\n'
+        '[simulated]\npreset = "tiny"\ntime_scale = 0\nfixed_pattern = false\n'
+    )
+    assert main([*words, "--exposure-ms", "20000"]) == 0
+    assert "Warning: 3 of 3 frames have saturated pixels, up to " in capsys.readouterr().err
+    assert main([*words, "--exposure-ms", "0.1"]) == 0
+    assert "saturated" not in capsys.readouterr().err
+
+
 def test_one_program_at_a_time_writes_to_a_run(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "plan.toml"]) == 0
     run = the_run(here)

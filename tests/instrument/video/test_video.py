@@ -315,6 +315,14 @@ def test_a_calibration_of_another_camera_is_said(recording: Path, tmp_path: Path
     assert doubt in json.loads((tmp_path / "o.json").read_text())["warnings"]
 
 
+def test_settings_that_change_within_a_recording_are_told(tmp_path: Path) -> None:
+    np.save(tmp_path / "psf.npy", cast([(0, 0, 100.0)]).astype(np.float32))
+    lit = {number: "off" if number < 3 else "disk" for number in range(6)}
+    run = write_recording(tmp_path, {t: scene(t) for t in range(6)}, led=lit)
+    told = " ".join(prepare_video(request(run, tmp_path)).warnings)
+    assert "frames differ in light: what gets brighter or dimmer with it is not the scene's doing" in told
+
+
 def test_prepared_is_what_the_window_shows(recording: Path, tmp_path: Path) -> None:
     prepared = prepare_video(request(recording, tmp_path))
     assert isinstance(prepared, PreparedVideo)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from instrument.cli import main
+from instrument.cli.app import Terminated
 from instrument.files.errors import FileError
 from instrument.reconstruction import video_work as block_module
 from instrument.reconstruction.video import (
@@ -146,6 +147,20 @@ def test_a_full_disk_is_said_with_what_is_kept_and_the_video_goes_on(
     assert f"4 of 10 frames are in {out}: the same command goes on" in said
     assert main(["reconstruct", str(recording), "--video", *given]) == 0
     assert "4 frames are done already" in capsys.readouterr().out
+
+
+def test_a_signal_that_ends_it_is_said_with_what_is_kept(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ended(*_: object) -> bool:
+        raise Terminated(143)
+
+    monkeypatch.setattr("instrument.tasks.video.solve_video", ended)
+    psf, out = str(recording.parent / "psf.npy"), str(tmp_path / "v.ome.zarr")
+    given = ["--psf", psf, "--dark", "20", "--bin", "2", "--out", out]
+    assert main(["reconstruct", str(recording), "--video", *given]) == 143
+    said = capsys.readouterr().err
+    assert f"0 of 10 frames are in {out}: the same command goes on" in said
 
 
 @pytest.mark.parametrize("what", ["numpy.savez", "zarr.Group.create_array"])
