@@ -238,6 +238,11 @@ class Stages(Listener):
             yield
             self._check()
 
+    def step(self, words: str) -> None:
+        """Hand on that a stage's next step begins, unless it is to end."""
+        self._check()
+        self._listener.step(words)
+
     def share(self, done: float, total: float, *, at_most: bool = False) -> None:
         """Hand on how much is done, unless it is to end."""
         self._check()
@@ -333,6 +338,7 @@ def _run(place: Path, listener: Listener, settings: DemoSettings, stages: Stages
     with stage("open the bench"):
         bench = open_bench(parse_config(settings.bench_toml(), place / "bench.toml"))
     with bench:
+        bench.foretell(bench.config.bench.name)
         journal.note(simulated=bool(bench.simulated_kinds), bench=bench.label)
         listener.said(f"Bench: {bench.label}")
         listener.said(f"Everything goes to {place}")

@@ -137,6 +137,7 @@ def _run(place: Path, listener: Listener, settings: FilmSettings, stages: Stages
     with stage("open the bench"):
         bench = open_bench(parse_config(settings.bench_toml(), place / "bench.toml"))
     with bench:
+        bench.foretell(bench.config.bench.name)
         journal.note(simulated=bool(bench.simulated_kinds), bench=bench.label)
         listener.said(f"Bench: {bench.label}")
         listener.said(f"Everything goes to {place}")

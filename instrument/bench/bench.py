@@ -34,6 +34,7 @@ from instrument.bench.safety import (
     try_all,
 )
 from instrument.bench.source_and_scene import Ask, Lights, Position, SceneSwitch, SourceMount, known_geometry
+from instrument.files import kept_times
 from instrument.files.errors import BenchError
 from recon.types import Geometry
 
@@ -80,6 +81,19 @@ class Bench:
             return made
 
         return within(driver.longest_call_s, f"{kind} ({driver.__name__})", "making it", make)
+
+    def foretell(self, of: str) -> None:
+        """Let how long the next steps take be told as this bench's: by its sensor, by what they took last.
+
+        ``of`` names the bench among others. Its camera is open.
+        """
+        height, width = self.camera.sensor_shape
+        kept_times.about(
+            of,
+            megapixels=1e-6 * height * width,
+            simulated="camera" in self.simulated_kinds,
+            awaits_light=getattr(self.camera, "awaits_light", bool),
+        )
 
     # Devices -----------------------------------------------------------------------------------
     @property

@@ -194,13 +194,7 @@ def open_and_say(bench: BenchConfig | Path | None, *, as_is: bool = False) -> Be
     kept_times.about(of)
     with one_task("Opening the bench"):
         opened = open_bench(config, ask=_taken_for_done if as_is else operator())
-    height, width = opened.camera.sensor_shape
-    kept_times.about(
-        of,
-        megapixels=1e-6 * height * width,
-        simulated="camera" in opened.simulated_kinds,
-        awaits_light=getattr(opened.camera, "awaits_light", bool),
-    )
+    opened.foretell(of)
     typer.echo(f"Bench: {opened.label}", err=True)
     return opened
 

@@ -47,6 +47,8 @@ SMALL = DemoSettings(
 SOLVING = ("reconstruct the picture", "reconstruct the volume", "chart methods")
 PHOTOGRAPHING = ("photograph the scene in three colours", "photograph lights in a volume")
 MOVING = ("dark frames and axial sweep", "response over the field", *PHOTOGRAPHING, *SOLVING)
+WITHIN = ("sweeping", "analysing", "photographing", "finding the scene's exposure")
+"""Steps of what is done in a stage."""
 SAFE = {"light": "off", "stage_moving": False, "scene_lit": False}
 
 
@@ -55,6 +57,7 @@ class Troubling(Listener):
 
     def __init__(self, trouble_in: str = "", trouble: BaseException | None = None) -> None:
         self.stages: list[str] = []
+        self.within: list[str] = []
         self.trouble_in, self.trouble = trouble_in, trouble
 
     def make_trouble(self) -> None:
@@ -63,6 +66,9 @@ class Troubling(Listener):
             raise trouble
 
     def step(self, words: str) -> None:
+        if words in WITHIN:
+            self.within.append(words)
+            return
         self.stages.append(words)
         if words == self.trouble_in and words not in MOVING:
             self.make_trouble()
@@ -87,6 +93,7 @@ def test_the_small_demo_reconstructs_its_scene(shown: tuple[DemoResult, Troublin
     assert result.comparison.psnr_db > 24
     assert result.comparison.ssim > 0.7
     assert list(result.seconds) == listener.stages
+    assert listener.within[:2] == ["sweeping", "analysing"]
     assert not any(photo.saturated_pixels for photo in (*result.measured.photos, result.measured.lights))
     assert result.placed.in_plane == SMALL.lights
     assert {point.psnr_db > 0 for point in result.chart.points} == {True}
