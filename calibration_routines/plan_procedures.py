@@ -16,7 +16,7 @@ from calibration_routines.purpose import REFUSED, completed
 from calibration_routines.routine import Routine, routines
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import Snapshot
-from instrument.files.errors import BenchError
+from instrument.files.errors import BenchError, count
 from instrument.plan import Plan, Step, check, estimate
 from instrument.plan.illumination import IlluminationOptions
 from instrument.runs.acquire import abilities_of, acquire, look, prepare_resume, settle
@@ -280,8 +280,10 @@ def run_outcome(run: Run) -> Outcome:
     dropped = sum(record.metadata.dropped_before for record in run.records.values())
     saturated = [i for i, record in run.records.items() if record.metadata.saturated_fraction > 0]
     if dropped:
-        words.append(f"The camera dropped {dropped} frames between these.")
-    if saturated:
+        words.append(f"The camera dropped {count(dropped, 'frame')} between these.")
+    if len(saturated) == 1:
+        words.append(f"Frame {saturated[0]} has saturated pixels.")
+    elif saturated:
         words.append(f"{len(saturated)} frames have saturated pixels, the first is frame {saturated[0]}.")
     complete = run.condition is RunCondition.COMPLETED
     return Outcome(

@@ -370,7 +370,8 @@ def _saturation(image: ImageFile, erased: Erased) -> tuple[str, ...]:
     if not count or erased.valid is not None:
         return ()
     share = f"{count / image.pixels.size:.2%}"
-    return (f"{count} pixels of the image ({share}) are saturated and used: expect halos there.",)
+    are = "pixel of the image ({}) is" if count == 1 else "pixels of the image ({}) are"
+    return (f"{count} {are.format(share)} saturated and used: expect halos there.",)
 
 
 def _suspicion(inputs: InputOptions, image: ImageFile) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.calibration_file import load_calibration
-from instrument.files.errors import BenchError, FileError
+from instrument.files.errors import BenchError, FileError, count
 from instrument.files.images import ImageFile
 from instrument.plan.illumination import DARK, PATTERN
 from instrument.reconstruction.job import Job, find_calibration, job_with
@@ -277,7 +277,8 @@ def _shares(patterns: Floats, path: Path) -> Floats:
 
 
 def _saturation(run: Run) -> tuple[str, ...]:
-    count = sum(record.metadata.saturated_fraction > 0 for record in run.records.values())
-    if not count:
+    number = sum(record.metadata.saturated_fraction > 0 for record in run.records.values())
+    if not number:
         return ()
-    return (f"{run.path}: {count} frames have saturated pixels: expose shorter.",)
+    have = "has" if number == 1 else "have"
+    return (f"{run.path}: {count(number, 'frame')} {have} saturated pixels: expose shorter.",)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.errors import BenchError, FileError
+from instrument.files.errors import BenchError, FileError, count
 from instrument.files.images import ImageFile, read_image
 from instrument.reconstruction.defects import defective_pixels
 from recon.base.blocks import block_mean
@@ -406,16 +406,16 @@ def reduce_valid(valid: npt.NDArray[np.bool_], crop: Crop | None, binning: int) 
 def _saturated(image: ImageFile, psf: npt.NDArray[Any] | None) -> Erased:
     saturated = saturated_pixels(image.pixels)
     left_out = saturated if psf is None else saturated | defective_pixels(image.pixels, psf)
-    unknown = np.count_nonzero(np.isnan(image.pixels))
-    nan = f"{unknown} pixels that are NaN" if unknown else ""
+    unknown = int(np.count_nonzero(np.isnan(image.pixels)))
+    nan = f"{count(unknown, 'pixel')} that {'is' if unknown == 1 else 'are'} NaN" if unknown else ""
     if not left_out.any():
         return Erased(None, nan or "none (no pixel is saturated)")
     said = []
-    if count := np.count_nonzero(saturated):
+    if number := int(np.count_nonzero(saturated)):
         tops = ", ".join(f"{top:g}" for top in np.unique(image.pixels[saturated]))
-        said += [f"{count} saturated pixels ({count / image.pixels.size:.2%}, at {tops})"]
-    if count := np.count_nonzero(left_out & ~saturated):
-        said += [f"{count} hot or dead ones" if said else f"{count} hot or dead pixels"]
+        said += [f"{count(number, 'saturated pixel')} ({number / image.pixels.size:.2%}, at {tops})"]
+    if number := int(np.count_nonzero(left_out & ~saturated)):
+        said += [count(number, f"hot or dead {'one' if said else 'pixel'}")]
     words = f"{' and '.join(said)}; --erasures none uses them"
     return Erased(~left_out, f"{nan}; {words}" if nan else words)
 

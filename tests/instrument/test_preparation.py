@@ -285,6 +285,8 @@ def test_hot_and_dead_pixels_are_erased_unless_the_psf_has_spots_as_narrow() -> 
     assert erased.reason == "4 hot or dead pixels; --erasures none uses them"
     holes = erasures_of("saturated", file(np.where(np.arange(160) == 5, np.nan, image).astype(np.float32)))
     assert holes.reason == "120 pixels that are NaN"
+    one = np.where(np.arange(image.size).reshape(image.shape) == 5, np.nan, image).astype(np.float32)
+    assert erasures_of("saturated", file(one)).reason == "1 pixel that is NaN"
 
 
 def test_hot_and_dead_pixels_of_a_psf_are_filled_unless_they_are_its_spots() -> None:
