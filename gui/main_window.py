@@ -35,6 +35,7 @@ from gui.widgets.device_chips import DeviceChips
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
 from gui.widgets.step_strip import StepStrip
+from gui.widgets.tab_order import stops_of
 from gui.words import in_the_window
 from instrument.bench.config import BenchConfig, Kind
 
@@ -350,6 +351,19 @@ class MainWindow(QMainWindow):
         ):
             self.session.stop()
         return False
+
+    def focusNextPrevChild(self, forward: bool) -> bool:  # noqa: N802 - Qt's name
+        """Go on by Tab from stop to stop.
+
+        Qt's own way stops at parts that hand the keyboard on to another as well, wherever they are in its
+        order: it went round within a panel, and never came to STOP.
+        """
+        stops, now = list(stops_of(self)), QApplication.focusWidget()
+        if now not in stops:
+            return super().focusNextPrevChild(forward)
+        reason = Qt.FocusReason.TabFocusReason if forward else Qt.FocusReason.BacktabFocusReason
+        stops[(stops.index(now) + (1 if forward else -1)) % len(stops)].setFocus(reason)
+        return True
 
     # What runs -----------------------------------------------------------------------------------
     def _show_simulated(self, _kind: str = "") -> None:

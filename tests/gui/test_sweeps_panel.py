@@ -7,9 +7,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PySide6.QtCore import QPoint, Qt
-from PySide6.QtWidgets import QMessageBox, QWidget
+from PySide6.QtWidgets import QApplication, QMessageBox, QWidget
 from pytestqt.qtbot import QtBot
 
 from calibration_routines.psf.sweep_procedure import SweepProcedure
@@ -372,6 +373,21 @@ def test_a_sweep_that_waits_says_for_what_and_can_be_aborted(
     gate.set()
     wait_for_check(qtbot, panel)
     assert panel.run_bar.start_button.isEnabled()
+
+
+def test_tab_goes_through_all_of_the_window_beside_a_picture(
+    qtbot: QtBot, window: MainWindow, panel: SweepsPanel
+) -> None:
+    panel._show_image(np.ones((8, 8), np.uint16))
+    panel.choice.setFocus()
+    stops = list(stops_of(window))
+    assert panel.frame.graphics in stops
+    for key in (Qt.Key.Key_Tab, Qt.Key.Key_Backtab):
+        seen = set()
+        for _ in stops:
+            qtbot.keyClick(QApplication.focusWidget(), key)
+            seen.add(QApplication.focusWidget())
+        assert seen == set(stops)
 
 
 def test_a_pause_that_is_not_yet_says_so(panel: SweepsPanel) -> None:
