@@ -301,13 +301,10 @@ def _shares(nodes: Floats, places: Floats, step: float) -> Floats:
     they add up to one and their centre is the plane's. Without that a bead of a plane whose steps differ on
     both sides would be deeper than it is, and its light, which lies along an oblique ray, beside it.
     """
-    steps = np.diff(nodes)
-    halves = np.concatenate([[_nearer(nodes)], steps / 2, steps[-1:] / 2])
-    first, last = nodes[0] - halves[0], nodes[-1] + halves[-1]
-    thickness = halves[:-1] + halves[1:]
+    first, last = nodes[0] - _nearer(nodes), nodes[-1] + (nodes[-1] - nodes[-2]) / 2
     # Of a voxel at either end the part counts that is in the volume.
     inside = np.minimum(places + step / 2, last) - np.maximum(places - step / 2, first)
-    shares: Floats = _between(nodes, places, step) * np.clip(inside, 0, step)[:, None] / thickness
+    shares: Floats = _between(nodes, places, step) * np.clip(inside, 0, step)[:, None]
     # Of a plane on one side of all that has a share of it: the two places beside it, by their distances.
     beside = np.stack([np.interp(nodes, places, unit) for unit in np.eye(len(places))])
     for k, node in enumerate(nodes):

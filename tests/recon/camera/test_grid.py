@@ -5,7 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.camera.grid import Grid, _between, metric_grid, metric_volume
+from recon.camera.grid import (
+    LEAN,
+    Grid,
+    _between,
+    _centred,
+    _nearer,
+    _shares,
+    depth_in_words,
+    metric_grid,
+    metric_volume,
+)
 from recon.errors import InputError
 
 Z_UM = 1 / np.linspace(1 / 9000, 1 / 15000, 7)
@@ -162,7 +172,9 @@ def test_what_cannot_be_brought_to_equal_voxels_is_refused(grid, voxel_um, words
         metric_grid(grid, voxel_um)
 
 
-@pytest.mark.parametrize(("z_um", "deep"), [((10, 12), 2), ((10, 12, 15), 3), ((10, 12, 15, 19, 24, 30), 5)])
+@pytest.mark.parametrize(
+    ("z_um", "deep"), [((10, 10.5), 0.5), ((10, 12), 2), ((10, 12, 15), 3), ((10, 12, 15, 19, 24, 30), 5)]
+)
 def test_a_voxel_is_as_deep_as_the_step_beside_the_middle_plane(z_um, deep):
     n = len(z_um)
     metric = metric_grid(Grid((n, 9, 9), (4, 4), np.array(z_um, float), np.ones(n)))
@@ -173,3 +185,81 @@ def test_the_mean_over_a_deep_voxel_is_that_of_eighths_of_its_triangle():
     """By hand: a voxel two planes deep looks at 0, +-1/2, +-1 and +-3/2 planes with weights 4, 3, 2 and 1."""
     weights = _between(np.arange(5.0), np.array([2.0]), 2.0)
     np.testing.assert_allclose(weights, np.array([[1, 8, 14, 8, 1]]) / 32)
+
+
+@pytest.mark.parametrize(("z_um", "reach"), [((10, 12, 20), 1), ((1, 10, 20), 1), ((4, 10, 20), 3)])
+def test_a_volume_goes_on_half_a_step_before_its_nearest_plane_or_to_the_diffuser(z_um, reach):
+    assert _nearer(np.array(z_um, float)) == reach
+
+
+def test_places_of_one_plane_span_the_pixels_that_see_them():
+    grid = Grid((2, 20, 30), (10, 15), np.array([1000.0, 3000.0]), np.array([2.0, 6.0]), 2.0, None, True)
+    places = np.array([[4.0, -2.0, 1100.0], [-12.0, 18.0, 2900.0]])  # 2 and -1 pixels; -2 and 3 pixels
+    assert grid.spanned_by(places) == (9.0, 13.0, 13.0, 17.0)
+    turned = replace(grid, upright=False)
+    assert turned.spanned_by(places) == (7.0, 13.0, 11.0, 17.0)
+    assert grid.spanned_by(np.full((1, 3), np.nan)) is None
+    assert replace(grid, pitch_um=np.array([np.nan, 6.0])).spanned_by(places) is None
+
+
+def test_differences_weigh_by_the_faces_between_voxels():
+    """A z face is pitch^2, an x face pitch times spacing; the last plane's spacing is that before it."""
+    grid = Grid((3, 9, 9), (4, 4), np.array([1000.0, 1400.0, 1500.0]), np.array([10.0, 14.0, 15.0]))
+    np.testing.assert_allclose(grid.axis_weights(), [[10 / 400, 1, 1], [14 / 100, 1, 1], [15 / 100, 1, 1]])
+    unknown = replace(grid, pitch_um=np.array([10.0, np.nan, 15.0]))
+    np.testing.assert_array_equal(unknown.axis_weights(), np.ones((3, 3)))
+    one = Grid((1, 9, 9), (4, 4), np.array([1000.0]), np.array([10.0]))
+    np.testing.assert_array_equal(one.axis_weights(), [[0, 1, 1]])
+    assert np.isnan(one.spacing_um).all()
+    assert len(one.spacing_um) == 1
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_a_pixel_looks_where_the_pitch_says_and_a_place_is_seen_there(upright):
+    grid = replace(GRID, upright=upright)
+    sign = 1 if upright else -1
+    x, y, z = grid.place_um(2, 43.0, 55.0)
+    pitch = sign * 2e-3 * Z_UM[2]
+    assert (x, y, z) == pytest.approx(
+        (GRID.axis_um[2, 0] - 5 * pitch, GRID.axis_um[2, 1] + 3 * pitch, Z_UM[2])
+    )
+    assert grid.pixel_of(2, x, y) == pytest.approx((43.0, 55.0))
+    assert grid.pixel_mrad == pytest.approx(2.0)
+    plain = replace(grid, axis_um=None)
+    angles = [np.degrees(np.arctan(sign * 2e-3 * pixels)) for pixels in (-5, 3)]
+    assert plain.direction_deg(43.0, 55.0) == pytest.approx(tuple(angles))
+    assert plain.pixel_of(2, 0.0, 0.0) == (40.0, 60.0)
+
+
+def test_one_column_of_pixels_has_voxels_too():
+    metric = metric_grid(Grid((4, 9, 1), (4, 0), np.arange(4) * 50.0 + 1000, np.full(4, 5.0), upright=True))
+    assert metric.shape == (4, 9, 1)
+
+
+def test_shares_add_up_about_their_plane_and_lie_wherever_it_is_the_nearest_on_a_side():
+    nodes, places = np.array([100.0, 110.0, 122.0, 132.0]), np.arange(95.0, 138.0, 3.0)
+    shares = _shares(nodes, places, 3.0)
+    assert (shares >= 0).all()
+    np.testing.assert_allclose(shares.sum(axis=0), 1)
+    np.testing.assert_allclose(places @ shares, nodes, atol=1e-6)
+    for k, (near, far) in enumerate([(100.0, 110.0), (100.0, 122.0), (110.0, 132.0)]):
+        if k:
+            np.testing.assert_array_equal(shares[:, k] > 0, (places > near) & (places < far))
+
+
+def test_shares_are_tilted_until_their_mean_is_in_the_middle_or_they_lean_as_far_as_they_may():
+    off = np.array([-1.0, 0.0, 1.0, 2.0])
+    shares = _centred(np.array([2.0, 3.0, 3.0, 1.0]), off)
+    assert shares.sum() == pytest.approx(1)
+    assert shares @ off == pytest.approx(0, abs=1e-9)
+    lean = np.log(shares / np.array([2.0, 3.0, 3.0, 1.0]))
+    np.testing.assert_allclose(np.diff(lean), np.diff(lean)[0])
+    far = np.array([-0.1, 5.0, 9.9])
+    expected = np.exp(-LEAN * far / 10)
+    np.testing.assert_allclose(_centred(np.ones(3), far), expected / expected.sum(), rtol=1e-9)
+    np.testing.assert_allclose(_centred(np.ones(3), -far[::-1])[::-1], expected / expected.sum(), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("z_um", "words"), [(12_500.0, "12.5 mm"), (1e9, "infinity"), (0.99e9, "990000 mm")])
+def test_a_depth_is_told_in_millimetres_up_to_what_counts_as_infinity(z_um, words):
+    assert depth_in_words(z_um) == words
