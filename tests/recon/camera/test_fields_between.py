@@ -10,9 +10,8 @@ from drivers.simulated.world import SimulatedWorld
 from recon.analysis.correlation import similarity
 from recon.camera.refocus_field import at_depth, refocus_field
 from recon.camera.two_part import two_part
-from recon.errors import InputError
 from recon.optics.fall_off import gaussian_fall_off
-from recon.types import Calibration, Geometry
+from recon.types import Calibration
 
 WORLD = SimulatedWorld(
     WorldOptions(preset="tiny", time_scale=0.0, fall_off="gaussian", fall_off_sigma_deg=13.0)
@@ -89,17 +88,3 @@ def test_a_point_that_shines_evenly_lights_a_pixel_by_the_cube_of_the_cosine():
                        for p in (place[1], place[0]))  # fmt: skip
         before = np.roll(1 / cube((0.0, 0.0)), (row, column), axis=(0, 1)) * cube(place)
         np.testing.assert_allclose(psf[lit], before[lit], rtol=1e-4)
-
-
-def test_what_a_field_needs_is_asked_for():
-    alone = _taken(_at(NEAR, [(0.0, 0.0)]))
-    bare = replace(alone, geometry=Geometry(None, 8.9))
-    with pytest.raises(InputError, match="does not say all"):
-        two_part(bare, gaussian_fall_off(13.0))
-    for z_um in (-NEAR, 0.0, np.nan, np.inf):
-        with pytest.raises(InputError, match="does not say all"):
-            two_part(
-                replace(alone, source_positions_um=np.array([[0.0, 0.0, z_um]])), gaussian_fall_off(13.0)
-            )
-    with pytest.raises(InputError, match="1 place a side"):
-        two_part(alone, gaussian_fall_off(13.0), points=0)

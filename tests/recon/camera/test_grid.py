@@ -181,6 +181,20 @@ def test_a_voxel_is_as_deep_as_the_step_beside_the_middle_plane(z_um, deep):
     np.testing.assert_allclose(np.diff(metric.z_um), deep)
 
 
+@pytest.mark.parametrize(("n", "middle"), [(2, 1), (3, 1), (6, 3), (7, 3)])
+def test_a_voxel_is_as_wide_as_a_pixel_of_the_middle_plane(n, middle):
+    z = 1000.0 + 10 * np.arange(n)
+    metric = metric_grid(Grid((n, 40, 40), (20, 20), z[::-1], z[::-1] / 100))
+    np.testing.assert_allclose(metric.pitch_um, z[middle] / 100)
+
+
+@pytest.mark.parametrize(("off", "metric"), [(0.0, True), (0.02, True), (0.03, False)])
+def test_voxels_that_differ_by_a_thousandth_have_one_size(off, metric):
+    sizes = np.array([25.0, 25.0 + off, 25.0])
+    assert Grid((3, 9, 9), (4, 4), np.array([500.0, 550, 600]), sizes).is_metric == metric
+    assert Grid((3, 9, 9), (4, 4), np.array([500.0, 525, 550 + off]), np.full(3, 9.0)).is_metric == metric
+
+
 def test_the_mean_over_a_deep_voxel_is_that_of_eighths_of_its_triangle():
     """By hand: a voxel two planes deep looks at 0, +-1/2, +-1 and +-3/2 planes with weights 4, 3, 2 and 1."""
     weights = _between(np.arange(5.0), np.array([2.0]), 2.0)
@@ -237,11 +251,12 @@ def test_one_column_of_pixels_has_voxels_too():
 
 
 def test_shares_add_up_about_their_plane_and_lie_wherever_it_is_the_nearest_on_a_side():
-    nodes, places = np.array([100.0, 110.0, 122.0, 132.0]), np.arange(95.0, 138.0, 3.0)
+    nodes, places = np.array([100.0, 110.0, 122.0, 132.0]), np.arange(86.0, 147.0, 3.0)
     shares = _shares(nodes, places, 3.0)
     assert (shares >= 0).all()
     np.testing.assert_allclose(shares.sum(axis=0), 1)
     np.testing.assert_allclose(places @ shares, nodes, atol=1e-6)
+    assert not shares[(places < 93) | (places > 139)].any()  # half a step before and behind it ends
     for k, (near, far) in enumerate([(100.0, 110.0), (100.0, 122.0), (110.0, 132.0)]):
         if k:
             np.testing.assert_array_equal(shares[:, k] > 0, (places > near) & (places < far))

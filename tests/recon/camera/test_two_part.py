@@ -1,9 +1,12 @@
 """The two-part model pixel by pixel, and patterns that go on beyond the sensor."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from recon.camera.two_part import is_cut, two_part
+from recon.errors import InputError
 from recon.types import Calibration, Geometry
 
 PITCH_UM, DISTANCE_MM = 100.0, 4.0
@@ -51,6 +54,23 @@ def test_each_pixel_is_the_patterns_by_the_response_to_the_source_at_its_place(p
                 np.testing.assert_allclose(made.psfs[number, 0], expected, rtol=1e-5, atol=1e-6)
                 number += 1
     assert dim > 0
+
+
+def test_what_a_field_needs_is_asked_for():
+    known = Calibration(
+        np.ones((1, 1, 6, 7), np.float32),
+        np.array([[0.0, 0, 2000]]),
+        geometry=Geometry(PITCH_UM, DISTANCE_MM),
+    )
+    lacking = [
+        *(replace(known, geometry=geometry) for geometry in (Geometry(None, 4.0), Geometry(PITCH_UM, None))),
+        *(replace(known, source_positions_um=np.array([[0, 0, z]])) for z in (-1e4, 0.0, np.nan, np.inf)),
+    ]
+    for calibration in lacking:
+        with pytest.raises(InputError, match="does not say all"):
+            two_part(calibration, skew)
+    with pytest.raises(InputError, match="1 place a side or more, not 0"):
+        two_part(known, skew, points=0)
 
 
 @pytest.mark.parametrize("side", [np.s_[0], np.s_[1], np.s_[-1], np.s_[-2], np.s_[:, 0], np.s_[:, -2]])
