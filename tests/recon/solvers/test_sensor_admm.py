@@ -363,8 +363,9 @@ def test_with_many_data_steps_an_object_solves_its_quadratic_problem(prior, shar
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3])
-def test_data_steps_are_those_of_preconditioned_conjugate_gradients(steps):
-    camera, data = problem()
+def test_data_steps_are_those_of_preconditioned_conjugate_gradients(monkeypatch, steps):
+    monkeypatch.setattr(cosine_preconditioner, "EXACT_MODES", 8)  # else the first step is the last
+    camera, data = problem(sensor=(14, 18))
     solver = SensorAdmm(camera, data, PRIORS["tv"])
     solver.step()
     mu_u, mu_w = solver._mu[:, 0]
@@ -385,6 +386,7 @@ def test_data_steps_are_those_of_preconditioned_conjugate_gradients(steps):
     z = precondition(r, np.empty_like(r)).copy()
     p, rho = z, float(np.vdot(r, z))
     for _ in range(steps):
+        assert rho > 1e-5
         length = rho / float(np.vdot(p, bent(p)))
         e = e + length * p
         r = r - length * bent(p)

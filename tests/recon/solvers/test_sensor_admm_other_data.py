@@ -10,6 +10,7 @@ from recon.camera.factors import BackgroundRemoval, Erasures
 from recon.priors import L1, Box, NonNegativity, TotalVariation
 from recon.priors.base import Prior
 from recon.solvers import SensorAdmm, StoppingRules
+from recon.solvers.cosine_preconditioner import PicturePreconditioner
 from recon.solvers.sensor_admm import fill_smoothly
 
 TV = TotalVariation(0.05) + NonNegativity()
@@ -126,13 +127,62 @@ def test_a_background_that_takes_another_share_has_the_preconditioners_told():
     solver = SensorAdmm(camera, data, TV, background=removal)
     removal.restrain(0.01)
     solver.set_data(data)
-    new = SensorAdmm(camera, data, TV, background=removal)
-    new._splits.set_penalties(solver._mu)
-    new._adapt()
     image = np.random.default_rng(0).standard_normal(SENSOR)
-    images = [of._preconditioners[1].apply(image, np.empty(SENSOR)).copy() for of in (solver, new)]
+    told = PicturePreconditioner(camera.power()[1], camera.grid_shape, SENSOR)
+    told.weigh((3, 3), np.sqrt(0.01 / 1.01))  # what is left of the smooth part
+    told.set_penalties(*solver._mu[:, 1])
+    images = [of.apply(image, np.empty(SENSOR)).copy() for of in (solver._preconditioners[1], told)]
     np.testing.assert_allclose(images[0], images[1], rtol=1e-9)
     assert solver._adapted_to == removal.taken
+
+
+def test_the_gradient_that_sets_pixels_penalties_is_of_what_a_background_leaves(monkeypatch):
+    camera, (data, _) = camera_and_data()
+    removal = background()
+    solver = SensorAdmm(camera, data, TV, background=removal)
+    for _ in range(12):
+        solver.advance()
+    monkeypatch.setattr(solver._splits, "balanced_penalties", lambda: solver._mu.copy())
+    w, seen = solver.solution, removal @ camera
+    gradient = seen.adjoint(seen.forward(w) - removal.forward(data))
+    found = solver._balanced_penalties()[1]
+    for channel in (0, 1):
+        multiplier = solver._mu[1, channel] * np.linalg.norm(solver._splits.t_w[channel] - w[channel])
+        slope = np.linalg.norm(gradient[channel])
+        expected = np.sqrt(multiplier * slope) / np.linalg.norm(w[channel])
+        assert solver._mu[1, channel] / 100 < expected < solver._mu[1, channel] * 100
+        assert found[channel] == pytest.approx(max(expected, 0.03 * solver._mu[0, channel]), rel=1e-9)
+
+
+def smoothed(image, reach):
+    """By a Gaussian in the frequencies of a mirrored image, as a matrix along each side."""
+    sides = []
+    for n in image.shape:
+        k = np.arange(n)[:, None]
+        cosines = np.sqrt(np.where(k, 2, 1) / n) * np.cos(np.pi * k * (np.arange(n) + 0.5) / n)
+        sides.append(cosines.T @ (np.exp(-0.5 * (reach * np.pi * k / n) ** 2) * cosines))
+    return sides[0] @ image @ sides[1].T
+
+
+@pytest.mark.parametrize("kind", ["a block", "a strip", "a corner"])
+def test_an_erased_pixel_is_the_mean_of_the_narrowest_gaussian_that_sees_a_twentieth_of_what_is_known(kind):
+    """What none of them sees that is narrower than the longer side is the mean of all that is known."""
+    weight = np.zeros({"a block": (22, 34), "a strip": (40, 3), "a corner": (16, 16)}[kind])
+    weight[:6, :4] = 1
+    if kind == "a block":
+        weight[...] = 1
+        weight[3:20, 2:31] = 0
+    image = 1 + np.random.default_rng(6).random(weight.shape)
+    expected, missing = image * weight, weight == 0
+    for reach in (reach for reach in (1, 2, 4, 8, 16, 32) if reach < max(weight.shape)):
+        share = smoothed(weight, reach)
+        near = missing & (share > 0.05)
+        expected[near] = smoothed(image * weight, reach)[near] / share[near]
+        missing &= ~near
+    assert missing.any() == (kind == "a corner")
+    expected[missing] = image[weight > 0].mean()
+    fill_smoothly(image, weight)
+    np.testing.assert_allclose(image, expected, rtol=1e-9)
 
 
 def test_object_and_multipliers_move_and_what_is_left_of_the_data_stays():
