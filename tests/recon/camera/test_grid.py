@@ -262,6 +262,13 @@ def test_shares_add_up_about_their_plane_and_lie_wherever_it_is_the_nearest_on_a
             np.testing.assert_array_equal(shares[:, k] > 0, (places > near) & (places < far))
 
 
+def test_a_plane_on_the_outermost_place_is_there_alone():
+    nodes = np.array([100.0, 112.0, 121.0])
+    shares = _shares(nodes, np.arange(100.0, 122.0, 3.0), 3.0)
+    np.testing.assert_allclose(shares[:, 0], np.eye(8)[0])
+    np.testing.assert_allclose(shares[:, 2], np.eye(8)[7])
+
+
 def test_shares_are_tilted_until_their_mean_is_in_the_middle_or_they_lean_as_far_as_they_may():
     off = np.array([-1.0, 0.0, 1.0, 2.0])
     shares = _centred(np.array([2.0, 3.0, 3.0, 1.0]), off)

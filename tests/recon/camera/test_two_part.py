@@ -69,6 +69,8 @@ def test_what_a_field_needs_is_asked_for():
     for calibration in lacking:
         with pytest.raises(InputError, match="does not say all"):
             two_part(calibration, skew)
+    near = replace(known, source_positions_um=np.array([[0, 0, 0.5]]))
+    assert len(two_part(near, skew, points=1).psfs) == 1
     with pytest.raises(InputError, match="1 place a side or more, not 0"):
         two_part(known, skew, points=0)
 
