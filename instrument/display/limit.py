@@ -111,11 +111,10 @@ def limit_lines(found: Sequence[Limit], display: Display, options: HologramOptio
             f"(a bound; {here.reached_db:.2f} dB is reached by what need not be frames of phases)"
         ]
     else:
-        none = "none is in sight" if is_told(here) else "not known after so short a search"
-        lines = [
-            f"limit: {none} {behind}; {here.reached_db:.2f} dB is reached by what need not be "
-            "frames of phases"
-        ]
+        none = (
+            f"none is in sight {behind}" if is_told(here) else f"not known {behind} after so short a search"
+        )
+        lines = [f"limit: {none}; {here.reached_db:.2f} dB is reached by what need not be frames of phases"]
     cutoff = band_of(display).cutoff
     least, coarse = display.factor / cutoff, "set by the mask within an SLM pixel, not by the SLM"
     if display.near:  # a period is farther than a mask pixel's first order goes aside
@@ -123,7 +122,9 @@ def limit_lines(found: Sequence[Limit], display: Display, options: HologramOptio
         least, coarse = display.field_mm / aside_mm / cutoff, "light does not go so far aside this near"
     for (low, high), wanted, reached in zip(pairwise(BANDS), here.wanted, here.reached, strict=True):
         why = ""
-        if reached < 0.7 and low < least:
+        if not is_told(here):  # the search may not have come to it yet
+            why = " so far"
+        elif reached < 0.7 and low < least:
             why = f"   {coarse}"
         elif reached < 0.7:
             why = "   more contrast than so many SLM pixels can make"

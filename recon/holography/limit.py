@@ -206,13 +206,16 @@ def limited_by(
     options: HologramOptions,
     efficiency: float,
 ) -> tuple[str, ...]:
-    """Return what keeps a hologram from being better: search, frames or contrast, light, alignment."""
+    """Return what keeps a hologram from being better: search, levels, frames, contrast, light, alignment."""
     found = []
     history = hologram.history
     late_db = history[-1].psnr_db - history[int(0.8 * (len(history) - 1))].psnr_db
     ended = (HologramStop.ITERATIONS, HologramStop.TIME, HologramStop.CANCELLED)
     if searching := late_db > 0.5 and hologram.stop_reason in ended:
         found.append(f"search: it still gained {late_db:.1f} dB in its last fifth (--iterations)")
+    lost_db = max(record.psnr_db for record in history) - history[-1].psnr_db
+    if options.phase_levels is not None and lost_db > _FELT_DB:
+        found.append(f"levels: rounded to {options.phase_levels} phases it lost {lost_db:.1f} dB (--levels)")
     gain_db = gain_of_frames(display, targets, options)
     if gain_db > _CLEARLY_DB:
         found.append(f"frames: many would reach about {gain_db:.0f} dB more (--frames {2 * options.frames})")

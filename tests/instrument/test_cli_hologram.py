@@ -360,6 +360,13 @@ def test_a_search_without_time_is_no_advice() -> None:
     for stop in (HologramStop.TIME, HologramStop.CANCELLED, HologramStop.ITERATIONS):
         assert at_most(replace(told, stop_reason=stop)) == "not known after so short a search"
     assert at_most(replace(told, stop_reason=HologramStop.QUALITY)) == "no limit in sight"
+    mask = no_mask((4, 4), design_wavelength_nm=532.0)
+    early = replace(told, wanted=np.ones(4), reached=np.full(4, 0.5))
+    lines = limit_lines(
+        [early], Display((4, 4), mask, slm_pitch_um=8.0, wavelength_nm=532.0), HologramOptions()
+    )
+    assert "limit: not known with these phases after so short a search" in lines[0]
+    assert all(line.endswith("50% reached so far") for line in lines[1:])
     assert at_most(replace(told, bound_db=21.0)) == "at most 21.00 dB"
 
 

@@ -159,6 +159,15 @@ def test_what_a_picture_lacks_is_frames_or_contrast(background, factor, limits):
         )
 
 
+def test_what_rounding_to_few_phases_costs_is_told():
+    display, image = Display(SHAPE, random_mask((SHAPE[0] * 2, SHAPE[1] * 2), seed=1)), picture()
+    for levels, told in ((4, True), (200, False), (None, False)):
+        options = HologramOptions(phase_levels=levels, iterations=20)
+        found = compute_hologram(HologramModel(display, [Target(image)], options))
+        words = limited_by(display, [Target(image)], found, options, 0.6)
+        assert any(line.startswith(f"levels: rounded to {levels} phases it lost") for line in words) is told
+
+
 def test_search_light_and_alignment_are_told_where_they_limit():
     display = replace(
         Display(SHAPE, random_mask((SHAPE[0] * 2, SHAPE[1] * 2), seed=1)),
