@@ -26,6 +26,7 @@ from drivers.frame import FrameMetadata
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, size
 from instrument.runs.acquire import record_of
+from instrument.runs.interrupts import interrupts_held
 from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_control import EndedEarlyError
 from instrument.runs.run_files import BENCH_TOML
@@ -177,12 +178,17 @@ class KeptFrames:
                 label = self._command.split()[-1]
                 self._writer = RunWriter.create(folder, label=label, bench=record_of(self._bench))
             self._writer.start(routine=self._command, typed=self._typed)
-        frames = []
-        for frame, asked in zip(taken, questions, strict=False):
-            self._writer.note(_ASKED, index=self._next, question=asked)
-            frames.append(FrameToStore(self._next, frame.image, frame.metadata))
-            self._next += 1
-        self._writer.write(frames)
+        frames = [FrameToStore(self._next + n, one.image, one.metadata) for n, one in enumerate(taken)]
+        try:
+            with interrupts_held() as held:  # all of a sequence are there, which may have taken minutes
+                for frame, asked in zip(frames, questions, strict=False):
+                    self._writer.note(_ASKED, index=frame.index, question=asked)
+                self._writer.write(frames)
+                self._next += len(frames)
+        except Exception as error:
+            held.answer(str(error))
+            raise
+        held.answer()
 
 
 def kept_words(bench: Bench, frames: int, again: Path | None) -> str:

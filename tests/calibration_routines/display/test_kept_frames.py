@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 from calibration_routines.display import display_learning
 from calibration_routines.display.display_learning import LearningProcedure
 from calibration_routines.display.hologram_photograph import HologramCamera
+from calibration_routines.display.kept_frames import KeptFrames
 from calibration_routines.display.mask_alignment import (
     AlignmentFailedError,
     AlignmentProcedure,
@@ -26,6 +29,7 @@ from instrument.files.errors import BenchError
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import EndedEarlyError, RunControl
+from instrument.runs.writer import RunWriter
 from recon.errors import InputError
 from tests.calibration_routines.display.test_mask_alignment import BENT, small
 
@@ -83,6 +87,29 @@ def test_a_table_that_ended_early_goes_on(tmp_path: Path, monkeypatch: pytest.Mo
     assert len(Run.open(path).records) == len(run.records)
     with pytest.raises(BenchError, match="of another picture"):
         measured(tmp_path, "other.json", again=path, levels=17)
+
+
+def test_frames_of_a_sequence_are_kept_when_ctrl_c_comes_while_they_are_noted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of one sequence are there when the first is noted, and may have taken minutes."""
+    note = RunWriter.note
+
+    def interrupted(writer: RunWriter, kind: str, **fields: Any) -> None:
+        note(writer, kind, **fields)
+        if fields.get("index") == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(RunWriter, "note", interrupted)
+    with (
+        Bench(parse_config(TEXT, None)).open() as bench,
+        pytest.raises(KeyboardInterrupt) as ended,
+        KeptFrames(bench, tmp_path, "calibrate slm", SlmProcedure()) as kept,
+    ):
+        kept.answers(["a", "b", "c"], lambda _: [bench.snap()] * 3)
+    (path,) = tmp_path.iterdir()
+    assert len(Run.open(path).records) == 3
+    assert ended.value.__notes__[0].startswith("3 frames are kept.")
 
 
 def test_an_alignment_that_was_interrupted_says_where_the_stage_is_and_goes_on(tmp_path: Path) -> None:
