@@ -211,7 +211,7 @@ def write_activity(
         len(video),
         activity.dff.shape[1:],
         period_s=video.period_s,
-        grid=None,
+        grid=None if "z" in video.axes else video.grid,  # planes seen as one differ in their pitch
         attributes={"quantity": "dF/F", "of": str(video.path.resolve()), "simulated": simulated},
     )
     stack = VideoPictures(made[3], write=True)

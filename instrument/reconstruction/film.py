@@ -26,7 +26,6 @@ from instrument.reconstruction.video_files import (
     samples_of,
 )
 from instrument.runs.run import Run
-from instrument.volumes.grid_facts import grid_of
 
 if TYPE_CHECKING:
     from recon.camera.grid import Grid
@@ -122,13 +121,7 @@ class Film:
     @property
     def grid(self) -> Grid | None:
         """Where its pixels lie in the object; None where no file tells of it, as of a recording."""
-        if self._video is None:
-            return None
-        facts = self.facts
-        sizes = dict(zip(self._video.axes, self._video.array.shape, strict=True))
-        if "pitch_um" not in facts and "z" not in sizes:
-            return None
-        return grid_of(facts, (sizes.get("z", 1), sizes["y"], sizes["x"]))
+        return None if self._video is None else self._video.grid
 
     def levels(self) -> tuple[float, float]:
         """Return black and white for all pictures, from some of them."""

@@ -16,7 +16,7 @@ from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import FileError
 from instrument.files.ome_zarr import ome_attributes, ome_channels
 from instrument.runs.run import Run
-from instrument.volumes.grid_facts import grid_facts, origin_um, voxel_um
+from instrument.volumes.grid_facts import grid_facts, grid_of, origin_um, voxel_um
 
 STILL = {"um": 0.5, "mrad": 0.02}
 """How far readings of a stage that stands may lie apart, by the unit that an axis' name ends in.
@@ -169,6 +169,15 @@ class VideoPictures:
         """Top, left, bottom and right between the outermost PSFs, where they vary over the field."""
         box = self.attributes.get("diffuserbench", {}).get("calibrated_px")
         return None if box is None else (box[0], box[1], box[2], box[3])
+
+    @property
+    def grid(self) -> Grid | None:
+        """Where pixels and planes lie in the object; None where the file does not tell."""
+        facts = self.attributes.get("diffuserbench", {})
+        sizes = dict(zip(self.axes, self.array.shape, strict=True))
+        if "pitch_um" not in facts and "z" not in sizes:
+            return None
+        return grid_of(facts, (sizes.get("z", 1), sizes["y"], sizes["x"]))
 
     def __len__(self) -> int:
         return int(self.array.shape[0])

@@ -19,10 +19,11 @@ from instrument.files.errors import BenchError, FileError, ranges
 from instrument.files.films import as_shown, write_mp4
 from instrument.files.images import write_image
 from instrument.files.ome_tiff import annotation, resolution
+from instrument.files.ome_zarr import is_zarr_name
 from instrument.files.record import plain
 from instrument.runs.frame_facts import z_steps_um
 from instrument.runs.run import Run
-from instrument.runs.run_files import RunError
+from instrument.runs.run_files import FRAMES, RunError
 
 Image = npt.NDArray[Any]
 _BIG_TIFF_BYTES = 3_900_000_000
@@ -82,6 +83,9 @@ def export(
         ".mp4": partial(_mp4, frames_per_s=frames_per_s),
     }
     writer = next((write for suffix, write in writers.items() if name.endswith(suffix)), None)
+    if is_zarr_name(target):
+        own = run.path / FRAMES
+        raise FileError(target, f"a run's frames are an OME-Zarr already: {own}.", "Copy that folder.")
     if writer is None:
         raise FileError(
             target, f"no known format. Choose a name ending in {', '.join(writers)}, or a folder."

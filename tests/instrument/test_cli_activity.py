@@ -16,6 +16,7 @@ from instrument.cli import main
 from instrument.files.errors import BenchError
 from instrument.reconstruction.activity import COPIES, ActivitySettings, find_activity
 from instrument.reconstruction.video_files import VideoPictures, create_output
+from recon.camera.grid import Grid
 
 COUNT, SHAPE, MISSING = 120, (32, 40), 7
 
@@ -29,7 +30,8 @@ def course() -> np.ndarray:
 @pytest.fixture
 def film(tmp_path: Path) -> Path:
     path = tmp_path / "film.ome.zarr"
-    create_output(path, COUNT, SHAPE, period_s=0.1, grid=None, attributes={"simulated": True})
+    grid = Grid((1, *SHAPE), (SHAPE[0] // 2, SHAPE[1] // 2), np.array([1e4]), np.array([3.0]))
+    create_output(path, COUNT, SHAPE, period_s=0.1, grid=grid, attributes={"simulated": True})
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     spot = np.exp(-((y - 12) ** 2 + (x - 25) ** 2) / 8)
     rng = np.random.default_rng(0)
@@ -56,6 +58,8 @@ def test_the_command_writes_what_it_found(
     (region,) = csv.DictReader((out / "regions.csv").read_text().splitlines())
     assert (float(region["row"]), float(region["column"])) == pytest.approx((12, 25), abs=0.5)
     dff = VideoPictures(out / "dff.ome.zarr")
+    scale = dff.attributes["ome"]["multiscales"][0]["datasets"][0]["coordinateTransformations"][0]["scale"]
+    assert scale == [0.1, 3.0, 3.0]  # as its film
     assert np.isnan(dff.read(MISSING)).all()
     assert dff.read(20)[12, 25] > 0.4
     assert cv2.imread(str(out / "activity.png")).shape[1] > 1000

@@ -184,6 +184,8 @@ def test_what_cannot_be_written_is_refused_and_leaves_nothing(tmp_path: Path) ->
     run = a_recording(tmp_path, colour=False)
     with pytest.raises(FileError, match="no known format"):
         export(run, tmp_path / "a.gif")
+    with pytest.raises(FileError, match=r"frames are an OME-Zarr already: .*/frames\.ome\.zarr"):
+        export(run, tmp_path / "a.ome.zarr")
     with pytest.raises(RunError, match="frame 3 is not there"):
         export(run, tmp_path / "a.tif", [2, 3])
     (tmp_path / "old.tif").write_text("old")
