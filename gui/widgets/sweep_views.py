@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QRectF, Qt, Signal
-from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPixmap
+from PySide6.QtGui import QColor, QImage, QPainter, QPaintEvent, QPixmap
 from PySide6.QtWidgets import QHBoxLayout, QSizePolicy, QWidget
 
 from calibration_routines.psf.psf_quality import MIN_SNR, PsfQuality
 from calibration_routines.psf.sweep_watch import PointTaken
-from gui.theme import LARGE_PT, colours
+from gui.theme import LARGE_PT, colours, spares_hues
 from gui.widgets.building import cell, fill, hint, split, table
 from gui.widgets.plots import dots, plot_widget
 
@@ -289,20 +289,32 @@ def small(image: Image) -> PsfPicture:
 NO_PICTURE = "No picture yet."
 
 
+_PAPER_IN_RED = QColor(150, 0, 0)
+"""Darker than STOP."""
+
+
 class Picture(QWidget):
     """Shows a pixmap, scaled down or up to the space there is."""
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.pixmap = QPixmap()
+        self._grey: QPixmap | None = None
         self._empty = NO_PICTURE
         self.setMinimumSize(160, 120)
         self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
 
     def show_pixmap(self, pixmap: QPixmap) -> None:
         """Show a picture; an empty one shows nothing."""
-        self.pixmap = pixmap
+        self.pixmap, self._grey = pixmap, None
         self.update()
+
+    def _in_grey(self) -> QPixmap:
+        """Return the picture without its hues, made once."""
+        if self._grey is None:
+            grey = self.pixmap.toImage().convertToFormat(QImage.Format.Format_Grayscale8)
+            self._grey = QPixmap.fromImage(grey)
+        return self._grey
 
     def clear(self, why: str = NO_PICTURE) -> None:
         """Show nothing but words."""
@@ -324,7 +336,10 @@ class Picture(QWidget):
         left, top = (self.width() - size.width()) / 2, (self.height() - size.height()) / 2
         painter = QPainter(self)
         painter.setRenderHint(QPainter.RenderHint.SmoothPixmapTransform)
-        painter.drawPixmap(
-            QRectF(left, top, size.width(), size.height()), self.pixmap, QRectF(self.pixmap.rect())
-        )
+        red = spares_hues(colours().colour_map)  # a page is white
+        place, shown = QRectF(left, top, size.width(), size.height()), self._in_grey() if red else self.pixmap
+        painter.drawPixmap(place, shown, QRectF(shown.rect()))
+        if red:
+            painter.setCompositionMode(QPainter.CompositionMode.CompositionMode_Multiply)
+            painter.fillRect(place, _PAPER_IN_RED)
         painter.end()

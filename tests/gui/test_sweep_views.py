@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from PySide6.QtGui import QColor, QPixmap
 from pytestqt.qtbot import QtBot
 
+from gui.theme import RED
 from gui.widgets.image_view import usual_levels
-from gui.widgets.sweep_views import PsfPictures, PsfTable, small
+from gui.widgets.sweep_views import Picture, PsfPictures, PsfTable, small
 
 
 def test_a_long_sweep_stays_small_and_every_psf_can_be_looked_at() -> None:
@@ -65,3 +68,19 @@ def test_a_psf_is_shown_by_its_own_values_and_counts_by_no_less_than_one() -> No
     assert 0 <= low < high <= psf.max() / psf.sum(), "not black: its sum is 1"
     assert usual_levels(np.full((8, 8), 3, np.uint16)) == (3, 4)
     assert usual_levels(np.zeros((8, 8), np.float32)) == (0, 1)
+
+
+def test_a_page_is_red_and_darker_than_stop_in_the_dark_room(
+    qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = QPixmap(60, 40)
+    page.fill(QColor("white"))
+    picture = Picture()
+    qtbot.addWidget(picture)
+    picture.resize(160, 120)
+    picture.show_pixmap(page)
+    assert picture.grab().toImage().pixelColor(80, 60) == QColor("white")
+    monkeypatch.setattr("gui.widgets.sweep_views.colours", lambda: RED)
+    seen = picture.grab().toImage().pixelColor(80, 60)
+    assert (seen.green(), seen.blue()) == (0, 0)
+    assert 100 < seen.red() < QColor(RED.error).red()
