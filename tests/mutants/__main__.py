@@ -114,6 +114,7 @@ def main() -> int:
     modules = sorted({path for area in areas for path in AREAS[area][0]})
     trials = Trials(ROOT, modules, chosen, options.jobs, 60 * options.minutes, options.most)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     os.environ["CI"] = "1"  # property tests try the same examples every time
     os.chdir(ROOT)
     failed = pytest.main(["-q", "-s", "-m", "not slow", "-p", "no:cacheprovider", *tests], plugins=[trials])

@@ -107,11 +107,26 @@ class Trials:
         self._failed = False
         self._folder = Path(tempfile.mkdtemp(prefix="mutants-"))
         self._number = 0
+        self._alive: set[int] = set()
 
     # What pytest calls -------------------------------------------------------------------------
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Watch each test, then try each mutant."""
+        try:
+            return self._all(session)
+        finally:
+            self.end_processes()
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def end_processes(self) -> None:
+        """End whatever still runs: a Ctrl-C or SIGTERM of the terminal reaches this process alone."""
+        for process in list(self._alive):
+            self._end(process)
+            os.kill(process, signal.SIGKILL)  # where it has no group of its own yet
+            os.waitpid(process, 0)
+
+    def _all(self, session: pytest.Session) -> bool:
         began_s = time.monotonic()
         for module in self._modules:  # what is imported when it is used, too
             importlib.import_module(module.removesuffix(".py").replace("/", "."))
@@ -126,10 +141,7 @@ class Trials:
         watched = self._watch(session)
         bad = [name for name, test in watched.items() if not test.passed]
         print(f"{len(watched)} tests watched in {time.monotonic() - began_s:.0f} s; not used: {bad}")
-        try:
-            self._try_all(session, watched, began_s + self._seconds)
-        finally:
-            shutil.rmtree(self._folder, ignore_errors=True)
+        self._try_all(session, watched, began_s + self._seconds)
         return True
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
@@ -269,9 +281,11 @@ class Trials:
         sys.stdout.flush()
         process = os.fork()
         if process:
+            self._alive.add(process)
             return _Child(process, answer, time.monotonic() + limit_s)
         try:
             os.setpgid(0, 0)
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
             null = os.open(os.devnull, os.O_RDWR)
             for handle in (0, 1, 2):
                 os.dup2(null, handle)
@@ -292,11 +306,15 @@ class Trials:
         ended, _ = os.waitpid(child.process, os.WNOHANG)
         if not ended and time.monotonic() < child.ends_s:
             return False, None
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(child.process, signal.SIGKILL)
+        self._end(child.process)
         if not ended:
             os.waitpid(child.process, 0)
         return True, pickle.loads(child.answer.read_bytes()) if child.answer.is_file() else None
+
+    def _end(self, process: int) -> None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process, signal.SIGKILL)
+        self._alive.discard(process)
 
     def pytest_configure(self, config: pytest.Config) -> None:
         """Keep what knows the temporary folders."""

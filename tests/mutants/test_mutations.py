@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import time
 from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
 
 from tests.mutants.__main__ import known_equal
 from tests.mutants.areas import AREAS
 from tests.mutants.mutations import mutants_of
-from tests.mutants.session import Watched, _digest, _Kept
+from tests.mutants.session import Trials, Watched, _digest, _Kept
 
 TEXT = '''
 class A:
@@ -78,3 +83,14 @@ def test_tests_are_watched_again_once_their_file_or_their_names_changed(tmp_path
     assert not kept.holds([])
     file.write_text("2")
     assert not kept.holds(["a[1]"])
+
+
+def test_no_process_with_a_mutant_outlives_the_run(tmp_path: Path) -> None:
+    trials = Trials(tmp_path, [], [], 1, 1.0, 1.0)
+    trials.pytest_configure(SimpleNamespace(_tmp_path_factory=SimpleNamespace()))  # type: ignore[arg-type]
+    child = trials._fork(lambda: time.sleep(60), 100.0)
+    time.sleep(0.1)  # its process group is its own by then
+    os.kill(child.process, 0)
+    trials.end_processes()
+    with pytest.raises(ProcessLookupError):
+        os.kill(child.process, 0)
