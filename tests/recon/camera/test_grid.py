@@ -245,6 +245,23 @@ def test_a_pixel_looks_where_the_pitch_says_and_a_place_is_seen_there(upright):
     assert plain.pixel_of(2, 0.0, 0.0) == (40.0, 60.0)
 
 
+def test_two_voxels_fit_into_the_depth_from_half_a_step_before_the_planes_to_half_a_step_behind():
+    grid = Grid((3, 9, 9), (4, 4), np.array([1000.0, 1100, 1200]), np.full(3, 100.0))
+    assert metric_grid(grid, 150.0).is_metric
+    with pytest.raises(InputError, match="depth of 300 um"):
+        metric_grid(grid, 151.0)
+    np.testing.assert_array_equal(
+        replace(grid, z_um=np.array([1200.0, 1100, 1050])).spacing_um, [100, 50, 50]
+    )
+    two = Grid((2, 9, 9), (4, 4), np.array([1000.0, 1100]), np.full(2, 100.0))
+    np.testing.assert_array_equal(two.spacing_um, [100, 100])
+
+
+def test_voxels_whose_middles_are_on_the_outermost_pixels_edges_belong_to_the_volume():
+    grid = Grid((4, 9, 7), (4, 3), np.arange(4) * 50.0 + 1000, np.full(4, 5.0), upright=True)
+    assert metric_grid(grid, 2.5).shape[1:] == (19, 15)  # 4.5 and 3.5 pixels on either side
+
+
 def test_one_column_of_pixels_has_voxels_too():
     metric = metric_grid(Grid((4, 9, 1), (4, 0), np.arange(4) * 50.0 + 1000, np.full(4, 5.0), upright=True))
     assert metric.shape == (4, 9, 1)
