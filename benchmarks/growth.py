@@ -6,7 +6,8 @@
     python benchmarks/growth.py --explained       # what --explain says of each kind, and what all of it takes
 
 Cases run in processes of their own on points seen through random lenslets (SIMULATED): first the
-forecast that ``reconstruct --explain`` gives, from six iterations, then the whole of it. Written are
+forecast that ``--explain`` gives, then the whole of it; frames and workers are those of films, by the clock
+where there are several. Written are
 ``growth.png`` and ``growth.csv``: seconds and memory against each size, the exponent by which they grow, what
 the forecast missed, and the largest that fits into this machine's memory, straight on from the last two.
 Sizes are scaled by ``--most``.
@@ -20,6 +21,8 @@ import ctypes
 import gc
 import multiprocessing
 import os
+import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,11 +33,17 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from instrument.files import kept_times
 from instrument.files.figures import ACCENT, INK, SECOND, save_figure, style
+from instrument.files.images import write_image
 from instrument.reconstruction import forecast as module
 from instrument.reconstruction.forecast import forecast
 from instrument.reconstruction.foretold import Foretold, Like
+from instrument.reconstruction.options import InputOptions, VideoOptions
+from instrument.reconstruction.video import VideoRequest, finish_video, prepare_video, solve_video
+from instrument.reconstruction.video_forecast import forecast_video, trial_of
+from instrument.reconstruction.video_work import BlockReport
 from recon import Calibration, Geometry, reconstruct
 from recon.base.blocks import block_mean
 from recon.base.threads import set_threads
@@ -43,6 +52,8 @@ from recon.evaluation.scene import make_scene
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.solvers.memory import GIB, MemoryMeter, available_bytes
+from recon.streams.joint import OverTimeName
+from tests.mocks.recordings import write_recording
 
 
 @dataclass(frozen=True)
@@ -53,8 +64,12 @@ class Case:
     planes: int = 1
     psfs: int = 1
     """Along each side of the field."""
-    frames: int = 1
+    frames: int = 0
+    """Of a film; 0: a photograph."""
     threads: int = 1
+    workers: int = 0
+    """Processes of a cluster; 0: none."""
+    over_time: OverTimeName | None = None
 
 
 def cases(most: float) -> dict[str, list[tuple[int, Case]]]:
@@ -64,7 +79,9 @@ def cases(most: float) -> dict[str, list[tuple[int, Case]]]:
         "pixels": [(n * n, Case(side=n)) for n in sides],
         "planes": [(n, Case(planes=n)) for n in (4, 8, 16, 32)],
         "PSFs": [(n * n, Case(side=128, psfs=n)) for n in (2, 3, 5)],
-        "frames": [(n, Case(side=128, frames=n)) for n in (2, 4, 8)],
+        "frames": [(n, Case(side=128, frames=n)) for n in (32, 96, 288)],
+        "frames together": [(n, Case(side=64, frames=n, over_time="tv")) for n in (32, 96)],
+        "workers": [(n, Case(side=128, frames=96, workers=n)) for n in (1, 2)],
         "threads": [(n, Case(side=384, threads=n)) for n in (1, 2)],
     }
 
@@ -87,7 +104,7 @@ def scene(case: Case) -> tuple[np.ndarray, Calibration]:
     calibration = Calibration(
         np.stack(psfs), np.array(places, np.float64), geometry=Geometry(10.0, 5.0, None)
     )
-    points = (rng.random((case.frames, n, n)) > 0.999).astype(np.float32)
+    points = (rng.random((max(case.frames, 1), n, n)) > 0.999).astype(np.float32)
     spectra = np.fft.rfft2(points) * np.fft.rfft2(np.fft.ifftshift(psfs[0][0]))
     light = np.fft.irfft2(spectra, (n, n)).clip(0)
     return rng.poisson(1000 * light / light.max() + 10).astype(np.float32), calibration
@@ -110,16 +127,65 @@ def measure(case: Case, iterations: int, foretold: bool, answer: Any) -> None:
     reconstruct(small[0][0], small[1], options, iterations=2)  # kernels are compiled
     if foretold:
         told = forecast(Measurement(photographs[0]), calibration, options)
-        answer.send((told.seconds * case.frames, told.memory_bytes))
+        answer.send((told.seconds, told.memory_bytes))
         return
-    meter, began, last = MemoryMeter(), time.perf_counter(), None
-    for photograph in photographs:
-        last = reconstruct(photograph, calibration, options, warm=last)
+    meter, began = MemoryMeter(), time.perf_counter()
+    reconstruct(photographs[0], calibration, options)
     answer.send((time.perf_counter() - began, meter.peak_mib() * 2**20))
+
+
+def film(case: Case, foretold: bool, answer: Any) -> None:
+    """Forecast a film, or make it; sends seconds (of the processor where one thread does all) and bytes."""
+    if case.threads == 1 and not case.workers:
+        time.perf_counter = time.process_time
+    set_threads(case.threads)
+    with TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        (folder / "small").mkdir()
+        make_film(film_request(Case(side=48, frames=6, over_time=case.over_time), folder / "small"))
+        asked = film_request(case, folder)
+        gc.collect()
+        ctypes.CDLL(None).malloc_trim(0)
+        if foretold:
+            with trial_of(asked) as trial:
+                told = forecast_video(trial)
+            assert told is not None
+            answer.send((told.seconds, told.memory_bytes))
+            return
+        meter, began = MemoryMeter(), time.perf_counter()
+        reports = make_film(asked)
+        took_s = time.perf_counter() - began
+        own = max(report.peak_bytes for report in reports)
+        answer.send((took_s, own if case.workers else meter.peak_mib() * 2**20))
+
+
+def make_film(asked: VideoRequest) -> list[BlockReport]:
+    """Make a film, as the terminal does; returns what was told of its blocks."""
+    prepared, reports = prepare_video(asked), list[BlockReport]()
+    solve_video(prepared, reports.append, threading.Event())
+    finish_video(prepared)
+    return reports
+
+
+def film_request(case: Case, folder: Path) -> VideoRequest:
+    """Write a recording and its PSF, and return what is asked of them."""
+    photographs, calibration = scene(case)
+    write_image(folder / "psf.tif", calibration.psfs[0, 0])
+    frames = dict(enumerate(photographs))
+    return VideoRequest(
+        run=write_recording(folder, frames),
+        out=folder / "film.ome.zarr",
+        psf=folder / "psf.tif",
+        inputs=InputOptions(dark=0.0, binning=1),
+        video=VideoOptions(workers=case.workers or None, over_time=case.over_time),
+    )
 
 
 def measured(case: Case, iterations: int) -> tuple[float, float, float, float]:
     """Forecast and run a case, each in a process of its own."""
+    if case.frames:
+        told, took = (in_process(film, case, foretold) for foretold in (True, False))
+        return told[0], told[1], took[0], took[1]
     told = in_process(measure, case, iterations, True)
     took = in_process(measure, case, iterations, False)
     return told[0], told[1], took[0], took[1]
@@ -332,7 +398,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1], help="of --explained")
     parser.add_argument("--by-course", action="store_true", help="of --explained: nothing is solved to tell")
     parser.add_argument(
-        "--only", nargs="+", help="of pixels, planes, PSFs, frames, threads; of --explained: kinds"
+        "--only", nargs="+", help="of pixels, planes, PSFs, frames, workers ...; of --explained: kinds"
     )
     parser.add_argument("--out", type=Path, default=Path("growth"))
     options = parser.parse_args()

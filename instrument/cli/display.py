@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import threading
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,8 +26,10 @@ from instrument.display.hologram import (
     unshowable,
 )
 from instrument.display.hologram_files import CHANNELS, HologramFiles, light_words, score_words
+from instrument.display.hologram_forecast import forecast_hologram
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import Pixels, read_image, read_stack
+from instrument.reconstruction.forecast import Forecast
 from instrument.tasks.spots import HologramInputs, make_spots, say_distance, tell_limit
 from instrument.tasks.task import Given, saying_what_is_left
 from recon.holography import (
@@ -108,28 +111,66 @@ def hologram(
         return
     frames = len(pictures) if inputs.video else 0
     writer = HologramFiles(inputs.out, config.display.slm_binning, options, displays, video=frames)
+    work = _Work(pictures, displays, depths, options, inputs, writer)
+    if inputs.explain:
+        typer.echo(f"{'Will take':<12}{work.forecast()}")
+        return
     writer.check(overwrite=inputs.force)
     with saying_what_is_left(*writer.files()), first_interrupt_cancels() as cancel:
-        initial: list[Any] = [None] * len(displays)
-        for number, planes in enumerate(pictures):
-            for channel, display in enumerate(displays):
-                targets = [
-                    prepare_target(
-                        _channel(picture, channel if inputs.color else None),
-                        display,
-                        options,
-                        z_mm=z,
-                        share=writer.shares[channel],
-                    )
-                    for picture, z in zip(planes, depths, strict=True)
-                ]
-                label = writer.label(number, channel)
-                share = writer.shares[channel]
-                part = EVERYWHERE.shrunk(share) if share < 1 and options.mirrors is None else None
-                result = _compute(display, targets, options, (initial[channel], part), cancel, label)
-                initial[channel] = result.hologram.slm if inputs.video else None
-                writer.write(number, channel, result)
-                _print(label, result, options)
+        work.compute(cancel)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Pictures to be shown: of each frame those of its planes, at these depths; a display for each colour."""
+
+    pictures: list[list[Pixels]]
+    displays: list[Display]
+    depths: list[float]
+    options: HologramOptions
+    inputs: HologramInputs
+    writer: HologramFiles
+
+    def targets(self, frame: int, channel: int) -> tuple[list[Target], Window | None]:
+        """Return the targets of a frame's pictures in a colour, and where in the field they are."""
+        share, options = self.writer.shares[channel], self.options
+        targets = [
+            prepare_target(
+                _channel(picture, channel if self.inputs.color else None),
+                self.displays[channel],
+                options,
+                z_mm=z,
+                share=share,
+            )
+            for picture, z in zip(self.pictures[frame], self.depths, strict=True)
+        ]
+        return targets, EVERYWHERE.shrunk(share) if share < 1 and options.mirrors is None else None
+
+    def forecast(self) -> Forecast:
+        """Carry out the first iterations of the first pattern, and say what all take."""
+        targets, part = self.targets(0, 0)
+        with one_task("the first iterations", 1.0) as advance:
+            return forecast_hologram(
+                self.displays[0],
+                targets,
+                self.options,
+                colours=len(self.displays),
+                frames=len(self.pictures),
+                part=part,
+                on_progress=advance,
+            )
+
+    def compute(self, cancel: threading.Event) -> None:
+        """Compute, tell and write all; raises Exit where it was interrupted, with what there is by then."""
+        initial: list[Any] = [None] * len(self.displays)
+        for number in range(len(self.pictures)):
+            for channel, display in enumerate(self.displays):
+                targets, part = self.targets(number, channel)
+                label = self.writer.label(number, channel)
+                result = _compute(display, targets, self.options, (initial[channel], part), cancel, label)
+                initial[channel] = result.hologram.slm if self.inputs.video else None
+                self.writer.write(number, channel, result)
+                _print(label, result, self.options)
                 if result.hologram.stop_reason is HologramStop.CANCELLED:
                     typer.echo("Interrupted: this is the pattern so far.", err=True)
                     raise typer.Exit(130)

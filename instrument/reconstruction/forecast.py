@@ -1,11 +1,15 @@
-"""What a reconstruction will take, time and memory, by its first iterations, which are carried out."""
+"""What work will take, time and memory, by its beginning, which is carried out: pictures and volumes.
+
+What is the same for all work stands here: a :class:`Forecast`, and how much is carried out for it
+(:func:`carried_out`). Films and holograms have theirs beside what they are.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from instrument.files.errors import duration
 from recon.reconstruction.course import expected_iterations
@@ -29,18 +33,20 @@ _LEAST, _UNCOUNTED = 16, 4
 """Fewer tell nothing of when they settle; the first are slower, of varying PSFs twice, and do not count."""
 ASTRAY = 1.5
 """How many times as many, or as few, the iterations may turn out that were told by the first."""
+UNEVEN = 1.2
+"""How many times as long, or as short, one may take later as the first ones did: 1.09 at most was seen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What a reconstruction will take on this machine, as busy as it is now.
+    """What work will take on this machine, as busy as it is now.
 
     Attributes
     ----------
     beside_s : float
         Choosing, first look, set-up, and judging.
     iteration_s : float
-        Each iteration, of all channels together; 0 for solvers in one step.
+        Each iteration, of all channels together; 0 for solvers in one step. Of a film each frame.
     iterations : int
         At most so many: it may settle before.
     memory_bytes : float
@@ -57,6 +63,10 @@ class Forecast:
     memory_bytes: float
     settles: int | None = None
     counted: bool = False
+    each: str = "iteration"
+    """What there are several of."""
+    where: str = ""
+    """Whose memory it is, where not this program's."""
 
     @property
     def seconds(self) -> float:
@@ -71,17 +81,17 @@ class Forecast:
         if self.settles is None:
             return self.beside_s, self.seconds
         longest = min(self.settles * ASTRAY, self.iterations)
-        return self._after(self.settles / ASTRAY), self._after(longest)
+        return self._after(self.settles / ASTRAY) / UNEVEN, self._after(longest) * UNEVEN
 
     def _after(self, iterations: float) -> float:
         return self.beside_s + iterations * self.iteration_s
 
     def __str__(self) -> str:
         """Say it in a line."""
-        each = f", {1e3 * self.iteration_s:.3g} ms an iteration" if self.iterations else ""
-        memory = (
-            "" if self.memory_bytes != self.memory_bytes else f"; {in_words(self.memory_bytes)} of memory"
-        )
+        an = "an" if self.each[0] in "aeiou" else "a"
+        each = f", {1e3 * self.iteration_s:.3g} ms {an} {self.each}" if self.iterations else ""
+        known = self.memory_bytes == self.memory_bytes
+        memory = f"; {in_words(self.memory_bytes)} of memory{self.where}" if known else ""
         if self.counted or not self.iterations:
             count = f", {self.settles} of them" if each else ""
             return f"about {duration(self.seconds)}{each}{count}{memory}"
@@ -92,6 +102,53 @@ class Forecast:
             f"about {duration(self.seconds)} ({least} to {most}){each}, about {self.settles} of them "
             f"by the course of the first{memory}"
         )
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Work that was carried out, or its first iterations, and what it took.
+
+    Attributes
+    ----------
+    seconds, memory_bytes : float
+        All of it.
+    histories : sequence of sequences of records
+        Of each run after the other; of a record its ``iteration`` and ``seconds`` count.
+    cut : bool
+        Whether it would have gone on without the limits of what was tried.
+    """
+
+    seconds: float
+    memory_bytes: float
+    histories: Sequence[Sequence[Any]]
+    cut: bool
+
+    @property
+    def longest(self) -> int:
+        """Iterations of the longest run."""
+        return max((run[-1].iteration for run in self.histories if run), default=0)
+
+    @property
+    def iteration_s(self) -> float:
+        """What an iteration of all runs takes."""
+        runs = [run for run in self.histories if len(run) > _UNCOUNTED]
+        return float(sum((r[-1].seconds - r[_UNCOUNTED - 1].seconds) / (len(r) - _UNCOUNTED) for r in runs))
+
+
+C = TypeVar("C", bound=Carried)
+
+
+def carried_out(begin: Callable[[int | None, float, float], C], soon_s: float) -> C:
+    """Carry work out for so many seconds; where that tells too little, its first iterations anew.
+
+    ``begin(iterations, time_s, done)`` carries it out up to these limits, the first none where None; ``done``
+    is the share of all that is carried out before.
+    """
+    trial = begin(None, soon_s, 0.0)
+    if not trial.cut or trial.longest >= TRIED:
+        return trial
+    further = begin(TRIED, TRIED_S, 0.5)
+    return replace(further, memory_bytes=max(trial.memory_bytes, further.memory_bytes))
 
 
 def forecast(
@@ -105,18 +162,15 @@ def forecast(
     ``on_stage`` and errors as of :func:`~recon.reconstruction.reconstruct.reconstruct`.
     """
     tell = on_stage or (lambda *_: None)
-    soon_s = SOLVED_S / (1 + REPEATS * options.uncertainty)
     one_step = options.solver != "auto" and SOLVERS.named(options.solver).one_step
-    tried = options if one_step else limited(options, None, soon_s)
-    trial = Trial.of(measurement, calibration, tried, lambda s, w: tell(s / 2, w))
-    cut = trial.cut_short(tried, options)
-    if cut and trial.longest < TRIED:
-        tried = limited(options, TRIED, TRIED_S)
-        further = Trial.of(measurement, calibration, tried, lambda s, w: tell((1 + s) / 2, w))
-        trial = replace(further, memory_bytes=max(trial.memory_bytes, further.memory_bytes))
-        cut = trial.cut_short(tried, options)
+
+    def begin(iterations: int | None, time_s: float, done: float) -> Trial:
+        tried = options if one_step else limited(options, iterations, time_s)
+        return Trial.of(measurement, calibration, tried, lambda s, w: tell(done + s / 2, w), options)
+
+    trial = carried_out(begin, SOLVED_S / (1 + REPEATS * options.uncertainty))
     count = trial.longest
-    if not cut:
+    if not trial.cut:
         return Forecast(trial.beside_s(count), trial.iteration_s, count, trial.memory_bytes, count, True)
     most = trial.most(options)
     settles = trial.settles(options, _tolerance(trial.found, measurement, calibration, options))
@@ -137,12 +191,10 @@ def most_iterations(options: ReconstructionOptions) -> int | None:
 
 
 @dataclass(frozen=True)
-class Trial:
+class Trial(Carried):
     """A reconstruction that was carried out, or its first iterations, and what it took."""
 
     found: Reconstruction
-    seconds: float
-    memory_bytes: float
     counted: int
     """Iterations of all runs, those of rounds whose result was not taken too."""
 
@@ -151,36 +203,27 @@ class Trial:
         cls,
         measurement: Measurement,
         calibration: Calibration,
-        options: ReconstructionOptions,
+        tried: ReconstructionOptions,
         on_stage: Stage,
+        options: ReconstructionOptions | None = None,
     ) -> Self:
-        """Carry it out; errors as :func:`~recon.reconstruction.reconstruct.reconstruct`."""
-        counted = 0
+        """Carry it out up to the limits that are ``tried``; ``options`` are those of all of it.
+
+        Errors as :func:`~recon.reconstruction.reconstruct.reconstruct`.
+        """
+        counted, options = 0, options or tried
 
         def note(_record: IterationRecord, _now: Callable[[], Any]) -> None:
             nonlocal counted
             counted += 1
 
         meter, began = MemoryMeter(), time.perf_counter()
-        found = reconstruct(measurement, calibration, options, on_progress=note, on_stage=on_stage)
-        return cls(found, time.perf_counter() - began, meter.peak_mib() * 2**20, counted)
-
-    @property
-    def longest(self) -> int:
-        """Iterations of the longest run."""
-        return max(map(len, self.found.histories), default=0)
-
-    @property
-    def iteration_s(self) -> float:
-        """What an iteration of all channels takes."""
-        runs = [history for history in self.found.histories if len(history) > _UNCOUNTED]
-        return sum((r[-1].seconds - r[_UNCOUNTED - 1].seconds) / (len(r) - _UNCOUNTED) for r in runs)
-
-    def cut_short(self, tried: ReconstructionOptions, options: ReconstructionOptions) -> bool:
-        """Whether it would have gone on by its options, without the limits of what was tried."""
-        reasons = self.found.stop_reasons
-        counted_out = StopReason.ITERATIONS in reasons and tried.iterations != most_iterations(options)
-        return counted_out or (StopReason.TIME in reasons and tried.time_s != options.time_s)
+        found = reconstruct(measurement, calibration, tried, on_progress=note, on_stage=on_stage)
+        seconds, memory_bytes = time.perf_counter() - began, meter.peak_mib() * 2**20
+        counted_out = StopReason.ITERATIONS in found.stop_reasons
+        cut = counted_out and tried.iterations != most_iterations(options)
+        cut = cut or (StopReason.TIME in found.stop_reasons and tried.time_s != options.time_s)
+        return cls(seconds, memory_bytes, found.histories, cut, found, counted)
 
     def most(self, options: ReconstructionOptions) -> int:
         """Return how many iterations there may be, by their number and time."""

@@ -249,8 +249,8 @@ class OutputOptions:
     force: bool = option(False, help="Overwrite files that exist.", label="Overwrite", group=_OUTPUT)
     explain: bool = option(
         False,
-        help="Only say what auto would choose, why, its cost, and a step up and down.",
-        applies=_KEPT,
+        help="Only say what auto would choose, why, and what time and memory it takes.",
+        applies=(*_KEPT, "video"),
         group=_OUTPUT,
     )
 

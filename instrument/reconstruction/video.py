@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import shutil
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from instrument.files.atomic import refuse_input, write_json
 from instrument.files.errors import BenchError, FileError
@@ -200,10 +201,10 @@ def solve_video(
     return True
 
 
-def finish_video(prepared: PreparedVideo) -> list[Path]:
+def finish_video(prepared: PreparedVideo, on_frame: Callable[[int], object] = lambda _: None) -> list[Path]:
     """Write film and record, and remove the job; returns what there is now.
 
-    Raises FileError or OSError.
+    ``on_frame`` is told how many frames of the film were looked at. Raises FileError or OSError.
     """
     request, plan = prepared.request, prepared.job.plan
     pictures = VideoPictures(request.out)
@@ -214,8 +215,13 @@ def finish_video(prepared: PreparedVideo) -> list[Path]:
     if request.video.film:
         black, white = levels_of(pictures.flat(index) for index in chosen)
         fps = request.video.fps or (1 / pictures.period_s if pictures.period_s else DEFAULT_FPS)
-        shown = (as_shown(pictures.flat(index), black, white) for index in plan.frames)
-        write_mp4(request.film_path, shown, fps)
+
+        def shown() -> Iterator[npt.NDArray[np.uint8]]:
+            for number, index in enumerate(plan.frames):
+                yield as_shown(pictures.flat(index), black, white)
+                on_frame(number + 1)
+
+        write_mp4(request.film_path, shown(), fps)
         written.append(request.film_path)
     unlit = prepared.job.unlit()
     record = {**plain(plan.settings), "frames": len(plan.frames), "run": plan.run, "frames_unlit": unlit}

@@ -12,6 +12,7 @@ import ipaddress
 import logging
 import os
 import pwd
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,12 +26,14 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from instrument.files.errors import BenchError, count
+from instrument.reconstruction.options import VideoOptions
 from instrument.reconstruction.video_files import VideoPictures
 from instrument.reconstruction.video_job import VideoJob
 from instrument.runs.run import Run
 from instrument.runs.run_files import log_size
 from recon.base.threads import get_threads, linear_algebra_on_one_thread, set_threads
 from recon.reconstruction.measurement import Floats
+from recon.solvers.memory import peak_resident_bytes
 from recon.streams.joint import solve_together
 from recon.streams.stillness import has_light
 from recon.streams.video import VideoSolver
@@ -44,7 +47,9 @@ _kept = threading.local()
 class BlockReport:
     """What a worker did: a block's number, how many frames it solved and wrote, and in how long.
 
-    ``unlit`` is how many of its frames hold nothing but noise.
+    ``unlit`` is how many of its frames hold nothing but noise; ``frame_s`` when each was on the disk, since
+    the block began; ``worker`` tells apart who solved; ``peak_bytes`` is the most memory of their program so
+    far.
     """
 
     block: int
@@ -52,6 +57,9 @@ class BlockReport:
     written: int
     seconds: float
     unlit: int = 0
+    frame_s: tuple[float, ...] = ()
+    worker: str = ""
+    peak_bytes: float = float("nan")
 
 
 @lru_cache(maxsize=1)
@@ -103,6 +111,7 @@ def solve_block(
     together_in = None if len(block) == 1 else plan.over_time
     written = 0
     unlit = 0
+    frame_s: list[float] = []
 
     def measured() -> Iterator[Floats]:
         nonlocal unlit
@@ -131,8 +140,19 @@ def solve_block(
             turned = np.rot90(picture, plan.rotate_deg // 90, (rows, rows + 1))
             pictures.write(index, np.ascontiguousarray(turned))
             written += 1
+        frame_s.append(time.perf_counter() - began_s)
     job.mark_done(number, unlit)
-    return BlockReport(number, len(block), written, time.perf_counter() - began_s, unlit)
+    worker = f"{socket.gethostname()} {os.getpid()} {threading.get_ident()}"
+    return BlockReport(
+        number,
+        len(block),
+        written,
+        time.perf_counter() - began_s,
+        unlit,
+        tuple(frame_s),
+        worker,
+        peak_resident_bytes(),
+    )
 
 
 def _solver_for(job: VideoJob) -> tuple[VideoJob, VideoSolver]:
@@ -176,7 +196,7 @@ def in_process(
     """
     cores = get_threads()
     together = VideoJob(job).plan.over_time is not None
-    workers = 1 if together else max(1, min(cores, len(blocks)))
+    workers = at_once(len(blocks), VideoOptions(), together=together)
     failed = threading.Event()
 
     def ended() -> bool:
@@ -198,6 +218,20 @@ def in_process(
                     future.cancel()
     finally:
         set_threads(cores)
+
+
+def at_once(blocks: int, video: VideoOptions, *, together: bool) -> int:
+    """Return how many blocks are solved at a time; errors as of :func:`cluster`.
+
+    ``together``: frames of a block are, with a prior over time.
+    """
+    if video.workers is not None:
+        return video.workers
+    if video.scheduler is not None:
+        with _client_of(_dask(), video.scheduler, video.scheduler_owner) as client:
+            crew = client.scheduler_info(n_workers=-1)["workers"].values()
+        return max(sum(int(worker["nthreads"]) for worker in crew), 1)
+    return 1 if together else max(1, min(get_threads(), blocks))
 
 
 def on_cluster(

@@ -63,6 +63,12 @@ class HologramInputs:
         group="What counts",
         applies=("limit",),
     )
+    explain: bool = option(
+        False,
+        help="Compute no pattern: only say what time and memory it takes.",
+        group="Files",
+        applies=_OF_PICTURES,
+    )
     z_mm: tuple[float, ...] = option(
         (),
         help="Depth of each target behind the focal plane; once a target.",

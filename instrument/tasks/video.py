@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +19,7 @@ from instrument.reconstruction.video import (
     prepare_video,
     solve_video,
 )
+from instrument.reconstruction.video_forecast import forecast_video, trial_of
 from instrument.reconstruction.video_work import BlockReport, require_crew
 from instrument.tasks.task import Desk, Done, Only, task
 from recon.base.declare import option
@@ -39,7 +41,7 @@ def video(
     desk: Desk,
     recording: Recording,
     source: Annotated[SourceOptions, Only("calibration", "psf")],
-    output: Annotated[OutputOptions, Only("out", "rotate_deg", "force")],
+    output: Annotated[OutputOptions, Only("out", "rotate_deg", "explain", "force")],
     video: VideoOptions,
     inputs: InputOptions,
     options: ReconstructionOptions,
@@ -55,7 +57,23 @@ def video(
         video=video,
         rotate_deg=int(output.rotate_deg),
     )
-    return make_video(desk, request, force=output.force)
+    return explain_video(desk, request) if output.explain else make_video(desk, request, force=output.force)
+
+
+def explain_video(desk: Desk, request: VideoRequest) -> Done:
+    """Only say what with, and what time and memory it will take."""
+    video = request.video
+    require_crew(workers=video.workers, scheduler=video.scheduler, owner=video.scheduler_owner)
+    with ExitStack() as kept:
+        with desk.step("choosing"):
+            trial = kept.enter_context(trial_of(request))
+        _tell(desk, trial.prepared)
+        with desk.interruptible() as cancel, desk.step("the first frames"):
+            told = forecast_video(trial, cancel)
+    if told is None:
+        return Done(kept="Interrupted: nothing is known of the time.")
+    desk.fact("Will take", str(told))
+    return Done()
 
 
 def make_video(desk: Desk, request: VideoRequest, *, force: bool) -> Done:
@@ -64,6 +82,28 @@ def make_video(desk: Desk, request: VideoRequest, *, force: bool) -> Done:
     # Before anything is written:
     require_crew(workers=video.workers, scheduler=video.scheduler, owner=video.scheduler_owner)
     prepared = prepare_video(request, force=force)
+    _tell(desk, prepared)
+    if prepared.resumed:
+        desk.fact("Resumed", f"{_frames_done(prepared)} frames are done already")
+    began_s, before = time.monotonic(), _frames_done(prepared)
+    with _told_what_is_kept(prepared):
+        complete = _solve(desk, prepared)
+    seconds, done = time.monotonic() - began_s, _frames_done(prepared)
+    if done > before:
+        rate = (done - before) / seconds
+        desk.fact("Done", f"{done - before} frames in {duration(seconds)}: {rate:.1f} frames/s")
+    if not complete:
+        total = len(prepared.job.plan.frames)
+        kept = f"Interrupted: {done} of {total} frames are in {request.out}. "
+        return Done(kept=f"{kept}The same command goes on with the rest.")
+    if unlit := prepared.job.unlit():
+        share = f"{unlit} of {len(prepared.job.plan.frames)} frames"
+        desk.warn(f"Warning: {share} hold nothing but noise: was the scene lit?")
+    with _told_what_is_kept(prepared), desk.step("film", len(prepared.job.plan.frames)) as advance:
+        return Done(tuple(finish_video(prepared, advance)))
+
+
+def _tell(desk: Desk, prepared: PreparedVideo) -> None:
     for name, text in prepared.notes.items():
         desk.fact(name, text)
     plan = prepared.job.plan
@@ -78,23 +118,6 @@ def make_video(desk: Desk, request: VideoRequest, *, force: bool) -> Done:
     desk.fact("Video", f"{len(plan.frames)} frames in {blocks}: {how}")
     for warning in prepared.warnings:
         desk.warn(f"Warning: {warning}")
-    if prepared.resumed:
-        desk.fact("Resumed", f"{_frames_done(prepared)} frames are done already")
-    began_s, before = time.monotonic(), _frames_done(prepared)
-    with _told_what_is_kept(prepared):
-        complete = _solve(desk, prepared)
-    seconds, done = time.monotonic() - began_s, _frames_done(prepared)
-    if done > before:
-        rate = (done - before) / seconds
-        desk.fact("Done", f"{done - before} frames in {duration(seconds)}: {rate:.1f} frames/s")
-    if not complete:
-        kept = f"Interrupted: {done} of {len(plan.frames)} frames are in {request.out}. "
-        return Done(kept=f"{kept}The same command goes on with the rest.")
-    if unlit := prepared.job.unlit():
-        share = f"{unlit} of {len(plan.frames)} frames"
-        desk.warn(f"Warning: {share} hold nothing but noise: was the scene lit?")
-    with _told_what_is_kept(prepared):
-        return Done(tuple(finish_video(prepared)))
 
 
 def _solve(desk: Desk, prepared: PreparedVideo) -> bool:

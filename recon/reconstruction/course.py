@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -140,8 +140,22 @@ def expected_bytes(problem: Problem) -> float:
     return float(plan.total) if plan.fits else float("nan")  # else some of it lies on a disk
 
 
+class Limits(Protocol):
+    """Options that say when a run ends at the latest."""
+
+    @property
+    def iterations(self) -> int | None:
+        """At most so many."""
+        ...
+
+    @property
+    def time_s(self) -> float | None:
+        """At most so long."""
+        ...
+
+
 def expected_iterations(
-    records: Sequence[IterationRecord], options: ReconstructionOptions, tolerance: float, runs: int = 1
+    records: Sequence[IterationRecord], options: Limits, tolerance: float, runs: int = 1
 ) -> int:
     """Return how many iterations a run will take, by those that it did.
 

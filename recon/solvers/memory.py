@@ -194,6 +194,11 @@ def resident_bytes() -> float:
     return _status_mib("VmRSS") * 2**20
 
 
+def peak_resident_bytes() -> float:
+    """Return the most memory that this process took since its meter was set; NaN as above."""
+    return _status_mib("VmHWM") * 2**20
+
+
 def _reset_peak_mib() -> float:
     """Forget the highest memory so far; return what is taken now, MiB (NaN where the system does not say)."""
     try:

@@ -22,6 +22,7 @@ from calibration_routines.display.hologram_photograph import (
 from calibration_routines.display.spot_photograph import photograph_spots
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
+from instrument.display import hologram_forecast
 from instrument.display.hologram import (
     Alignment,
     CaptureOptions,
@@ -538,3 +539,17 @@ def test_etendue_draws_what_it_says(tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
     assert main([*asked, "--force"]) == 0
     assert main(["etendue", "--figure", "page.txt"]) == 2
+
+
+@pytest.mark.usefixtures("here")
+def test_what_it_takes_is_told_before_and_nothing_is_written(capsys, monkeypatch):
+    assert main(["hologram", "picture.png", "--iterations", "8", "--explain"]) == 0
+    assert ", 8 of them; " in capsys.readouterr().out
+    monkeypatch.setattr(hologram_forecast, "SOLVED_S", 1e-9)  # one iteration, and then the first ones
+    write_image("colour.png", np.stack([read_image("picture.png").pixels] * 3, axis=-1))
+    given = ["hologram", "colour.png", "--iterations", "90", "--color", "--explain"]
+    assert main(given) == 0
+    assert re.search(r"ms a pattern, 3 of them; \d", capsys.readouterr().out)
+    assert main([*given, "--psnr", "90"]) == 0
+    assert "at most " in capsys.readouterr().out
+    assert not list(Path().glob("slm*"))

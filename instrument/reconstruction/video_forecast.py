@@ -1,0 +1,161 @@
+"""What a film will take, time and memory, by the first frames of some of its blocks, which are carried out.
+
+As many blocks at a time as the film will have, on threads or on the workers that were asked for; each of them
+has a second one, as a worker is slower at its first. What is written for it lies beside the film, and is
+removed.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from instrument.files.errors import count
+from instrument.files.volumes import stem_of
+from instrument.reconstruction.forecast import Forecast
+from instrument.reconstruction.video import (
+    PreparedVideo,
+    VideoRequest,
+    finish_video,
+    prepare_video,
+    solve_video,
+)
+from instrument.reconstruction.video_job import VideoPlan
+from instrument.reconstruction.video_work import BlockReport, at_once
+from recon.solvers.memory import MemoryMeter
+
+FRAMES = 4
+"""Of each block that is tried: one that begins cold, and three that go on."""
+ITERATIONS = (3, 9)
+"""Of frames that are solved together: what the second take more is that of six."""
+
+
+@dataclass(frozen=True)
+class PreparedTrial:
+    """A film prepared to be tried: nothing of it lies where the film will."""
+
+    prepared: PreparedVideo
+    seconds: float
+    """That preparing took."""
+    meter: MemoryMeter
+
+
+@contextmanager
+def trial_of(request: VideoRequest) -> Iterator[PreparedTrial]:
+    """Give a film prepared in a folder of its own beside it, which is removed in the end.
+
+    Raises FileError, BenchError or InputError as :func:`~instrument.reconstruction.video.prepare_video`.
+    """
+    meter, began_s = MemoryMeter(), time.perf_counter()
+    with TemporaryDirectory(prefix=f".{stem_of(request.out)}.trial-", dir=request.out.parent) as folder:
+        prepared = prepare_video(replace(request, out=Path(folder) / request.out.name))
+        yield PreparedTrial(prepared, time.perf_counter() - began_s, meter)
+
+
+def forecast_video(trial: PreparedTrial, cancel: threading.Event | None = None) -> Forecast | None:
+    """Carry out the first frames of some blocks, and say what all take; None when cancelled.
+
+    Errors as of :func:`~instrument.reconstruction.video.solve_video`.
+    """
+    prepared, cancel = trial.prepared, cancel or threading.Event()
+    job, video = prepared.job, prepared.request.video
+    plan, blocks = job.plan, job.blocks
+    together = plan.over_time is not None
+    workers = at_once(len(blocks), video, together=together)
+    if together:
+        chosen = range(min(workers, len(blocks)))
+        tried = tuple(index for number in chosen for index in blocks[number])
+        plans = [replace(plan, frames=tried, cold_iterations=n) for n in ITERATIONS]
+    else:
+        spread = np.linspace(0, len(blocks) - 1, 2 * workers).round().astype(int)
+        tried = tuple(index for number in np.unique(spread) for index in blocks[number][:FRAMES])
+        plans = [replace(plan, frames=tried)]
+    runs = [_solved(trial, one, cancel) for one in plans]
+    if cancel.is_set():
+        return None
+    pace = _together(runs, plan.cold_iterations, len(blocks[0])) if together else _one_by_one(runs[0].reports)
+    began_s = time.perf_counter()
+    finish_video(prepared)
+    finish_s = (time.perf_counter() - began_s) * len(plan.frames) / len(tried)
+    frames_s = _longest(map(len, blocks), workers, pace) + finish_s
+    beside_s = trial.seconds + min(run.beside_s for run in runs)
+    elsewhere = video.workers is not None or video.scheduler is not None
+    own = max(report.peak_bytes for run in runs for report in run.reports)
+    return Forecast(
+        beside_s,
+        frames_s / len(plan.frames),
+        len(plan.frames),
+        own if elsewhere else trial.meter.peak_mib() * 2**20,
+        settles=len(plan.frames),
+        counted=True,
+        each="frame",
+        where=f" in each of {count(workers, 'worker')}" if elsewhere else "",
+    )
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """Blocks that were solved, in this order, and what it took."""
+
+    reports: list[BlockReport]
+    seconds: float
+
+    @property
+    def beside_s(self) -> float:
+        """What nobody was at work: a cluster that begins and ends."""
+        busy: dict[str, float] = {}
+        for report in self.reports:
+            busy[report.worker] = busy.get(report.worker, 0.0) + report.seconds
+        return max(self.seconds - max(busy.values(), default=0.0), 0.0)
+
+
+def _solved(trial: PreparedTrial, plan: VideoPlan, cancel: threading.Event) -> _Solved:
+    """Solve the blocks of a shorter plan."""
+    job, reports = trial.prepared.job, list[BlockReport]()
+    job.go_on_without(plan, sorted(job.done()))
+    began_s = time.perf_counter()
+    solve_video(trial.prepared, reports.append, cancel)
+    return _Solved(reports, time.perf_counter() - began_s)
+
+
+Pace = Callable[[int, bool], float]
+"""Seconds that a block of so many frames takes, the first of its worker or not."""
+
+
+def _one_by_one(reports: list[BlockReport]) -> Pace:
+    """Return how long blocks take whose frames go on from one another."""
+    seen: set[str] = set()
+    first, later = list[float](), list[float]()
+    for report in reports:
+        (later if report.worker in seen else first).append(report.frame_s[0])
+        seen.add(report.worker)
+    steps = [b - a for report in reports for a, b in pairwise(report.frame_s)]
+    first_s, warm_s = float(np.mean(first)), float(np.mean(steps)) if steps else 0.0
+    cold_s = float(np.mean(later)) if later else first_s
+    end_s = float(np.mean([report.seconds - report.frame_s[-1] for report in reports]))
+    return lambda frames, is_first: (first_s if is_first else cold_s) + (frames - 1) * warm_s + end_s
+
+
+def _together(runs: list[_Solved], iterations: int, frames: int) -> Pace:
+    """Return how long blocks take whose frames are solved together."""
+    few_s, more_s = (float(np.mean([report.seconds for report in run.reports])) for run in runs)
+    each_s = max(more_s - few_s, 0.0) / (ITERATIONS[1] - ITERATIONS[0])
+    block_s = few_s + (iterations - ITERATIONS[0]) * each_s
+    return lambda n, _is_first: block_s * n / frames
+
+
+def _longest(sizes: Iterator[int], workers: int, pace: Pace) -> float:
+    """Return when the last block ends where each is taken by the worker that is free first."""
+    ends = [0.0] * workers
+    for size in sizes:
+        free = int(np.argmin(ends))
+        ends[free] += pace(size, ends[free] == 0)
+    return max(ends)

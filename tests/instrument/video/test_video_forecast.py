@@ -1,0 +1,72 @@
+"""What is told of a film before it: by blocks that were carried out; nothing of them is left."""
+
+from __future__ import annotations
+
+from itertools import chain
+from pathlib import Path
+
+import pytest
+
+from instrument.cli import main
+from instrument.reconstruction import video_forecast as module
+from instrument.reconstruction.video_forecast import forecast_video, trial_of
+from instrument.reconstruction.video_work import BlockReport
+from tests.instrument.video.recorded import request
+
+
+def report(number: int, worker: str, *frame_s: float) -> BlockReport:
+    return BlockReport(number, len(frame_s), len(frame_s), frame_s[-1] + 0.5, 0, frame_s, worker)
+
+
+def test_a_block_takes_longer_where_it_is_the_first_of_its_worker() -> None:
+    reports = [report(0, "a", 5.0, 5.2), report(1, "b", 7.0, 7.2), report(2, "a", 3.0, 3.2)]
+    pace = module._one_by_one(reports)
+    assert pace(11, True) == pytest.approx(6.0 + 10 * 0.2 + 0.5)
+    assert pace(11, False) == pytest.approx(3.0 + 10 * 0.2 + 0.5)
+    ended = module._longest(iter([11, 11, 1]), 2, pace)
+    assert ended == pytest.approx(pace(11, True) + pace(1, False)), "the third waits for one that is free"
+    assert module._Solved(reports, 20.0).beside_s == pytest.approx(20.0 - (5.7 + 3.7)), "a cluster's start"
+
+
+def test_frames_solved_together_go_by_their_iterations() -> None:
+    few, more = ([report(0, "a", s)] for s in (1.5, 2.7))
+    pace = module._together([module._Solved(few, 2.0), module._Solved(more, 3.2)], 59, 4)
+    assert pace(4, True) == pytest.approx(2.0 + 56 * 0.2)
+    assert pace(2, True) == pytest.approx(pace(4, True) / 2)
+
+
+def test_the_first_frames_are_carried_out_and_nothing_is_left(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved: list[list[int]] = []
+    true = module.solve_video
+
+    def noted(prepared, *rest):
+        solved.append([len(block) for block in prepared.job.blocks])
+        return true(prepared, *rest)
+
+    monkeypatch.setattr(module, "solve_video", noted)
+    monkeypatch.setattr(module, "FRAMES", 2)
+    for asked in ({"block": 3}, {"over_time": "tv", "block": 5}):
+        with trial_of(request(recording, tmp_path, **asked)) as trial:
+            told = forecast_video(trial)
+        assert told is not None
+        assert (told.settles, told.each) == (10, "frame"), "of eleven one was lost"
+        assert told.seconds > told.beside_s > 0
+        assert told.memory_bytes > 0
+    frames = list(chain(*solved))
+    assert max(solved[0]) == 2
+    assert frames[-2:] == [5, 5], "what is solved together is, with few iterations"
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_only_says_it(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, psf = tmp_path / "v.ome.zarr", recording.parent / "psf.npy"
+    given = ["reconstruct", str(recording), "--video", "--psf", str(psf), "--out", str(out), "--explain"]
+    assert main([*given, "--iterations", "3", "--warm", "1", "--dark", "20", "--bin", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "Will take   about " in said
+    assert " ms a frame, 10 of them; " in said
+    assert not list(tmp_path.iterdir())
