@@ -32,6 +32,7 @@ _TRANSFORMS_PER_MEGAPIXEL = {
     "finding exposures": (48.0, 48.0),
     "photographing bead slides": (120.0, 120.0),
     "rehearsing all of it on a simulated bench of its own": (110.0, 110.0),
+    "rehearsing on a simulated bench of its own": (110.0, 110.0),
 }
 """Steps that compute light on a simulated bench: their time of the processor, in that of a picture of
 1024 x 1024 which is transformed and back; where light has to be computed first, and where it is there."""
@@ -49,7 +50,17 @@ _TRANSFORMS = {
     "finding the screen": 1000.0,
     "aligning the mask": 4800.0,
     "render the animal's light": 6500.0,
-    "photograph lights in a volume": 300.0,
+    "blind deconvolution": 2000.0,
+    "learning": 14000.0,
+    "expose without saturating": 120.0,
+    "dark frames and axial sweep": 510.0,
+    "response over the field": 160.0,
+    "photograph the scene in three colours": 650.0,
+    "photograph lights in a volume": 280.0,
+    "reconstruct the picture": 380.0,
+    "reconstruct the volume": 200.0,
+    "chart methods": 270.0,
+    "write the pictures": 160.0,
     "testing cameras": 950.0,
     "testing solvers": 160.0,
     "testing bench": 250.0,
