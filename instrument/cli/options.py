@@ -54,7 +54,17 @@ class GroupedCommand(TyperCommand):
             message = getattr(error, "message", "")
             if "unexpected extra argument" in message and (meant := self._meant(ctx, typed)):
                 error.message = f"{message}. Did you mean {meant}?"  # type: ignore[attr-defined]
+            missing = getattr(error, "param", None)
+            if not message and getattr(missing, "param_type_name", "") == "argument":
+                error.message = self._wanted(missing)  # type: ignore[attr-defined]
             raise
+
+    def _wanted(self, argument: Any) -> str:
+        """Say what an argument is that was not given, and how the command is typed."""
+        said = str(argument.help or "").partition("  [")[0].strip()
+        words = (line.strip() for line in (self.epilog or "").splitlines())
+        example = next((line for line in words if line.startswith("diffuserbench ")), "")
+        return " ".join(filter(None, (said, f"For example: {example}" if example else "")))
 
     def _meant(self, ctx: typer.Context, typed: list[str]) -> str:
         """Guess the options that files without one were meant for; empty where there are none."""

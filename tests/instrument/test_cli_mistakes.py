@@ -137,3 +137,21 @@ def test_a_float_photograph_with_a_raw_psf_is_doubted(
     assert "it was converted" in capsys.readouterr().err
     assert main(["reconstruct", *words, "--iterations", "1", "--dark", "0", "--force"]) == 0
     assert "give --dark" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        (
+            "analyze",
+            "'CALIBRATION'. A calibration, or a run with one. For example: diffuserbench analyze runs/",
+        ),
+        ("compare runs/a", "'NEW'. A later one of the same camera. For example: diffuserbench compare runs/"),
+        ("plan show", "'FILE'. The plan, .toml or .json. For example: diffuserbench plan show plan.toml"),
+    ],
+)
+def test_a_missing_argument_is_described_with_an_example(
+    typed: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(typed.split()) == 2
+    assert f"Missing argument {said}" in capsys.readouterr().err
