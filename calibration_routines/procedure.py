@@ -23,6 +23,7 @@ from instrument.runs.pace import keep_pace
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import RunStatus
+from recon.base.arguments import require_argument
 
 if TYPE_CHECKING:
     from calibration_routines.display.spot_camera import SpotLook
@@ -115,6 +116,13 @@ class Listener:
 
     def look(self, look: SpotLook) -> None:
         """Note what a picture of spots showed: a frame of a mask alignment."""
+
+
+def require_whereabouts(folder: object, control: object, listener: object) -> None:
+    """Raise InputError where a run's folder, its control or its listener is something else."""
+    require_argument("folder", folder, Path | None)
+    require_argument("control", control, RunControl | None)
+    require_argument("listener", listener, Listener | None)
 
 
 class Procedure(ABC):

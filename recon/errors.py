@@ -11,5 +11,11 @@ class StructureError(InputError, TypeError):
     """A solver has no way for this kind of operator or prior; the text says which solver may."""
 
 
+class NoSuchNameError(InputError, KeyError):
+    """Nothing is registered under a name; the text says what is."""
+
+    __str__ = Exception.__str__
+
+
 class NoMemoryError(InputError, MemoryError):
     """The memory that may be taken does not hold the problem; the text says how much it needs."""

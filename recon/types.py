@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,13 @@ class Geometry:
     """``(height, width)`` of the aperture on the diffuser."""
     wavelength_nm: float | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("pixel_pitch_um", "diffuser_distance_mm", "wavelength_nm"):
+            if not isinstance(value := getattr(self, name), Real | None):
+                raise InputError(
+                    f"{name} must be a number, or None where unknown, not {type(value).__name__}."
+                )
+
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
@@ -91,7 +99,8 @@ class Calibration:
 
     def __post_init__(self) -> None:
         for name, dtype in _DTYPES.items():
-            if (given := getattr(self, name)) is not None and getattr(given, "dtype", None) != dtype:
+            given = getattr(self, name)
+            if (given is not None or name != "background") and getattr(given, "dtype", None) != dtype:
                 object.__setattr__(self, name, real_array(given, name, dtype))
         if self.psfs.ndim != 4:
             hint = {2: ": psf[None, None] of a grey one", 3: ": psfs[:, None] of grey ones"}

@@ -327,3 +327,78 @@ def test_a_chart_of_a_result_is_drawn(
         "chart.html",
         "chart.csv",
     }
+
+
+WRONG = {
+    "db.photograph('x')": "bench must be a Bench, not 'x'",
+    "db.photograph(None)": "bench must be a Bench, not None",
+    "db.calibrate_sweep(3, None)": "bench must be a Bench, not 3",
+    "db.PointSweep(points_um=[(1, 2), (3, 4)])": "must be a tuple of positions",
+    "db.StoppingRules('a')": "iterations must be a whole number, 1 or more, not 'a'",
+    "db.StoppingRules(time_s=[1])": r"time_s must be a number, above 0, not \[1\]",
+    "db.StoppingRules(tolerance=None)": "tolerance must be a number, 0 or more, not None",
+    "db.hologram('head', slm=(16, 16))": "show 18 x 18 details of a picture, and it is judged from 21 x 21",
+    "db.hologram('head', slm='16x16')": r"slm must be \(height, width\), two whole numbers, not '16x16'",
+    "db.hologram('head', slm=(2.5, 4))": "slm must be a whole number, 1 or more, not 2.5",
+    "db.hologram('head', 3)": "bench must be the name of a file, not 3. Or one of the simulated ones",
+    "db.hologram('head', None, 'lbfgs')": "options must be a HologramOptions, not 'lbfgs'",
+    "db.hologram('head', z_mm='near')": "z_mm must be a number, not 'near'",
+    "db.hologram('head', z_mm=[0, 30])": "one a picture: there are 1, not 2",
+    "db.hologram('head', cancel=True)": "cancel must be an Event, not True",
+    "db.hologram('head', on_progress=3)": "on_progress must be a function, not 3",
+    "db.hologram('head', alignment=3)": "alignment must be the name of a file, not 3",
+    "db.reconstruct(SQUARE, SQUARE, cancel=3)": "cancel must be an Event, not 3",
+    "db.reconstruct(SQUARE, SQUARE, on_stage='x')": "on_stage must be a function, not 'x'",
+    "db.run(3)": "folder must be the name of a folder, not 3",
+    "db.open_result(SQUARE)": r"path must be the name of a file, not an array of shape \(9, 9\)",
+    "db.bench(3)": "bench must be the name of a file, not 3",
+    "db.save_calibration('folder', SQUARE)": "A Calibration is expected, not str",
+    "db.write_image(SQUARE, 'a.tif')": "path must be the name of a file, not an array",
+    "db.write_image('a.tif', None)": "image must be an array .* of real numbers, or a stack, not NoneType",
+    "db.write_image('a.tif', 1j * SQUARE)": "not an array of complex128",
+    "db.write_image('a.tif', SQUARE[0])": r"image must be \(height, width\[, channels\]\)",
+    "db.show(SQUARE[:0])": r"this is float64 \(0, 9\)",
+    "db.show_figure(SQUARE)": "A figure of Matplotlib is shown",
+    "db.analyse(CALIBRATION, 'x')": "settings must be an AnalysisSettings, not 'x'",
+    "db.chart('beads', budget_s='long')": "budget_s must be a number, above 0, not 'long'",
+    "db.chart('beads', size=1.5)": "size must be a whole number, 1 or more, not 1.5",
+    "db.chart('beads', folder=3)": "folder must be the name of a folder, not 3",
+    "db.Calibration(None, None)": "psfs must hold real numbers",
+    "db.Geometry('6.5')": "pixel_pitch_um must be a number, or None where unknown, not str",
+    "db.NoiseModel(SQUARE, 1)": "read_noise must be a number, in counts",
+    "db.L1('a')": "A prior's weight must be a number, not 'a'",
+    "db.TotalVariation(SQUARE)": r"must be a number, not an array of shape \(9, 9\)",
+    "db.Box('a', 1)": "The lower limit must be a number, not 'a'",
+    "db.Convolution('psf.tif', (9, 9))": "psfs must be an array .* not str",
+    "db.Convolution(SQUARE[None], 9)": r"sensor_shape must be \(height, width\), two whole numbers, not 9",
+    "db.Erasures(SQUARE[0, :5], (1, 9, 9))": r"valid must be an array \(height, width\)",
+    "db.Fista(SQUARE, SQUARE, db.L1(1))": "operator must be a LinearOperator",
+    "db.Fista(CAMERA, SQUARE, db.L1(1))": r"data must be .* an array of shape \(1, 9, 9\)",
+    "db.Admm(CAMERA, SQUARE[None], 'tv')": "prior must be a Prior, not 'tv'. db.PRIORS names them",
+    "db.metrics.psnr('scene.tif', SQUARE)": "The image must be an array .* of real numbers, not str",
+    "db.PRIORS['TV']": "There is no prior 'TV', but tv, ",
+    "db.SOLVERS[3]": "There is no solver 3, but admm",
+}
+"""What may be given to what ``diffuserbench`` offers by mistake, and what is said then."""
+
+
+@pytest.mark.parametrize("typed", WRONG)
+def test_what_is_no_argument_is_said_in_a_sentence(typed: str) -> None:
+    square = np.ones((9, 9))
+    camera = db.Convolution(square[None].astype(np.float32), (9, 9))
+    calibration = db.Calibration(square[None, None], [[0, 0, 1e4]])
+    names = {"db": db, "SQUARE": square, "CAMERA": camera, "CALIBRATION": calibration}
+    with pytest.raises((InputError, BenchError), match=WRONG[typed]) as found:
+        eval(typed, names)
+    said = str(found.value)
+    assert said[-1] == "."
+    assert "\n" not in said
+
+
+def test_names_that_are_not_registered_are_missing_as_in_any_mapping() -> None:
+    assert db.SOLVERS.get("none of these") is None
+    assert "none of these" not in db.PRIORS
+    with pytest.raises(KeyError):
+        db.CAMERAS["none of these"]
+    with pytest.raises(TypeError, match="unsupported operand"):
+        db.L1(1.0) + 3

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from calibration_routines.options import Checked
 from calibration_routines.planned import outlook_of
-from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, require_whereabouts
 from calibration_routines.psf.analysis import (
     ambient_findings,
     channels_first,
@@ -43,6 +43,7 @@ from instrument.plan import OFF, Part, Plan, check
 from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
+from recon.base.arguments import require_argument
 from recon.base.blocks import block_mean
 from recon.base.declare import RARE, option
 
@@ -128,6 +129,12 @@ def photograph(
     CalibrationError
         When the run was ended before its last frame; others as :func:`instrument.runs.acquire.acquire`.
     """
+    require_argument("bench", bench, Bench, "'with db.bench() as bench:' opens one.")
+    require_argument("exposure_ms", exposure_ms, float | None, above=0)
+    require_argument("average", average, int, least=1)
+    require_argument("dark_frames", dark_frames, int, least=0)
+    require_argument("binning", binning, int, least=1)
+    require_whereabouts(folder, control, listener)
     control, listener = control or RunControl(), listener or Listener()
     if exposure_ms is None:
         listener.step("finding the scene's exposure")

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration_routines.procedure import Listener
+from calibration_routines.procedure import Listener, require_whereabouts
 from calibration_routines.psf.analysis import (
     PlaneFrames,
     SweepAnalysis,
@@ -66,6 +66,8 @@ from instrument.runs.acquire import acquire
 from instrument.runs.run import Run
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import Runner
+from recon.base.arguments import require_argument
+from recon.errors import InputError
 from recon.types import Calibration
 
 _INTERRUPTIONS = (KeyboardInterrupt, SystemExit, EndedEarlyError)
@@ -140,6 +142,13 @@ def calibrate_sweep(
     Raises PlanError, SettingsError when the sweep leaves the limits of the bench or the disk (nothing moved);
     CalibrationError when no exposure is usable, or the run was ended before its last frame.
     """
+    require_argument("bench", bench, Bench, "'with db.bench() as bench:' opens one.")
+    if not hasattr(sweep, "planned"):
+        raise InputError(
+            "sweep must be an AxialSweep, LateralSweep, VolumeSweep or PointSweep, "
+            f"as db.AxialSweep(z_min_um=..., z_max_um=...), not {type(sweep).__name__}."
+        )
+    require_whereabouts(folder, control, listener)
     control, listener = control or RunControl(), listener or Listener()
     where = Path(folder) if folder is not None else None
     points = sweep.planned(bench).sweep

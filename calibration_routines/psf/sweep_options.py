@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import MISSING, dataclass, fields, replace
+from numbers import Real
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -103,6 +104,10 @@ class Taking(Checked):
         return {field.name: getattr(self, field.name) for field in fields(Taking)}
 
 
+def _is_position(point: object) -> bool:
+    return isinstance(point, tuple | list) and len(point) == 3 and all(isinstance(x, Real) for x in point)
+
+
 @dataclass(frozen=True, kw_only=True)
 class PointSweep(Taking):
     """PSFs at listed places, ``(x, y, z)`` from the diffuser's centre."""
@@ -113,6 +118,8 @@ class PointSweep(Taking):
 
     def disagreements(self, wrong: Collection[str]) -> list[tuple[str, str]]:
         """As :meth:`Checked.disagreements`."""
+        if not (isinstance(self.points_um, tuple | list) and all(map(_is_position, self.points_um))):
+            return [("points_um", "points must be a tuple of positions, ((x, y, z), ...), in um")]
         words = {
             "a sweep needs at least one point": not self.points_um,
             "a point is listed twice": len(set(self.points_um)) != len(self.points_um),

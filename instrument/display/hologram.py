@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 
 
 Image = npt.NDArray[np.float64]
+JUDGED_PX = 21
+"""Along each axis, at least: the middle half has 11 then, the SSIM's window."""
 
 
 HOLOGRAM, PHOTOGRAPHED = "hologram", "Photographed, with --capture"
@@ -123,6 +125,13 @@ def compute_and_judge(
     where it has no start, ``initial``.
     """
     model = HologramModel(display, targets, options)
+    if min(seen_px := within(part or targets[0].window, model.wanted(0)).shape) < JUDGED_PX:
+        height, width = display.slm_shape
+        raise BenchError(
+            f"The SLM's {height} x {width} pixels (binned as [display] says) show {seen_px[0]} x "
+            f"{seen_px[1]} details of a picture, and it is judged from {JUDGED_PX} x {JUDGED_PX} on. "
+            "Take more of them."
+        )
     hologram = compute_hologram(model, initial=initial, callback=callback, cancel=cancel)
     if model.options.grid != "alias-free":
         model = HologramModel(display, targets, options, grid="alias-free")

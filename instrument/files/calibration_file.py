@@ -28,6 +28,8 @@ from instrument.files.ome_zarr import ome_attributes
 from instrument.files.pieces import piece_bytes
 from instrument.files.reading import folder_bytes, require_plausible
 from instrument.files.record import RecordFormat
+from recon.base.arguments import require_argument
+from recon.base.checks import require_calibration
 from recon.types import Calibration, Geometry
 
 _JSON = "calibration.json"
@@ -60,6 +62,8 @@ def save_calibration(calibration: Calibration, folder: Path | str, *, overwrite:
     Raises CalibrationFileError when something is there already, the place cannot be written, or the disk is
     full. What was there before is still there then.
     """
+    require_calibration(calibration)
+    require_argument("folder", folder, Path)
     target = Path(folder)
     if target.exists() and not overwrite:
         raise CalibrationFileError(target, "exists already.", "Choose another name, or allow overwriting.")

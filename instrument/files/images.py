@@ -42,6 +42,8 @@ from instrument.files.pictures import ALPHA, READABLE
 from instrument.files.seen import as_seen, levels_of, png_bytes
 from instrument.files.tiff_pages import open_tiff
 from instrument.files.tiffs import files_of
+from recon.base.arguments import require_argument, require_numbers
+from recon.errors import InputError
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
 
@@ -168,6 +170,12 @@ def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str
     Raises FileError when the suffix or the dtype does not fit, or the folder cannot be written to; OSError
     when the disk is full.
     """
+    require_argument("path", path, Path)
+    image = require_numbers(
+        "image", image, "an array (height, width[, channels]) of real numbers, or a stack"
+    )
+    if image.ndim < 2 or not image.size:
+        raise InputError(f"image must be (height, width[, channels]), or a stack of such, not {image.shape}.")
     path = Path(path)
     check_suffix(path)
     text = json.dumps(metadata, indent=1, default=str) if metadata is not None else None

@@ -16,6 +16,7 @@ from instrument.files.atomic import write_json
 from instrument.files.errors import BenchError
 from instrument.notebook.result import Result, figure_png, show_figure
 from instrument.notebook.words import speaking
+from recon.base.arguments import require_argument
 from recon.evaluation.scene import FAMILIES
 
 if TYPE_CHECKING:
@@ -82,6 +83,11 @@ def chart(
 
     Raises BenchError when there was no time for any setting; InputError when the subject cannot be charted.
     """
+    require_argument("budget_s", budget_s, float, above=0)
+    require_argument("size", size, int, least=1)
+    require_argument("seed", seed, int, least=0)
+    require_argument("folder", folder, Path | None)
+    require_argument("on_progress", on_progress, Callable | None)
     if not isinstance(subject, Result) and not (isinstance(subject, str) and subject in FAMILIES):
         given = repr(subject) if isinstance(subject, str) else type(subject).__name__
         raise BenchError(

@@ -27,9 +27,10 @@ from instrument.display.hologram_files import HologramFiles, hologram_figure
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, drop_alpha
 from instrument.files.sample_images import SAMPLES
-from instrument.notebook.reconstruct import bench_config
+from instrument.notebook.reconstruct import bench_config, require_hooks
 from instrument.notebook.result import figure_png, show_figure
 from instrument.notebook.words import in_python, speaking
+from recon.base.arguments import require_argument, require_shape
 from recon.base.checks import plain_array
 from recon.base.declare import with_overrides
 from recon.holography import HologramOptions, HologramRecord
@@ -125,14 +126,18 @@ def hologram(
     Raises InputError, BenchError or FileError: what was found, what was expected, what to do.
     """
     alignment = overrides.pop("alignment", None)
+    require_argument("alignment", alignment, Path | None)
+    require_argument("options", options, HologramOptions | None, "Single ones are given by name: frames=2.")
+    require_hooks(on_progress, cancel)
     options = with_overrides(options or HologramOptions(), overrides)
     config = bench_config(bench)
     shape, pitch_um = slm_size(config, phases=options.mirrors is None)
-    display = options.display_of(bench_display(config, (slm or shape, pitch_um), expansion=options.expansion))
+    shape = shape if slm is None else require_shape("slm", slm)
+    display = options.display_of(bench_display(config, (shape, pitch_um), expansion=options.expansion))
     if alignment is not None:
         display = load_alignment(Path(alignment)).of(display)
     pictures = list(picture) if isinstance(picture, list | tuple) else [picture]
-    depths = [float(z) for z in np.broadcast_to(np.asarray(z_mm, float), (len(pictures),))]
+    depths = _depths(z_mm, len(pictures))
     images = [_image(one, options) for one in pictures]
     said = [f"{image.path}: {note}." for image in images for note in image.notes]
     said += list(filter(None, (field_words(image.pixels, options.fit) for image in images)))[:1]
@@ -145,6 +150,18 @@ def hologram(
     found = compute_and_judge(display, targets, options, callback=on_progress, cancel=cancel)
     files = HologramFiles(Path("slm.png"), config.display.slm_binning, options, [display])
     return HologramShown(**{f.name: getattr(found, f.name) for f in fields(HologramResult)}, files=files)
+
+
+def _depths(z_mm: Any, count: int) -> list[float]:
+    """Return a depth for each picture; raises BenchError where there are others."""
+    given = [z_mm] if isinstance(z_mm, str) or not hasattr(z_mm, "__len__") else list(z_mm)
+    for z in given:
+        require_argument("z_mm", z, float)
+    if not count or len(given) not in (1, count):
+        raise BenchError(
+            f"Give one z_mm for all pictures, or one a picture: there are {count}, not {len(given)}."
+        )
+    return [float(z) for z in given] * (count if len(given) == 1 else 1)
 
 
 def _image(picture: Any, options: HologramOptions) -> ImageFile:

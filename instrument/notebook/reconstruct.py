@@ -6,7 +6,7 @@ import inspect
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from numbers import Real
 from pathlib import Path
@@ -29,6 +29,7 @@ from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import refocused, volume_job
 from instrument.runs.run import Run
 from instrument.runs.run_files import is_run
+from recon.base.arguments import require_argument
 from recon.base.checks import as_channels, plain_array
 from recon.base.declare import options_of, require, require_known, with_overrides
 from recon.errors import InputError
@@ -67,6 +68,7 @@ def run(folder: Path | str) -> Run:
 
     Raises RunError where there is none.
     """
+    require_argument("folder", folder, Path)
     folder = Path(folder)
     return Run.open(folder.parent if is_calibration(folder) and is_run(folder.parent) else folder)
 
@@ -95,6 +97,7 @@ def bench_config(config: BenchConfig | Path | str | None) -> BenchConfig:
     """Return the configuration that :func:`bench` opens."""
     if isinstance(config, BenchConfig):
         return config
+    require_argument("bench", config, Path | None, f"Or one of the simulated ones: {', '.join(TEMPLATES)}.")
     if isinstance(config, str) and config in TEMPLATES and not Path(config).exists():
         return parse_config(template(config), None)
     return load_config(config)
@@ -146,6 +149,8 @@ def reconstruct(
             f"options are db.Options(...), not {type(options).__name__}; single ones are given by name: "
             "prior='l1', warm=result."
         )
+    require_hooks(on_progress, cancel)
+    require_argument("on_stage", on_stage, Callable | None)
     told = on_stage or _Told()
     further: dict[str, Any] = {"warm": warm, "on_progress": on_progress, "cancel": cancel, "on_stage": told}
     try:
@@ -168,6 +173,12 @@ def reconstruct(
     finally:
         if isinstance(told, _Told):
             told.end()
+
+
+def require_hooks(on_progress: object, cancel: object) -> None:
+    """Raise InputError where what tells of progress is no function, or what ends the work no event."""
+    require_argument("on_progress", on_progress, Callable | None)
+    require_argument("cancel", cancel, threading.Event | None, "threading.Event() makes one.")
 
 
 def _require_one(image: Any, psf: Any) -> None:

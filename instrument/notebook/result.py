@@ -235,11 +235,12 @@ def _pixels(picture: Any) -> Shown:
     if isinstance(picture, Calibration):
         picture = np.moveaxis(picture.psfs[picture.nearest_to_axis()], 0, -1).squeeze()
     array = np.asarray(picture)
-    if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
+    if array.dtype.kind not in "uifb" or array.ndim not in (2, 3) or not array.size:
         raise BenchError(
             f"A picture is (height, width) or (height, width, channels) of real numbers; this is "
             f"{array.dtype} {array.shape}."
         )
+    array = array.astype(np.float32) if array.dtype == bool else array
     return as_seen(array, raw=array.dtype.kind == "u")
 
 
@@ -252,6 +253,11 @@ def figure_png(figure: Figure) -> bytes:
 
 def show_figure(figure: Figure) -> None:
     """Show a figure where there is a place for it; say where there is none."""
+    if not hasattr(figure, "savefig"):
+        raise BenchError(
+            f"A figure of Matplotlib is shown, as result.figure() gives it, not {type(figure).__name__}: "
+            "db.show(...) shows pictures."
+        )
     ipython = sys.modules.get("IPython")
     if ipython is not None and ipython.get_ipython() is not None:
         shown: Any = import_module("IPython.display")  # installed or not, typed or not

@@ -16,6 +16,7 @@ from instrument.files.errors import BenchError
 from instrument.reconstruction import stored_result
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.stored_result import StoredResult
+from recon.base.arguments import require_argument
 from recon.base.declare import Option, in_other_words, options_of
 from recon.errors import InputError
 from recon.reconstruction.result import Reconstruction
@@ -122,6 +123,7 @@ def open_result(path: Path | str) -> StoredResult:
 
     Raises FileError when it is none, or its record is damaged.
     """
+    require_argument("path", path, Path)
     found = stored_result.open_result(path)
     record = dict(found.record)
     if warnings := record.get("warnings"):

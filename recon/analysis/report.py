@@ -39,8 +39,10 @@ from recon.analysis.resolution import (
 )
 from recon.analysis.settings import AnalysisSettings, axial_spacing, lateral_spacing, response_of
 from recon.analysis.stated_distance import AT_NEARER, InVolumes, Reached
+from recon.base.arguments import require_argument
 from recon.base.brief import brief
 from recon.base.checks import require_calibration
+from recon.base.declare import require
 from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.camera_model import choose_model, sort_by_depth
 from recon.camera.depth_mixture import central_psfs
@@ -151,7 +153,9 @@ def analyse(
         Called with what is being done and the share done.
     """
     require_calibration(calibration)
+    require_argument("settings", settings, AnalysisSettings | None)
     settings = settings or AnalysisSettings()
+    require(settings)
     on_progress = on_progress or (lambda _what, _share: None)
     pitch_um, distance_um = _geometry(calibration)
     notes: list[str] = []

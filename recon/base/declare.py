@@ -272,6 +272,8 @@ def _in_words(kind: Any) -> str:
     """Say what a value of a type is; empty where its words say it."""
     if kind is Path:
         return "the name of a file"
+    if kind is Callable:
+        return "a function"
     if inside := typing.get_args(kind):
         many = typing.get_origin(kind) is tuple
         return f"{'several' if inside[1:] == (...,) else len(inside)} values" if many else ""

@@ -13,6 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.arguments import require_numbers
+from recon.errors import InputError
+
 Image = npt.NDArray[Any]
 
 
@@ -84,10 +87,12 @@ def _peak(truth: Image, data_range: float | None) -> float:
 
 
 def _pair(image: Image, truth: Image, fit_scale: bool = False) -> tuple[Image, Image]:
-    if image.shape != truth.shape or image.ndim not in (2, 3):
-        raise ValueError(
+    expected = "an array (height, width[, n_channels]) of real numbers"
+    one, other = require_numbers("The image", image, expected), require_numbers("The truth", truth, expected)
+    if one.shape != other.shape or one.ndim not in (2, 3):
+        raise InputError(
             "Both images must be (height, width) or (height, width, n_channels) and of one shape, "
-            f"not {image.shape} and {truth.shape}."
+            f"not {one.shape} and {other.shape}."
         )
-    a, b = np.asarray(image, np.float64), np.asarray(truth, np.float64)
+    a, b = one.astype(np.float64), other.astype(np.float64)
     return (a * scale_to(a, b) if fit_scale else a), b

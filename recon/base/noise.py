@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from recon.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +26,11 @@ class NoiseModel:
 
     read_noise: float
     counts_per_electron: float
+
+    def __post_init__(self) -> None:
+        for name in ("read_noise", "counts_per_electron"):
+            if not isinstance(value := getattr(self, name), Real):
+                raise InputError(f"{name} must be a number, in counts, not {type(value).__name__}.")
 
     def deviation(self, measurement: npt.NDArray[Any]) -> float:
         """Root mean square of the noise expected in a measurement (background subtracted, counts)."""

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
-from recon.errors import InputError
+from recon.errors import InputError, NoSuchNameError
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -98,9 +98,17 @@ class Registry(Mapping[str, T], Generic[T]):
         return tuple(self._all())
 
     def __getitem__(self, name: str) -> T:
-        """Return what has a name; KeyError where nothing has."""
-        own = self._known_own()
-        return own[name] if name in own else self._foreign[name]
+        """Return what has a name; NoSuchNameError, a KeyError, where nothing has."""
+        if name in self:
+            own = self._known_own()
+            return own[name] if name in own else self._foreign[name]
+        raise NoSuchNameError(
+            f"There is no {self.what} {name!r}, but {', '.join(self._all())}. .register(...) offers another."
+        )
+
+    def __contains__(self, name: object) -> bool:
+        """Whether something has this name."""
+        return isinstance(name, str) and (name in self._known_own() or name in self._foreign)
 
     def __iter__(self) -> Iterator[str]:
         """Iterate over names."""

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
+from recon.base.arguments import require_shape
 from recon.base.threads import in_blocks
 from recon.camera.base import Array, LinearOperator
 from recon.errors import InputError
@@ -108,6 +109,10 @@ class Convolution(LinearOperator):
         dtype: npt.DTypeLike = np.float32,
         allocate: Callable[[tuple[int, ...], npt.DTypeLike], Array] = np.empty,
     ) -> None:
+        if getattr(psfs, "ndim", 0) == 0:
+            raise InputError(
+                f"psfs must be an array ([n_z, ]n_channels, height, width), not {type(psfs).__name__}."
+            )
         if psfs.ndim not in (3, 4):
             raise InputError(f"psfs must be ([n_z, ]n_channels, height, width), not {psfs.shape}.")
         if len(psfs) == 0:
@@ -120,7 +125,7 @@ class Convolution(LinearOperator):
             raise InputError(
                 f"PSFs of {own_channels} channels do not serve {n_channels}: give 1 or {n_channels}."
             )
-        self.sensor_shape = (int(sensor_shape[0]), int(sensor_shape[1]))
+        self.sensor_shape = require_shape("sensor_shape", sensor_shape)
         self.field_shape, self.centre = field_of(self.sensor_shape, tuple(psf_shape))
         height, width = fft.fast_shape(self.field_shape) if grid_shape is None else grid_shape
         self.grid_shape = (height, width)

@@ -38,7 +38,12 @@ class Erasures(Projection):
         dtype: npt.DTypeLike = np.float32,
     ) -> None:
         super().__init__(shape, shape, dtype)
-        self.valid = np.broadcast_to(np.asarray(valid, bool), shape)
+        try:
+            self.valid = np.broadcast_to(np.asarray(valid, bool), shape)
+        except ValueError:
+            raise InputError(
+                f"valid must be an array (height, width) or {shape} of True and False, not {np.shape(valid)}."
+            ) from None
 
     def forward(self, x: Array, out: Array | None = None) -> Array:
         """Zero the pixels that are not valid."""

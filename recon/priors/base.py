@@ -73,6 +73,8 @@ class Prior(ABC):
 
     def __add__(self, other: Prior) -> Prior:
         """Return the sum of two priors: one prior where the prox of the sum is known, else a :class:`Sum`."""
+        if not isinstance(other, Prior):
+            return NotImplemented
         parts: list[Prior] = []
         for term in (*self.terms(), *other.terms()):
             for i, part in enumerate(parts):
@@ -108,10 +110,24 @@ class Sum(Prior):
 
 
 def require_weight(weight: float) -> float:
-    """Return a prior's weight; raises ValueError for a negative one."""
+    """Return a prior's weight; raises InputError for a negative one, and for what is no number."""
+    weight = _number("A prior's weight", weight)
     if not weight >= 0:
-        raise ValueError(f"A prior's weight must not be negative; got {weight}.")
-    return float(weight)
+        raise InputError(f"A prior's weight must not be negative; got {weight}.")
+    return weight
+
+
+def _number(name: str, value: Any) -> float:
+    """Return a number, be it an array's only one, on whatever device; InputError where it is none."""
+    try:
+        if not isinstance(value, str | bytes):
+            return float(value)
+    except (TypeError, ValueError):
+        pass
+    shape = getattr(value, "shape", ())
+    raise InputError(
+        f"{name} must be a number, not {f'an array of shape {shape}' if shape else repr(value)}."
+    )
 
 
 class Separable(Prior):
@@ -122,11 +138,10 @@ class Separable(Prior):
     """
 
     def __init__(self, weight: float = 0.0, lower: float = -np.inf, upper: float = np.inf) -> None:
-        if not lower <= upper:
-            raise ValueError(f"The box's lower limit {lower:g} is above its upper limit {upper:g}.")
         self.weight = require_weight(weight)
-        self.lower = float(lower)
-        self.upper = float(upper)
+        self.lower, self.upper = _number("The lower limit", lower), _number("The upper limit", upper)
+        if not self.lower <= self.upper:
+            raise InputError(f"The box's lower limit {lower:g} is above its upper limit {upper:g}.")
 
     @property
     def is_zero(self) -> bool:

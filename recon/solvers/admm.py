@@ -25,7 +25,7 @@ from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import Convolution
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
-from recon.solvers.base import IterationRecord
+from recon.solvers.base import IterationRecord, require_parts
 from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
 from recon.solvers.prior_splits import PictureSplitting, ratio
 
@@ -82,6 +82,7 @@ class Admm(PictureSplitting):
         penalties: Penalties | None = None,
         relax: float = 1.7,
     ) -> None:
+        require_parts(operator, data, prior)
         super().__init__(operator, prior, initial)
         valid = np.ascontiguousarray(np.where(self._weight > 0, data, 0), operator.dtype)
         self.relax = relax

@@ -14,9 +14,12 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.arguments import require_argument
 from recon.base.brief import brief
 from recon.base.namespace import Namespace, namespace_of, to_host
 from recon.base.threads import linear_algebra_on_one_thread
+from recon.camera.base import LinearOperator
+from recon.errors import InputError
 from recon.priors.base import Prior
 
 
@@ -89,14 +92,12 @@ class StoppingRules:
     patience: int = 3
 
     def __post_init__(self) -> None:
+        require_argument("iterations", self.iterations, int | None, least=1)
+        require_argument("time_s", self.time_s, float | None, above=0)
+        require_argument("tolerance", self.tolerance, float, least=0)
+        require_argument("patience", self.patience, int)
         if self.iterations is None and self.time_s is None and self.tolerance <= 0:
-            raise ValueError("A run needs an end: give iterations, time_s or a tolerance above 0.")
-        if self.iterations is not None and self.iterations < 1:
-            raise ValueError(f"iterations must be 1 or more, not {self.iterations}.")
-        if self.time_s is not None and not self.time_s > 0:
-            raise ValueError(f"time_s must be above 0, not {self.time_s:g}.")
-        if not self.tolerance >= 0:
-            raise ValueError(f"tolerance must not be negative; got {self.tolerance:g}.")
+            raise InputError("A run needs an end: give iterations, time_s or a tolerance above 0.")
 
 
 @dataclass(slots=True)
@@ -130,6 +131,19 @@ class StopCheck:
 
 Array = npt.NDArray[Any]
 Callback = Callable[["Solver", IterationRecord], object]
+
+
+def require_parts(operator: object, data: Array, prior: object) -> None:
+    """Raise InputError where a solver's parts are none, or the data are not what the operator gives."""
+    require_argument("operator", operator, LinearOperator)
+    require_argument("prior", prior, Prior, "db.PRIORS names them, db.L1(weight) is one.")
+    assert isinstance(operator, LinearOperator)
+    shape = getattr(data, "shape", None)
+    if shape != operator.range_shape:
+        given = type(data).__name__ if shape is None else f"an array of shape {shape}"
+        raise InputError(
+            f"data must be what the operator gives, an array of shape {operator.range_shape}, not {given}."
+        )
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from recon.camera.base import Array, LinearOperator
 from recon.priors.base import Prior
-from recon.solvers.base import IterationRecord, Solver
+from recon.solvers.base import IterationRecord, Solver, require_parts
 
 Restart = Literal["function", "gradient", "none"]
 
@@ -56,6 +56,7 @@ class Fista(Solver):
         step: float | None = None,
     ) -> None:
         super().__init__()
+        require_parts(operator, data, prior)
         self.operator = operator
         self.data = np.asarray(data, operator.dtype)
         self.prior: Prior = prior.for_a_run()

@@ -69,7 +69,7 @@ REFUSED: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: volume(Separable(0.1, lower=-1.0)), StructureError, "for l1 and non-negativity alone"),
     (lambda: require_exact(L1(0.1), HaarTotalVariation(0.1)), StructureError, "HaarTotalVariation is only"),
     (lambda: of_own(Cropping(0.1)), InputError, "Cropping: its prox must return an array like its argument"),
-    (lambda: of_own(L1(0.1), Bare()), AttributeError, "Bare has no dtype: its __init__ must call super()"),
+    (lambda: of_own(L1(0.1), Bare()), AttributeError, "Bare has no range_shape: its __init__ must call"),
     (lambda: L1(-0.1), ValueError, "must not be negative; got -0.1"),
     (lambda: require_weight(float("nan")), ValueError, "must not be negative; got nan"),
     (lambda: TotalVariation(-1.0), ValueError, "must not be negative"),

@@ -1,0 +1,54 @@
+"""What functions are given in Python: a sentence where it is nothing that they take."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.declare import Declaration, Option
+from recon.errors import InputError
+
+Function = Callable[..., Any]
+
+
+def require_argument(name: str, value: object, kind: Any, remedy: str = "", **limits: float) -> None:
+    """Raise InputError where an argument is not of its kind: what it must be, what it is, the ``remedy``.
+
+    ``kind`` is its type as a parameter is annotated (``float | None``; ``Path`` takes text, too), ``limits``
+    are those of a :class:`~recon.base.declare.Declaration`.
+    """
+    asked = Option(name, kind, dataclasses.MISSING, Declaration(help="", **limits))  # type: ignore[arg-type]
+    if (mistake := asked.mistake(value)) is None:
+        return
+    if value is None:
+        mistake = f"{name} must be {asked.expected()}, not None."
+    if name == "folder":
+        mistake = mistake.replace("the name of a file", "the name of a folder")
+    raise InputError(f"{mistake} {remedy}".strip())
+
+
+def require_shape(name: str, value: Any) -> tuple[int, int]:
+    """Return height and width; raises InputError for what is not two whole numbers, 1 or more."""
+    if isinstance(value, str | bytes) or not hasattr(value, "__len__") or len(value) != 2:
+        given = f"an array of shape {np.shape(value)}" if isinstance(value, np.ndarray) else repr(value)
+        raise InputError(f"{name} must be (height, width), two whole numbers, not {given}.")
+    height, width = value
+    for number in (height, width):
+        require_argument(name, number, int, "It is (height, width).", least=1)
+    return int(height), int(width)
+
+
+def require_numbers(name: str, array: npt.ArrayLike, expected: str) -> npt.NDArray[Any]:
+    """Return an array of real numbers as it is; raises InputError for anything else, as ``expected`` says."""
+    try:
+        found: npt.NDArray[Any] = np.asarray(array)
+    except (TypeError, ValueError):
+        found = np.asarray(None)
+    if found.dtype.kind not in "uifb" or not found.ndim:
+        given = type(array).__name__ if not found.ndim else f"an array of {found.dtype}"
+        raise InputError(f"{name} must be {expected}, not {given}.")
+    return found
