@@ -73,8 +73,10 @@ def hologram(
     Writes the pattern, a JSON file with settings and metrics, and a preview of what will be seen with and
     without the eye's low-pass (computed, not photographed). Ctrl-C keeps the pattern so far.
     """
-    if (inputs.spots is None) == (not target):
-        raise BenchError("Give a TARGET picture, or --spots.")
+    if inputs.spots is not None and target:
+        raise BenchError(f"{target[0]} and --spots exclude each other: give a picture, or --spots.")
+    if inputs.spots is None and not target:
+        raise BenchError("Give a picture (diffuserbench hologram picture.png), or --spots 10x10.")
     config = load_and_say(bench)
     if inputs.spots is not None:
         given.refuse("--spots", "spots")

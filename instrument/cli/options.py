@@ -54,10 +54,21 @@ class GroupedCommand(TyperCommand):
             message = getattr(error, "message", "")
             if "unexpected extra argument" in message and (meant := self._meant(ctx, typed)):
                 error.message = f"{message}. Did you mean {meant}?"  # type: ignore[attr-defined]
+            if unknown := getattr(error, "option_name", ""):
+                self._suggest(error, unknown)
             missing = getattr(error, "param", None)
             if not message and getattr(missing, "param_type_name", "") == "argument":
                 error.message = self._wanted(missing)  # type: ignore[attr-defined]
             raise
+
+    def _suggest(self, error: Any, unknown: str) -> None:
+        """Name the option that is meant where only capitals differ, or its name is that in Python."""
+        meant = unknown.lstrip("-").casefold().replace("_", "-")
+        for option in self.params:
+            flags = [flag for flag in option.opts if flag.startswith("--")]
+            known = [str(option.name).rpartition("__")[2].replace("_", "-"), *(flag[2:] for flag in flags)]
+            if flags and meant in known:
+                error.possibilities = [flags[0]]
 
     def _wanted(self, argument: Any) -> str:
         """Say what an argument is that was not given, and how the command is typed."""

@@ -215,7 +215,8 @@ class Run:
         """
         path = Path(path)
         if not path.is_dir():
-            raise RunError(path, "no such folder." if not path.exists() else "is no folder.")
+            found = "is no folder" if path.exists() else "no such folder"
+            raise RunError(path, f"{found}; a run's folder is expected.", "diffuserbench list shows runs.")
         if not is_run(path):
             raise RunError(path, f"is no run folder: it has no {STATE}.", "diffuserbench list shows runs.")
         try:

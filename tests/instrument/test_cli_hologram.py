@@ -306,7 +306,7 @@ def test_spots_without_a_mask_come_from_an_array_or_a_list(capsys):
     Path("list.csv").write_text("y,x,intensity\n0.3,0.4,1\n0.6,0.7,2\n")
     assert main(["hologram", "--spots", "list.csv", "--out", "list.png"]) == 0
     for wrong, words in (
-        (["picture.png", "--spots", "2x2"], "Give a TARGET picture, or --spots"),
+        (["picture.png", "--spots", "2x2"], "picture.png and --spots exclude each other"),
         (["--spots", "2x2", "--video"], "--spots these do not apply: --video (for a picture)"),
         (["--spots", "2x2", "--limit", "--srgb"], "--limit (for a limit); --srgb (for a picture or a limit)"),
         (["picture.png", "--limit", "--frames", "2"], "--limit these do not apply: --frames"),

@@ -155,3 +155,14 @@ def test_a_missing_argument_is_described_with_an_example(
 ) -> None:
     assert main(typed.split()) == 2
     assert f"Missing argument {said}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [("--PSF psf.tif", "--psf"), ("--mosaic rggb", "--bayer"), ("--warm-iterations 3", "--warm")],
+)
+def test_an_option_in_capitals_or_by_its_name_in_python_is_found(
+    typed: str, meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["reconstruct", *typed.split()]) == 2
+    assert f"(Possible options: {meant})" in capsys.readouterr().err
