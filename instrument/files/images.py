@@ -171,12 +171,12 @@ def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str
     when the disk is full.
     """
     require_argument("path", path, Path)
-    image = require_numbers(
-        "image", image, "an array (height, width[, channels]) of real numbers, or a stack"
-    )
+    path = Path(path)
+    expected = "an array (height, width[, channels]) of real numbers, or a stack"
+    kinds = "uifbc" if path.suffix.lower() == ".npy" else "uifb"
+    image = require_numbers("image", image, expected, kinds=kinds)
     if image.ndim < 2 or not image.size:
         raise InputError(f"image must be (height, width[, channels]), or a stack of such, not {image.shape}.")
-    path = Path(path)
     check_suffix(path)
     text = json.dumps(metadata, indent=1, default=str) if metadata is not None else None
     suffix = path.suffix.lower()

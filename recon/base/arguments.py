@@ -42,13 +42,18 @@ def require_shape(name: str, value: Any) -> tuple[int, int]:
     return int(height), int(width)
 
 
-def require_numbers(name: str, array: npt.ArrayLike, expected: str) -> npt.NDArray[Any]:
-    """Return an array of real numbers as it is; raises InputError for anything else, as ``expected`` says."""
+def require_numbers(
+    name: str, array: npt.ArrayLike, expected: str, *, kinds: str = "uifb"
+) -> npt.NDArray[Any]:
+    """Return an array of numbers as it is; raises InputError for anything else, as ``expected`` says.
+
+    ``kinds`` are NumPy's letters for them: real ones.
+    """
     try:
         found: npt.NDArray[Any] = np.asarray(array)
     except (TypeError, ValueError):
         found = np.asarray(None)
-    if found.dtype.kind not in "uifb" or not found.ndim:
+    if found.dtype.kind not in kinds or not found.ndim:
         given = type(array).__name__ if not found.ndim else f"an array of {found.dtype}"
         raise InputError(f"{name} must be {expected}, not {given}.")
     return found

@@ -217,7 +217,7 @@ def test_history_tells_all_that_is_known(case):
         ({"iterations": 0}, "1 or more, not 0"),
         ({"time_s": 0}, "above 0, not 0"),
         ({"time_s": float("nan")}, "above 0, not nan"),
-        ({"tolerance": -1e-9}, "must not be negative"),
+        ({"tolerance": -1e-9}, "tolerance must be a number, 0 or more"),
     ],
 )
 def test_rules_by_which_no_run_ends_well_are_refused(rules: dict[str, Any], says: str) -> None:
