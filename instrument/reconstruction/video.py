@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -210,18 +210,9 @@ def finish_video(prepared: PreparedVideo, on_frame: Callable[[int], object] = la
     pictures = VideoPictures(request.out)
     pictures.remove_litter()
     written = [request.out]
-    chosen = samples_of(plan.frames)
-    pictures.say_white(chosen)
+    pictures.say_white(samples_of(plan.frames))
     if request.video.film:
-        black, white = levels_of(pictures.flat(index) for index in chosen)
-        fps = request.video.fps or (1 / pictures.period_s if pictures.period_s else DEFAULT_FPS)
-
-        def shown() -> Iterator[npt.NDArray[np.uint8]]:
-            for number, index in enumerate(plan.frames):
-                yield as_shown(pictures.flat(index), black, white)
-                on_frame(number + 1)
-
-        write_mp4(request.film_path, shown(), fps)
+        write_film(prepared, plan.frames, on_frame)
         written.append(request.film_path)
     unlit = prepared.job.unlit()
     record = {**plain(plan.settings), "frames": len(plan.frames), "run": plan.run, "frames_unlit": unlit}
@@ -229,6 +220,22 @@ def finish_video(prepared: PreparedVideo, on_frame: Callable[[int], object] = la
     write_json(request.record_path, record)
     prepared.job.remove()
     return [*written, request.record_path]
+
+
+def write_film(
+    prepared: PreparedVideo, frames: Sequence[int], on_frame: Callable[[int], object] = lambda _: None
+) -> None:
+    """Write an MP4 of these frames, which are on the disk; raises FileError or OSError."""
+    request, pictures = prepared.request, VideoPictures(prepared.request.out)
+    black, white = levels_of(pictures.flat(index) for index in samples_of(frames))
+
+    def shown() -> Iterator[npt.NDArray[np.uint8]]:
+        for number, index in enumerate(frames):
+            yield as_shown(pictures.flat(index), black, white)
+            on_frame(number + 1)
+
+    fps = request.video.fps or (1 / pictures.period_s if pictures.period_s else DEFAULT_FPS)
+    write_mp4(request.film_path, shown(), fps)
 
 
 # Pieces ------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -20,13 +20,14 @@ import numpy as np
 
 from instrument.files.errors import count
 from instrument.files.volumes import stem_of
-from instrument.reconstruction.forecast import Forecast
+from instrument.reconstruction.forecast import TRIED, Forecast
 from instrument.reconstruction.video import (
     PreparedVideo,
     VideoRequest,
     finish_video,
     prepare_video,
     solve_video,
+    write_film,
 )
 from instrument.reconstruction.video_job import VideoPlan
 from instrument.reconstruction.video_work import BlockReport, at_once
@@ -34,8 +35,6 @@ from recon.solvers.memory import MemoryMeter
 
 FRAMES = 4
 """Of each block that is tried: one that begins cold, and three that go on."""
-ITERATIONS = (3, 9)
-"""Of frames that are solved together: what the second take more is that of six."""
 
 
 @dataclass(frozen=True)
@@ -71,24 +70,23 @@ def forecast_video(trial: PreparedTrial, cancel: threading.Event | None = None) 
     together = plan.over_time is not None
     workers = at_once(len(blocks), video, together=together)
     if together:
-        chosen = range(min(workers, len(blocks)))
+        chosen = range(min(2 * workers, len(blocks)))
         tried = tuple(index for number in chosen for index in blocks[number])
-        plans = [replace(plan, frames=tried, cold_iterations=n) for n in ITERATIONS]
+        asked = replace(plan, frames=tried, cold_iterations=min(plan.cold_iterations, TRIED))
     else:
         spread = np.linspace(0, len(blocks) - 1, 2 * workers).round().astype(int)
         tried = tuple(index for number in np.unique(spread) for index in blocks[number][:FRAMES])
-        plans = [replace(plan, frames=tried)]
-    runs = [_solved(trial, one, cancel) for one in plans]
+        asked = replace(plan, frames=tried)
+    run = _solved(trial, asked, cancel)
     if cancel.is_set():
         return None
-    pace = _together(runs, plan.cold_iterations, len(blocks[0])) if together else _one_by_one(runs[0].reports)
-    began_s = time.perf_counter()
-    finish_video(prepared)
-    finish_s = (time.perf_counter() - began_s) * len(plan.frames) / len(tried)
-    frames_s = _longest(map(len, blocks), workers, pace) + finish_s
-    beside_s = trial.seconds + min(run.beside_s for run in runs)
+    times = plan.cold_iterations / asked.cold_iterations
+    pace = _together(run.reports, times) if together else _one_by_one(run.reports)
+    once_s, film_s = _finished(prepared, tried)
+    frames_s = _longest(map(len, blocks), workers, pace) + film_s * len(plan.frames)
+    beside_s = trial.seconds + run.beside_s + once_s
     elsewhere = video.workers is not None or video.scheduler is not None
-    own = max(report.peak_bytes for run in runs for report in run.reports)
+    own = max(report.peak_bytes for report in run.reports)
     return Forecast(
         beside_s,
         frames_s / len(plan.frames),
@@ -126,6 +124,17 @@ def _solved(trial: PreparedTrial, plan: VideoPlan, cancel: threading.Event) -> _
     return _Solved(reports, time.perf_counter() - began_s)
 
 
+def _finished(prepared: PreparedVideo, frames: Sequence[int]) -> tuple[float, float]:
+    """Finish what was solved; return what that takes of any film, and of each of its frames."""
+    began_s, one_s = time.perf_counter(), 0.0
+    if prepared.request.video.film:
+        write_film(prepared, frames[:1])
+        one_s = time.perf_counter() - began_s
+    finish_video(prepared)
+    each_s = max(time.perf_counter() - began_s - 2 * one_s, 0.0) / max(len(frames) - 1, 1)
+    return one_s, each_s
+
+
 Pace = Callable[[int, bool], float]
 """Seconds that a block of so many frames takes, the first of its worker or not."""
 
@@ -133,23 +142,23 @@ Pace = Callable[[int, bool], float]
 def _one_by_one(reports: list[BlockReport]) -> Pace:
     """Return how long blocks take whose frames go on from one another."""
     seen: set[str] = set()
-    first, later = list[float](), list[float]()
+    first, later = list[BlockReport](), list[BlockReport]()
     for report in reports:
-        (later if report.worker in seen else first).append(report.frame_s[0])
+        (later if report.worker in seen else first).append(report)
         seen.add(report.worker)
-    steps = [b - a for report in reports for a, b in pairwise(report.frame_s)]
-    first_s, warm_s = float(np.mean(first)), float(np.mean(steps)) if steps else 0.0
-    cold_s = float(np.mean(later)) if later else first_s
+    first_s = float(np.mean([report.frame_s[0] for report in first]))
+    used = later or first  # the first frames of a worker are slow ones
+    cold_s = float(np.mean([report.frame_s[0] for report in used]))
+    steps = [b - a for report in used for a, b in pairwise(report.frame_s)]
+    warm_s = float(np.mean(steps)) if steps else 0.0
     end_s = float(np.mean([report.seconds - report.frame_s[-1] for report in reports]))
     return lambda frames, is_first: (first_s if is_first else cold_s) + (frames - 1) * warm_s + end_s
 
 
-def _together(runs: list[_Solved], iterations: int, frames: int) -> Pace:
-    """Return how long blocks take whose frames are solved together."""
-    few_s, more_s = (float(np.mean([report.seconds for report in run.reports])) for run in runs)
-    each_s = max(more_s - few_s, 0.0) / (ITERATIONS[1] - ITERATIONS[0])
-    block_s = few_s + (iterations - ITERATIONS[0]) * each_s
-    return lambda n, _is_first: block_s * n / frames
+def _together(reports: list[BlockReport], times: float) -> Pace:
+    """Return how long blocks take whose frames are solved together, in so many times the iterations."""
+    frame_s = float(np.mean([report.seconds / report.solved for report in reports]))
+    return lambda frames, _is_first: times * frame_s * frames
 
 
 def _longest(sizes: Iterator[int], workers: int, pace: Pace) -> float:
