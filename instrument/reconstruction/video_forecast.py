@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from instrument.files.errors import count
-from instrument.files.volumes import stem_of
+from instrument.files.ome_zarr import stem_of
 from instrument.reconstruction.forecast import TRIED, Forecast
 from instrument.reconstruction.video import (
     PreparedVideo,

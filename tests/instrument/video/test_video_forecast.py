@@ -53,7 +53,7 @@ def test_the_first_frames_are_carried_out_and_nothing_is_left(
         assert told.seconds > told.beside_s > 0
         assert told.memory_bytes > 0
     assert max(solved[0]) == 2
-    assert solved[1] == [5], "what is solved together is carried out so"
+    assert solved[1] == [5, 4], "what is solved together is carried out so"
     assert not list(tmp_path.iterdir())
 
 
