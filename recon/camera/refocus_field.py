@@ -87,7 +87,9 @@ def refocus_field(calibration: Calibration, z_um: float) -> Calibration:
     fields = _of_equal_places([_Side.of(calibration, group) for group in sides])
     x_um, y_um = _axis_at(calibration, mixture, z_um)
     # Pixels by which the pattern of a place is displaced go with x / z: linear in 1 / z between the depths.
-    ratios = [depths[k] / z_um if len(fields) == 1 else 1.0 for k in mixture.members]
+    # Beyond one of them x and y are kept; at infinity, where all of these are one direction, the angles.
+    beyond = len(fields) == 1 and z_um < FAR_UM
+    ratios = [depths[k] / z_um if beyond else 1.0 for k in mixture.members]
     points = np.zeros_like(fields[0].points)
     for weight, ratio, side in zip(mixture.weights, ratios, fields, strict=True):
         points += weight * ratio * side.points

@@ -47,6 +47,16 @@ def test_a_field_between_two_depths_is_that_measured_there(angles):
     assert refocus_field(both, NEAR).source_positions_um.tolist() == [list(p) for p in _at(NEAR)]
 
 
+def test_a_field_brought_to_infinity_keeps_its_angles() -> None:
+    """At the same x and y all of it would be one direction, and no field."""
+    near = _taken(_at(NEAR, PLACES[:3]))
+    made = refocus_field(near, 1e30)
+    assert (made.source_positions_um[:, 2] == 1e9).all()
+    pixel = 13.0 / 8900.0
+    angles = made.source_positions_um[:, :2] / 1e9
+    np.testing.assert_allclose(angles, np.array(PLACES[:3]) / NEAR, atol=pixel)
+
+
 def test_depths_with_other_places_are_interpolated_at_those_of_the_fuller_one():
     line = [(-2000.0, 0.0), (0.0, 0.0), (2000.0, 0.0)]
     made = refocus_field(_taken([*_at(NEAR, line), *_at(FAR, line[:2])]), 12.3e3)
