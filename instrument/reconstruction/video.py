@@ -212,7 +212,7 @@ def finish_video(prepared: PreparedVideo, on_frame: Callable[[int], object] = la
     written = [request.out]
     pictures.say_white(samples_of(plan.frames))
     if request.video.film:
-        write_film(prepared, plan.frames, on_frame)
+        write_shown(prepared, plan.frames, on_frame)
         written.append(request.film_path)
     unlit = prepared.job.unlit()
     record = {**plain(plan.settings), "frames": len(plan.frames), "run": plan.run, "frames_unlit": unlit}
@@ -222,7 +222,7 @@ def finish_video(prepared: PreparedVideo, on_frame: Callable[[int], object] = la
     return [*written, request.record_path]
 
 
-def write_film(
+def write_shown(
     prepared: PreparedVideo, frames: Sequence[int], on_frame: Callable[[int], object] = lambda _: None
 ) -> None:
     """Write an MP4 of these frames, which are on the disk; raises FileError or OSError."""

@@ -27,7 +27,7 @@ from instrument.reconstruction.video import (
     finish_video,
     prepare_video,
     solve_video,
-    write_film,
+    write_shown,
 )
 from instrument.reconstruction.video_job import VideoPlan
 from instrument.reconstruction.video_work import BlockReport, at_once
@@ -128,7 +128,7 @@ def _finished(prepared: PreparedVideo, frames: Sequence[int]) -> tuple[float, fl
     """Finish what was solved; return what that takes of any film, and of each of its frames."""
     began_s, one_s = time.perf_counter(), 0.0
     if prepared.request.video.film:
-        write_film(prepared, frames[:1])
+        write_shown(prepared, frames[:1])
         one_s = time.perf_counter() - began_s
     finish_video(prepared)
     each_s = max(time.perf_counter() - began_s - 2 * one_s, 0.0) / max(len(frames) - 1, 1)
