@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.measured_variants import coarse_pairs, variants
+from benchmarks.measured_variants import coarse_pairs, dark_levels, variants
 from benchmarks.uncertainty import measured_pairs_held
 from recon import Calibration, Reconstruction, reconstruct
 from recon.base.blocks import block_mean
@@ -274,6 +274,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Path], list[str]]]] = {
     "pairs": ("The pairs", pairs),
     "variants": ("The hand as other files are", variants),
     "coarse": ("Pairs in coarse pixels", coarse_pairs),
+    "dark": ("Pairs whose dark level is wrong", dark_levels),
     "intervals": ("How far the pairs' pictures may be off", intervals),
 }
 """By name: a title, and what makes the section."""

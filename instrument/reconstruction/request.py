@@ -38,7 +38,7 @@ from recon.reconstruction.problem import Problem, Stage
 from recon.reconstruction.psf_refinement import refined
 from recon.reconstruction.reconstruct import reconstruct, require_two_images
 from recon.reconstruction.result import Reconstruction
-from recon.reconstruction.selection import choice_for
+from recon.reconstruction.selection import choose
 from recon.reconstruction.solvers import SOLVERS, volume_priors
 from recon.solvers.base import IterationRecord, Keeper
 from recon.types import Calibration, Geometry
@@ -103,7 +103,9 @@ class _Request:
         _require_choice("--explain", self.options.model)
         problem = Problem.of(self._measurement(job), job.calibration, self.options)
         require_two_images(problem)
-        return choice_for(refined(problem)[0] if self.options.refine_psf else problem)
+        choice = choose(refined(problem)[0] if self.options.refine_psf else problem).choice
+        assert choice is not None  # of the model "auto"
+        return choice
 
     def forecast(self, job: Job, on_stage: Stage | None = None) -> Forecast:
         """Say what time and memory it will take, by its first iterations; errors as :meth:`solve`."""

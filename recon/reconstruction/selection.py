@@ -21,6 +21,7 @@ from recon.reconstruction.background import (
     beyond_of,
     floor,
     trial_of,
+    with_dark_restored,
 )
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import channels_of, merged
@@ -46,6 +47,9 @@ from recon.reconstruction.weights import kind_of
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
+BELOW_ZERO = 0.07
+"""How far a background of a picture that is taken for light may lie below zero, relative to the data's mean:
+measured stray light 0.04, a dark level that is a tenth too large 0.22 to 0.3, light that falls off 0.11."""
 
 
 def choose(
@@ -86,7 +90,22 @@ def choose(
                 "Leave one of the two out."
             )
         return with_background(problem, problem.calibration) if problem.n_planes == 1 else problem
-    return reduced(choice_for(problem, on_stage), problem)
+    problem, choice = _chosen(problem, on_stage)
+    return reduced(choice, problem)
+
+
+def _chosen(problem: Problem, on_stage: Stage | None = None) -> tuple[Problem, Choice]:
+    """Return what is chosen, and the problem: with its dark level restored where no light explains that."""
+    choice = choice_for(problem, on_stage)
+    (smooth,) = (d for d in choice.decisions if d.name == "background")
+    if choice.background and smooth.numbers.get("least", 0.0) > -BELOW_ZERO:
+        return problem, choice
+    restored = with_dark_restored(problem)
+    if restored is problem:
+        return problem, choice
+    choice, why = choice_for(restored, on_stage), "an even offset was added instead"
+    told = tuple(replace(d, why=why) if d.name == "background" else d for d in choice.decisions)
+    return restored, replace(choice, decisions=told)
 
 
 def with_background(problem: Problem, calibration: Calibration) -> Problem:
@@ -101,7 +120,11 @@ def with_background(problem: Problem, calibration: Calibration) -> Problem:
     asked = replace(
         options, model="auto", choose=Overrides(model=model, binning=1, channels="all", beyond=False)
     )
-    choice = choice_for(Problem.of(problem.measurement, calibration, asked))
+    seen = Problem.of(problem.measurement, calibration, asked)
+    restored, choice = _chosen(seen)
+    if restored is not seen:
+        problem = Problem.of(restored.measurement, problem.calibration, options)
+        return replace(problem, warnings=tuple(dict.fromkeys((*problem.warnings, *restored.warnings))))
     if choice.background != problem.smooth:
         options = replace(options, estimate_background=choice.background)
         problem = Problem.of(problem.measurement, problem.calibration, options)
