@@ -1,11 +1,14 @@
 """What ``calibrate ... --dry-run`` tells of the time, held against what the routine then takes.
 
     python benchmarks/dry_runs.py [--only axial angular beads stage screen] [--compiled]
+    python benchmarks/dry_runs.py --processor 4
 
 Each on the preset ``tiny`` in real time, told and then taken in two processes, in a folder of its own without
 what other runs took, and without kernels that others compiled (``--compiled``: with those that are there).
 The time that the program takes to start is in neither: taken is what goes by from its first words on. The
-screen is that of ``diffuserbench new --screen``, by default and smaller and larger.
+screen is that of ``diffuserbench new --screen``, by default and smaller and larger. ``--processor`` is for a
+busy machine: it tells and takes the screen by default in processor seconds of one thread, the rehearsal ended
+after so many.
 """
 
 from __future__ import annotations
@@ -18,8 +21,13 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
-from instrument.bench.config_file import template
+from calibration_routines import rehearsal
+from calibration_routines.routine import routines
+from instrument.bench.bench import open_bench
+from instrument.bench.config_file import parse_config, template
+from recon.base.threads import set_threads
 
 ROOT = Path(__file__).resolve().parents[1]
 BENCH = """
@@ -77,6 +85,22 @@ def carried_out(routine: str, words: list[str], folder: Path, *, compiled: bool)
     return time.monotonic() - began_s, "".join(said)
 
 
+def by_the_processor(enough_s: float) -> None:
+    """Print what is told of the screen and what it then takes, both in processor seconds of one thread."""
+    set_threads(1)
+    rehearsal.time = SimpleNamespace(perf_counter=time.process_time)  # type: ignore[assignment, attr-defined]
+    rehearsal.ENOUGH_S = enough_s
+    routine = routines["screen"]
+    asked = routine.options()
+    procedure = routine.procedure(asked)
+    with open_bench(parse_config(template("screen"), None)) as bench, tempfile.TemporaryDirectory() as made:
+        work = procedure.outlook(bench).work
+        print(*rehearsal.rehearse_whole(routine, asked, bench, lambda *_: None, work), flush=True)
+        began_s = time.process_time()
+        procedure.carry_out(bench, Path(made))
+        print(f"It took {time.process_time() - began_s:.1f} processor seconds.")
+
+
 def told_by(said: str) -> str:
     """Return the sentence with the time."""
     found = re.search(r"^(In all, |Up to the end of ).*", said, re.MULTILINE)
@@ -88,7 +112,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--only", nargs="+", choices=list(ROUTINES), default=list(ROUTINES))
     parser.add_argument("--compiled", action="store_true", help="with the kernels that are there")
+    parser.add_argument("--processor", type=float, help="seconds after which a rehearsal ends")
     asked = parser.parse_args()
+    if asked.processor is not None:
+        by_the_processor(asked.processor)
+        return
     print("| `calibrate` | told | took, s | load |\n|---|---|---|---|", flush=True)
     for routine, typed in ((name, typed) for name in asked.only for typed in ROUTINES[name]):
         with tempfile.TemporaryDirectory() as made:
