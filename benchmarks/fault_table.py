@@ -80,7 +80,7 @@ DRIVERS = {
     SimulatedSlm: Slm,
 }
 """Each with the interface whose methods are called."""
-AT_ONCE = ("pattern", "displayed")
+AT_ONCE = ("pattern", "displayed", "computed_s")
 """They do not hang: a driver tells them without asking its device (docs/reference/safety.md)."""
 FAULTS = ("exception", "hang", "nan", "garbage", "unplugged")
 _ALIGN = ["align", "mask", "--reach", "8", "--depth-um", "100", "--spots", "25", "--moves", "1"]

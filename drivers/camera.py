@@ -317,6 +317,14 @@ class Camera(Device):
         """What a snap, or a free-running sequence's next frame, may take before the camera has failed."""
         return self.longest_silence_s + 3e-3 * self.exposure_ms
 
+    def computed_s(self) -> float:
+        """Return how long a simulated camera has computed what it is to see, seconds of the processor.
+
+        While that grows it is slow, and does not hang. A real camera does not compute: 0. Asked while
+        another call is waited for: told at once, without asking the device.
+        """
+        return 0.0
+
     frames_in_flight: ClassVar[int] = 2
     """Frames that can be between the sensor and the host while the next one is exposed, at most."""
 

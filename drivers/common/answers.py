@@ -22,6 +22,9 @@ CALL_MARGIN_S = 20.0
 """Beyond what an exposure needs: connecting anew, a slow bus, a busy computer."""
 
 
+_LOOK_S = 1.0
+"""After which it is looked whether what is waited for goes on."""
+
 EXIT_WAIT_S = 3.0
 """For calls that were given up, when the program ends."""
 
@@ -34,6 +37,36 @@ def is_bounded() -> bool:
     return getattr(_here, "bounded", False)
 
 
+class Computed:
+    """Whether a device's driver went on computing what it simulates: then it is slow, and does not hang.
+
+    Parameters
+    ----------
+    computed_s : callable
+        How long it has computed; what never grows (real devices: 0) is waited for as if nothing were told.
+    """
+
+    def __init__(self, computed_s: Callable[[], float]) -> None:
+        self._computed_s, self._seen_s = computed_s, computed_s()
+
+    def went_on(self) -> bool:
+        """Return whether it has computed since this was asked last."""
+        seen_s, self._seen_s = self._seen_s, self._computed_s()
+        return self._seen_s > seen_s
+
+
+def _wait(over: threading.Event, seconds: float, computed: Computed) -> None:
+    """Wait for an event, or until nothing was computed for so long; standing still is no time."""
+    left_s = seconds
+    while left_s > 0:
+        look_s, began_s = min(left_s, _LOOK_S), time.monotonic()
+        if over.wait(look_s):
+            return
+        left_s -= min(time.monotonic() - began_s, 2 * look_s)
+        if computed.went_on():
+            left_s = seconds
+
+
 def within(
     seconds: float,
     device: str,
@@ -42,12 +75,14 @@ def within(
     *,
     undo: Callable[[], object] | None = None,
     left: list[threading.Thread] | None = None,
+    computed_s: Callable[[], float] = float,
 ) -> T:
     """Return what ``call`` returns, or raise what it raises, unless it takes longer than ``seconds``.
 
     The call is made in a thread of its own, which is left to itself where it hangs: nothing can end it. When
     it ends after all, or was interrupted by Ctrl-C, nobody wants what it did: ``undo`` is called after it.
-    Such a thread is put into ``left``. One that had not begun by then does not begin.
+    Such a thread is put into ``left``. One that had not begun by then does not begin. While ``computed_s``
+    grows (of a simulated camera: see :meth:`drivers.camera.Camera.computed_s`) the time begins anew.
 
     Raises DeviceTimeoutError, naming the device and what it was to do.
     """
@@ -97,7 +132,7 @@ def within(
     thread = threading.Thread(target=run, name=f"{device}: {what}", daemon=True)
     try:
         thread.start()
-        over.wait(seconds)
+        _wait(over, seconds, Computed(computed_s))
     except BaseException:  # Ctrl-C
         if not give_up():
             undone()
@@ -105,7 +140,7 @@ def within(
     if give_up():
         raise DeviceTimeoutError(
             device,
-            f"hangs: {what} has not ended for {seconds:g} s.",
+            f"hangs: {what} has not ended for {seconds:.4g} s.",
             "Unplug it or switch it off and on, then start the program again.",
         )
     if errors:

@@ -151,10 +151,10 @@ def _in_time(device: Device, name: str, call: Callable[[], _T]) -> _T:
     if name not in _SAFE:
         require_ended(device)
     undo = getattr(device, _UNDONE_BY[name]) if name in _UNDONE_BY else None
+    computed_s = device.computed_s if isinstance(device, Camera) else float
+    limit_s, what = call_limit_s(device, name), name.replace("_", " ")
     try:
-        return within(
-            call_limit_s(device, name), device.name, name.replace("_", " "), call, undo=undo, left=left
-        )
+        return within(limit_s, device.name, what, call, undo=undo, left=left, computed_s=computed_s)
     except Exception:
         raise
     except BaseException as interruption:  # Ctrl-C: nothing moves on, or is lit late, that nobody waits for

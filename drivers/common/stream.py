@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from drivers.common.answers import CALL_MARGIN_S, STOP_ANSWER_S, within
+from drivers.common.answers import CALL_MARGIN_S, STOP_ANSWER_S, Computed, within
 from drivers.common.stream_reader import StreamReader, Subscription
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import Frame
@@ -253,7 +253,10 @@ class FrameStream:
         return self._next_of(reader)
 
     def _next_of(self, reader: StreamReader) -> Frame:
+        computed = Computed(self.camera.computed_s)
         frame = reader.next_frame(self.camera.longest_wait_s)
+        while frame is None and self._running and computed.went_on():
+            frame = reader.next_frame(self.camera.longest_wait_s)
         if frame is None and self._running:
             raise DeviceTimeoutError(self.camera.name, "sent no frame while a fresh one was waited for.")
         if frame is None:
@@ -281,7 +284,7 @@ class FrameStream:
 
     # The producer --------------------------------------------------------------------------------
     def _produce(self) -> None:
-        silent_s = 0.0
+        silent_s, computed = 0.0, Computed(self.camera.computed_s)
         try:
             while self._running:
                 buffer = self._buffer()
@@ -291,7 +294,7 @@ class FrameStream:
                         self._scratch if buffer is None else buffer, _POLL_S
                     )
                 except DeviceTimeoutError as error:
-                    silent_s += time.monotonic() - began_s
+                    silent_s = 0.0 if computed.went_on() else silent_s + time.monotonic() - began_s
                     limit_s = self.camera.longest_wait_s
                     if self.camera.trigger_mode == "free_run" and silent_s > limit_s:
                         raise DeviceTimeoutError(

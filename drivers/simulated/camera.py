@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,6 +61,14 @@ class _Look:
         finally:
             self._over.set()
 
+    def computed_s(self) -> float:
+        """Return how long the thread has computed, seconds of the processor; 0 where that is not said."""
+        try:
+            said = Path(f"/proc/self/task/{self.thread.native_id}/stat").read_text()
+        except OSError:  # over, or another system than Linux
+            return 0.0
+        return sum(map(int, said.rpartition(")")[2].split()[11:13])) / os.sysconf("SC_CLK_TCK")
+
     def give_up(self) -> None:
         """Let go of who waits; what is being computed is kept by the world."""
         self._over.set()
@@ -74,6 +84,8 @@ class _Look:
 _LAST_LOOK_S = 5.0
 _MOST_LATE_FRAMES = 4
 """So many frames a camera holds back for a host that does not fetch them; what is later than that is lost."""
+_UNWANTED_S = 1.0
+"""Where nothing is waited for, frames are not computed for a host that has asked for none for this long."""
 
 
 class SimulatedCamera(SimulatedCameraSettings):
@@ -111,6 +123,7 @@ class SimulatedCamera(SimulatedCameraSettings):
         self._failure: DeviceError | None = None
         self._light: tuple[Any, npt.NDArray[np.float32]] | None = None
         self._looks: list[_Look] = []
+        self._asked_s = 0.0
         self._coarse: tuple[Pixels, int] | None = None
         self._pattern: tuple[Any, FixedPattern] | None = None
         self._replay: tuple[npt.NDArray[np.float32], Any, list[tuple[Pixels, float]]] | None = None
@@ -137,6 +150,10 @@ class SimulatedCamera(SimulatedCameraSettings):
         alive = isinstance(self.world, SimulatedWorld) and self.world.animal is not None
         return super().longest_wait_s + (self.longest_birth_s if alive else 0.0)
 
+    def computed_s(self) -> float:
+        """Return how long the light that is computed now has been computed, seconds of the processor."""
+        return sum(look.computed_s() for look in self._looks)
+
     # Taking images ---
     def snap(self) -> Frame:
         """Take one frame whose exposure begins now, and wait for it."""
@@ -161,6 +178,7 @@ class SimulatedCamera(SimulatedCameraSettings):
             raise StoppedError(self.name, "the sequence was stopped before it began.")
         with self._arrived:
             self._ring = deque(maxlen=n_buffers)
+            self._asked_s = time.monotonic()
             self._triggers = 0
             self._pulse, self._ready_ns = None, 0
             self._lost = 0
@@ -174,7 +192,8 @@ class SimulatedCamera(SimulatedCameraSettings):
     def next_frame(self, timeout_s: float) -> Frame:
         """Return the oldest frame of the running sequence not yet fetched."""
         self._require()
-        deadline = time.monotonic() + timeout_s
+        self._asked_s = time.monotonic()
+        deadline = self._asked_s + timeout_s
         with self._arrived:
             while not self._ring:
                 if self._failure is not None:
@@ -255,6 +274,8 @@ class SimulatedCamera(SimulatedCameraSettings):
                 # A camera's clock does not wait for a busy host: what was late is made up for, up to a point.
                 due = max(due + period, time.monotonic() - _MOST_LATE_FRAMES * period)
                 self._abort.wait(due - time.monotonic())
+                while self._is_unwanted() and not self._abort.wait(0.1):
+                    pass
         except StoppedError:
             return
         except DeviceError as error:
@@ -269,6 +290,11 @@ class SimulatedCamera(SimulatedCameraSettings):
                         ended = DeviceError(self.name, "its sequence ended by an error.", "See the log.")
                         self._failure = self._failure or ended
                 self._arrived.notify_all()
+
+    def _is_unwanted(self) -> bool:
+        """Whether the next frame would be computed for nobody: a host that hangs would burn a processor."""
+        hurries, is_full = self.world.clock.time_scale == 0, len(self._ring) == self._ring.maxlen
+        return hurries and is_full and time.monotonic() - self._asked_s > _UNWANTED_S
 
     def _await_trigger(self) -> bool:
         with self._arrived:

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.camera import Camera, TriggerEdge
-from drivers.common.answers import STOP_ANSWER_S, within
+from drivers.common.answers import STOP_ANSWER_S, Computed, within
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import OFF, LedArray, LedPattern
@@ -227,6 +227,7 @@ def _played(
     frames: list[Frame] = []
     quiet_s = max(_QUIET_S, 2e-3 * period_ms)
     silent_since_s, ended_s = time.monotonic(), math.inf
+    computed = Computed(camera.computed_s)
     try:
         while True:
             try:
@@ -237,6 +238,8 @@ def _played(
                     if failed or len(frames) >= count or time.monotonic() - ended_s > _MISSING_S:
                         break
                     continue
+                if computed.went_on():
+                    silent_since_s = time.monotonic()
                 if time.monotonic() - silent_since_s > camera.longest_wait_s + 1e-3 * (count * period_ms):
                     raise
                 continue

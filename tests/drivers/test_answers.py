@@ -81,6 +81,31 @@ def test_what_a_call_returns_and_raises_comes_through_and_a_hang_is_named() -> N
     ended.set()
 
 
+@pytest.mark.parametrize(
+    "computed_s", [[0.0, 0.0], [0.0, 1.0, 2.0, 2.0], [np.nan, np.nan], [3.0, 1.0, 2.0, 2.0]]
+)
+def test_what_goes_on_computing_is_slow_and_does_not_hang(computed_s: list[float]) -> None:
+    let_go, said = threading.Event(), iter(computed_s)
+    with pytest.raises(DeviceTimeoutError, match="hangs: snap has not ended"):
+        within(0.02, "camera", "snap", lambda: let_go.wait(20), computed_s=lambda: next(said))
+    let_go.set()
+    assert list(said) == (computed_s[2:] if computed_s[0] == 3 else [])
+
+
+def test_time_when_the_program_stood_still_is_nobodys_hang(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s, looks = [0.0], list[float]()
+
+    class StandsStill(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            looks.append(timeout or 0.0)
+            now_s[0] += 1000.0 if len(looks) == 1 else timeout or 0.0
+            return False
+
+    monkeypatch.setattr(answers, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    answers._wait(StandsStill(), 30.0, answers.Computed(float))
+    assert len(looks) == 29
+
+
 def test_calls_that_were_given_up_are_known_and_waited_for_at_the_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -357,7 +382,7 @@ def test_every_call_of_a_device_has_an_end_or_is_known_to_have_another() -> None
         if not name.startswith("_") and inspect.isfunction(member)
     }
     streams = {"start_sequence", "stop_sequence", "next_frame", "next_frame_into", "stream"}
-    computed = {"check", "single", "move_duration_s", "settles_within"}
+    computed = {"check", "single", "move_duration_s", "settles_within", "computed_s"}
     assert {name for name in calls if not is_timed(name)} - streams - computed <= {"close", "play", "stop"}
 
 

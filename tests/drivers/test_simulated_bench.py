@@ -323,6 +323,50 @@ def test_stop_does_not_wait_until_a_new_light_is_computed(monkeypatch: pytest.Mo
     assert not any(thread.name == "simulated light" for thread in threading.enumerate())
 
 
+def test_what_a_light_takes_of_the_processor_is_told_and_waiting_is_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bench = Bench()
+    waits, ends = threading.Event(), threading.Event()
+    see = bench.world.photons_per_s
+
+    def busy_then_waiting(weights: Rgb, binning: int = 1) -> object:
+        until_s = time.thread_time() + 0.05
+        while time.thread_time() < until_s:
+            pass
+        waits.set()
+        assert ends.wait(20.0)
+        return see(weights, binning)
+
+    monkeypatch.setattr(bench.world, "photons_per_s", busy_then_waiting)
+    assert bench.camera.computed_s() == 0
+    bench.camera.start_sequence()
+    assert waits.wait(20.0)
+    time.sleep(0.05)
+    computed_s = bench.camera.computed_s()
+    time.sleep(0.1)
+    assert bench.camera.computed_s() == computed_s > 0
+    ends.set()
+    bench.camera.stop_sequence()
+
+
+def test_frames_that_nobody_asks_for_are_not_computed_where_nothing_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("drivers.simulated.camera._UNWANTED_S", 0.05)
+    bench = Bench()
+    bench.camera.start_sequence(2)
+    frame_id = bench.camera.next_frame(20).metadata.frame_id
+    time.sleep(0.3)
+    computed = bench.camera._next_id
+    time.sleep(0.3)
+    assert bench.camera._next_id == computed
+    for _ in range(4):
+        frame_id, before = bench.camera.next_frame(20).metadata.frame_id, frame_id
+        assert frame_id > before
+    bench.camera.stop_sequence()
+
+
 # The camera's electronics ---
 def test_stop_ends_homing_on_the_reference_mark_too() -> None:
     bench = Bench()

@@ -318,6 +318,26 @@ def test_a_camera_that_falls_silent_is_an_error(monkeypatch: pytest.MonkeyPatch)
             list(iter(lambda: reader.next_frame(5), None))
 
 
+def test_a_camera_that_computes_is_not_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.camera.Camera.longest_silence_s", 0.05)
+    camera, computed_s = FreeRunningCamera(), itertools.chain(range(4), itertools.repeat(4))
+    asked = list[float]()
+
+    def silent(*_: object) -> None:
+        asked.append(1.0)
+        time.sleep(0.1)
+        raise DeviceTimeoutError(camera.name, "no frame.")
+
+    monkeypatch.setattr(camera, "computed_s", lambda: float(next(computed_s)))
+    monkeypatch.setattr(camera, "next_frame_into", silent)
+    with (
+        FrameStream(camera) as stream,
+        pytest.raises(DeviceTimeoutError, match=r"has sent no frame for 0\.1 s"),
+    ):
+        stream.reader().next_frame(20)
+    assert len(asked) == 5
+
+
 def test_stopping_the_camera_from_elsewhere_ends_the_stream_without_error() -> None:
     camera = FreeRunningCamera()
     with FrameStream(camera) as stream:
