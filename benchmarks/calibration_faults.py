@@ -46,7 +46,8 @@ from calibration_routines.display.mask_alignment import AlignmentReport
 from calibration_routines.optics.angular_response import AngularResponse
 from calibration_routines.optics.bead_photographs import BeadSlides, photograph_slides
 from calibration_routines.optics.dpc import DiffuserSurface
-from calibration_routines.optics.photograph import Photograph, measure_field_response
+from calibration_routines.optics.field_response import measure_field_response
+from calibration_routines.optics.photograph import Photograph
 from calibration_routines.procedure import Listener
 from calibration_routines.routine import routines
 from calibration_routines.scatter import compare

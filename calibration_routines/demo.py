@@ -22,12 +22,8 @@ from calibration_routines.demo_chart import chart_of
 from calibration_routines.demo_picture import Comparison, Viewer, compare
 from calibration_routines.demo_volume import Lights, Placed
 from calibration_routines.demo_write import write_pictures
-from calibration_routines.optics.photograph import (
-    FieldResponse,
-    Photograph,
-    measure_field_response,
-    photograph,
-)
+from calibration_routines.optics.field_response import FieldResponse, measure_field_response
+from calibration_routines.optics.photograph import Photograph, photograph
 from calibration_routines.procedure import Listener
 from calibration_routines.psf.exposure import expose_scene
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep

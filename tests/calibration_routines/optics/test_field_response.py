@@ -7,11 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration_routines import CalibrationError
-from calibration_routines.optics.photograph import fit_field_response, measure_field_response
+from calibration_routines import CalibrationError, Listener, photograph
+from calibration_routines.optics.field_response import (
+    field_response_of,
+    fit_field_response,
+    measure_field_response,
+)
+from calibration_routines.plan_procedures import ResumeProcedure
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
 from instrument.plan import PlanError
+from recon.errors import InputError
 
 PLACES = [(0.0, 0.0, 1e5), (3e4, 0.0, 1e5), (-3e4, 0.0, 1e5), (0.0, 2e4, 1e5), (0.0, -2e4, 1e5)]
 BENCH = """
@@ -107,3 +113,44 @@ def test_other_light_that_comes_in_meanwhile_is_refused(tmp_path: Path) -> None:
         bench.stage.home()
         with pytest.raises(CalibrationError, match="other light"):
             measure_field_response(bench, (7e3, 10e3), 100e3, 2.0, tmp_path)
+
+
+class _CtrlC(Listener):
+    """Ends what it listens to at a frame, as a person does."""
+
+    def __init__(self, at: int) -> None:
+        self._left = at
+
+    def frame(self, *_: object) -> None:
+        self._left -= 1
+        if self._left == 0:
+            raise KeyboardInterrupt
+
+
+def test_what_was_interrupted_is_gone_on_with_and_analysed(tmp_path: Path) -> None:
+    asked = (7e3, 10e3), 100e3, 2.0
+    with open_bench(parse_config(BENCH, None)) as bench:
+        assert bench.stage is not None
+        bench.stage.home()
+        usual = measure_field_response(bench, *asked, tmp_path / "whole")
+        assert field_response_of(next((tmp_path / "whole").iterdir())) == usual
+        with pytest.raises(KeyboardInterrupt) as ended:
+            measure_field_response(bench, *asked, tmp_path, listener=_CtrlC(13))
+        assert "field_response_of" in ended.value.__notes__[-1]
+        run = next(tmp_path.glob("*_field-response-sweep"))
+        with pytest.raises(CalibrationError, match=r"ended early.*diffuserbench resume"):
+            field_response_of(run)
+        ResumeProcedure(run).carry_out(bench)
+    went_on = field_response_of(run)
+    assert (went_on.along_x, went_on.along_y) == pytest.approx((usual.along_x, usual.along_y), rel=0.02)
+
+
+def test_a_run_of_something_else_gives_no_response(tmp_path: Path) -> None:
+    with open_bench(parse_config(BENCH, None)) as bench:
+        assert bench.stage is not None
+        bench.stage.home()
+        with pytest.raises(InputError, match="dark_frames"):
+            photograph(bench, 1.0, tmp_path, dark_frames=0)
+        photograph(bench, 1.0, tmp_path, dark_frames=1)
+    with pytest.raises(CalibrationError, match="'photograph'"):
+        field_response_of(next(tmp_path.iterdir()))
