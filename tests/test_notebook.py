@@ -57,7 +57,7 @@ def test_the_ten_lines_of_the_readme_run(
     assert (tmp_path / "scene.png").exists()
     with pytest.warns(UserWarning, match="no screen"):
         db.show("photo.tif")
-    with pytest.raises(db.BenchError, match="given together by `psf`"):
+    with pytest.raises(db.BenchError, match=r"holds 5 images; .* their mean\.$"):
         db.show(ImageFile(Path("films.tif"), np.zeros((5, 9, 9), np.uint8)))
     assert "counts from both" in names["tv"].job.notes["Dark"]
     assert names["tv"].image.shape == (48, 48)

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from instrument.files.errors import ConfigProblem
+from instrument.files.validation import in_words
 
 # Suffix to (dimension, factor to its base unit); how units are written in this project's names.
 _UNITS: Mapping[str, tuple[str, float]] = {
@@ -89,19 +90,9 @@ def _sentence(detail: ErrorDetails, names: Sequence[str], models: Sequence[type[
         hint = _other_unit(str(key), value, names) or nearest(str(key), names)
         return f"there is no such key.{hint}" + (f" Keys here: {', '.join(names)}." if names else "")
     if kind == "missing":
-        what = "this value" if isinstance(key, int) else "this key"
-        return f"{what} is missing.{_about(detail, models)}"
-    message = detail["msg"]
-    for start, instead in (
-        ("Input should be a valid ", "must be a "),
-        ("Input should be ", "must be "),
-        ("Value error, ", ""),
-    ):
-        if message.startswith(start):
-            message = instead + message.removeprefix(start)
-            break
+        return f"{in_words(detail)}.{_about(detail, models)}"
     found = "" if isinstance(value, Mapping) else f", not {value!r}"  # a whole table is in the file to see
-    return f"{_article(message)}{found}.{_about(detail, models)}"
+    return f"{in_words(detail)}{found}.{_about(detail, models)}"
 
 
 def _about(detail: ErrorDetails, models: Sequence[type[BaseModel]]) -> str:
@@ -109,13 +100,6 @@ def _about(detail: ErrorDetails, models: Sequence[type[BaseModel]]) -> str:
     names = [step for step in detail["loc"] if isinstance(step, str)]
     fields = [model.model_fields[names[-1]] for model in models if names and names[-1] in model.model_fields]
     return f" {fields[0].description}" if fields and fields[0].description else ""
-
-
-def _article(message: str) -> str:
-    articles = (("a array", "an array"), ("a integer", "an integer"), ("an object", "a table"))
-    for wrong, right in (*articles, ("a object", "a table")):
-        message = message.replace(wrong, right)
-    return message.replace("string", "text").replace("boolean", "true or false")
 
 
 def _other_unit(key: str, value: object, names: Iterable[str]) -> str:

@@ -66,7 +66,8 @@ def save_calibration(calibration: Calibration, folder: Path | str, *, overwrite:
     require_argument("folder", folder, Path)
     target = Path(folder)
     if target.exists() and not overwrite:
-        raise CalibrationFileError(target, "exists already.", "Choose another name, or allow overwriting.")
+        remedy = "Choose another name, or overwrite it: --force, in Python overwrite=True."
+        raise CalibrationFileError(target, "exists already.", remedy)
     if target.exists() and not (target / _JSON).is_file():
         raise CalibrationFileError(target, "exists and is no calibration.", "It is not overwritten.")
     try:

@@ -108,8 +108,10 @@ class ImageFile:
         return None if self.is_stack else png_bytes(as_seen(self.pixels, raw=True))
 
 
-def read_image(path: Path | str | ImageFile, *, holes: bool = False) -> ImageFile:
+def read_image(path: Path | str | ImageFile, *, holes: bool = False, several: str = "") -> ImageFile:
     """Read one image; one that was read already is returned. With ``holes`` it may have NaN pixels.
+
+    ``several`` is what else helps who gives a stack.
 
     A folder with one image in it, as a photograph's run is, stands for that image.
 
@@ -118,11 +120,12 @@ def read_image(path: Path | str | ImageFile, *, holes: bool = False) -> ImageFil
     """
     if isinstance(path, ImageFile):
         if path.is_stack:
-            raise _several(path.path, len(path.pixels))
+            raise _several(path.path, len(path.pixels), several)
         _refuse_non_finite(path.path, path.pixels, holes=holes)
         return path
-    path, array, notes = _decoded(_only_image(Path(path)), _one_image)
-    array, more = _one_image(path, array)
+    one = partial(_one_image, several=several)
+    path, array, notes = _decoded(_only_image(Path(path)), one)
+    array, more = one(path, array)
     pixels, converted = _standard_dtype(path, array, holes=holes)
     return ImageFile(path, pixels, (*notes, *more, *converted), image_metadata(path))
 
@@ -354,15 +357,14 @@ def _decoded(
 
 
 # Shapes and dtypes ---------------------------------------------------------------------------------
-def _several(path: Path, count: int) -> FileError:
-    return FileError(
-        path,
-        f"holds {count} images; a single one is expected.",
-        "Give one of them, or their mean; PSFs, one a depth, are given together by --volume.",
-    )
+def _several(path: Path, count: int, further: str) -> FileError:
+    remedy = f"Give one of them, or their mean. {further}".rstrip()
+    return FileError(path, f"holds {count} images; a single one is expected.", remedy)
 
 
-def _one_image(path: Path, array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
+def _one_image(
+    path: Path, array: npt.NDArray[Any], several: str = ""
+) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
     notes: tuple[str, ...] = ()
     while array.ndim > 2 and array.shape[0] == 1:
         array = array[0]
@@ -373,7 +375,7 @@ def _one_image(path: Path, array: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], t
         array = array[..., 0] if array.shape[-1] == 1 else array
         notes += dropped
     elif array.ndim == 3:
-        raise _several(path, len(array))
+        raise _several(path, len(array), several)
     elif array.ndim != 2:
         raise FileError(path, f"holds an array of shape {array.shape}; an image is expected.")
     if 0 in array.shape:

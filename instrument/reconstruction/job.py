@@ -132,7 +132,8 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
     if isinstance(psf_file, Path) and psf_file.is_dir():
         other = "PSFs of several depths in a folder are given by --volume, a calibration by --calibration."
         raise FileError(psf_file, "is a folder; a file is expected.", other)
-    raw_psf, image = read_image(psf_file), read_image(image_file, holes=True)
+    raw_psf = read_image(psf_file, several="PSFs, one a depth, are given together by --volume.")
+    image = read_image(image_file, holes=True)
     crop, binning = inputs.crop, inputs.binning
     _refuse_constant(image)
     pattern = pattern_of(inputs.mosaic, image)

@@ -14,6 +14,18 @@ from recon.errors import InputError, StructureError
 Array = npt.NDArray[Any]
 
 
+def refuse_lookalike(prior: object) -> None:
+    """Raise InputError for what has a prior's methods and is none, saying how it becomes one."""
+    made = prior if isinstance(prior, type) else type(prior)
+    if issubclass(made, Prior) or not (hasattr(made, "value") and hasattr(made, "prox")):
+        return
+    name = made.__name__
+    raise InputError(
+        f"prior must be a Prior, and {name}, which has value and prox, is none: derive its class, "
+        f"class {name}(db.Prior), and give an object, {name}(...)."
+    )
+
+
 class Prior(ABC):
     """A convex function that is small for likely objects. One of your own needs ``value`` and ``prox``.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,6 +64,13 @@ class Measurement:
     patterns: npt.ArrayLike | None = None
 
     __repr__ = brief
+
+    def __post_init__(self) -> None:
+        """Raise InputError where the image is no array of numbers: a file's name is read by db.read."""
+        if self.image is None or isinstance(self.image, str | bytes | Path):
+            remedy = "" if self.image is None else " db.read reads a file."
+            expected = "The measurement must be an array, (height, width[, n_channels])"
+            raise InputError(f"{expected}, not {self.image!r}.{remedy}")
 
     @property
     def flat(self) -> bool:

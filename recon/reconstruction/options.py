@@ -16,6 +16,7 @@ from recon.camera.camera_model import ModelName, model_names
 from recon.camera.grid import FAR_UM
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior
+from recon.priors.base import refuse_lookalike
 
 Precision = Literal["float32", "float64"]
 PRECISIONS: tuple[Precision, ...] = ("float32", "float64")
@@ -334,6 +335,7 @@ class ReconstructionOptions:
         from recon.reconstruction.solvers import require_solver
 
         require_solver(self.solver)
+        refuse_lookalike(self.prior)
         require(self)
         if self.z_um == math.inf:  # as the command line has it: records hold no infinities
             object.__setattr__(self, "z_um", FAR_UM)

@@ -20,7 +20,7 @@ from recon.base.namespace import Namespace, namespace_of, to_host
 from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.base import LinearOperator
 from recon.errors import InputError
-from recon.priors.base import Prior
+from recon.priors.base import Prior, refuse_lookalike
 
 
 class StopReason(enum.StrEnum):
@@ -136,6 +136,7 @@ Callback = Callable[["Solver", IterationRecord], object]
 def require_parts(operator: object, data: Array, prior: object) -> None:
     """Raise InputError where a solver's parts are none, or the data are not what the operator gives."""
     require_argument("operator", operator, LinearOperator)
+    refuse_lookalike(prior)
     require_argument("prior", prior, Prior, "db.PRIORS names them, db.L1(weight) is one.")
     assert isinstance(operator, LinearOperator)
     shape = getattr(data, "shape", None)

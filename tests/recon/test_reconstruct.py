@@ -222,6 +222,16 @@ GOOD = np.ones((12, 14)) + np.eye(12, 14)
 BAD = np.where(np.arange(12 * 14).reshape(12, 14) == 30, np.nan, GOOD)
 
 
+class LikeAPrior:
+    """Has a prior's methods and is none."""
+
+    def value(self, x):
+        return 0.0
+
+    def prox(self, x, step):
+        return x
+
+
 @pytest.mark.parametrize(
     ("measurement", "psf", "options", "message"),
     [
@@ -266,6 +276,15 @@ BAD = np.where(np.arange(12 * 14).reshape(12, 14) == 30, np.nan, GOOD)
         (GOOD, GOOD, {"tolerance": -1e-3}, "tolerance must be a number, 0 or more"),
         (GOOD, GOOD, {"z_um": -5}, "z_um must be a number, above 0 .um., or inf, not -5"),
         (GOOD, GOOD, {"prior": 3}, "prior must be one of tv, .* or a Prior, not 3"),
+        (
+            GOOD,
+            GOOD,
+            {"prior": LikeAPrior()},
+            r"LikeAPrior, .* is none: derive .* class LikeAPrior\(db.Prior\)",
+        ),
+        (GOOD, GOOD, {"prior": LikeAPrior}, "LikeAPrior, which has value and prox, is none"),
+        ("photo.tif", GOOD, {}, r"must be an array, .* not 'photo.tif'\. db.read reads a file"),
+        (None, GOOD, {}, r"must be an array, .* not None\.$"),
         (GOOD, GOOD, {"field": "half"}, "field must be one of sensor, full, not 'half'"),
         (np.ones((1, 1)), np.ones((1, 1)), {}, "constant"),
     ],

@@ -73,7 +73,7 @@ def test_its_pictures_are_valid_ome_zarr(tmp_path: Path) -> None:
 
 def test_an_existing_calibration_is_replaced_only_on_request(tmp_path: Path) -> None:
     path = save_calibration(make(), tmp_path / "c")
-    with pytest.raises(CalibrationFileError, match="exists already"):
+    with pytest.raises(CalibrationFileError, match=r"exists already.* --force, in Python overwrite=True"):
         save_calibration(make(1), path)
     assert len(load_calibration(path).psfs) == 3
     save_calibration(make(1), path, overwrite=True)

@@ -123,8 +123,8 @@ def test_stacks_from_pages_arrays_and_folders(tmp_path: Path) -> None:
     for path in (tmp_path / "s.tif", tmp_path / "s.npy", folder):
         np.testing.assert_array_equal(read_stack(path).pixels, stack)
     for given in (tmp_path / "s.tif", read_stack(tmp_path / "s.tif")):
-        with pytest.raises(FileError, match=r"5 images; a single one .* are given together"):
-            read_image(given)
+        with pytest.raises(FileError, match=r"5 images; a single one .* mean\. PSFs go by --volume"):
+            read_image(given, several="PSFs go by --volume.")
     write_image(folder / "psf99.tif", stack[0, :3])
     with pytest.raises(FileError, match=r"psf99\.tif: is 3 x 7 .* psf00\.tif is 6 x 7"):
         read_stack(folder)

@@ -162,5 +162,5 @@ def test_a_stack_where_one_picture_is_wanted_is_refused_before_its_pixels_are_re
         case _:
             zarr.save_array(path, stack)
             monkeypatch.setattr(zarr.Array, "__getitem__", lambda *_: pytest.fail("read"))
-    with pytest.raises(FileError, match=rf"{name}: holds 5 images; a single one is expected"):
+    with pytest.raises(FileError, match=rf"{name}: holds 5 images; a single one is expected\..* mean\.$"):
         read_image(path)

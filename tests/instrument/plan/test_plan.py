@@ -147,6 +147,11 @@ def test_every_mistake_of_a_plan_is_named() -> None:
     text = str(caught.value)
     assert all(words in text for words in ("parts[0].avrage", "parts[1].exposures_ms[0]", "parts[1].light"))
     assert len(caught.value.problems) == 3
+    with pytest.raises(PlanError) as caught:
+        Plan.checked({"label": "x", "parts": [{"light": "source", "average": "many"}]})
+    missing, other = caught.value.problems
+    assert missing == "parts[0].label: this key is missing"
+    assert other.startswith("parts[0].average: must be an integer")
 
 
 def test_everything_out_of_reach_is_named_with_its_steps() -> None:
