@@ -7,7 +7,7 @@
 
 Cases run in processes of their own on points seen through random lenslets (SIMULATED): first the
 forecast that ``--explain`` gives, then the whole of it; frames and workers are those of films, by the clock
-where there are several. Written are
+where there are several; holograms are those of a picture through a scattering mask. Written are
 ``growth.png`` and ``growth.csv``: seconds and memory against each size, the exponent by which they grow, what
 the forecast missed, and the largest that fits into this machine's memory, straight on from the last two.
 Sizes are scaled by ``--most``.
@@ -25,7 +25,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -34,9 +34,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from instrument.display.hologram import compute_and_judge
+from instrument.display.hologram_forecast import forecast_hologram
 from instrument.files import kept_times
 from instrument.files.figures import ACCENT, INK, SECOND, save_figure, style
 from instrument.files.images import write_image
+from instrument.files.sample_images import load_sample
 from instrument.reconstruction import forecast as module
 from instrument.reconstruction.forecast import forecast
 from instrument.reconstruction.foretold import Foretold, Like
@@ -49,6 +52,7 @@ from recon.base.blocks import block_mean
 from recon.base.threads import set_threads
 from recon.evaluation.measured_sets import MEASURED, measured_set
 from recon.evaluation.scene import make_scene
+from recon.holography import Display, HologramOptions, Target, random_mask
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.solvers.memory import GIB, MemoryMeter, available_bytes
@@ -70,6 +74,10 @@ class Case:
     workers: int = 0
     """Processes of a cluster; 0: none."""
     over_time: OverTimeName | None = None
+    expansion: int = 0
+    """Of a hologram, whose SLM has so many pixels along each side; 0: none."""
+    again: int = 1
+    """Holograms, each from where the one before ended."""
 
 
 def cases(most: float) -> dict[str, list[tuple[int, Case]]]:
@@ -81,6 +89,9 @@ def cases(most: float) -> dict[str, list[tuple[int, Case]]]:
         "PSFs": [(n * n, Case(side=128, psfs=n)) for n in (2, 3, 5)],
         "frames": [(n, Case(side=128, frames=n)) for n in (32, 96, 288)],
         "frames together": [(n, Case(side=64, frames=n, over_time="tv")) for n in (32, 96)],
+        "holograms": [(n * n, Case(side=n, expansion=4)) for n in (128, 256, 512)],
+        "expansions": [(n, Case(side=128, expansion=n)) for n in (1, 4, 16)],
+        "holograms in a row": [(n, Case(side=128, expansion=4, again=n)) for n in (1, 3)],
         "workers": [(n, Case(side=128, frames=96, workers=n)) for n in (1, 2)],
         "threads": [(n, Case(side=384, threads=n)) for n in (1, 2)],
     }
@@ -181,10 +192,37 @@ def film_request(case: Case, folder: Path) -> VideoRequest:
     )
 
 
+def holograms(case: Case, foretold: bool, answer: Any) -> None:
+    """Forecast holograms by default options, or compute them; sends seconds of the processor, and bytes."""
+    time.perf_counter = time.process_time
+    set_threads(1)
+    options = HologramOptions()
+    factor = round(case.expansion**0.5)
+    small = Display((32, 32), random_mask((32 * factor, 32 * factor)))
+    compute_and_judge(
+        small, [Target(load_sample("leaves", small.mask.shape))], replace(options, iterations=2)
+    )  # it is compiled
+    display = Display((case.side, case.side), random_mask((case.side * factor, case.side * factor)))
+    targets = [Target(load_sample("leaves", display.mask.shape))]
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
+    if foretold:
+        told = forecast_hologram(display, targets, options, frames=case.again)
+        answer.send((told.seconds, told.memory_bytes))
+        return
+    meter, began, slm = MemoryMeter(), time.perf_counter(), None
+    for _ in range(case.again):
+        slm = compute_and_judge(display, targets, options, initial=slm).hologram.slm
+    answer.send((time.perf_counter() - began, meter.peak_mib() * 2**20))
+
+
 def measured(case: Case, iterations: int) -> tuple[float, float, float, float]:
     """Forecast and run a case, each in a process of its own."""
     if case.frames:
         told, took = (in_process(film, case, foretold) for foretold in (True, False))
+        return told[0], told[1], took[0], took[1]
+    if case.expansion:
+        told, took = (in_process(holograms, case, foretold) for foretold in (True, False))
         return told[0], told[1], took[0], took[1]
     told = in_process(measure, case, iterations, True)
     took = in_process(measure, case, iterations, False)
