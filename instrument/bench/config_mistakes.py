@@ -12,8 +12,7 @@ from typing import Any, Union
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from instrument.files.errors import ConfigProblem
-from instrument.files.validation import in_words
+from instrument.files.errors import ConfigProblem, mistake_in_words
 
 # Suffix to (dimension, factor to its base unit); how units are written in this project's names.
 _UNITS: Mapping[str, tuple[str, float]] = {
@@ -90,9 +89,9 @@ def _sentence(detail: ErrorDetails, names: Sequence[str], models: Sequence[type[
         hint = _other_unit(str(key), value, names) or nearest(str(key), names)
         return f"there is no such key.{hint}" + (f" Keys here: {', '.join(names)}." if names else "")
     if kind == "missing":
-        return f"{in_words(detail)}.{_about(detail, models)}"
+        return f"{mistake_in_words(detail)}.{_about(detail, models)}"
     found = "" if isinstance(value, Mapping) else f", not {value!r}"  # a whole table is in the file to see
-    return f"{in_words(detail)}{found}.{_about(detail, models)}"
+    return f"{mistake_in_words(detail)}{found}.{_about(detail, models)}"
 
 
 def _about(detail: ErrorDetails, models: Sequence[type[BaseModel]]) -> str:

@@ -7,8 +7,12 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from drivers.errors import DeviceError
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 
 class BenchError(Exception):
@@ -186,3 +190,33 @@ def duration(seconds: float) -> str:
         return f"{seconds:.1f} s"
     minutes = seconds / 60
     return f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
+
+
+_STARTS = (
+    ("Input should be a valid ", "must be a "),
+    ("Input should be ", "must be "),
+    ("Value error, ", ""),
+)
+_WORDS = (
+    ("a array", "an array"),
+    ("a integer", "an integer"),
+    ("an object", "a table"),
+    ("a object", "a table"),
+    ("string", "text"),
+    ("boolean", "true or false"),
+)
+
+
+def mistake_in_words(detail: ErrorDetails) -> str:
+    """Return what pydantic finds wrong, without place and value, in the words of who wrote the file."""
+    if detail["type"] == "missing":
+        is_item = bool(detail["loc"]) and isinstance(detail["loc"][-1], int)
+        return f"this {'value' if is_item else 'key'} is missing"
+    message = detail["msg"]
+    for start, instead in _STARTS:
+        if message.startswith(start):
+            message = instead + message.removeprefix(start)
+            break
+    for word, instead in _WORDS:
+        message = message.replace(word, instead)
+    return message

@@ -19,9 +19,8 @@ from pydantic import (
 )
 
 from instrument.files.atomic import protect, write_text
-from instrument.files.errors import BenchError, FileError
+from instrument.files.errors import BenchError, FileError, mistake_in_words
 from instrument.files.reading import parse_json, parse_toml, read_bytes
-from instrument.files.validation import in_words
 from instrument.plan.led_shapes import LedPlaces
 from instrument.plan.patterns import OFF, Light
 from instrument.plan.positions import PlanData, Positions, SourcePosition, StagePoints
@@ -318,7 +317,7 @@ def plan_problems(error: ValidationError) -> tuple[str, ...]:
     mistakes = error.errors(include_url=False)
     places = [found["loc"] for found in mistakes]
     return tuple(
-        f"{_place(found['loc'])}: {in_words(found)}"
+        f"{_place(found['loc'])}: {mistake_in_words(found)}"
         + (f" (found {found['input']!r:.80})" if not isinstance(found["input"], Mapping) else "")
         for found in mistakes
         # A list whose every item is wrong counts as empty too; its items' own mistakes say it better.
