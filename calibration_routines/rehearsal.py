@@ -42,9 +42,9 @@ def rehearse_whole(
     All of it is done on a bench like the open one that waits for nothing; what waiting would take is added,
     and what kernels took to compile, which are there from then on, is taken off. A long one is ended on the
     way, and told by how far it came; what follows by its ``work`` (:class:`Outlook`), as quickly as the work
-    went that was done or told up to there. ``on_progress`` gets the seconds that it has gone on and
-    :data:`ENOUGH_S`. Nothing where a device is not simulated, where frames that were kept are seen again, and
-    where it cannot be done there.
+    was computed that was done or told up to there: what waited is no such work. ``on_progress`` gets the
+    seconds that it has gone on and :data:`ENOUGH_S`. Nothing where a device is not simulated, where frames
+    that were kept are seen again, and where it cannot be done there.
     """
     if getattr(options, "again", None) is not None:
         return ()
@@ -81,8 +81,8 @@ class _Watch(Listener):
         self._began_s = time.perf_counter()
         self._step = ""
         self._done, self._total, self._at_most, self._several = 0.0, 0.0, False, False
-        self._paces_s: list[float] = []
-        self._seen_s = 0.0
+        self._paces_s: list[tuple[float, float]] = []
+        self._seen_s = (0.0, 0.0)
         self._compiled_s, self._compiling, self._compiles_since_s = 0.0, 0, 0.0
 
     @contextmanager
@@ -106,8 +106,10 @@ class _Watch(Listener):
         with event.install_listener("numba:compile", Compiles()):
             yield
 
-    def _now_s(self) -> float:
-        return time.perf_counter() - self._began_s - self._compiled_s + self._waiting_s()
+    def _now_s(self) -> tuple[float, float]:
+        """Return the seconds so far: computed and waited, and those of computing alone."""
+        computed_s = time.perf_counter() - self._began_s - self._compiled_s
+        return computed_s + self._waiting_s(), computed_s
 
     def step(self, words: str) -> None:
         """Begin another step; of several alike, as slides are, they are counted and not their frames."""
@@ -118,7 +120,7 @@ class _Watch(Listener):
             self._done = self._total = 0.0
             self._paces_s = []
             if self._work and name == self._work[0][0]:
-                self._works_since_s = self._now_s()
+                self._works_since_s = self._now_s()[1]
         self._several = several is not None
         if several is not None:
             self._see(int(several[1]) - 1, int(several[2]), at_most=False)
@@ -138,31 +140,37 @@ class _Watch(Listener):
         if self._control.ending is None:
             now_s = self._now_s()
             if 0 < self._done < done:
-                self._paces_s.append((now_s - self._seen_s) / (done - self._done))
+                part = done - self._done
+                took_s, computing_s = (now - seen for now, seen in zip(now_s, self._seen_s, strict=True))
+                self._paces_s.append((took_s / part, computing_s / part))
             self._done, self._total, self._at_most, self._seen_s = done, total, at_most, now_s
-            if seconds > ENOUGH_S and len(self._paces_s) >= _PARTS and self._left_s() > ENOUGH_S:
+            if seconds > ENOUGH_S and len(self._paces_s) >= _PARTS and self._left_s()[0] > ENOUGH_S:
                 self._control.abort()
 
-    def _left_s(self) -> float:
-        """Return what is left of the step: as most of its parts were, of which one may load and compile."""
-        return median(self._paces_s) * (self._total - self._done)
+    def _left_s(self) -> tuple[float, float]:
+        """Return what is left of the step, as ``_now_s``: as most parts were; one may load and compile."""
+        took_s, computing_s = (median(paces) for paces in zip(*self._paces_s, strict=True))
+        left = self._total - self._done
+        return took_s * left, computing_s * left
 
     def words(self) -> str:
         """Say how long all of it takes, or what it was told by."""
         if self._control.ending is None:
-            return f"{IN_ALL}by a rehearsal on a simulated bench of its own: about {duration(self._now_s())}."
+            return (
+                f"{IN_ALL}by a rehearsal on a simulated bench of its own: about {duration(self._now_s()[0])}."
+            )
         most = "at most " if self._at_most else "about "
-        end_s = self._seen_s + self._left_s()
+        end_s, computed_s = (seen + left for seen, left in zip(self._seen_s, self._left_s(), strict=True))
         by = f'by a rehearsal up to {self._done / self._total:.0%} of "{self._step}"'
-        if (following_s := self._following_s(end_s)) is not None:
+        if (following_s := self._following_s(computed_s)) is not None:
             return f"{IN_ALL}{by} and the sizes of what follows: {most}{duration(end_s + following_s)}."
         return f"Up to the end of that step, {by}: {most}{duration(end_s)}. What follows it comes on top."
 
-    def _following_s(self, end_s: float) -> float | None:
-        """Return what follows a step that ends at ``end_s``, as quick as work was so far; None: not known."""
+    def _following_s(self, computed_s: float) -> float | None:
+        """Return what follows a step, as quick as work was so far without waiting; None: not known."""
         steps = [step for step, _ in self._work]
         if self._step not in steps:
             return None
         following = steps.index(self._step) + 1
         done, left = (sum(w for _, w in part) for part in (self._work[:following], self._work[following:]))
-        return (end_s - self._works_since_s) * left / done
+        return (computed_s - self._works_since_s) * left / done

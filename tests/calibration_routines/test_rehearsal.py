@@ -160,6 +160,24 @@ def test_what_follows_a_step_in_which_a_rehearsal_ends_is_told_by_its_work(
     assert words.startswith("Up to the end of")
 
 
+def test_exposures_are_waited_for_and_not_scaled_by_the_work(
+    bench: Bench, hands: Hands, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three seconds a picture are the camera's: the solving that follows does not wait for them."""
+    waited = [0.0]
+    monkeypatch.setattr(rehearsal, "not_waited_s", lambda _: waited[0])
+
+    def deed(_twin: Bench, control: RunControl, listener: Listener, _asked: Asked) -> None:
+        listener.step("showing")
+        for done in range(1, 1001):
+            hands.now_s, waited[0] = hands.now_s + 1.0, waited[0] + 3.0
+            listener.share(done, 1000)
+            control.check()
+
+    (words,) = told(deed, bench, work=(("showing", 1000.0), ("solving", 1000.0)))
+    assert f"about {duration(1000 * (1 + 3) + 1000)}." in words
+
+
 def test_one_slow_part_is_not_taken_for_all(bench: Bench, hands: Hands) -> None:
     """As of an SLM's table, whose third picture computes what all others find."""
 

@@ -82,3 +82,25 @@ def test_the_log_names_no_options_of_the_terminal() -> None:
     assert in_the_log(said) == (
         "Find activity: Give either “psf” FILE or “calibration” FOLDER; “dry run” tells all of it."
     )
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/home/u/a--b/run",
+        "/home/u/--dry-run/run",
+        r"C:\u\--dry-run",
+        "a--b",
+        "/home/x/slm (copy)/run: y",
+        "/home/x/led_array: y",
+        "/home/x/led_array (2)",
+        r"C:\x\slm (copy)",
+    ],
+)
+def test_the_log_leaves_paths_as_they_are(path: str) -> None:
+    """Who copies one from there would find nothing."""
+    assert in_the_log(f"Wrote {path}") == f"Wrote {path}"
+
+
+def test_the_log_names_options_behind_brackets_and_quotes() -> None:
+    assert in_the_log("--psf, (--calibration) or '--dry-run'") == "“psf”, (“calibration”) or '“dry run”'"
