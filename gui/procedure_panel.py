@@ -352,7 +352,7 @@ class ProcedurePanel(Panel):
             take_slice(self.views.parts(self.routine.name))
             self._making.start()
         except StopIteration:
-            tab_in_order(self)
+            tab_in_order(self.view, after=self.choice)
             self._typed()
 
     @property

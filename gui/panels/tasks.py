@@ -175,8 +175,9 @@ class TasksPanel(Panel):
         if name not in self._pages:
             self._pages[name] = self._made(name, task)
             self._look_for_calibration(name)
-            self.stack.addWidget(scrolled(self._pages[name].form))
-            tab_in_order(self)
+            place = scrolled(self._pages[name].form)
+            self.stack.addWidget(place)
+            tab_in_order(place, after=self.choice)
         if name != self.name:
             return
         self.stack.setCurrentIndex(list(self._pages).index(name))

@@ -21,15 +21,15 @@ from PySide6.QtWidgets import (
 )
 
 
-def tab_in_order(root: QWidget) -> None:
+def tab_in_order(root: QWidget, *, after: QWidget | None = None) -> None:
     """Have Tab go through what a widget holds from top to bottom and from left to right.
 
     Qt goes in the order in which widgets got their place, which in panels made a part at a time is none that
-    anybody sees.
+    anybody sees. What is made later comes right ``after`` another part; the rest stays as it is.
     """
     stops = [part for part in _in_order(root) if part.focusPolicy() & Qt.FocusPolicy.TabFocus]
-    for before, after in pairwise(stops):
-        QWidget.setTabOrder(before, after)
+    for earlier, later in pairwise(stops if after is None else [after, *stops]):
+        QWidget.setTabOrder(earlier, later)
 
 
 def stops_of(window: QWidget) -> Iterator[QWidget]:

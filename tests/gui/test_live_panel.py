@@ -456,28 +456,11 @@ def test_a_photograph_stands_in_the_runs_and_goes_to_be_reconstructed(
     assert handed == ["reconstructions", live.photograph]
 
 
-def test_stop_during_a_recording_leaves_it_dark(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:
-    live.record()
-    qtbot.waitUntil(lambda: "frames" in live.record_bar.note.text(), timeout=WAIT_MS)
-    with qtbot.waitSignal(live.session.stopped, timeout=WAIT_MS):
-        qtbot.keyClick(window, Qt.Key.Key_Escape)
-    qtbot.waitUntil(lambda: live.record_bar.job is None, timeout=WAIT_MS)
-    assert not live.session.bench.scene_lit
-    (folder,) = live.session.runs_folder.glob("*recording*")
-    assert len(Run.open(folder).records) > 0
-    assert folder.name in live.record_bar.note.text()
-    qtbot.mouseClick(live.record_bar.look_button, Qt.MouseButton.LeftButton)
-    qtbot.waitUntil(lambda: "runs" in window.maker.panels, timeout=WAIT_MS)
-    runs = window.maker.panels["runs"]
-    assert isinstance(runs, RunsPanel)
-    qtbot.waitUntil(lambda: runs.opened is not None and runs.opened.path == folder, timeout=WAIT_MS)
-
-
 def _disk_full(*_: object, **__: object) -> None:
     raise BenchError("The disk is full.")
 
 
-def test_a_recording_that_was_stopped_goes_on_in_its_light_to_its_end(
+def test_a_recording_that_was_stopped_is_kept_in_the_dark_and_goes_on_in_its_light_to_its_end(
     qtbot: QtBot, window: MainWindow, live: LivePanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bar = live.record_bar
@@ -485,11 +468,22 @@ def test_a_recording_that_was_stopped_goes_on_in_its_light_to_its_end(
     bar.seconds.set_value(60.0)
     live.record()
     qtbot.waitUntil(lambda: "frames" in bar.note.text(), timeout=WAIT_MS)
-    qtbot.keyClick(window, Qt.Key.Key_Escape)
+    with qtbot.waitSignal(live.session.stopped, timeout=WAIT_MS):
+        qtbot.keyClick(window, Qt.Key.Key_Escape)
     qtbot.waitUntil(bar.rest_button.isVisible, timeout=WAIT_MS)
     assert bar._left is not None
     assert 0 < bar._left.seconds < 60
+    assert bar.job is None
     assert not live.session.bench.scene_lit
+    (folder,) = live.session.runs_folder.glob("*recording*")
+    assert len(Run.open(folder).records) > 0
+    assert folder.name in bar.note.text()
+    qtbot.mouseClick(bar.look_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: "runs" in window.maker.panels, timeout=WAIT_MS)
+    runs = window.maker.panels["runs"]
+    assert isinstance(runs, RunsPanel)
+    qtbot.waitUntil(lambda: runs.opened is not None and runs.opened.path == folder, timeout=WAIT_MS)
+    window.show_panel("live")
     bar._left = replace(bar._left, seconds=0.2)  # a minute is long
     camera = live.session.bench.camera
     exposure_ms = camera.exposure_ms

@@ -19,6 +19,7 @@ from gui.panel import whole
 from gui.panels.tasks import TasksPanel
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
+from gui.widgets.tab_order import stops_of
 from instrument.files.calibration_file import save_calibration
 from instrument.files.images import write_image
 from instrument.reconstruction.video_files import VideoPictures, create_output
@@ -74,6 +75,11 @@ def test_every_task_has_a_form_of_its_own_declarations(qtbot: QtBot, panel: Task
         ]
         assert panel.objects() is None if required else panel.objects() is not None
         assert panel.as_python().startswith("#") == bool(required)
+    stops = list(stops_of(panel))
+    inside = [stop for stop in stops if form.isAncestorOf(stop)]
+    begins = stops.index(panel.choice) + 1
+    assert stops[begins : begins + len(inside)] == inside, "Tab goes from the choice into the form"
+    assert len(inside) > 1
 
 
 def test_what_is_exported_is_turned_as_it_is_seen(qtbot: QtBot, panel: TasksPanel, tmp_path: Path) -> None:

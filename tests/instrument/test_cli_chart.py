@@ -159,22 +159,18 @@ def test_mistakes_are_named(arguments, said, tmp_path):
     assert said in str(result.exception)
 
 
-def test_a_setting_runs_in_a_process_of_its_own():
-    from instrument.evaluation.chart import in_own_process
+def test_a_setting_runs_in_a_process_of_its_own_that_can_be_ended(monkeypatch):
+    """In one test: the first process takes seconds to import what all others share."""
+    import instrument.evaluation.chart as job
     from instrument.evaluation.chart_problems import problem_of_scene
 
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
-    found = in_own_process(problem, Setting("wiener", "convolution", "none"), 20.0)
+    found = job.in_own_process(problem, Setting("wiener", "convolution", "none"), 20.0)
     assert not isinstance(found, str)
     assert found.points[0].peak_mib < 500
     assert found.finished
-    refused = in_own_process(problem, Setting("admm", "convolution", "tv-haar"), 20.0)
+    refused = job.in_own_process(problem, Setting("admm", "convolution", "tv-haar"), 20.0)
     assert isinstance(refused, str)
-
-
-def test_a_setting_that_takes_its_time_can_be_ended(monkeypatch):
-    import instrument.evaluation.chart as job
-    from instrument.evaluation.chart_problems import problem_of_scene
 
     def ended(left_s):
         assert 0 < left_s <= 3600
@@ -182,7 +178,6 @@ def test_a_setting_that_takes_its_time_can_be_ended(monkeypatch):
 
     monkeypatch.setattr(job, "_TELL_S", 0.0)
     before = set(multiprocessing.active_children())
-    problem, _ = problem_of_scene("sparse-picture", 32, 0)
     with pytest.raises(KeyboardInterrupt):
         job.in_own_process(problem, Setting("admm", "convolution", "tv"), 3600.0, ended)
     assert set(multiprocessing.active_children()) <= before
