@@ -33,11 +33,13 @@ _REST = r"(?:\s+(?:--[a-z][a-z-]*|[A-Z]{3,}|mask|slm|illumination|(?:/|[A-Za-z]:
 
 _FORCE = re.compile(r"--force(?![\w-])")
 """The same field in every form that has it."""
+_NO_PATH, _NO_FOLDER = r"(?<![/\\\w])", r"(?![^()]*\)[/\\])"
+"""Neither in a folder nor the name of one: a file is found by its name as it is."""
 _SIGNS = (
     (re.compile(r"(?<=\d) um\b(?![/\\])"), " µm"),
     (re.compile(r"\+-(?=[ \d])"), "±"),
-    (re.compile(r"\bled_array(?= \(| opened|:)"), "LED array"),
-    (re.compile(r"\bslm(?= \()"), "SLM"),
+    (re.compile(rf"{_NO_PATH}led_array(?= opened|:| \({_NO_FOLDER})"), "LED array"),
+    (re.compile(rf"{_NO_PATH}slm(?= \({_NO_FOLDER})"), "SLM"),
 )
 """Units and signs as the window's own figures have them; a terminal may lack the letters."""
 

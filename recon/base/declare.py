@@ -289,7 +289,8 @@ def option(default: Any = dataclasses.MISSING, **declaration: Any) -> Any:
     return dataclasses.field(default=default, metadata={_KEY: Declaration(**declaration)})
 
 
-_FLAG = re.compile(r"(?:diffuserbench|dask) [^.,;:()]*|--[a-z][\w-]*")
+_FLAG = re.compile(r"(?:diffuserbench|dask) [^.,;:()]*|(?<![^\s(\[{\"'`“‘])--[a-z][\w-]*")
+"""A command, or a flag; no dashes within a word or a path."""
 
 
 def in_other_words(
