@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from instrument.files.atomic import require_new, write_text
-from instrument.files.errors import FileError
+from instrument.files.errors import FileError, count
 from instrument.tasks.task import Desk, Done, task
 from recon.analysis.point_places import PointOptions, PointPlaces
 from recon.base.declare import option
+
+if TYPE_CHECKING:
+    from instrument.reconstruction.stored_result import StoredResult
 
 _SHOWN = 20
 _COLUMNS = (
@@ -24,7 +28,7 @@ class PointFiles:
     """In which volume, and where its points go."""
 
     volume: Path = option(
-        help="A reconstructed volume (.ome.zarr, .tif, .npy), exported ones too.",
+        help="A reconstructed volume (.ome.zarr, .tif; .npy, which keeps no places), exported ones too.",
         metavar="VOLUME",
         positional=True,
         group="Files",
@@ -69,7 +73,7 @@ def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
     write_text(files.out, _table(found))
     desk.fact("Points", str(len(found)))
     if not len(found):
-        desk.warn("Warning: the volume is black.")
+        desk.warn("Warning: nothing in the volume is above 0.")
     elif known:
         across, deep = np.median(found.deviations_um[:, :2].max(axis=1)), np.median(found.deviations_um[:, 2])
         desk.fact("Known to", f"{across:.3g} um across, {deep:.3g} um in depth (medians)")
@@ -84,11 +88,28 @@ def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
     else:
         desk.warn(
             "Warning: the volume does not tell where its planes are: the table has planes, rows and columns "
-            "alone. Of PSFs from files --pixel-um and --distance-mm of reconstruct say them."
+            f"alone. {_why_unknown(result)}"
         )
     if ends := int(found.at_end.sum()):
-        desk.warn(f"Warning: {ends} are brightest in an outermost plane and may lie beyond it.")
+        desk.warn(f"Warning: {_at_the_ends(ends, grid.shape[0])}")
     return Done((files.out,))
+
+
+def _why_unknown(result: StoredResult) -> str:
+    """Say why a volume's places are not known, and what to do."""
+    if result.path.suffix.lower() == ".npy":
+        return "A .npy keeps no places: give the .ome.zarr or .tif that it was exported from."
+    if result.volume is not None and "z_um" in {**result.record.get("grid", {}), **result.volume.facts}:
+        return "It was made of PSFs from files: --pixel-um and --distance-mm of reconstruct say them."
+    return "The .ome.zarr and .tif of diffuserbench keep places; other programs' tell steps at most."
+
+
+def _at_the_ends(ends: int, planes: int) -> str:
+    """Say what it means that so many points are brightest in an outermost plane."""
+    if planes == 2:
+        return "the volume has two planes; points may lie beyond either of them."
+    are, they = ("is", "it") if ends == 1 else ("are", "they")
+    return f"{count(ends, 'point')} {are} brightest in an outermost plane; {they} may lie beyond it."
 
 
 def _table(found: PointPlaces) -> str:

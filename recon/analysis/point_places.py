@@ -95,10 +95,16 @@ def point_places(
     on_progress : callable, optional
         Called with the share done.
 
-    Raises InputError when there is one plane, or more points than are told apart.
+    Raises InputError when there is one plane, one is not in front of the diffuser, or there are more points
+    than are told apart.
     """
     if grid.shape[0] < 2:
         raise InputError("Points in depth are found in volumes of two planes or more; this has one.")
+    if (behind := np.flatnonzero(grid.z_um <= 0)).size:
+        raise InputError(
+            f"Plane {behind[0]} is at {grid.z_um[behind[0]]:g} um; depths are counted from the diffuser and "
+            "are above 0: no ray through it goes to planes in it or behind it. Leave them out."
+        )
     read = volume if callable(volume) else volume.__getitem__
     search = _Search(read, grid, on_progress or (lambda _share: None))
     brightest = search.brightest((options or PointOptions()).least)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ def test_the_table_has_places_deviations_and_light(
     assert main(["points", str(volume), "--out", str(out)]) == 0
     told = capsys.readouterr()
     assert "Points      2" in told.out
-    assert "1 are brightest in an outermost plane" in told.err
+    assert "1 point is brightest in an outermost plane; it may lie beyond it" in " ".join(told.err.split())
     rows = list(csv.DictReader(out.read_text().splitlines()))
     assert [float(row["light"]) for row in rows] == [40, 4]
     place = GRID.place_um(2, 12, 30)
@@ -60,7 +61,35 @@ def test_a_volume_that_knows_no_places_gives_voxels(
     assert main(["points", str(stack), "--out", str(out)]) == 0
     (row,) = csv.DictReader(out.read_text().splitlines())
     assert (row["x_um"], row["z_deviation_um"], row["plane"], row["column"]) == ("", "", "1", "9")
-    assert "--pixel-um and --distance-mm" in capsys.readouterr().err
+    assert "A .npy keeps no places" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("depth", "value", "words"),
+    [
+        (3, -1, "nothing in the volume is above 0"),
+        (3, 1, "other programs' tell steps at most"),
+        (2, 1, "the volume has two planes"),
+    ],
+)
+def test_volumes_from_elsewhere_are_not_blamed_for_another_thing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], depth: int, value: int, words: str
+) -> None:
+    stack = tmp_path / "stack.ome.tif"
+    voxels = np.full((depth, 20, 20), min(value, 0), np.float32)
+    voxels[1, 7, 9] = value
+    tifffile.imwrite(stack, voxels, metadata={"axes": "ZYX", "PhysicalSizeZ": 2, "PhysicalSizeX": 1})
+    assert main(["points", str(stack), "--out", str(tmp_path / "points.csv")]) == 0
+    assert words in " ".join(capsys.readouterr().err.split())
+
+
+def test_psfs_without_places_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, nowhere = tmp_path / "beads.ome.zarr", np.full(5, np.nan)
+    voxels = np.zeros(GRID.shape, np.float32)
+    voxels[2, 12, 30] = 1
+    write_volume_zarr(path, voxels, voxels.shape, replace(GRID, z_um=nowhere, pitch_um=nowhere), {})
+    assert main(["points", str(path), "--out", str(tmp_path / "points.csv")]) == 0
+    assert "--pixel-um and --distance-mm" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_picture_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -132,6 +132,9 @@ def test_what_is_no_volume_of_points_is_refused(monkeypatch: pytest.MonkeyPatch)
     grid = grid_of(even_in_inverse(5))
     with pytest.raises(InputError, match="two planes or more; this has one"):
         point_places(np.ones((1, *SHAPE)), grid_of(np.array([10e3])))
+    for z_um in ([-10.0, 0.0, 10.0], [0.0, 10.0, 20.0]):
+        with pytest.raises(InputError, match=r"Plane 0 is at .* above 0"):
+            point_places(np.ones((3, *SHAPE)), grid_of(np.array(z_um)))
     monkeypatch.setattr(module, "MOST", 3)
     with pytest.raises(InputError, match="more than 3 points as bright"):
         point_places(lit(grid, random_points()), grid)
