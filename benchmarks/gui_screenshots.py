@@ -38,7 +38,9 @@ from PySide6.QtTest import QTest
 
 import instrument
 from gui.app import application
+from gui.jobs import Job
 from gui.main_window import MainWindow
+from gui.panel import Panel
 from gui.panels import PANELS
 from gui.session import BenchSession
 from gui.theme import THEMES, apply_theme
@@ -120,8 +122,8 @@ def main() -> int:
     if set(names) & DISPLAY:
         _prepare_display(work / "display")
         window = _open(work / "display", width, height)
-        _align(window)  # holograms need it, too
         if "alignment" in names:
+            _align(window)
             _grab(window, given.out / "alignment.png")
         if "holograms" in names:
             _hologram(window)
@@ -371,9 +373,8 @@ def _reconstructions(window: MainWindow, out: Path) -> None:
         panel._suggest_out()
         _wait(lambda: not panel.jobs.jobs, "a free name")
         job = panel.reconstruct()
-        if job is None:
-            raise SystemExit(panel._note.toolTip())
-        _wait(lambda: panel.result is not None, "the reconstruction")
+        _wait_for(job, panel)
+        _wait(lambda: panel.result is not None, "the result to open")
         if kind == CALIBRATION:
             _grab(window, out / f"{shot}.png")
             continue
@@ -393,12 +394,15 @@ def _hologram(window: MainWindow) -> None:
     """Compute a foveated hologram, show it, photograph it."""
     from gui.panels.holograms import HologramsPanel
 
+    folder = window.session.runs_folder
+    if not list(folder.glob("*alignment*.json")):
+        _align(window)
+    alignments = sorted(folder.glob("*alignment*.json"), key=lambda path: path.stat().st_mtime)
     panel = window.show_panel("holograms")
     assert isinstance(panel, HologramsPanel)
-    alignments = sorted(panel.session.runs_folder.glob("*.json"), key=lambda path: path.stat().st_mtime)
     panel.form.set_values(
         {
-            "picture": panel.session.runs_folder.parent / "portrait.png",
+            "picture": folder.parent / "portrait.png",
             "alignment": alignments[-1],
             "counts": "a fovea, dragged",
             "iterations": 60,
@@ -406,12 +410,7 @@ def _hologram(window: MainWindow) -> None:
     )
     panel.target.set_fovea((0.42, 0.5), 0.24)
     for start in (panel.compute, panel.photograph):
-        job = start()
-        if job is None:
-            raise SystemExit(panel._note.toolTip())
-        _wait(lambda job=job: job.is_over, job.title)
-        if job.error is not None:
-            raise SystemExit(f"{job.title}: {job.error}")
+        _wait_for(start(), panel)
 
 
 def _align(window: MainWindow) -> None:
@@ -426,6 +425,8 @@ def _align(window: MainWindow) -> None:
     panel.run.over.connect(lambda: over.append(True))
     panel.run_bar.start_button.click()
     _wait(lambda: bool(over), "the alignment")
+    if not list(panel.session.runs_folder.glob("*alignment*.json")):
+        raise SystemExit(f"The alignment: {panel._note.toolTip() or panel.run_bar.words.text()}")
 
 
 def _grab(window: MainWindow, path: Path) -> None:
@@ -433,6 +434,15 @@ def _grab(window: MainWindow, path: Path) -> None:
     if not window.grab().save(str(path)):
         raise SystemExit(f"{path}: could not be written.")
     print(path)
+
+
+def _wait_for(job: Job | None, panel: Panel) -> None:
+    """Wait for the end of a job; SystemExit with the reason of one that was refused or failed."""
+    if job is None:
+        raise SystemExit(panel._note.toolTip())
+    _wait(lambda: job.is_over, job.title)
+    if job.error is not None:
+        raise SystemExit(f"{job.title}: {job.error}")
 
 
 def _wait(until: Callable[[], bool], what: str) -> None:
