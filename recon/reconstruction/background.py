@@ -272,7 +272,8 @@ def with_dark_restored(problem: Problem) -> Problem:
     """Return a problem of a picture with an even offset added to its data, where that alone explains them.
 
     The problem itself where nothing is missing, and where somebody said what the background is, the light is
-    patterned, PSFs vary over the field, or the prior or solver takes light below zero.
+    patterned, PSFs vary over the field, or the prior or solver takes light below zero; and where erased
+    pixels all over it leave no small copy: on the whole sensor that would take long.
 
     Parameters
     ----------
@@ -289,7 +290,11 @@ def with_dark_restored(problem: Problem) -> Problem:
     one_step = options.solver != "auto" and SOLVERS.named(options.solver).one_step
     if isinstance(problem.prior, Prior) or one_step:
         return problem
-    counts, share = _offset_of([_small(problem, c) for c in range(problem.n_channels)])
+    most = max(1, -(-max(problem.sensor_shape) // LONGEST_PX))
+    factor = whole_blocks(problem.valid, most)
+    if factor < most // 2:
+        return problem
+    counts, share = _offset_of([_small(problem, c, factor) for c in range(problem.n_channels)])
     if not counts:
         return problem
     restored = Problem.of(
@@ -338,14 +343,13 @@ def _left2(channel: Problem, offset: float) -> float:
     return float(np.mean(left.astype(np.float64) ** 2))
 
 
-def _small(problem: Problem, channel: int) -> Problem:
-    """Return a channel on few pixels."""
+def _small(problem: Problem, channel: int, factor: int) -> Problem:
+    """Return a channel on blocks of so many pixels a side."""
     own = slice(channel, channel + 1)
     psfs = problem.calibration.psfs
     calibration = problem.calibration
     if psfs.shape[1] > 1:
         calibration = replace(calibration, psfs=psfs[:, own])
-    factor = whole_blocks(problem.valid, max(1, -(-max(problem.sensor_shape) // LONGEST_PX)))
     counts = problem.data[own] * problem.noise[channel]
     return Problem.of(
         on_blocks(counts, problem.valid[own], None, factor, flat=True),

@@ -61,3 +61,12 @@ def test_channels_share_one_dark_level() -> None:
     restored = with_dark_restored(Problem.of(Measurement(colour - lost), psfs))
     assert np.ndim(restored.measurement.background) == 0
     assert -float(np.asarray(restored.measurement.background)) == pytest.approx(float(lost), rel=0.5)
+
+
+def test_no_offset_is_looked_for_on_the_whole_sensor_where_erasures_leave_no_small_copy() -> None:
+    scene = make_scene("sparse-picture", size=260, photons=3000.0, seed=4)
+    image = scene.measurement - np.float32(0.3 * scene.measurement.mean())
+    for share, looked in ((0.1, False), (1e-4, True)):
+        erased = np.random.default_rng(0).random(image.shape[:2]) < share
+        problem = Problem.of(Measurement(image, erasures=erased), scene.calibration, ReconstructionOptions())
+        assert (with_dark_restored(problem) is not problem) is looked
