@@ -27,6 +27,10 @@ Voxel = tuple[int, int, int]
 
 REACH = 2
 """Voxels from its brightest one that a point's light is taken from, along its ray and across."""
+BESIDE = (REACH + 0.5) * 2**0.5 + (REACH**2 + 2 * (REACH + 0.5) ** 2) ** 0.5
+"""Pixels between rays of two points, where one may be nearer to a voxel of the other's window."""
+CELL = 8
+"""Rows and columns of a plane that points are kept by while others near them are looked for."""
 MOST = 10_000
 """Points: where there are more, they are texture."""
 OFF_PLANES, OFF_PX = 0.1, 0.1
@@ -136,43 +140,62 @@ class _Search:
 
         self.plane = lru_cache(maxsize=2 * REACH + 2)(plane)
         self.grid, self.on_progress = grid, on_progress
-        self.found: dict[int, list[Voxel]] = {}
+        self.found: dict[Voxel, list[Voxel]] = {}
         self.known = bool(np.isfinite(grid.z_um).all() and np.isfinite(grid.pitch_um).all())
         self.steps_um = np.abs(np.gradient(grid.z_um)) if self.known else np.full(len(grid.z_um), np.nan)
+        self.angles = grid.pitch_um / grid.z_um if self.known else np.ones(len(grid.z_um))
 
     def brightest(self, least: float) -> list[Voxel]:
         """Return the brightest voxel of every point, from the first plane to the last."""
         from scipy.ndimage import maximum_filter  # late: importing recon stays light
 
         count, top = self.grid.shape[0], 0.0
-        candidates: list[tuple[float, Voxel]] = []
+        lights, voxels = [np.zeros(0, np.float32)], [np.zeros((0, 3), np.int32)]
         for z in range(count):
             plane = self.plane(z)
             top = max(top, float(plane.max()))
             peaks = (plane == maximum_filter(plane, 2 * REACH + 1)) & (plane > 0) & (plane >= least * top)
-            rows, columns = np.nonzero(peaks)
-            candidates += zip(
-                plane[peaks].tolist(),
-                ((z, int(row), int(column)) for row, column in zip(rows, columns, strict=True)),
-                strict=True,
-            )
+            rows, columns = _plateaus(peaks)
+            lights.append(plane[rows, columns])
+            voxels.append(np.stack([np.full(len(rows), z), rows, columns], axis=1).astype(np.int32))
             self.on_progress((z + 1) / (2 * count))
-        for light, voxel in sorted(candidates, reverse=True):
-            if light < least * top:
-                break
-            if not any(self._is_beside(other, voxel) for other in self._near(voxel, REACH)):
-                self.found.setdefault(voxel[0], []).append(voxel)
-            if sum(map(len, self.found.values())) > MOST:
+        light, at = np.concatenate(lights), np.concatenate(voxels)
+        light, at = light[light >= least * top], at[light >= least * top]
+        order = np.lexsort((at[:, 2], at[:, 1], at[:, 0], light))[::-1]
+        found: list[Voxel] = []
+        for number in order:
+            z, row, column = at[number].tolist()
+            voxel = (z, row, column)
+            if not any(self._is_beside(other, voxel) for other in self._near(voxel, REACH, REACH + 0.5)):
+                self.found.setdefault(self._cell(*voxel), []).append(voxel)
+                found.append(voxel)
+            if len(found) > MOST:
                 raise InputError(
                     f"There are more than {MOST} points as bright as {least:g} of the brightest: this is no "
                     "volume of single points. Ask for brighter ones."
                 )
-        return [voxel for z in sorted(self.found) for voxel in self.found[z]]
+            self.on_progress(0.5)
+        return sorted(found, key=lambda voxel: voxel[0])
 
-    def _near(self, voxel: Voxel, planes: int) -> Iterator[Voxel]:
-        """Give the points found so far in planes near a voxel's."""
-        for z in range(voxel[0] - planes, voxel[0] + planes + 1):
-            yield from self.found.get(z, ())
+    def _cell(self, z: int, row: float, column: float) -> Voxel:
+        """Return the cell of a plane's rows and columns that points found in it are kept by."""
+        return z, int(row // CELL), int(column // CELL)
+
+    def _near(self, voxel: Voxel, planes: int, pixels: float) -> Iterator[Voxel]:
+        """Give points found, in planes near a voxel, whose rays may be so near to its ray; some others.
+
+        ``pixels`` are of any of these planes: where pixels look at wider angles, there are fewer of them.
+        """
+        nearest, farthest = max(voxel[0] - planes, 0), min(voxel[0] + planes, self.grid.shape[0] - 1)
+        widest = self.angles[nearest : farthest + 1].max()
+        for z in range(nearest, farthest + 1):
+            row, column = self._on_ray(voxel, z)
+            reach = pixels * widest / self.angles[z] + 1e-6
+            _, top, left = self._cell(z, row - reach, column - reach)
+            _, bottom, right = self._cell(z, row + reach, column + reach)
+            for down in range(top, bottom + 1):
+                for across in range(left, right + 1):
+                    yield from self.found.get((z, down, across), ())
 
     def _is_beside(self, point: Voxel, voxel: Voxel) -> bool:
         """Whether a voxel is as near to the ray through a point as its light may be."""
@@ -202,7 +225,7 @@ class _Search:
     def _light_of(self, voxel: Voxel) -> tuple[Floats, Whole]:
         """Return light and (plane, row, column) of the voxels about a ray that are nearest to this point."""
         count, *size = self.grid.shape
-        others = [other for other in self._near(voxel, 2 * REACH) if other != voxel]
+        others = [other for other in self._near(voxel, 2 * REACH, BESIDE) if other != voxel]
         light, voxels = [], []
         for z in range(max(voxel[0] - REACH, 0), min(voxel[0] + REACH + 1, count)):
             down, across = (
@@ -244,3 +267,18 @@ class _Search:
         rays = [self.grid.pixel_of(k, *place[:2] * self.grid.z_um[k] / depth) for k in at[:, 0]]
         beside = np.column_stack([at[:, 0] - plane, at[:, 1:] - np.array(rays)])
         return place, centre, beside
+
+
+def _plateaus(peaks: npt.NDArray[np.bool_]) -> tuple[Whole, Whole]:
+    """Return row and column of the voxel in the middle of each connected part; the last where two are."""
+    from scipy.ndimage import label
+
+    labels, count = label(peaks, np.ones((3, 3), int))
+    rows, columns = np.nonzero(peaks)
+    of = labels[rows, columns] - 1
+    sizes = np.bincount(of, minlength=count)
+    middles = (np.bincount(of, each, count) / sizes for each in (rows, columns))
+    off = sum((each - middle[of]) ** 2 for each, middle in zip((rows, columns), middles, strict=True))
+    order = np.lexsort((-np.arange(len(of)), off, of))
+    chosen = order[np.searchsorted(of[order], np.arange(count))]
+    return rows[chosen], columns[chosen]

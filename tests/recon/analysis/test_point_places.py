@@ -128,6 +128,40 @@ def test_colours_ends_and_places_that_nobody_knows() -> None:
     assert point_places(0 * grey, grid).places_um.shape == (0, 3)
 
 
+def test_a_point_is_compared_with_those_near_it_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid, asked = replace(grid_of(even_in_inverse(5)), shape=(5, 180, 180)), 0
+    volume = np.zeros(grid.shape, np.float32)
+    volume[2, 6::12, 6::12] = 1 + np.random.default_rng(0).random((15, 15))
+    on_ray = module._Search._on_ray
+
+    def counted(self: module._Search, voxel: module.Voxel, z: int) -> tuple[float, float]:
+        nonlocal asked
+        asked += 1
+        return on_ray(self, voxel, z)
+
+    monkeypatch.setattr(module._Search, "_on_ray", counted)
+    assert len(point_places(volume, grid)) == 225
+    assert asked < 60 * 225, "by pairs it is a thousand a point"
+
+
+def test_the_search_for_too_many_points_can_be_stopped() -> None:
+    grid, told = replace(grid_of(even_in_inverse(5)), shape=(5, 30, 40), centre=(15, 20)), []
+    volume = np.random.default_rng(0).random(grid.shape).astype(np.float32)
+    found = point_places(volume, grid, on_progress=told.append)
+    assert told == sorted(told)
+    assert len(told) > 2 * len(found) + 5, "while they are told apart, too"
+
+
+def test_voxels_as_bright_as_their_neighbours_are_one_candidate() -> None:
+    peaks = np.zeros((12, 12), bool)
+    peaks[1:6, 1:6] = peaks[8, 2:4] = peaks[9, 9] = peaks[10, 10] = True
+    rows, columns = module._plateaus(peaks)
+    assert sorted(zip(rows.tolist(), columns.tolist(), strict=True)) == [(3, 3), (8, 3), (10, 10)]
+    flat = np.zeros((5, *SHAPE), np.float32)
+    flat[2, 20:40, 20:60] = 1
+    assert len(point_places(flat, grid_of(even_in_inverse(5)))) == 1
+
+
 def test_what_is_no_volume_of_points_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     grid = grid_of(even_in_inverse(5))
     with pytest.raises(InputError, match="two planes or more; this has one"):
