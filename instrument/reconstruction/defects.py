@@ -30,6 +30,10 @@ noise none."""
 DEPTHS = 0.5
 """Share of a stack's depths at more of which a pixel of the camera's stands alone; a focus does at one."""
 
+WHOLE, MOST_LINES = 0.9, 8
+"""Shares of a column or row at full scale, and of all such pixels in such lines, from which these are defects
+of the sensor; and so many lines at most: more is a bright field."""
+
 
 def mended_psf(pixels: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], int]:
     """Return a PSF image whose hot and dead pixels are filled by their neighbours, and how many those were.
@@ -128,6 +132,22 @@ def _alone(plane: FloatImage, odd: FloatImage) -> npt.NDArray[np.bool_]:
     where = np.zeros(plane.shape, bool)
     where[rows, columns] = beyond[rows, columns] > ALONE * most
     return where
+
+
+def whole_lines(saturated: npt.NDArray[np.bool_]) -> str:
+    """Name the whole columns or rows, from 0, that nearly all saturated pixels lie in; "" where they do not.
+
+    Parameters
+    ----------
+    saturated : ndarray of bool, (height, width[, n_channels])
+    """
+    plane = saturated if saturated.ndim == 2 else saturated.any(axis=-1)
+    for name, axis in (("column", 0), ("row", 1)):
+        lines = np.flatnonzero(plane.mean(axis=axis) > WHOLE)
+        held = np.count_nonzero(np.take(plane, lines, axis=1 - axis))
+        if 0 < len(lines) <= MOST_LINES and held > WHOLE * np.count_nonzero(plane):
+            return f"{name}{'s' if len(lines) > 1 else ''} {', '.join(map(str, lines))}"
+    return ""
 
 
 def is_spread(psf: npt.NDArray[Any]) -> bool:

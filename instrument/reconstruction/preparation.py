@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from instrument.files.errors import BenchError, FileError, count
 from instrument.files.images import ImageFile, read_image
-from instrument.reconstruction.defects import defective_pixels
+from instrument.reconstruction.defects import defective_pixels, whole_lines
 from recon.base.blocks import block_mean
 from recon.base.checks import saturated_share
 from recon.errors import InputError
@@ -150,10 +150,14 @@ def check_psf(psf: ImageFile, *, allow_saturated: bool = False) -> tuple[str, ..
     share = float(np.sum(pixels[saturated] - lowest, dtype=np.float64)) / total
     found = f"{count} pixels of the PSF are saturated (at {highest:g}) and hold {share:.1%} of its light"
     if share > SATURATED_LIGHT_LIMIT and is_full_scale(pixels) and not allow_saturated:
+        lines = whole_lines(saturated)
         raise FileError(
             psf.path,
             f"{found}; up to {SATURATED_LIGHT_LIMIT:.0%} is allowed.",
-            "Take it again with a shorter exposure, or use --allow-saturated.",
+            f"They fill {lines}: defects of the sensor, which no exposure mends. Put the mean of the "
+            "lines beside them there in the PSF; in the photograph --erasures leaves them out."
+            if lines
+            else "Take it again with a shorter exposure, or use --allow-saturated.",
         )
     return (f"{found}.",)
 

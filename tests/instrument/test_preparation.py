@@ -173,6 +173,18 @@ def test_a_saturated_psf_is_refused_unless_allowed(full_scale: int) -> None:
     assert "saturated" in check_psf(file(psf), allow_saturated=True)[0]
 
 
+def test_columns_at_full_scale_are_called_defects() -> None:
+    psf = psf_pixels().astype(np.uint16)
+    psf[:, [7, 30]] = 65535
+    with pytest.raises(FileError, match=r"columns 7, 30: defects of the sensor") as refused:
+        check_psf(file(psf))
+    assert "exposure, or" not in str(refused.value)
+    row = psf_pixels().astype(np.uint16)
+    row[12] = 65535
+    with pytest.raises(FileError, match=r"row 12: defects"):
+        check_psf(file(row))
+
+
 def test_a_few_saturated_pixels_are_a_warning_and_a_single_bright_one_is_none() -> None:
     psf = psf_pixels().astype(np.uint16)
     psf[20, 30:32] = 4095
