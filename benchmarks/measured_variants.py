@@ -213,7 +213,7 @@ def coarse_pairs(_: Path, names: tuple[str, ...] = ("394", "65")) -> list[str]:
     return lines
 
 
-def dark_levels(_: Path, names: tuple[str, ...] = ("394", "157", "65"), binning: int = 4) -> list[str]:
+def dark_levels(_: Path, binning: int = 4) -> list[str]:
     """Show pairs with too much taken off as their dark level, each by the PSF of the other six."""
     known, photographs, pictures = measured_pairs()
     data, truths = (block_mean(images, binning, about_axis=True) for images in (photographs, pictures))
@@ -233,8 +233,7 @@ def dark_levels(_: Path, names: tuple[str, ...] = ("394", "157", "65"), binning:
         f"| picture | {' | '.join(changes)} |",
         "|---" * (1 + len(changes)) + "|",
     ]
-    for name in names:
-        number = known.index(name)
+    for number, name in enumerate(known):
         others = np.arange(len(data)) != number
         solved = psf_from_pictures(data[others], truths[others])
         light = truths[number] ** solved.gamma

@@ -11,6 +11,7 @@ from recon.reconstruction.background import with_dark_restored
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
+from recon.reconstruction.selection import choose
 from recon.types import Calibration
 
 
@@ -51,6 +52,13 @@ def test_nothing_is_added_where_nothing_is_missing(stray: float) -> None:
 def test_nothing_is_added_where_somebody_said_what_the_background_is() -> None:
     problem = problem_of(strokes(), 0.3, estimate_background=False)
     assert with_dark_restored(problem) is problem
+
+
+def test_light_that_falls_off_keeps_the_background_that_explains_it() -> None:
+    scene = make_scene("texture", size=56, field=0.65, fall_off_deg=16.0, photons=2e4, seed=2)
+    chosen = choose(Problem.of(Measurement(scene.measurement), scene.calibration, ReconstructionOptions()))
+    assert chosen.smooth
+    assert not any("were added" in words for words in chosen.warnings)
 
 
 def test_channels_share_one_dark_level() -> None:
