@@ -49,8 +49,9 @@ def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
     """Find points of light in a volume (beads, cells): x, y, z in micrometres, how well known, and light.
 
     Places are between voxels and in the scene's coordinates: a point's light is followed along its ray
-    through the diffuser. The volume as it was reconstructed serves best, not one made metric. Deviations are
-    one standard deviation, as points of simulated photographs were off.
+    through the diffuser. The volume as it was reconstructed serves best, not one made metric, of which
+    voxels finer than the planes are summed. Deviations are one standard deviation, as points of simulated
+    photographs were off.
     """
     from instrument.reconstruction.stored_result import open_result
     from recon.analysis.point_places import point_places
@@ -69,6 +70,11 @@ def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
             found = point_places(result.volume.plane, grid, options, advance)
     finally:
         result.close()
+    if grid.upright and grid.is_metric and grid.made_of_um is None:
+        desk.warn(
+            "Warning: this metric volume does not tell the planes it was made of. Where voxels are finer, "
+            "one point is told as several: give the volume as it was reconstructed, or export it again."
+        )
     known = bool(np.isfinite(found.places_um).all())
     write_text(files.out, _table(found))
     desk.fact("Points", str(len(found)))

@@ -66,6 +66,7 @@ def grid_facts(grid: Grid) -> dict[str, Any]:
         "pitch_um": known(grid.pitch_um),
         "axis_um": None if grid.axis_um is None else grid.axis_um.tolist(),
         "upright": grid.upright,
+        **({} if grid.made_of_um is None else {"made_of_um": list(grid.made_of_um)}),
     }
 
 
@@ -93,7 +94,9 @@ def grid_of(facts: Mapping[str, Any], shape: tuple[int, int, int]) -> Grid:
     centre = numbers(facts.get("centre"), (2,))
     row, column = (n // 2 for n in size) if centre is None else centre.astype(int).tolist()
     axis_um = numbers(facts.get("axis_um"), (n_z, 2))
-    return Grid(shape, (row, column), z_um, pitch_um, None, axis_um, facts.get("upright") is True)
+    steps = numbers(facts.get("made_of_um"), (2,))
+    made_of_um = None if steps is None or (steps <= 0).any() else (float(steps[0]), float(steps[1]))
+    return Grid(shape, (row, column), z_um, pitch_um, None, axis_um, facts.get("upright") is True, made_of_um)
 
 
 def numbers(value: Any, shape: tuple[int, ...]) -> npt.NDArray[np.float64] | None:

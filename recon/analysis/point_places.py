@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.analysis.whole_steps import in_whole_steps
 from recon.base.declare import option
 from recon.camera.grid import Grid
 from recon.errors import InputError
@@ -26,7 +27,7 @@ Whole = npt.NDArray[np.intp]
 Voxel = tuple[int, int, int]
 
 REACH = 2
-"""Voxels from its brightest one that a point's light is taken from, along its ray and across."""
+"""Planes and pixels from its brightest voxel that a point's light is taken from, along its ray and across."""
 BESIDE = (REACH + 0.5) * 2**0.5 + (REACH**2 + 2 * (REACH + 0.5) ** 2) ** 0.5
 """Pixels between rays of two points, where one may be nearer to a voxel of the other's window."""
 CELL = 8
@@ -92,9 +93,10 @@ def point_places(
     Parameters
     ----------
     volume : ndarray, (n_z, height, width[, n_channels]), or callable
-        Or what returns a plane of it by its number. Any grid: a reconstruction's own, or a metric one.
+        Or what returns a plane of it by its number. A reconstruction's own grid, or a metric one.
     grid : Grid
-        Of the volume.
+        Of the volume. Of a metric one with voxels finer than the planes and pixels it was made of, voxels are
+        summed to these (:attr:`Grid.made_of_um`): one point is told once, and no better known than before.
     options : PointOptions, optional
     on_progress : callable, optional
         Called with the share done.
@@ -110,7 +112,8 @@ def point_places(
             "are above 0: no ray through it goes to planes in it or behind it. Leave them out."
         )
     read = volume if callable(volume) else volume.__getitem__
-    search = _Search(read, grid, on_progress or (lambda _share: None))
+    light, summed, factors = in_whole_steps(lambda z: _light(read(z)), grid)
+    search = _Search(light, summed, on_progress or (lambda _share: None))
     brightest = search.brightest((options or PointOptions()).least)
     found = []
     for number, voxel in enumerate(brightest):
@@ -120,24 +123,25 @@ def point_places(
     places, off, voxels = (
         np.array([found[k][part] for k in order], np.float64).reshape(-1, 3) for part in range(3)
     )
-    ends = np.array([brightest[k][0] in (0, grid.shape[0] - 1) for k in order], bool)
+    last = round(grid.shape[0] / factors[0]) - 1  # less than half a plane at the end is none
+    ends = np.array([not 0 < brightest[k][0] < last for k in order], bool)
+    voxels = voxels * factors + (factors - 1) / 2
     return PointPlaces(places, off, voxels, np.array([found[k][3] for k in order]), ends)
 
 
+def _light(plane: npt.NDArray[Any]) -> Plane:
+    """Return a plane without its channels and what is below 0."""
+    voxels = np.asarray(plane, np.float32)
+    grey = voxels.sum(axis=2) if voxels.ndim == 3 else voxels
+    return np.maximum(np.nan_to_num(grey, nan=0.0, posinf=0.0, neginf=0.0), 0)
+
+
 class _Search:
-    """A volume's planes, without its channels and what is below 0."""
+    """Planes of light, and the points found in them so far."""
 
     def __init__(
-        self,
-        read: Callable[[int], npt.NDArray[Any]],
-        grid: Grid,
-        on_progress: Callable[[float], object],
+        self, plane: Callable[[int], Plane], grid: Grid, on_progress: Callable[[float], object]
     ) -> None:
-        def plane(z: int) -> Plane:
-            voxels = np.asarray(read(z), np.float32)
-            grey = voxels.sum(axis=2) if voxels.ndim == 3 else voxels
-            return np.maximum(np.nan_to_num(grey, nan=0.0, posinf=0.0, neginf=0.0), 0)
-
         self.plane = lru_cache(maxsize=2 * REACH + 2)(plane)
         self.grid, self.on_progress = grid, on_progress
         self.found: dict[Voxel, list[Voxel]] = {}

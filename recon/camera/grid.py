@@ -64,6 +64,8 @@ class Grid:
     upright : bool
         Whether rows and columns go with y and x. On the sensor's grid they go against them: the picture
         stands upside down (:mod:`recon.types`).
+    made_of_um : (float, float), or None
+        Step and pitch of the middle plane of what a metric grid was made of: finer voxels tell no more.
     """
 
     shape: tuple[int, int, int]
@@ -73,6 +75,7 @@ class Grid:
     sensor_pitch_um: float | None = None
     axis_um: Floats | None = None
     upright: bool = False
+    made_of_um: tuple[float, float] | None = None
 
     @property
     def spacing_um(self) -> Floats:
@@ -176,8 +179,8 @@ def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
     if voxel_um is not None and not 0 < voxel_um < np.inf:
         raise InputError(f"A voxel's edge is above 0 um, not {voxel_um:g}.")
     middle = min(n_z // 2, n_z - 2)
-    across = float(grid.pitch_um[order][n_z // 2]) if voxel_um is None else voxel_um
-    deep = float(steps[middle]) if voxel_um is None else voxel_um
+    made_of_um = float(steps[middle]), float(grid.pitch_um[order][n_z // 2])
+    deep, across = made_of_um if voxel_um is None else (voxel_um, voxel_um)
     near = _nearer(z)
     span = z[-1] - z[0] + near + steps[-1] / 2
     # A voxel lies on the nearest plane, none of the planes outside, and half a step beyond the outermost is
@@ -211,6 +214,7 @@ def metric_grid(grid: Grid, voxel_um: float | None = None) -> Grid:
         grid.sensor_pitch_um,
         None,
         True,
+        grid.made_of_um or made_of_um,
     )
 
 

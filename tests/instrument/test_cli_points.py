@@ -83,6 +83,29 @@ def test_volumes_from_elsewhere_are_not_blamed_for_another_thing(
     assert words in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.parametrize("name", ["metric.ome.zarr", "metric.tif"])
+def test_an_export_with_finer_voxels_has_as_many_points(
+    tmp_path: Path, volume: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    metric, out = tmp_path / name, tmp_path / "points.csv"
+    assert main(["export", str(volume), str(metric), "--metric", "--voxel-um", "60"]) == 0
+    assert main(["points", str(metric), "--out", str(out), "--least", "0.02"]) == 0
+    assert "does not tell the planes it was made of" not in " ".join(capsys.readouterr().err.split())
+    assert [row["in_outermost_plane"] for row in csv.DictReader(out.read_text().splitlines())] == ["0", "1"]
+
+
+def test_a_metric_volume_that_tells_no_planes_is_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, z_um = tmp_path / "metric.ome.zarr", 1e4 + 10.0 * np.arange(5)
+    voxels = np.zeros(GRID.shape, np.float32)
+    voxels[2, 12, 30] = 1
+    grid = replace(GRID, z_um=z_um, pitch_um=np.full(5, 10.0), upright=True)
+    write_volume_zarr(path, voxels, voxels.shape, grid, {})
+    assert main(["points", str(path), "--out", str(tmp_path / "points.csv")]) == 0
+    assert "does not tell the planes it was made of" in " ".join(capsys.readouterr().err.split())
+
+
 def test_psfs_without_places_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, nowhere = tmp_path / "beads.ome.zarr", np.full(5, np.nan)
     voxels = np.zeros(GRID.shape, np.float32)

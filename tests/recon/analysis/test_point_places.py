@@ -82,6 +82,27 @@ def test_in_a_metric_volume_a_point_is_followed_along_its_ray() -> None:
     assert farthest_off(found, points, [*metric.pitch_um[:2].tolist(), float(metric.spacing_um[0])]) < 0.5
 
 
+@pytest.mark.parametrize("voxel_um", [None, 100.0, 30.0, 12.0])
+def test_in_a_finer_metric_volume_a_point_is_one_and_no_better_known(voxel_um: float | None) -> None:
+    z_um = 1 / np.linspace(1 / 2000, 1 / 3600, 8)
+    grid = Grid((8, 31, 31), (15, 15), z_um, 20 * z_um / 2000)
+    voxels = np.zeros(grid.shape, np.float32)
+    voxels[4:6, 16, 23] = 0.5
+    own = point_places(voxels, grid)
+    volume, metric = metric_volume(voxels, grid, voxel_um)
+    found = point_places(volume, metric)
+    assert len(found) == len(own) == 1
+    off = np.abs(found.places_um - own.places_um)[0] / [*metric.pitch_um[:2], grid.spacing_um[4]]
+    assert off[2] < 0.2
+    assert off[:2].max() < 0.75
+    assert (found.deviations_um >= 0.7 * own.deviations_um).all()
+    assert found.light[0] == pytest.approx(1, rel=0.1)
+    plane, row, column = found.voxels[0]
+    told = metric.place_um(round(plane), row, column)[:2]
+    np.testing.assert_allclose(told, found.places_um[0, :2], atol=metric.pitch_um[0])
+    assert metric.z_um[0] + plane * metric.spacing_um[0] == pytest.approx(found.places_um[0, 2], rel=0.01)
+
+
 def test_the_dim_end_of_a_point_counts() -> None:
     grid = grid_of(even_in_inverse(6))
     z = 1 / (0.92 / grid.z_um[2] + 0.08 / grid.z_um[3])
