@@ -284,8 +284,9 @@ class FrameStream:
 
     # The producer --------------------------------------------------------------------------------
     def _produce(self) -> None:
-        silent_s, computed = 0.0, Computed(self.camera.computed_s)
+        silent_s = 0.0
         try:
+            computed = Computed(self.camera.computed_s)
             while self._running:
                 buffer = self._buffer()
                 began_s = self._asked_s = time.monotonic()

@@ -34,8 +34,8 @@ _LEAST, _UNCOUNTED = 16, 4
 ASTRAY = 1.5
 """How many times as many, or as few, the iterations may turn out that were told by the first."""
 UNEVEN = 1.2
-"""How many times as long, or as short, one may take later as the first ones did. A guess: one volume by the
-low-rank model took 1.06 times the end that was told it without this (docs/benchmarks/time-told.md)."""
+"""How many times as long, or as short, one may take later as the first ones did. A guess: a volume by the
+low-rank model took 1.05 and 1.06 times the end that is told without this (docs/benchmarks/time-told.md)."""
 
 
 @dataclass(frozen=True, slots=True)

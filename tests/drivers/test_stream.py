@@ -406,9 +406,11 @@ def test_a_drivers_mistake_reaches_those_who_read(monkeypatch: pytest.MonkeyPatc
     def broken(*_: object) -> None:
         raise ValueError("wrong shape")
 
-    monkeypatch.setattr(camera, "next_frame_into", broken)
-    with FrameStream(camera, 4) as stream, pytest.raises(DeviceError, match="wrong shape"):
-        stream.reader().next_frame(5.0)
+    for call in ("next_frame_into", "computed_s"):
+        monkeypatch.setattr(camera, call, broken)
+        with FrameStream(camera, 4) as stream, pytest.raises(DeviceError, match="wrong shape"):
+            stream.reader().next_frame(5.0)
+        monkeypatch.undo()
 
 
 def test_a_stream_has_three_buffers_at_least_and_runs_from_its_start_on() -> None:
