@@ -47,6 +47,11 @@ def real_array(given: Any, name: str, dtype: type[np.floating] = np.float32) -> 
     return cast
 
 
+def plain_number(given: Any) -> Any:
+    """Return the number that an array without axes holds, as np.load gives it; anything else as it is."""
+    return given.item() if getattr(given, "shape", None) == () and hasattr(given, "item") else given
+
+
 @dataclass(frozen=True, slots=True)
 class Geometry:
     """The optics that a calibration was taken with.
@@ -64,7 +69,8 @@ class Geometry:
 
     def __post_init__(self) -> None:
         for name in ("pixel_pitch_um", "diffuser_distance_mm", "wavelength_nm"):
-            if not isinstance(value := getattr(self, name), Real | None):
+            object.__setattr__(self, name, value := plain_number(getattr(self, name)))
+            if not isinstance(value, Real | None):
                 raise InputError(
                     f"{name} must be a number, or None where unknown, not {type(value).__name__}."
                 )

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import multiprocessing
+import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +15,10 @@ import numpy as np
 import pytest
 
 import diffuserbench as db
+from instrument.bench.config_file import template
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, write_image
+from instrument.notebook.reconstruct import require_hooks
 from instrument.notebook.words import in_python
 from recon.base.declare import options_of
 from recon.errors import InputError
@@ -336,6 +341,7 @@ WRONG = {
     "db.PointSweep(points_um=[(1, 2), (3, 4)])": "must be a tuple of positions",
     "db.StoppingRules('a')": "iterations must be a whole number, 1 or more, not 'a'",
     "db.StoppingRules(time_s=[1])": r"time_s must be a number, above 0, not \[1\]",
+    "db.StoppingRules(time_s=float('inf'))": "time_s must be a finite number, above 0, not inf",
     "db.StoppingRules(tolerance=None)": "tolerance must be a number, 0 or more, not None",
     "db.hologram('head', slm=(16, 16))": "show 18 x 18 details of a picture, and it is judged from 21 x 21",
     "db.hologram('head', slm='16x16')": r"slm must be \(height, width\), two whole numbers, not '16x16'",
@@ -348,6 +354,7 @@ WRONG = {
     "db.hologram('head', on_progress=3)": "on_progress must be a function, not 3",
     "db.hologram('head', alignment=3)": "alignment must be the name of a file, not 3",
     "db.reconstruct(SQUARE, SQUARE, cancel=3)": "cancel must be an Event, not 3",
+    "db.reconstruct(SQUARE, SQUARE, cancel=threading.Event)": "cancel must be an object, not its class",
     "db.reconstruct(SQUARE, SQUARE, on_stage='x')": "on_stage must be a function, not 'x'",
     "db.run(3)": "folder must be the name of a folder, not 3",
     "db.open_result(SQUARE)": r"path must be the name of a file, not an array of shape \(9, 9\)",
@@ -382,17 +389,56 @@ WRONG = {
 """What may be given to what ``diffuserbench`` offers by mistake, and what is said then."""
 
 
-@pytest.mark.parametrize("typed", WRONG)
-def test_what_is_no_argument_is_said_in_a_sentence(typed: str) -> None:
+def _names() -> dict[str, Any]:
     square = np.ones((9, 9))
     camera = db.Convolution(square[None].astype(np.float32), (9, 9))
     calibration = db.Calibration(square[None, None], [[0, 0, 1e4]])
-    names = {"db": db, "SQUARE": square, "CAMERA": camera, "CALIBRATION": calibration}
+    modules = {"db": db, "np": np, "threading": threading, "multiprocessing": multiprocessing}
+    modules |= {"require_hooks": require_hooks}
+    return modules | {"SQUARE": square, "CAMERA": camera, "CALIBRATION": calibration}
+
+
+@pytest.mark.parametrize("typed", WRONG)
+def test_what_is_no_argument_is_said_in_a_sentence(typed: str) -> None:
     with pytest.raises((InputError, BenchError), match=WRONG[typed]) as found:
-        eval(typed, names)
+        eval(typed, _names())
     said = str(found.value)
     assert said[-1] == "."
     assert "\n" not in said
+
+
+TAKEN = (
+    "db.open_result(IMAGE)",
+    "db.bench(BENCH)",
+    "db.write_image(IMAGE, SQUARE)",
+    "db.write_image('line.npy', SQUARE[0])",
+    "db.write_image('number.npy', np.array(2.0))",
+    "require_hooks(None, multiprocessing.Event())",
+    "db.Geometry(np.array(6.5))",
+    "db.NoiseModel(np.array(2.0), np.array(0.1))",
+    "db.StoppingRules(tolerance=np.array(1e-3), time_s=np.array(2))",
+    "db.Convolution(SQUARE[None], (9.0, np.array(9)))",
+    "db.Fista(CAMERA, SQUARE[None].tolist(), db.L1(np.array(1.0)))",
+    "db.Admm(CAMERA, SQUARE[None].tolist(), db.L1(1))",
+)
+"""What is of another type than the one documented, and as good."""
+
+
+@pytest.fixture(scope="module")
+def taken_names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    folder = tmp_path_factory.mktemp("taken")
+    write_image(folder / "image.tif", np.ones((9, 9), np.float32))
+    (folder / "bench.toml").write_text(template("default"))
+    entries = {entry.name: entry for entry in os.scandir(folder)}
+    return {"IMAGE": entries["image.tif"], "BENCH": entries["bench.toml"]}
+
+
+@pytest.mark.parametrize("typed", TAKEN)
+def test_what_is_as_good_as_what_is_documented_is_taken(
+    typed: str, taken_names: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    eval(typed, _names() | taken_names)
 
 
 def test_names_that_are_not_registered_are_missing_as_in_any_mapping() -> None:

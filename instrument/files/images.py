@@ -177,8 +177,8 @@ def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str
     path = Path(path)
     expected = "an array (height, width[, channels]) of real numbers, or a stack"
     kinds = "uifbc" if path.suffix.lower() == ".npy" else "uifb"
-    image = require_numbers("image", image, expected, kinds=kinds)
-    if image.ndim < 2 or not image.size:
+    image = require_numbers("image", image, expected, kinds=kinds, least_axes=0 if kinds[-1] == "c" else 1)
+    if (image.ndim < 2 and kinds[-1] != "c") or not image.size:
         raise InputError(f"image must be (height, width[, channels]), or a stack of such, not {image.shape}.")
     check_suffix(path)
     text = json.dumps(metadata, indent=1, default=str) if metadata is not None else None

@@ -176,9 +176,13 @@ def reconstruct(
 
 
 def require_hooks(on_progress: object, cancel: object) -> None:
-    """Raise InputError where what tells of progress is no function, or what ends the work no event."""
+    """Raise InputError where what tells of progress is no function, or what ends the work no event.
+
+    An event is what has ``is_set``: one of processes, say.
+    """
     require_argument("on_progress", on_progress, Callable | None)
-    require_argument("cancel", cancel, threading.Event | None, "threading.Event() makes one.")
+    if isinstance(cancel, type) or not callable(getattr(cancel, "is_set", None)):
+        require_argument("cancel", cancel, threading.Event | None, "threading.Event() makes one.")
 
 
 def _require_one(image: Any, psf: Any) -> None:

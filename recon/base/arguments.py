@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,19 +10,21 @@ import numpy.typing as npt
 
 from recon.base.declare import Declaration, Option
 from recon.errors import InputError
+from recon.types import plain_number
 
-Function = Callable[..., Any]
 
+def require_argument(name: str, value: object, kind: Any, remedy: str = "", **limits: float) -> Any:
+    """Return an argument, of an array without axes its number; raises InputError where it is not of its kind.
 
-def require_argument(name: str, value: object, kind: Any, remedy: str = "", **limits: float) -> None:
-    """Raise InputError where an argument is not of its kind: what it must be, what it is, the ``remedy``.
+    The error says what it must be, what it is, and the ``remedy``.
 
     ``kind`` is its type as a parameter is annotated (``float | None``; ``Path`` takes text, too), ``limits``
     are those of a :class:`~recon.base.declare.Declaration`.
     """
+    value = plain_number(value)
     asked = Option(name, kind, dataclasses.MISSING, Declaration(help="", **limits))  # type: ignore[arg-type]
     if (mistake := asked.mistake(value)) is None:
-        return
+        return value
     if value is None:
         mistake = f"{name} must be {asked.expected()}, not None."
     if name == "folder":
@@ -36,14 +37,13 @@ def require_shape(name: str, value: Any) -> tuple[int, int]:
     if isinstance(value, str | bytes) or not hasattr(value, "__len__") or len(value) != 2:
         given = f"an array of shape {np.shape(value)}" if isinstance(value, np.ndarray) else repr(value)
         raise InputError(f"{name} must be (height, width), two whole numbers, not {given}.")
-    height, width = value
-    for number in (height, width):
-        require_argument(name, number, int, "It is (height, width).", least=1)
+    whole = [int(n) if isinstance(n, float) and n.is_integer() else n for n in map(plain_number, value)]
+    height, width = (require_argument(name, n, int, "It is (height, width).", least=1) for n in whole)
     return int(height), int(width)
 
 
 def require_numbers(
-    name: str, array: npt.ArrayLike, expected: str, *, kinds: str = "uifb"
+    name: str, array: npt.ArrayLike, expected: str, *, kinds: str = "uifb", least_axes: int = 1
 ) -> npt.NDArray[Any]:
     """Return an array of numbers as it is; raises InputError for anything else, as ``expected`` says.
 
@@ -53,7 +53,7 @@ def require_numbers(
         found: npt.NDArray[Any] = np.asarray(array)
     except (TypeError, ValueError):
         found = np.asarray(None)
-    if found.dtype.kind not in kinds or not found.ndim:
+    if found.dtype.kind not in kinds or found.ndim < least_axes:
         given = type(array).__name__ if not found.ndim else f"an array of {found.dtype}"
         raise InputError(f"{name} must be {expected}, not {given}.")
     return found

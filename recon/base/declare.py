@@ -12,12 +12,13 @@ import difflib
 import enum
 import functools
 import math
+import os
 import re
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Integral, Real
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, TypeVar
 
 from recon.errors import InputError
@@ -211,7 +212,10 @@ class Option:
         if is_number and said.least <= value <= said.most and said.above < value < said.below:  # type: ignore[operator]
             return None
         shown = f"{value / said.shown_factor:g}" if typed and is_number else _shown(value)  # type: ignore[operator]
-        return f"{name} must be {self.expected(typed=typed)}, not {shown}."
+        expected = self.expected(typed=typed)
+        if is_number and said.infinity is None and math.isinf(value):  # type: ignore[arg-type]
+            expected = expected.replace("a number", "a finite number", 1)
+        return f"{name} must be {expected}, not {shown}."
 
     @property
     def is_whole(self) -> bool:
@@ -259,12 +263,16 @@ def _fits(kind: Any, value: object) -> bool:
     if typing.get_origin(kind) is typing.Literal:
         return isinstance(value, str)  # which words is another question
     if typing.get_origin(kind) is tuple:
-        several = hasattr(value, "__len__") and not isinstance(value, str)
+        several = (
+            hasattr(value, "__len__") and not isinstance(value, str) and getattr(value, "shape", None) != ()
+        )
         items = typing.get_args(kind)
         return several and (items[1:] == (...,) or len(value) == len(items))  # type: ignore[arg-type]
     if not isinstance(kind, type):
         return True
-    also = (str, PurePath) if kind is Path else tuple if issubclass(kind, tuple) else ()
+    if kind is Path and isinstance(value, os.PathLike):
+        return isinstance(os.fspath(value), str)
+    also = str if kind is Path else tuple if issubclass(kind, tuple) else ()
     return isinstance(value, (kind, also))
 
 
@@ -408,8 +416,8 @@ def _plain(value: Any) -> Any:
         return value.value
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if isinstance(value, Path):
-        return str(value)
+    if isinstance(value, os.PathLike):
+        return str(os.fspath(value))
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.errors import InputError
+from recon.types import plain_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +30,8 @@ class NoiseModel:
 
     def __post_init__(self) -> None:
         for name in ("read_noise", "counts_per_electron"):
-            if not isinstance(value := getattr(self, name), Real):
+            object.__setattr__(self, name, value := plain_number(getattr(self, name)))
+            if not isinstance(value, Real):
                 raise InputError(f"{name} must be a number, in counts, not {type(value).__name__}.")
 
     def deviation(self, measurement: npt.NDArray[Any]) -> float:

@@ -82,7 +82,7 @@ class Admm(PictureSplitting):
         penalties: Penalties | None = None,
         relax: float = 1.7,
     ) -> None:
-        require_parts(operator, data, prior)
+        data = require_parts(operator, data, prior)
         super().__init__(operator, prior, initial)
         valid = np.ascontiguousarray(np.where(self._weight > 0, data, 0), operator.dtype)
         self.relax = relax

@@ -14,13 +14,14 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.arguments import require_argument
+from recon.base.arguments import require_argument, require_numbers
 from recon.base.brief import brief
 from recon.base.namespace import Namespace, namespace_of, to_host
 from recon.base.threads import linear_algebra_on_one_thread
 from recon.camera.base import LinearOperator
 from recon.errors import InputError
 from recon.priors.base import Prior, refuse_lookalike
+from recon.types import plain_number
 
 
 class StopReason(enum.StrEnum):
@@ -92,10 +93,15 @@ class StoppingRules:
     patience: int = 3
 
     def __post_init__(self) -> None:
-        require_argument("iterations", self.iterations, int | None, least=1)
-        require_argument("time_s", self.time_s, float | None, above=0)
-        require_argument("tolerance", self.tolerance, float, least=0)
-        require_argument("patience", self.patience, int)
+        settled = {
+            "iterations": require_argument("iterations", self.iterations, int | None, least=1),
+            "time_s": require_argument("time_s", self.time_s, float | None, above=0),
+            "tolerance": require_argument("tolerance", self.tolerance, float, least=0),
+            "noise_norm": plain_number(self.noise_norm),
+            "patience": require_argument("patience", self.patience, int),
+        }
+        for name, value in settled.items():
+            object.__setattr__(self, name, value)
         if self.iterations is None and self.time_s is None and self.tolerance <= 0:
             raise InputError("A run needs an end: give iterations, time_s or a tolerance above 0.")
 
@@ -133,18 +139,20 @@ Array = npt.NDArray[Any]
 Callback = Callable[["Solver", IterationRecord], object]
 
 
-def require_parts(operator: object, data: Array, prior: object) -> None:
-    """Raise InputError where a solver's parts are none, or the data are not what the operator gives."""
+def require_parts(operator: object, data: npt.ArrayLike, prior: object) -> Array:
+    """Return the data as an array; raises InputError where they are not what the operator gives.
+
+    So it does where operator or prior is none.
+    """
     require_argument("operator", operator, LinearOperator)
     refuse_lookalike(prior)
     require_argument("prior", prior, Prior, "db.PRIORS names them, db.L1(weight) is one.")
     assert isinstance(operator, LinearOperator)
-    shape = getattr(data, "shape", None)
-    if shape != operator.range_shape:
-        given = type(data).__name__ if shape is None else f"an array of shape {shape}"
-        raise InputError(
-            f"data must be what the operator gives, an array of shape {operator.range_shape}, not {given}."
-        )
+    expected = f"what the operator gives, an array of shape {operator.range_shape}"
+    found = require_numbers("data", data, f"{expected} of real numbers")
+    if found.shape != operator.range_shape:
+        raise InputError(f"data must be {expected}, not an array of shape {found.shape}.")
+    return found
 
 
 @dataclass(frozen=True)

@@ -56,9 +56,8 @@ class Fista(Solver):
         step: float | None = None,
     ) -> None:
         super().__init__()
-        require_parts(operator, data, prior)
+        self.data = np.asarray(require_parts(operator, data, prior), operator.dtype)
         self.operator = operator
-        self.data = np.asarray(data, operator.dtype)
         self.prior: Prior = prior.for_a_run()
         self.restart = restart
         self.accelerate = accelerate
