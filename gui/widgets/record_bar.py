@@ -79,6 +79,8 @@ class RecordBar(QWidget):
         self.rest_button.hide()
         self._left: _Left | None = None
         """Of the recording that runs, or was broken off."""
+        self._before: tuple[Path | None, _Left | None, str] = (None, None, "")
+        """What was taken and left, and said of it, before the recording that runs."""
         parts = (self.button, self.seconds, self.label, self.gauge, (self.note, 1))
         fill(self, *parts, self.rest_button, self.look_button, across=True)
         every(self, _DISK_MS, self._look_at_disk)
@@ -112,13 +114,23 @@ class RecordBar(QWidget):
         def work(context: JobContext) -> Run:
             from instrument.runs.recorder import prepare_recording
 
-            if asked.began is not None:
-                restore_camera(session.bench.camera, asked.began[1])
-                asked.began[0].put_back(session.bench)
-            lit = Lit.now(session.bench)
-            recorder = prepare_recording(
-                session.bench, session.runs_folder, label=label, seconds=seconds, on_progress=context.report
-            )
+            before = Lit.now(session.bench)
+            try:
+                if asked.began is not None:
+                    restore_camera(session.bench.camera, asked.began[1])
+                    asked.began[0].put_back(session.bench)
+                lit = Lit.now(session.bench)
+                recorder = prepare_recording(
+                    session.bench,
+                    session.runs_folder,
+                    label=label,
+                    seconds=seconds,
+                    on_progress=context.report,
+                )
+            except BaseException:
+                if asked.began is not None:  # what STOP had darkened stays dark
+                    before.put_back(session.bench)
+                raise
             self._recorder, self._taken = recorder, recorder.path
             self._left = replace(asked, began=(lit, camera_settings(session.bench.camera)))
             with session.live.watching(recorder.newest):
@@ -127,11 +139,13 @@ class RecordBar(QWidget):
             lit.put_back(session.bench)
             return run
 
+        before = self._taken, self._left, self.note.text()
+        self._taken, self._left, self._came_s = None, asked, 0.0  # the work tells them anew
         job = self._panel.begin(lambda: session.exclusive_job("Recording", work), self.button)
         if job is None:
+            self._taken, self._left, _ = before
             return
-        self._came_s = 0.0
-        self.job, self._taken, self._left = job, None, asked
+        self.job, self._before = job, before
         self.note.clear()
         self.look_button.hide()
         self.rest_button.hide()
@@ -160,13 +174,17 @@ class RecordBar(QWidget):
     def _done(self, run: Run) -> None:
         count = len(run.records)
         frames = f"{count} frame{'' if count == 1 else 's'}"
+        self._left = None
         self.note.setText(f"{frames} in {run.path.name}")
         self._session.log("info", f"Recorded {frames}: {run.path}")
         self._session.run_finished.emit(run.path)
 
     def _ended_early(self, how: str) -> None:
-        """Say what is kept of a recording that was broken off."""
-        if self._taken is not None:
+        """Say what is kept of a recording that was broken off; of the one before where it was refused."""
+        if self._taken is None:
+            self._taken, self._left, said = self._before
+            self.note.setText(said)
+        else:
             kept = self.note.text().partition(" · ")[0] or "no frame yet"
             self.note.setText(f"Ended {how} ({kept}); what was taken is kept in {self._taken.name}")
             self._session.run_finished.emit(self._taken)

@@ -489,10 +489,15 @@ def test_a_recording_that_was_stopped_is_kept_in_the_dark_and_goes_on_in_its_lig
     exposure_ms = camera.exposure_ms
     camera.set_exposure_ms(2 * exposure_ms)  # as a camera that was connected again
     qtbot.waitUntil(lambda: not live.session.jobs.is_busy("camera"), timeout=WAIT_MS)
+    said = bar.note.text()
+    assert " is kept in " in said
     with monkeypatch.context() as full:
         full.setattr("instrument.runs.recorder.prepare_recording", _disk_full)
         qtbot.mouseClick(bar.rest_button, Qt.MouseButton.LeftButton)
         qtbot.waitUntil(lambda: bar.job is None and bar.rest_button.isVisible(), timeout=WAIT_MS)
+    assert not live.session.bench.scene_lit, "as dark as it was before"
+    assert bar.note.text() == said, "there is no other film"
+    assert bar.look_button.isVisible()
     qtbot.mouseClick(bar.rest_button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: bar.job is None and " in " in bar.note.text(), timeout=WAIT_MS)
     assert live.session.bench.scene_lit
