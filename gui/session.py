@@ -494,6 +494,8 @@ class BenchSession(QObject):
         state = replace(state, text=in_the_window(state.text))
         if self._states[kind] != state:
             self._states[kind] = state
+            if kind == "camera" and state.condition != "open":
+                self._forget_live_failure()  # the camera's state says what is wrong from here on
             self.device_changed.emit(kind)
 
     def _in_window(self, call: Callable[..., object], *arguments: object) -> None:

@@ -44,9 +44,9 @@ from recon.types import Calibration
 
 _LOOK_MS = 50
 _BUDGET_MS = 80.0
+"""A picture's time: twelve a second leave half of a two-core machine to the camera and the window."""
 _PATIENCE_S = 1.5
 """Without a frame for longer than this and three exposures, the picture is called old."""
-"""A picture's time: twelve a second leave half of a two-core machine to the camera and the window."""
 _NO_CALIBRATION = "Choose a calibration; the Sweeps panel makes one."
 _ALL_DEPTHS = "all depths"
 _WHITE = 99.8

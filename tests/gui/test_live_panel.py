@@ -17,7 +17,7 @@ from PySide6.QtWidgets import QComboBox, QLineEdit
 from pytestqt.qtbot import QtBot
 
 from drivers.device import OwnSetting
-from drivers.errors import LimitError
+from drivers.errors import DeviceError, LimitError
 from gui.main_window import MainWindow
 from gui.panel import whole
 from gui.panels.live import LivePanel
@@ -166,6 +166,28 @@ def test_a_view_that_did_not_start_says_why_and_is_tried_again(
     qtbot.waitUntil(lambda: session.live.is_running, timeout=WAIT_MS)
     qtbot.waitUntil(live.again_button.isHidden, timeout=WAIT_MS)
     assert not session.live_failure
+
+
+def test_a_reason_goes_with_the_camera(
+    qtbot: QtBot, live: LivePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A camera that was lost is connected again, not tried again."""
+    session, camera = live.session, live.session.bench.camera
+    with qtbot.waitSignal(session.jobs.job_ended, timeout=WAIT_MS):
+        session.stop_live()
+
+    def busy(_: int = 8) -> None:
+        raise LimitError(camera.name, "is busy.", "Wait for its other user.")
+
+    monkeypatch.setattr(camera, "start_sequence", busy)
+    session.start_live()
+    qtbot.waitUntil(live.again_button.isVisible, timeout=WAIT_MS)
+    session.note_failure(DeviceError(camera.name, "was unplugged."), surely=True)
+    assert session.state("camera").condition == "failed"
+    live.count()
+    assert live.again_button.isHidden()
+    assert not session.live_failure
+    assert not session._live_again.isActive()
 
 
 def test_what_comes_is_shown_coarsely_first_and_says_so(
