@@ -258,7 +258,7 @@ def _depths(tiff: tifffile.TiffFile) -> dict[str, Any]:
 def _times(tiff: tifffile.TiffFile) -> dict[str, float]:
     """Return the time from frame to frame of ImageJ's stacks."""
     stack = tiff.imagej_metadata or {}
-    unit = SECONDS.get(str(stack.get("tunit", "")), 0.0)
+    unit = SECONDS.get(str(stack.get("tunit", "")).strip().casefold(), 0.0)
     period_s, fps = unit * float(stack.get("finterval", 0)), float(stack.get("fps", 0))
     period_s = period_s or (1 / fps if fps > 0 else 0.0)
     return {"frame_period_s": period_s} if stack.get("frames", 0) > 1 and period_s > 0 else {}

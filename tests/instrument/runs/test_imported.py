@@ -42,7 +42,9 @@ def test_a_recording_goes_out_as_ome_tiff_and_comes_back(tmp_path: Path) -> None
             assert getattr(facts, name) == getattr(before, name), name
 
 
-@pytest.mark.parametrize(("unit", "written"), [("ms", 20.0), ("sec", 0.02), ("min", 0.02 / 60)])
+@pytest.mark.parametrize(
+    ("unit", "written"), [("ms", 20.0), ("Sec", 0.02), ("Seconds", 0.02), ("ns", 2e7), ("min", 0.02 / 60)]
+)
 def test_imagejs_time_has_a_unit(tmp_path: Path, unit: str, written: float) -> None:
     film = tmp_path / "film.tif"
     told = {"axes": "TYX", "finterval": written, "tunit": unit}
