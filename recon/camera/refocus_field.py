@@ -87,13 +87,13 @@ def refocus_field(calibration: Calibration, z_um: float) -> Calibration:
     fields = _of_equal_places([_Side.of(calibration, group) for group in sides])
     x_um, y_um = _axis_at(calibration, mixture, z_um)
     # Pixels by which the pattern of a place is displaced go with x / z: linear in 1 / z between the depths.
-    # Beyond one of them x and y are kept; at infinity, where all of these are one direction, the angles.
-    beyond = len(fields) == 1 and z_um < FAR_UM
-    ratios = [depths[k] / z_um if beyond else 1.0 for k in mixture.members]
-    points = np.zeros_like(fields[0].points)
-    for weight, ratio, side in zip(mixture.weights, ratios, fields, strict=True):
-        points += weight * ratio * side.points
+    points: Any = sum(weight * side.points for weight, side in zip(mixture.weights, fields, strict=True))
     points = np.round(points)  # whole pixels are registered back without another interpolation
+    if len(fields) == 1:
+        # Beyond one of them x and y are kept; so far away that these are one direction, the angles.
+        same_xy = np.round(depths[mixture.members[0]] / z_um * fields[0].points)
+        if len(np.unique(same_xy, axis=0)) == len(np.unique(points, axis=0)):
+            points = same_xy
     per_px = pitch_um * z_um / distance_um
     positions = [(x_um - column * per_px, y_um - row * per_px, z_um) for row, column in points]
     made = [
