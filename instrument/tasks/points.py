@@ -107,7 +107,7 @@ def _why_unknown(result: StoredResult) -> str:
         return "A .npy keeps no places: give the .ome.zarr or .tif that it was exported from."
     if result.volume is not None and "z_um" in {**result.record.get("grid", {}), **result.volume.facts}:
         return "It was made of PSFs from files: --pixel-um and --distance-mm of reconstruct say them."
-    return "The .ome.zarr and .tif of diffuserbench keep places; other programs' tell steps at most."
+    return "This program's .ome.zarr and .tif keep places; other programs' tell steps at most."
 
 
 def _at_the_ends(ends: int, planes: int) -> str:
