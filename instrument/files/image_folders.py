@@ -29,14 +29,28 @@ _MICRO_MANAGERS = (
 def images_in(folder: Path) -> list[Path]:
     """Return a folder's image files as people count: numbers by their value, 2 before 10.
 
-    A dot within a number is a decimal point, unless two names would be the same number so: 1.1 and 1.10 are
-    counted.
+    A dot within a number is a decimal point, unless names that are the same but for their numbers would be
+    the same so, or end in a 0 that shorter ones lack: 1.1 and 1.10, 1.9 and 1.10 are counted.
     """
     found = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
-    values = {(texts, tuple(numbers)) for texts, numbers in (_parts(path.name, _NUMBER) for path in found)}
-    number = _NUMBER if len(values) == len(found) else _COUNT
-    plain = {_parts(path.name, number)[0] for path in found}
-    return sorted(found, key=lambda path: _natural(path.name, plain, number))
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for path in found:
+        alike.setdefault(_parts(path.name, _NUMBER)[0], []).append(path.name)
+    number = {name: _COUNT if _are_counted(names) else _NUMBER for names in alike.values() for name in names}
+    plain = {_parts(path.name, number[path.name])[0] for path in found}
+    return sorted(found, key=lambda path: _natural(path.name, plain, number[path.name]))
+
+
+def _are_counted(names: Sequence[str]) -> bool:
+    """Whether dots within numbers of names, which are the same but for these, are no decimal points."""
+    if len({tuple(_parts(name, _NUMBER)[1]) for name in names}) < len(names):
+        return True
+    for column in zip(*(_NUMBER.findall(name) for name in names), strict=True):
+        digits = [after for number in column if (after := number.partition(".")[2])]
+        most = max(map(len, digits), default=0)
+        if most > 1 and min(map(len, digits)) < most and any(len(d) == most and d[-1] == "0" for d in digits):
+            return True
+    return False
 
 
 def in_order(folder: Path, paths: Sequence[Path]) -> tuple[list[Path], tuple[float, ...]]:

@@ -42,6 +42,8 @@ PICTURE = STACK[0]
         (["10x_1mm.tif", "10x_2mm.tif", "10x_10mm.tif"], (1e3, 2e3, 1e4)),
         ([f"day3.{n}.tif" for n in range(1, 12)], ()),
         (["v1.125.tif", "v1.25.tif", "v1.5.tif"], ()),
+        ([f"run.1.{n}.tif" for n in range(5, 13)], ()),
+        (["b01.tif", "b1.tif", "z0.5.tif", "z0.75.tif", "z0.9.tif"], ()),
     ],
 )  # fmt: skip
 def test_a_folder_is_read_in_the_order_that_people_mean(
