@@ -18,6 +18,7 @@ import diffuserbench as db
 from instrument.bench.config_file import template
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, write_image
+from instrument.notebook.hologram import _depths
 from instrument.notebook.reconstruct import require_hooks
 from instrument.notebook.words import in_python
 from recon.base.declare import options_of
@@ -345,6 +346,19 @@ WRONG = {
     "db.StoppingRules(tolerance=None)": "tolerance must be a number, 0 or more, not None",
     "db.hologram('head', slm=(16, 16))": "show 18 x 18 details of a picture, and it is judged from 21 x 21",
     "db.hologram('head', slm='16x16')": r"slm must be \(height, width\), two whole numbers, not '16x16'",
+    "db.hologram('head', slm=np.array(64))": r"slm must be \(height, width\), two whole numbers, not an ",
+    "db.hologram('head', z_mm={0})": "z_mm must be a number, not {0}",
+    "db.PointSweep(points_um=[[0, 0, 1e4], [1, 'a', 1e4]])": "must be a tuple of positions",
+    "db.write_image('a.tif', SQUARE, metadata=3)": "metadata must be a Mapping, not 3",
+    "db.Convolution(SQUARE[None], {9, 8})": r"sensor_shape must be \(height, width\), two whole numbers",
+    "db.Convolution(SQUARE[None].astype(str), (9, 9))": "psfs must be an array .* not an array of <U",
+    "db.Convolution(1j * SQUARE[None], (9, 9))": "psfs must be an array .* not an array of complex128",
+    "db.Fista(CAMERA, SQUARE[None], db.L1(1), step='a')": "step must be a number, above 0, not 'a'",
+    "db.Fista(CAMERA, SQUARE[None], db.L1(1), initial=SQUARE[:5])": "initial must be an array of shape",
+    "db.Fista(CAMERA, 1j * SQUARE[None], db.L1(1))": "data must be .* not an array of complex128",
+    "db.Admm(CAMERA, [[['a']]], db.L1(1))": "data must be what the operator gives, .* not an array of <U1",
+    "db.Admm(CAMERA, SQUARE[None], db.L1(1), penalties=3)": "penalties must be a Penalties, not 3",
+    "db.Admm(CAMERA, SQUARE[None], db.L1(1), relax='a')": "relax must be a number, above 0, not 'a'",
     "db.hologram('head', slm=(2.5, 4))": "slm must be a whole number, 1 or more, not 2.5",
     "db.hologram('head', 3)": "bench must be the name of a file, not 3. Or one of the simulated ones",
     "db.hologram('head', None, 'lbfgs')": "options must be a HologramOptions, not 'lbfgs'",
@@ -394,7 +408,7 @@ def _names() -> dict[str, Any]:
     camera = db.Convolution(square[None].astype(np.float32), (9, 9))
     calibration = db.Calibration(square[None, None], [[0, 0, 1e4]])
     modules = {"db": db, "np": np, "threading": threading, "multiprocessing": multiprocessing}
-    modules |= {"require_hooks": require_hooks}
+    modules |= {"require_hooks": require_hooks, "depths_of": _depths}
     return modules | {"SQUARE": square, "CAMERA": camera, "CALIBRATION": calibration}
 
 
@@ -415,6 +429,9 @@ TAKEN = (
     "db.write_image('number.npy', np.array(2.0))",
     "require_hooks(None, multiprocessing.Event())",
     "db.Geometry(np.array(6.5))",
+    "depths_of(np.array(0.0), 2)",
+    "db.PointSweep(points_um=[[0, 0, 1e4], [1, 0, 1e4]])",
+    "db.PointSweep(points_um=np.array([[0, 0, 1e4], [1, 0, 1e4]]))",
     "db.NoiseModel(np.array(2.0), np.array(0.1))",
     "db.StoppingRules(tolerance=np.array(1e-3), time_s=np.array(2))",
     "db.Convolution(SQUARE[None], (9.0, np.array(9)))",

@@ -21,8 +21,10 @@ from calibration_routines.psf.sampling import MOST_PLANES, Position, axial_plane
 from instrument.bench.bench import Bench
 from instrument.files.errors import SettingsError
 from instrument.plan import Span
+from recon.base.arguments import is_several
 from recon.base.declare import RARE, option
 from recon.optics.fall_off import FallOff, gaussian_fall_off
+from recon.types import plain_number
 
 LEAST_POINTS_WITH_REFERENCE = 4
 """A shorter sweep is over before a source drifts: no reference visits."""
@@ -115,6 +117,12 @@ class PointSweep(Taking):
     points_um: tuple[Position, ...]
     kind: str = "volume"
     by_hand: bool = False
+
+    def __post_init__(self) -> None:
+        if is_several(self.points_um) and all(map(is_several, self.points_um)):
+            points = tuple(tuple(map(plain_number, point)) for point in self.points_um)
+            object.__setattr__(self, "points_um", points)
+        super().__post_init__()
 
     def disagreements(self, wrong: Collection[str]) -> list[tuple[str, str]]:
         """As :meth:`Checked.disagreements`."""

@@ -174,6 +174,7 @@ def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str
     when the disk is full.
     """
     require_argument("path", path, Path)
+    require_argument("metadata", metadata, Mapping | None)
     path = Path(path)
     expected = "an array (height, width[, channels]) of real numbers, or a stack"
     kinds = "uifbc" if path.suffix.lower() == ".npy" else "uifb"

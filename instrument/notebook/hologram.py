@@ -30,7 +30,7 @@ from instrument.files.sample_images import SAMPLES
 from instrument.notebook.reconstruct import bench_config, require_hooks
 from instrument.notebook.result import figure_png, show_figure
 from instrument.notebook.words import in_python, speaking
-from recon.base.arguments import require_argument, require_shape
+from recon.base.arguments import is_several, require_argument, require_shape
 from recon.base.checks import plain_array
 from recon.base.declare import with_overrides
 from recon.holography import HologramOptions, HologramRecord
@@ -154,9 +154,8 @@ def hologram(
 
 def _depths(z_mm: Any, count: int) -> list[float]:
     """Return a depth for each picture; raises BenchError where there are others."""
-    given = [z_mm] if isinstance(z_mm, str) or not hasattr(z_mm, "__len__") else list(z_mm)
-    for z in given:
-        require_argument("z_mm", z, float)
+    given = list(z_mm) if is_several(z_mm) else [z_mm]
+    given = [require_argument("z_mm", z, float) for z in given]
     if not count or len(given) not in (1, count):
         raise BenchError(
             f"Give one z_mm for all pictures, or one a picture: there are {count}, not {len(given)}."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,9 +33,16 @@ def require_argument(name: str, value: object, kind: Any, remedy: str = "", **li
     raise InputError(f"{mistake} {remedy}".strip())
 
 
+def is_several(value: object) -> bool:
+    """Whether it is a sequence, or an array with an axis; a text is none, nor a set, which has no order."""
+    return bool(getattr(value, "shape", ())) or (
+        isinstance(value, Sequence) and not isinstance(value, str | bytes)
+    )
+
+
 def require_shape(name: str, value: Any) -> tuple[int, int]:
     """Return height and width; raises InputError for what is not two whole numbers, 1 or more."""
-    if isinstance(value, str | bytes) or not hasattr(value, "__len__") or len(value) != 2:
+    if not is_several(value) or len(value) != 2:
         given = f"an array of shape {np.shape(value)}" if isinstance(value, np.ndarray) else repr(value)
         raise InputError(f"{name} must be (height, width), two whole numbers, not {given}.")
     whole = [int(n) if isinstance(n, float) and n.is_integer() else n for n in map(plain_number, value)]

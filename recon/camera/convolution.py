@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
-from recon.base.arguments import require_shape
+from recon.base.arguments import require_numbers, require_shape
 from recon.base.threads import in_blocks
 from recon.camera.base import Array, LinearOperator
 from recon.errors import InputError
@@ -109,10 +109,9 @@ class Convolution(LinearOperator):
         dtype: npt.DTypeLike = np.float32,
         allocate: Callable[[tuple[int, ...], npt.DTypeLike], Array] = np.empty,
     ) -> None:
-        if getattr(psfs, "ndim", 0) == 0:
-            raise InputError(
-                f"psfs must be an array ([n_z, ]n_channels, height, width), not {type(psfs).__name__}."
-            )
+        if getattr(psfs, "ndim", 0) == 0 or psfs.dtype.kind not in "uifb":
+            expected = "an array ([n_z, ]n_channels, height, width) of real numbers"
+            psfs = require_numbers("psfs", psfs, expected)
         if psfs.ndim not in (3, 4):
             raise InputError(f"psfs must be ([n_z, ]n_channels, height, width), not {psfs.shape}.")
         if len(psfs) == 0:

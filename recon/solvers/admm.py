@@ -20,6 +20,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from recon.base import fft
+from recon.base.arguments import require_argument
 from recon.base.threads import over_rows
 from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import Convolution
@@ -83,10 +84,11 @@ class Admm(PictureSplitting):
         relax: float = 1.7,
     ) -> None:
         data = require_parts(operator, data, prior)
+        relax = require_argument("relax", relax, float, above=0)
+        penalties = require_argument("penalties", penalties, Penalties | None) or Penalties()
         super().__init__(operator, prior, initial)
         valid = np.ascontiguousarray(np.where(self._weight > 0, data, 0), operator.dtype)
         self.relax = relax
-        penalties = penalties or Penalties()
         self._settles = penalties.differences is None
         self._split = DataSplit(self._camera, valid, self._weight, penalties.data, self._y, relax)
         power = float(np.mean(self._camera.power()))

@@ -155,6 +155,19 @@ def require_parts(operator: object, data: npt.ArrayLike, prior: object) -> Array
     return found
 
 
+def starting_point(operator: LinearOperator, initial: npt.ArrayLike | None) -> Array:
+    """Return an iterate to begin with on the operator's domain, default zeros; InputError for others."""
+    start = np.zeros(operator.domain_shape, operator.dtype)
+    if initial is not None:
+        expected = f"an array of shape {start.shape}"
+        given = require_numbers("initial", initial, f"{expected} of real numbers", least_axes=0)
+        try:
+            start[...] = given
+        except ValueError as error:
+            raise InputError(f"initial must be {expected}, not of shape {given.shape}.") from error
+    return start
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What a run reached: the object on the operator's domain, how, and why it ended."""

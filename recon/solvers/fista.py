@@ -6,9 +6,10 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from recon.base.arguments import require_argument
 from recon.camera.base import Array, LinearOperator
 from recon.priors.base import Prior
-from recon.solvers.base import IterationRecord, Solver, require_parts
+from recon.solvers.base import IterationRecord, Solver, require_parts, starting_point
 
 Restart = Literal["function", "gradient", "none"]
 
@@ -59,13 +60,12 @@ class Fista(Solver):
         self.data = np.asarray(require_parts(operator, data, prior), operator.dtype)
         self.operator = operator
         self.prior: Prior = prior.for_a_run()
-        self.restart = restart
+        self.restart = require_argument("restart", restart, Restart)
+        step = require_argument("step", step, float | None, above=0)
         self.accelerate = accelerate
         bound = operator.norm_bound
         self.step_length = step if step is not None else 1.0 / bound**2 if bound > 0 else 1.0
-        self.x = np.zeros(operator.domain_shape, operator.dtype)
-        if initial is not None:
-            self.x[...] = initial
+        self.x = starting_point(operator, initial)
         self.previous = self.x.copy()
         self.forward_x = operator.forward(self.x)
         self.forward_previous = self.forward_x.copy()

@@ -20,7 +20,7 @@ from recon.camera.factors import as_cropped_convolution
 from recon.errors import StructureError
 from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation
-from recon.solvers.base import Solver
+from recon.solvers.base import Solver, starting_point
 from recon.solvers.moving import move
 
 STRIPS = 16
@@ -332,10 +332,7 @@ class PictureSplitting(Solver):
         super().__init__()
         structure = as_cropped_convolution(operator)
         self._camera, self._weight = structure.convolution, np.ascontiguousarray(structure.weight)
-        start = np.zeros(operator.domain_shape, operator.dtype)
-        if initial is not None:
-            start[...] = initial
-        self._splits = PriorSplits(prior, start)
+        self._splits = PriorSplits(prior, starting_point(operator, initial))
         self._y, self._mu, self.splits = self._splits.y, self._splits.mu, self._splits.others
 
     @property
