@@ -161,10 +161,11 @@ class _Watch(Listener):
             )
         most = "at most " if self._at_most else "about "
         end_s, computed_s = (seen + left for seen, left in zip(self._seen_s, self._left_s(), strict=True))
-        by = f'by a rehearsal up to {self._done / self._total:.0%} of "{self._step}"'
+        step, share = f'"{self._step}"', f"by a rehearsal up to {self._done / self._total:.0%} of"
         if (following_s := self._following_s(computed_s)) is not None:
-            return f"{IN_ALL}{by} and the sizes of what follows: {most}{duration(end_s + following_s)}."
-        return f"Up to the end of that step, {by}: {most}{duration(end_s)}. What follows it comes on top."
+            whole = duration(end_s + following_s)
+            return f"{IN_ALL}{share} {step} and the sizes of what follows: {most}{whole}."
+        return f"Up to the end of {step}, {share} it: {most}{duration(end_s)}. What follows it comes on top."
 
     def _following_s(self, computed_s: float) -> float | None:
         """Return what follows a step, as quick as work was so far without waiting; None: not known."""

