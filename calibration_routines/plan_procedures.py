@@ -23,7 +23,7 @@ from instrument.runs.acquire import abilities_of, acquire, look, prepare_resume,
 from instrument.runs.inspection import Verification, run_paths, verify
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
-from instrument.runs.run_files import RunError, is_run, refuse_within
+from instrument.runs.run_files import PLAN, RunError, is_run, refuse_within
 from instrument.runs.runner import Runner, discarded
 
 
@@ -253,10 +253,14 @@ def unfinished(path: Path | None) -> Path | None:
 
 
 def left_unfinished(folder: Path, names: Collection[str]) -> Path | None:
-    """Return a folder's newest run of some routines (``"plan"``: of none) if it did not end, else None."""
+    """Return a folder's newest run of some routines (``"plan"``: of none) if it did not end, else None.
+
+    Recordings are none of them: what they lack, another film takes.
+    """
     for path in reversed(run_paths(folder)):
         routine = routine_of(path)
-        if (routine.name if routine else "plan") in names:
+        of = routine.name if routine else "plan" if (path / PLAN).exists() else ""
+        if of in names:
             return unfinished(path)
     return None
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import shutil
 import time
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from PySide6.QtWidgets import QLineEdit, QProgressBar, QWidget
 
@@ -15,29 +14,18 @@ from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.widgets.building import button, every, fill, label
 from gui.widgets.entry import NumberEdit
-from instrument.bench.camera_settings import camera_settings, restore_camera
 from instrument.bench.photograph import Lit
 from instrument.files.atomic import SPARE_BYTES, free_bytes, there_now
-from instrument.files.errors import FileError, duration, size
+from instrument.files.errors import FileError, count, duration, size
 
 if TYPE_CHECKING:
     from instrument.runs.recorder import Recorder, RecordingStatus
+    from instrument.runs.recording_rest import RecordingRest
     from instrument.runs.run import Run
 
 _DISK_MS = 5000
-_LEAST_REST_S = 0.1
-"""Less than that is not worth a film of its own."""
 _SILENT_S = 4.0
 """A disk that takes longer is called silent."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Left:
-    """What is to be recorded: how long, under what name; its light and camera's settings once it began."""
-
-    seconds: float
-    label: str
-    began: tuple[Lit, dict[str, Any]] | None = None
 
 
 class RecordBar(QWidget):
@@ -77,14 +65,16 @@ class RecordBar(QWidget):
         self.look_button.hide()
         self.rest_button = button("Go on with it", clicked=self._go_on)
         self.rest_button.hide()
-        self._left: _Left | None = None
-        """Of the recording that runs, or was broken off."""
-        self._before: tuple[Path | None, _Left | None, str] = (None, None, "")
-        """What was taken and left, and said of it, before the recording that runs."""
+        self.rest: RecordingRest | None = None
+        """What a recording lacks that was cut, now or on an earlier day."""
+        self._before: tuple[Path | None, str] = (None, "")
+        """What was taken, and said of it, before the recording that runs."""
+        self._rests = NewestOnly(panel.jobs, "Looking for a recording that was cut")
         parts = (self.button, self.seconds, self.label, self.gauge, (self.note, 1))
         fill(self, *parts, self.rest_button, self.look_button, across=True)
         every(self, _DISK_MS, self._look_at_disk)
         self._look_at_disk()
+        self._look_for_rest()
 
     def toggle(self) -> None:
         """Start a recording, or end the one that runs."""
@@ -100,52 +90,48 @@ class RecordBar(QWidget):
         if not self.seconds.submit():
             self.seconds.setFocus()
             return
-        self._begin(_Left(self.seconds.value or 0.0, self.label.text().strip() or "recording"))
+        self._begin(self.seconds.value or 0.0, self.label.text().strip() or "recording")
 
     def _go_on(self) -> None:
-        """Record what a recording that was broken off lacks, in the light that it had."""
-        if self._left is not None and self.job is None:
-            self._begin(self._left)
+        """Record what a recording that was cut lacks, in the light that it had."""
+        if (rest := self.rest) is not None and self.job is None:
+            self._begin(rest.seconds, rest.label, rest)
 
-    def _begin(self, asked: _Left) -> None:
+    def _begin(self, seconds: float | None, label: str, rest: RecordingRest | None = None) -> None:
         session = self._session
-        seconds, label = asked.seconds, asked.label
 
         def work(context: JobContext) -> Run:
-            from instrument.runs.recorder import prepare_recording
+            from instrument.runs.recorder import RecordingOptions, prepare_recording
 
+            frames = None if rest is None else rest.n_frames
+            asked = RecordingOptions(label=label, seconds=seconds, n_frames=frames)
             before = Lit.now(session.bench)
             try:
-                if asked.began is not None:
-                    restore_camera(session.bench.camera, asked.began[1])
-                    asked.began[0].put_back(session.bench)
+                if rest is not None:
+                    rest.set_up(session.bench)
                 lit = Lit.now(session.bench)
                 recorder = prepare_recording(
-                    session.bench,
-                    session.runs_folder,
-                    label=label,
-                    seconds=seconds,
-                    on_progress=context.report,
+                    session.bench, session.runs_folder, asked, on_progress=context.report
                 )
             except BaseException:
-                if asked.began is not None:  # what STOP had darkened stays dark
+                if rest is not None:  # what STOP had darkened stays dark
                     before.put_back(session.bench)
                 raise
             self._recorder, self._taken = recorder, recorder.path
-            self._left = replace(asked, began=(lit, camera_settings(session.bench.camera)))
             with session.live.watching(recorder.newest):
                 run = recorder.execute()
             context.check()
             lit.put_back(session.bench)
             return run
 
-        before = self._taken, self._left, self.note.text()
-        self._taken, self._left, self._came_s = None, asked, 0.0  # the work tells them anew
+        before = self._taken, self.note.text()
+        self._taken = None  # the work tells it anew
         job = self._panel.begin(lambda: session.exclusive_job("Recording", work), self.button)
         if job is None:
-            self._taken, self._left, _ = before
+            self._taken, _ = before
             return
         self.job, self._before = job, before
+        self._rests.forget()
         self.note.clear()
         self.look_button.hide()
         self.rest_button.hide()
@@ -157,7 +143,6 @@ class RecordBar(QWidget):
         job.ended.connect(self._ended)
 
     def _show(self, status: RecordingStatus) -> None:
-        self._came_s = status.seconds
         left_s = max(0, status.free_bytes - SPARE_BYTES) / max(status.bytes_per_s, 1.0)
         words = [
             f"{status.written} frames",
@@ -174,7 +159,7 @@ class RecordBar(QWidget):
     def _done(self, run: Run) -> None:
         count = len(run.records)
         frames = f"{count} frame{'' if count == 1 else 's'}"
-        self._left = None
+        self.rest = None
         self.note.setText(f"{frames} in {run.path.name}")
         self._session.log("info", f"Recorded {frames}: {run.path}")
         self._session.run_finished.emit(run.path)
@@ -182,23 +167,42 @@ class RecordBar(QWidget):
     def _ended_early(self, how: str) -> None:
         """Say what is kept of a recording that was broken off; of the one before where it was refused."""
         if self._taken is None:
-            self._taken, self._left, said = self._before
+            self._taken, said = self._before
             self.note.setText(said)
-        else:
-            kept = self.note.text().partition(" · ")[0] or "no frame yet"
-            self.note.setText(f"Ended {how} ({kept}); what was taken is kept in {self._taken.name}")
-            self._session.run_finished.emit(self._taken)
-        self._offer_rest()
-
-    def _offer_rest(self) -> None:
-        """Offer to record the time that is left."""
-        left = self._left
-        if left is None or left.began is None or (seconds := left.seconds - self._came_s) < _LEAST_REST_S:
+            self.rest_button.setVisible(self.rest is not None)
             return
-        self._left = replace(left, seconds=seconds)
-        tip = f"Record the {duration(seconds)} that it lacks, in its light and settings, as a film of its own"
+        kept = self.note.text().partition(" · ")[0] or "no frame yet"
+        self.note.setText(f"Ended {how} ({kept}); what was taken is kept in {self._taken.name}")
+        self._session.run_finished.emit(self._taken)
+        self.rest = None
+        self._look_for_rest()
+
+    def _look_for_rest(self) -> None:
+        """Offer what the newest recording lacks where it was cut, by a kill or on an earlier day as well."""
+        folder = self._session.runs_folder
+
+        def read() -> RecordingRest | None:
+            from instrument.runs.recording_rest import newest_rest
+
+            return newest_rest(folder)
+
+        self._rests.ask(read, self._offer_rest)
+
+    def _offer_rest(self, rest: RecordingRest | None) -> None:
+        if rest is None or self.job is not None:
+            return
+        self.rest = rest
+        lacks = [duration(rest.seconds)] if rest.seconds is not None else []
+        lacks += [count(rest.n_frames, "frame")] if rest.n_frames is not None else []
+        tip = (
+            f"Record the {' or '.join(lacks)} that it lacks, in its light and settings, as a film of its own"
+        )
         self.rest_button.setToolTip(tip)
         self.rest_button.show()
+        if self._taken is None:  # of an earlier day
+            self._taken = rest.run
+            self.note.setText(f"{rest.run.name} did not end: {count(rest.stored, 'frame')} kept")
+            self.look_button.show()
 
     def _look_at_it(self) -> None:
         self._session.handed_on.emit("runs", self._taken)

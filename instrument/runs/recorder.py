@@ -16,8 +16,10 @@ from drivers.common.stream_reader import StreamReader
 from drivers.errors import DeviceError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from instrument.bench.bench import Bench
+from instrument.bench.photograph import Lit
 from instrument.files.atomic import SPARE_BYTES, free_bytes
 from instrument.files.errors import BenchError, count, size
+from instrument.files.record import plain
 from instrument.runs.acquire import record_of
 from instrument.runs.finish import end_run
 from instrument.runs.log import Gap
@@ -200,7 +202,13 @@ class Recorder:
         try:
             stream = self._stream = FrameStream(self._bench.camera, self.n_buffers)
             reader = stream.reader()
-            self._writer.start(drops_counted_by=self._bench.camera.drops_counted_by, n_buffers=self.n_buffers)
+            self._writer.start(
+                drops_counted_by=self._bench.camera.drops_counted_by,
+                n_buffers=self.n_buffers,
+                seconds=self._seconds,
+                n_frames=self._n_frames,
+                lit=plain(Lit.now(self._bench)),
+            )
             with stream:
                 self._record(reader)
         except StoppedError:

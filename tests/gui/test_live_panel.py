@@ -30,7 +30,8 @@ from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.live.frame_view import FrameFigures, not_stretched
 from instrument.plan.led_shapes import BrightField
-from instrument.runs.run import Run
+from instrument.runs.recorder import RecordingStatus, record
+from instrument.runs.run import Run, RunCondition
 
 WAIT_MS = 60_000
 
@@ -493,8 +494,9 @@ def test_a_recording_that_was_stopped_is_kept_in_the_dark_and_goes_on_in_its_lig
     with qtbot.waitSignal(live.session.stopped, timeout=WAIT_MS):
         qtbot.keyClick(window, Qt.Key.Key_Escape)
     qtbot.waitUntil(bar.rest_button.isVisible, timeout=WAIT_MS)
-    assert bar._left is not None
-    assert 0 < bar._left.seconds < 60
+    assert bar.rest is not None
+    assert bar.rest.seconds is not None
+    assert 0 < bar.rest.seconds < 60
     assert bar.job is None
     assert not live.session.bench.scene_lit
     (folder,) = live.session.runs_folder.glob("*recording*")
@@ -506,7 +508,7 @@ def test_a_recording_that_was_stopped_is_kept_in_the_dark_and_goes_on_in_its_lig
     assert isinstance(runs, RunsPanel)
     qtbot.waitUntil(lambda: runs.opened is not None and runs.opened.path == folder, timeout=WAIT_MS)
     window.show_panel("live")
-    bar._left = replace(bar._left, seconds=0.2)  # a minute is long
+    bar.rest = replace(bar.rest, seconds=0.2)  # a minute is long
     camera = live.session.bench.camera
     exposure_ms = camera.exposure_ms
     camera.set_exposure_ms(2 * exposure_ms)  # as a camera that was connected again
@@ -526,6 +528,40 @@ def test_a_recording_that_was_stopped_is_kept_in_the_dark_and_goes_on_in_its_lig
     assert bar.rest_button.isHidden()
     assert camera.exposure_ms == pytest.approx(exposure_ms)
     assert len(list(live.session.runs_folder.glob("*recording*"))) == 2
+    bar._look_for_rest()
+    qtbot.waitUntil(lambda: not bar._rests.is_reading, timeout=WAIT_MS)
+    assert bar.rest_button.isHidden(), "it has been gone on with"
+
+
+def test_a_recording_that_a_kill_cut_is_offered_when_the_program_starts_anew(
+    qtbot: QtBot, session: BenchSession
+) -> None:
+    bench = session.bench
+    bench.scene_on()
+
+    def fail(_: RecordingStatus) -> None:
+        raise KeyboardInterrupt
+
+    with session.live.paused(), pytest.raises(KeyboardInterrupt):
+        record(bench, session.runs_folder, seconds=60.0, label="cells", on_progress=fail)
+    (cut,) = session.runs_folder.glob("*cells*")
+    state = cut / "state.json"
+    state.write_text(state.read_text().replace('"finished"', '"running"'))
+    assert Run.open(cut).condition is RunCondition.CRASHED
+    live = whole(LivePanel(session))
+    qtbot.addWidget(live, before_close_func=lambda p: p.shutdown())
+    live.show()
+    bar = live.record_bar
+    qtbot.waitUntil(bar.rest_button.isVisible, timeout=WAIT_MS)
+    assert bar.note.text().startswith(f"{cut.name} did not end: ")
+    assert bar.look_button.isVisible()
+    assert bar.rest is not None
+    bar.rest = replace(bar.rest, seconds=0.2)  # a minute is long
+    qtbot.mouseClick(bar.rest_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: bar.job is None and " in " in bar.note.text(), timeout=WAIT_MS)
+    assert bench.scene_lit
+    assert bar.rest_button.isHidden()
+    assert len(list(session.runs_folder.glob("*cells*"))) == 2
 
 
 def test_profile_and_cross_hair_follow_the_frame(qtbot: QtBot, live: LivePanel) -> None:
