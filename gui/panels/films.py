@@ -41,7 +41,7 @@ from recon.base.declare import Imports, expression
 _FASTEST_MS = 20
 _REST_MS = 250
 """After a region was dragged, before its curve is read."""
-_FILTERS = "Films and curves (*.mp4 *.gif *.ome.zarr *.csv)"
+_FILTERS = "Films and curves (*.mp4 *.gif *.ome.zarr *.ome.tif *.csv)"
 _NO_REGION = "Regions, dragged over the picture, get a curve each"
 _EMPTY = "Open a recording of this bench, or a video that was reconstructed from one."
 

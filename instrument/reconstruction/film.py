@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.atomic import require_new, whole_file, write_text
-from instrument.files.errors import FileError
+from instrument.files.errors import FileError, ranges
 from instrument.files.films import as_shown, write_mp4
 from instrument.files.ome_zarr import is_zarr_name
 from instrument.files.orientation import AS_IT_IS, Kind, Orientation
@@ -25,7 +25,9 @@ from instrument.reconstruction.video_files import (
     require_video,
     samples_of,
 )
+from instrument.runs.export import export
 from instrument.runs.run import Run
+from instrument.volumes.writing import write_film_tiff
 
 if TYPE_CHECKING:
     from recon.camera.grid import Grid
@@ -33,7 +35,8 @@ if TYPE_CHECKING:
 Window = tuple[slice, slice]
 """Rows and columns."""
 Advance = Callable[[int, int], object]
-FILM_SUFFIXES = (".mp4", ".gif", ".ome.zarr", ".csv")
+TIFF_SUFFIXES = (".tif", ".tiff")
+FILM_SUFFIXES = (".mp4", ".gif", ".ome.zarr", *TIFF_SUFFIXES, ".csv")
 BASELINE_PERCENTILE = 20.0
 _GIF_MS = 10
 """What a GIF's times are told in."""
@@ -77,6 +80,11 @@ class Film:
             self.simulated = self._run.is_simulated
         if not self.indices:
             raise FileError(path, "has no pictures yet.")
+
+    @property
+    def recording(self) -> Run | None:
+        """The run that its pictures are frames of; None where they were reconstructed."""
+        return self._run
 
     @property
     def is_recording(self) -> bool:
@@ -176,7 +184,8 @@ def write_film(
     Parameters
     ----------
     target : Path
-        ``.mp4``, ``.gif`` (8 bit), ``.ome.zarr`` (all values), ``.csv`` (means of regions). Must not exist.
+        ``.mp4``, ``.gif`` (8 bit), ``.ome.zarr`` and ``.tif`` (OME-TIFF; both all values, of volumes all
+        planes), ``.csv`` (means of regions). Must not exist.
     fps : float, optional
         Pictures a second; default: as it was taken.
     levels : (float, float), optional
@@ -200,6 +209,9 @@ def write_film(
         return target
     if name.endswith(".ome.zarr"):
         _write_zarr(film, target, advance)
+        return target
+    if name.endswith(TIFF_SUFFIXES):
+        _write_tiff(film, target, advance)
         return target
     low, high = film.levels() if levels is None else levels
     shown = (
@@ -245,9 +257,9 @@ def curves_csv(film: Film, regions: Sequence[Window], courses: npt.NDArray[np.fl
     return text.getvalue()
 
 
-def _pictures(film: Film, advance: Advance | None) -> Iterator[npt.NDArray[Any]]:
+def _pictures(film: Film, advance: Advance | None, *, whole: bool = False) -> Iterator[npt.NDArray[Any]]:
     for place in range(len(film)):
-        yield film.read(place)
+        yield film.whole(place) if whole else film.read(place)
         if advance is not None:
             advance(place + 1, len(film))
 
@@ -267,6 +279,18 @@ def _write_zarr(film: Film, target: Path, advance: Advance | None) -> None:
     except BaseException:
         shutil.rmtree(target)
         raise
+
+
+def _write_tiff(film: Film, target: Path, advance: Advance | None) -> None:
+    """Write all values of the pictures that there are, with their times; of a recording its own numbers."""
+    if film.recording is not None:
+        export(film.recording, target, on_progress=advance)
+        return
+    pictures = (np.asarray(picture, np.float32) for picture in _pictures(film, advance, whole=True))
+    about = {**film.facts, "of": str(film.path.resolve()), "simulated": film.simulated}
+    about["frames"] = ranges(list(film.indices))
+    times_s = film.times_s if film.period_s else None
+    write_film_tiff(target, pictures, (len(film), *film.whole(0).shape), film.grid, times_s, about)
 
 
 def _write_gif(target: Path, shown: Iterator[npt.NDArray[np.uint8]], fps: float) -> None:

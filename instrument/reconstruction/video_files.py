@@ -121,8 +121,7 @@ def create_output(
     steps: dict[str, float | None] = {"t": period_s}
     if grid is not None:
         attributes = attributes | grid_facts(grid)
-        pitch = float(grid.pitch_um[0])
-        steps |= voxel_um(grid) if deep else dict.fromkeys("yx", pitch if np.isfinite(pitch) else None)
+        steps |= voxel_um(grid)
     with whole_folder(path) as draft:
         group = zarr.open_group(draft, mode="w", zarr_format=3)
         group.create_array(

@@ -134,7 +134,8 @@ class ExportOptions:
     )
     out: Path = option(
         help="File ending in .ome.tif, .tif, .h5, .npy, .mp4, .gif or .csv, or a folder for PNG files. "
-        "A picture: .tif, .npy, .png; a volume: .tif, .npy, .ome.zarr; a video: .mp4, .gif, .csv, .ome.zarr.",
+        "A picture: .tif, .npy, .png; a volume: .tif, .npy, .ome.zarr; "
+        "a video: .mp4, .gif, .csv, .ome.zarr, .ome.tif.",
         metavar="TARGET",
         label="Target",
         positional=True,

@@ -38,10 +38,14 @@ def uneven_steps(z_um: npt.NDArray[np.float64]) -> str:
 
 
 def voxel_um(grid: Grid) -> dict[str, float]:
-    """Return the middle plane's voxel size; nothing where it is not known."""
-    if not (np.isfinite(grid.pitch_um).all() and np.isfinite(grid.spacing_um).all()):
+    """Return the middle plane's voxel size, of one plane its pixels'; nothing where it is not known."""
+    if not np.isfinite(grid.pitch_um).all():
         return {}
     pitch = float(grid.pitch_um[len(grid.z_um) // 2])
+    if len(grid.z_um) == 1:
+        return {"y": pitch, "x": pitch}
+    if not np.isfinite(grid.spacing_um).all():
+        return {}
     return {"z": middle_step_um(grid.z_um), "y": pitch, "x": pitch}
 
 
@@ -51,7 +55,9 @@ def origin_um(grid: Grid) -> dict[str, float]:
     Along rows and columns as they are stored: of a grid that is not upright these go against y and x.
     """
     voxel = voxel_um(grid)
-    if not voxel or (np.diff(grid.z_um) < 0).any():  # told by a step and a place, planes go away from it
+    if (
+        "z" not in voxel or (np.diff(grid.z_um) < 0).any()
+    ):  # told by a step and a place, planes go away from it
         return {}
     row, column = grid.centre
     return {"z": float(grid.z_um[0]), "y": -row * voxel["y"], "x": -column * voxel["x"]}
@@ -76,6 +82,8 @@ def scale_in_words(grid: Grid) -> str:
         return "All voxels have one size; rows and columns go with y and x; values are light a voxel."
     if not voxel_um(grid):
         return "The size of the voxels is not known."
+    if len(grid.z_um) == 1:
+        return "The pictures stand upside down: rows and columns go against the scene's y and x."
     return (
         "Perspective grid: voxels of plane z are pitch_um[z] wide, and the scale is the middle plane's. The "
         "planes stand upside down: rows and columns go against the scene's y and x. diffuserbench export "

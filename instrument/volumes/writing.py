@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 from instrument.files.atomic import whole_file, whole_folder
 from instrument.files.ome_tiff import annotation, ome_tiff_channels, resolution
 from instrument.files.ome_zarr import ome_attributes, ome_channels, stem_of
-from instrument.volumes.grid_facts import grid_facts, origin_um, scale_in_words, voxel_um
+from instrument.volumes.grid_facts import EVEN, grid_facts, origin_um, scale_in_words, voxel_um
 
 if TYPE_CHECKING:
     from recon.camera.grid import Grid
@@ -111,29 +111,77 @@ def write_volume_tiff(
 
     Raises FileError or OSError when it cannot be written.
     """
+    _write_tiff(path, planes, shape, grid, {})
+
+
+def write_film_tiff(
+    path: Path,
+    pictures: Iterable[npt.NDArray[np.float32]],
+    shape: tuple[int, ...],
+    grid: Grid | None,
+    times_s: npt.NDArray[np.float64] | None,
+    facts: Mapping[str, Any],
+) -> None:
+    """Write a film as OME-TIFF, ``T``, ``Z`` where it is of volumes, ``C`` where in colour, ``YX``.
+
+    Whole or not at all, with one picture in memory; as :func:`write_volume_tiff`.
+
+    Parameters
+    ----------
+    pictures : iterable of ndarray, float32, ([n_z,] height, width[, n_channels])
+    shape : tuple of int
+        Of all of them, how many there are in front.
+    grid : Grid, optional
+        Where pixels and planes lie in the object; None: not known, and the pictures are flat.
+    times_s : ndarray, (n,), optional
+        When each was taken; None where that is not known.
+    facts : mapping
+        JSON-compatible, annotated.
+    """
+    deep = grid is not None and grid.shape[0] > 1
+    planes = (plane for picture in pictures for plane in (picture if deep else picture[None]))
+    _write_tiff(path, planes, shape[1:] if deep else (1, *shape[1:]), grid, facts, shape[0], times_s)
+
+
+def _write_tiff(
+    path: Path,
+    planes: Iterable[npt.NDArray[np.float32]],
+    shape: tuple[int, ...],
+    grid: Grid | None,
+    facts: Mapping[str, Any],
+    count: int | None = None,
+    times_s: npt.NDArray[np.float64] | None = None,
+) -> None:
+    """Write ``count`` volumes of a shape with n_z in front, one after the other; None: one, without T."""
     import tifffile
 
-    colour = len(shape) == 4
+    n_z, height, width, *channels = shape
+    deep, colour = count is None or n_z > 1, bool(channels)
     pages = (page for plane in planes for page in (np.moveaxis(plane, -1, 0) if colour else plane[None]))
-    sizes = {f"PhysicalSize{axis.upper()}": size for axis, size in voxel_um(grid).items()}
-    metadata: dict[str, Any] = {"axes": "ZCYX" if colour else "ZYX", **sizes}
+    sizes = {} if grid is None else {f"PhysicalSize{axis.upper()}": v for axis, v in voxel_um(grid).items()}
+    film = count is not None
+    metadata: dict[str, Any] = {"axes": "T" * film + "Z" * deep + "C" * colour + "YX", **sizes}
     metadata["Name"] = stem_of(path).removesuffix(".ome")
-    if shape[3:] == (3,):
+    if channels == [3]:
         metadata["Channel"] = ome_tiff_channels()
     metadata |= {f"{name}Unit": "µm" for name in sizes}
-    n_pages = shape[0] * (shape[3] if colour else 1)
-    if origin := origin_um(grid):
-        places = {
-            axis.upper(): np.repeat(grid.z_um, n_pages // shape[0])
-            if axis == "z"
-            else np.full(n_pages, place)
-            for axis, place in origin.items()
-        }
-        metadata["Plane"] = {f"Position{axis}": list(map(float, where)) for axis, where in places.items()}
-        metadata["Plane"] |= {f"Position{axis}Unit": ["µm"] * n_pages for axis in places}
-    metadata["MapAnnotation"] = annotation({"words": scale_in_words(grid), **grid_facts(grid)})
-    stored = (shape[0], shape[3], *shape[1:3]) if colour else shape
-    big = 4 * int(np.prod(shape)) > _BIG_TIFF_BYTES
+    volumes, per_plane = count or 1, channels[0] if colour else 1
+    told: dict[str, list[Any]] = {}
+    for axis, place in ({} if grid is None else origin_um(grid)).items():
+        where = grid.z_um if grid is not None and axis == "z" else np.full(n_z, place)
+        told[f"Position{axis.upper()}"] = np.tile(np.repeat(where, per_plane), volumes).tolist()
+        told[f"Position{axis.upper()}Unit"] = ["µm"] * (volumes * n_z * per_plane)
+    if times_s is not None:
+        told["DeltaT"] = np.repeat(times_s, n_z * per_plane).tolist()
+        told["DeltaTUnit"] = ["s"] * (volumes * n_z * per_plane)
+        if len(steps := np.diff(times_s)) and np.ptp(steps) <= EVEN * steps.min():
+            metadata |= {"TimeIncrement": float(steps.mean()), "TimeIncrementUnit": "s"}
+    if told:
+        metadata["Plane"] = told
+    where_it_lies = {} if grid is None else {"words": scale_in_words(grid), **grid_facts(grid)}
+    metadata["MapAnnotation"] = annotation({**facts, **where_it_lies})
+    stored = (*(volumes,) * film, *(n_z,) * deep, *channels, height, width)
+    big = 4 * int(np.prod(stored)) > _BIG_TIFF_BYTES
     with whole_file(path) as temporary, tifffile.TiffWriter(temporary, ome=True, bigtiff=big) as tiff:
         size = resolution(sizes.get("PhysicalSizeX"))
         tiff.write(pages, shape=stored, dtype=np.float32, photometric="minisblack", metadata=metadata, **size)
