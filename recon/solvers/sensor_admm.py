@@ -32,6 +32,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from recon.base import fft
+from recon.base.filling import fill_smoothly
 from recon.base.threads import over_rows
 from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import Convolution
@@ -63,9 +64,6 @@ FIRST_PIXEL_SHARE = 0.05
 
 IMPUTATION = 1.5
 """Over-relaxation of the erased pixels' imputation, between 1 and 2."""
-
-LEAST_SHARE = 0.05
-"""Share of valid pixels from which a local mean is worth taking."""
 
 FIRST_DATA_STEPS = 4
 """Conjugate gradient steps of the first iteration, whose start is nowhere near."""
@@ -361,22 +359,3 @@ def _compile(dtype: np.dtype[Any]) -> None:
     solver = SensorAdmm(masked, np.ones((1, 2, 2), dtype), TotalVariation(1.0), data_steps=2)
     solver.move(0.5, 0.5)
     solver.step()
-
-
-def fill_smoothly(image: Array, weight: Array) -> None:
-    """Replace, in place, pixels of weight 0 by local means of the others, from the nearest that there are."""
-    found = weight > 0
-    image[~found] = 0
-    known, valid = fft.dct(image, np.empty_like(image)), fft.dct(weight, np.empty_like(weight))
-    frequency = [np.pi * np.arange(n) / n for n in image.shape]
-    total, share = np.empty_like(image), np.empty_like(image)
-    reach = 1.0
-    while not found.all() and reach < max(image.shape):
-        blur = np.outer(*(np.exp(-0.5 * (reach * f) ** 2) for f in frequency)).astype(image.dtype)
-        fft.idct(known * blur, total)
-        fft.idct(valid * blur, share)
-        near = ~found & (share > LEAST_SHARE)
-        image[near] = total[near] / share[near]
-        found |= near
-        reach *= 2
-    image[~found] = known[0, 0] / valid[0, 0]

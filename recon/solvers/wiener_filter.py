@@ -7,6 +7,7 @@ import time
 import numpy as np
 
 from recon.base import fft
+from recon.base.filling import fill_smoothly
 from recon.camera.base import Array, LinearOperator
 from recon.camera.factors import CroppedConvolution, as_cropped_convolution
 from recon.solvers.base import Outcome, StopReason
@@ -100,7 +101,9 @@ def _continue_beyond_sensor(structure: CroppedConvolution, data: Array) -> Array
     """
     convolution = structure.convolution
     if not structure.weight.all():
-        data = _filled(data, structure.weight)
+        data = data.copy()
+        for image, weight in zip(data, structure.weight, strict=True):
+            fill_smoothly(image, weight)
     rows, row_fade = _nearest(convolution.grid_shape[0], convolution.corner[0], data.shape[1])
     columns, column_fade = _nearest(convolution.grid_shape[1], convolution.corner[1], data.shape[2])
     # Columns first, on the sensor's rows alone: whole rows are then copied at the speed of memory.
@@ -118,22 +121,3 @@ def _nearest(grid: int, start: int, length: int) -> tuple[Array, Array]:
     distance = np.minimum(beyond, before)
     reach = max((grid - length) / 2, 1)
     return index, 0.5 + 0.5 * np.cos(np.pi * np.minimum(distance / reach, 1))
-
-
-def _filled(data: Array, weight: Array) -> Array:
-    """Replace erased pixels by a weighted mean of valid ones, the nearer the heavier."""
-    from scipy.ndimage import gaussian_filter
-
-    filled = data * weight
-    known = weight.copy()
-    sigma = 1.0
-    while sigma < max(data.shape[1:]):
-        smooth = gaussian_filter(data * weight, (0, sigma, sigma))
-        share = gaussian_filter(weight, (0, sigma, sigma))
-        fresh = (known == 0) & (share > 1e-3)
-        filled[fresh] = smooth[fresh] / share[fresh]
-        known[fresh] = 1
-        if known.all():
-            break
-        sigma *= 2
-    return filled

@@ -163,10 +163,16 @@ AREAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "recon/solvers/tv_admm_volume.py",
             "recon/solvers/volume_admm.py",
             "recon/solvers/wiener_filter.py",
+            "recon/base/filling.py",
             "recon/priors/base.py",
             "recon/priors/total_variation.py",
         ),
-        ("tests/recon/solvers", "tests/recon/priors", "tests/golden/test_golden.py"),
+        (
+            "tests/recon/solvers",
+            "tests/recon/priors",
+            "tests/recon/base/test_filling.py",
+            "tests/golden/test_golden.py",
+        ),
     ),
     "operators": (
         (

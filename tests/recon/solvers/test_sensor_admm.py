@@ -17,7 +17,6 @@ from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariat
 from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules, StopReason, cosine_preconditioner
 from recon.solvers.cosine_preconditioner import PicturePreconditioner
 from recon.solvers.prior_splits import PriorSplits
-from recon.solvers.sensor_admm import fill_smoothly
 
 PRIORS = {
     "tv": TotalVariation(0.05, tolerance=1e-8) + NonNegativity(),
@@ -262,22 +261,6 @@ def test_preconditioner_bounds_the_condition_of_what_remains(monkeypatch):
     assert np.linalg.eigvalsh(approximate).min() > 0
     assert spread(system) > 1e3
     assert spread(approximate @ system) < 10
-
-
-def test_fills_erased_pixels_from_their_neighbours():
-    y, x = np.mgrid[:40, :50]
-    image = 3 + np.sin(y / 20) + x / 25
-    weight = np.ones_like(image)
-    weight[10:14, 20:25] = weight[::7, ::5] = 0
-    filled = np.where(weight > 0, image, np.nan)
-    fill_smoothly(filled, weight)
-    assert np.array_equal(filled[weight > 0], image[weight > 0])
-    assert filled == pytest.approx(image, abs=0.3)
-    lonely = np.zeros((40, 50))
-    lonely[3, 4] = 1
-    filled = 7 * lonely
-    fill_smoothly(filled, lonely)
-    assert filled == pytest.approx(np.full((40, 50), 7.0))
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

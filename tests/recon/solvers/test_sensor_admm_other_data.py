@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from recon.base.filling import fill_smoothly
 from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval, Erasures
 from recon.priors import L1, Box, NonNegativity, TotalVariation
 from recon.priors.base import Prior
 from recon.solvers import SensorAdmm, StoppingRules
 from recon.solvers.cosine_preconditioner import PicturePreconditioner
-from recon.solvers.sensor_admm import fill_smoothly
 
 TV = TotalVariation(0.05) + NonNegativity()
 ONLY_A_PROX = TotalVariation(0.05, axis_weights=(0.5, 1.0), tolerance=1e-8)
@@ -152,37 +152,6 @@ def test_the_gradient_that_sets_pixels_penalties_is_of_what_a_background_leaves(
         expected = np.sqrt(multiplier * slope) / np.linalg.norm(w[channel])
         assert solver._mu[1, channel] / 100 < expected < solver._mu[1, channel] * 100
         assert found[channel] == pytest.approx(max(expected, 0.03 * solver._mu[0, channel]), rel=1e-9)
-
-
-def smoothed(image, reach):
-    """By a Gaussian in the frequencies of a mirrored image, as a matrix along each side."""
-    sides = []
-    for n in image.shape:
-        k = np.arange(n)[:, None]
-        cosines = np.sqrt(np.where(k, 2, 1) / n) * np.cos(np.pi * k * (np.arange(n) + 0.5) / n)
-        sides.append(cosines.T @ (np.exp(-0.5 * (reach * np.pi * k / n) ** 2) * cosines))
-    return sides[0] @ image @ sides[1].T
-
-
-@pytest.mark.parametrize("kind", ["a block", "a strip", "a corner"])
-def test_an_erased_pixel_is_the_mean_of_the_narrowest_gaussian_that_sees_a_twentieth_of_what_is_known(kind):
-    """What none of them sees that is narrower than the longer side is the mean of all that is known."""
-    weight = np.zeros({"a block": (22, 34), "a strip": (40, 3), "a corner": (16, 16)}[kind])
-    weight[:6, :4] = 1
-    if kind == "a block":
-        weight[...] = 1
-        weight[3:20, 2:31] = 0
-    image = 1 + np.random.default_rng(6).random(weight.shape)
-    expected, missing = image * weight, weight == 0
-    for reach in (reach for reach in (1, 2, 4, 8, 16, 32) if reach < max(weight.shape)):
-        share = smoothed(weight, reach)
-        near = missing & (share > 0.05)
-        expected[near] = smoothed(image * weight, reach)[near] / share[near]
-        missing &= ~near
-    assert missing.any() == (kind == "a corner")
-    expected[missing] = image[weight > 0].mean()
-    fill_smoothly(image, weight)
-    np.testing.assert_allclose(image, expected, rtol=1e-9)
 
 
 def test_object_and_multipliers_move_and_what_is_left_of_the_data_stays():

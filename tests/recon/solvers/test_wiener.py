@@ -8,7 +8,7 @@ import pytest
 from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.solvers.base import StopReason
-from recon.solvers.wiener_filter import FLATNESS, WienerFilter, _filled, cross_validated, wiener
+from recon.solvers.wiener_filter import FLATNESS, WienerFilter, cross_validated, wiener
 
 
 def camera_and_data(sensor=(11, 14), noise=0.02, psf=(6, 7)):
@@ -88,54 +88,6 @@ def test_the_regularisation_is_what_left_out_data_ask_for():
     clean = wiener(camera, camera_and_data((30, 33), 0.0)[1], 1e-4).solution
     errors = {r: np.linalg.norm(wiener(camera, data, r).solution - clean) for r in np.logspace(-6, 2, 17)}
     assert np.linalg.norm(wiener(camera, data).solution - clean) < 1.3 * min(errors.values())
-
-
-def blurred(image, sigma):
-    """By a Gaussian of four sigma, mirrored at the edges, as a matrix along each side."""
-    sides = []
-    for n in image.shape:
-        reach = int(4 * sigma + 0.5)
-        offsets = np.arange(-reach, reach + 1)
-        weights = np.exp(-0.5 * (offsets / sigma) ** 2)
-        matrix = np.zeros((n, n))
-        for at in range(n):
-            mirrored = (at + offsets) % (2 * n)
-            np.add.at(matrix[at], np.minimum(mirrored, 2 * n - 1 - mirrored), weights / weights.sum())
-        sides.append(matrix)
-    return sides[0] @ image @ sides[1].T
-
-
-def holes(kind):
-    rng = np.random.default_rng(6)
-    if kind == "a band and a block":
-        weight = np.ones((2, 22, 34))
-        weight[0, :, 9:22] = 0  # 1.16 thousandths of two pixels in its middle
-        weight[1] = rng.random((22, 34)) > 0.4
-        weight[1, 3:20, 2:31] = 0
-    else:
-        weight = np.zeros((1, *{"a strip": (40, 3), "a corner": (16, 16)}[kind]))
-        weight[0, 0, 0] = 1
-    return rng.random(weight.shape), weight
-
-
-@pytest.mark.parametrize("kind", ["a band and a block", "a strip", "a corner"])
-def test_an_erased_pixel_is_the_mean_by_the_narrowest_gaussian_that_sees_a_thousandth_of_what_is_known(kind):
-    """As long as it is narrower than the longer side."""
-    data, weight = holes(kind)
-    expected = data * weight
-    for image, known, filled in zip(data, weight, expected, strict=True):
-        missing = known == 0
-        for sigma in (sigma for sigma in (1, 2, 4, 8, 16, 32) if sigma < max(image.shape)):
-            share = blurred(known, sigma)
-            near = missing & (share > 1e-3)
-            filled[near] = (blurred(image * known, sigma)[near]) / share[near]
-            missing &= ~near
-        assert missing.any() == (kind == "a corner")
-    np.testing.assert_allclose(_filled(data, weight), expected, atol=1e-12)
-
-
-def test_where_nothing_is_known_nothing_is_filled():
-    assert not _filled(np.ones((1, 5, 6)), np.zeros((1, 5, 6))).any()
 
 
 @pytest.mark.parametrize(("enough", "every"), [(None, 1), (10_000, 1), (300, 1), (250, 2)])
