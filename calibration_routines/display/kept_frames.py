@@ -24,7 +24,7 @@ import numpy.typing as npt
 from drivers.errors import StoppedError
 from drivers.frame import FrameMetadata
 from instrument.bench.bench import Bench
-from instrument.files.errors import BenchError, size
+from instrument.files.errors import BenchError, count, size
 from instrument.runs.acquire import record_of
 from instrument.runs.interrupts import interrupts_held
 from instrument.runs.run import FinishReason, Run
@@ -103,7 +103,9 @@ class KeptFrames:
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
     ) -> None:
         if error is not None and self.path is not None:
-            kept, what = f"{self._next} frames are kept", "go on with them"
+            number = max(self._next, len(self._questions))
+            kept = f"{count(number, 'frame')} {'is' if number == 1 else 'are'} kept"
+            what = "go on with them"
             if self._complete:
                 kept, what = f"All {kept}", "see them again"
             error.add_note(f"{kept}. To {what}: {_typed_again(self._typed, self.path)}")

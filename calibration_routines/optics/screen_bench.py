@@ -18,7 +18,13 @@ import numpy as np
 from calibration_routines.display.display_io import require_slm
 from calibration_routines.optics.screen_pairs import PairFiles, look_at_pairs, solve_pairs
 from calibration_routines.optics.screen_pictures import Levels, ScreenMap, dead_leaves, random_cells
-from calibration_routines.optics.screen_search import FINDING, SEARCH, ScreenView, find_screen
+from calibration_routines.optics.screen_search import (
+    FINDING,
+    SEARCH,
+    ScreenView,
+    find_screen,
+    search_not_kept,
+)
 from calibration_routines.optics.screen_solve import (
     AGAIN,
     JUDGED,
@@ -172,11 +178,12 @@ class ScreenProcedure(Procedure):
             bench.source_off()
         if bench.can_switch_scene:
             bench.scene_off()
-        found = find_screen(bench, control, listener)
-        height, width = bench.camera.frame_shape[:2]
-        levels = draw_pictures(asked, found, (height, width), require_slm(bench).shape)
-        listener.step(SHOWING)
-        exposure_ms = ScreenView(bench, control).expose(levels[AGAIN][0], 0.7)
+        with search_not_kept():
+            found = find_screen(bench, control, listener)
+            height, width = bench.camera.frame_shape[:2]
+            levels = draw_pictures(asked, found, (height, width), require_slm(bench).shape)
+            listener.step(SHOWING)
+            exposure_ms = ScreenView(bench, control).expose(levels[AGAIN][0], 0.7)
         record = ScreenRecord(asked, found, bench.geometry, bench.label, bool(bench.simulated_kinds))
         with TemporaryDirectory() as drawn:
             plan = screen_plan(_written(levels, Path(drawn)), asked, exposure_ms)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import time
+from collections.abc import Iterator
+
 import numpy as np
 import numpy.typing as npt
 
@@ -11,6 +15,7 @@ from calibration_routines.procedure import Listener
 from calibration_routines.psf.exposure import ExposureOutcome, TooDarkError, auto_expose, hot_pixels
 from calibration_routines.purpose import CalibrationError
 from instrument.bench.bench import Bench
+from instrument.files.errors import duration
 from instrument.reconstruction.mosaic import in_colours
 from instrument.runs.run_control import RunControl
 from recon.base.blocks import block_mean
@@ -71,6 +76,23 @@ class ScreenView:
         image = in_colours(np.asarray(taken.image, np.float32), taken.metadata.pixel_format)
         grey = image.mean(axis=-1, dtype=np.float32) if image.ndim == 3 else image
         return grey if self._black is None else grey - self._black
+
+
+@contextlib.contextmanager
+def search_not_kept() -> Iterator[None]:
+    """Say of what breaks off a search that it begins anew, and what it took: none of its frames is kept."""
+    began = time.monotonic()
+    try:
+        yield
+    except CalibrationError:
+        raise
+    except BaseException as error:
+        took = duration(time.monotonic() - began)
+        error.add_note(
+            f"Of the search for the screen nothing is kept ({took} so far): next time its {SEARCH} "
+            "photographs are taken anew. Frames of the pictures after it are kept."
+        )
+        raise
 
 
 def find_screen(bench: Bench, control: RunControl, listener: Listener) -> ScreenMap:

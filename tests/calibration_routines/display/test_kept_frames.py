@@ -112,6 +112,23 @@ def test_frames_of_a_sequence_are_kept_when_ctrl_c_comes_while_they_are_noted(
     assert ended.value.__notes__[0].startswith("3 frames are kept.")
 
 
+def test_frames_that_were_not_seen_again_yet_are_told_as_kept(tmp_path: Path) -> None:
+    def interrupted(asked: list[str], again: Path | None) -> None:
+        with KeptFrames(bench, tmp_path, "calibrate slm", SlmProcedure(again=again)) as kept:
+            kept.answers(asked, lambda _: [bench.snap()])
+            raise KeyboardInterrupt
+
+    told: list[str] = []
+    run: Path | None = None
+    with Bench(parse_config(TEXT, None)).open() as bench:
+        for asked in (["a"], ["a", "b", "c"], ["a"]):
+            with pytest.raises(KeyboardInterrupt) as ended:
+                interrupted(asked, run)
+            (run,) = tmp_path.iterdir()
+            told.append(ended.value.__notes__[0].partition(".")[0])
+    assert told == ["1 frame is kept", "3 frames are kept", "3 frames are kept"]
+
+
 def test_an_alignment_that_was_interrupted_says_where_the_stage_is_and_goes_on(tmp_path: Path) -> None:
     near = AlignmentSettings(reach=8.0, depth_um=100.0, spots=25, section_pictures=1, refinements=1)
     settings = replace(near, max_frames=10, out=tmp_path / "a.json")

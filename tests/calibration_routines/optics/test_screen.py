@@ -25,6 +25,7 @@ from calibration_routines.optics.screen_solve import (
     ScreenOptions,
     findings_of,
 )
+from calibration_routines.procedure import Listener
 from calibration_routines.purpose import CalibrationError
 from calibration_routines.times import first_guess
 from drivers.simulated.world import SimulatedWorld
@@ -32,6 +33,7 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
 from instrument.files.errors import BenchError
+from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import RunStatus
 from recon.camera.registration import aligned, register
 from tests.mocks.listeners import Following
@@ -95,6 +97,20 @@ def test_a_run_that_was_cut_off_is_resumed_to_its_calibration(
     assert (run / "calibration" / "calibration.json").is_file()
 
 
+def test_who_interrupts_the_search_is_told_that_it_begins_anew(tmp_path: Path) -> None:
+    class Stop(Listener):
+        def share(self, done: float, total: float, *, at_most: bool = False) -> None:
+            if done == 2:
+                control.abort()
+
+    control = RunControl()
+    with small_bench() as bench, pytest.raises(EndedEarlyError) as ended:
+        ScreenProcedure(ASKED).carry_out(bench, tmp_path, control=control, listener=Stop())
+    assert "nothing is kept" in ended.value.__notes__[0]
+    assert "50 photographs are taken anew" in ended.value.__notes__[0]
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_outlook_tells_frames_and_what_each_step_computes(monkeypatch: pytest.MonkeyPatch) -> None:
     with small_bench() as bench:
         outlook, binned = (
@@ -124,8 +140,9 @@ def test_a_bench_without_a_screen_and_a_dark_screen_are_said_in_words(tmp_path: 
     with small_bench(template()) as bench, pytest.raises(BenchError, match="is no screen"):
         ScreenProcedure(ASKED).outlook(bench)
     dark = SMALL.replace("black = 0.001", "black = 0.001\nwhite = 1e-7")
-    with small_bench(dark) as bench, pytest.raises(CalibrationError, match="hardly lights the camera"):
+    with small_bench(dark) as bench, pytest.raises(CalibrationError, match="hardly lights the camera") as no:
         ScreenProcedure(ASKED).carry_out(bench, tmp_path)
+    assert not hasattr(no.value, "__notes__")
     assert not list(tmp_path.iterdir())
 
 
