@@ -33,10 +33,12 @@ from instrument.display.hologram import (
     read_picture,
 )
 from instrument.display.hologram_files import HologramFiles, drawn_pattern
+from instrument.display.hologram_forecast import forecast_hologram
 from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError
 from instrument.files.results import free_result
 from instrument.files.slm_image import load_slm_correction
+from instrument.reconstruction.forecast import Forecast
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from recon.base.declare import Imports, expression, option
 from recon.holography import Display, HologramOptions, HologramRecord, Target
@@ -174,6 +176,16 @@ def compute(
         files.write(0, 0, result)
     seen = next((target for target in targets if target.z_mm == 0), targets[0])
     return Computed(order, display, seen, result, tuple(files.patterns(0, 0)) if write else ())
+
+
+def explain(
+    order: HologramOrder, config: BenchConfig, size: tuple[tuple[int, int], float], context: JobContext
+) -> Forecast:
+    """Say what time and memory a hologram will take, by its first iterations; the share done is reported."""
+    display = order.display(config, size)
+    targets = order.targets(display)
+    context.check()
+    return forecast_hologram(display, targets, order.options, on_progress=context.report)
 
 
 def show_on_slm(bench: Bench, computed: Computed, correction: Path | None, context: JobContext) -> None:

@@ -10,15 +10,13 @@ from drivers.frame import Frame
 from gui.session import BenchSession
 from gui.session_news import OwnFiles, names_of
 from instrument.bench.config import BenchConfig
-from instrument.bench.photograph import PHOTOGRAPHS
+from instrument.bench.photograph import PHOTOGRAPHS, SPOILT
 from instrument.files.atomic import DOUBTFUL
 from instrument.files.calibration_file import newest_calibration
 from instrument.files.results import find_results
 
 _DARK = 0.05
 """Below this share of full scale a picture's brightest pixels are lost in the noise of most cameras."""
-SATURATED = 1e-3
-"""Share of saturated pixels from which a photograph is spoilt."""
 EXPOSE = "expose"
 """What the live view is asked to do: to find an exposure for what is lit."""
 EXPOSING = "Auto exposure"
@@ -128,7 +126,7 @@ def light_of(frame: Frame | None) -> str:
     if frame is None:
         return "unknown"
     metadata = frame.metadata
-    if metadata.saturated_fraction > SATURATED:
+    if metadata.saturated_fraction > SPOILT:
         return "saturated"
     brightest = int(frame.image[::_STRIDE, ::_STRIDE].max())
     return "dark" if brightest < _DARK * ((1 << metadata.significant_bits) - 1) else "good"

@@ -9,7 +9,7 @@ upside down, and pixel offset ``p`` from the centre looks at ``x = -p pitch z / 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import Any
@@ -27,14 +27,28 @@ _DTYPES: Mapping[str, type[np.floating]] = {
 }
 
 
+def plain_array(given: npt.ArrayLike) -> npt.NDArray[Any]:
+    """Return an array of anything; NaN where NumPy's masks hide a value: they are not seen elsewhere."""
+    if isinstance(given, np.ma.MaskedArray) and np.ma.is_masked(given):
+        plain = np.array(given.data, np.result_type(given.dtype, np.float32))
+        plain[np.ma.getmaskarray(given)] = np.nan
+        return plain
+    return np.asarray(given)
+
+
+def numbers_of(dtype: np.dtype[Any]) -> str:
+    """Return what makes numbers of an array's values where they may be some; empty where nothing does."""
+    return "; array.astype(float) makes numbers of what are" if dtype.kind == "O" else ""
+
+
 def real_array(given: Any, name: str, dtype: type[np.floating] = np.float32) -> npt.NDArray[Any]:
     """Return an array of real numbers of any kind as one of ``dtype``.
 
     Raises InputError where it is none, or holds finite numbers that are beyond ``dtype``.
     """
-    array = np.asarray(given)
+    array = plain_array(given)
     if array.dtype.kind not in "uifb":
-        raise InputError(f"{name} must hold real numbers, not {array.dtype}.")
+        raise InputError(f"{name} must hold real numbers, not {array.dtype}{numbers_of(array.dtype)}.")
     with np.errstate(over="ignore"):
         cast = np.asarray(array, dtype)
     if cast.dtype.itemsize < array.dtype.itemsize:
@@ -74,6 +88,19 @@ class Geometry:
                 raise InputError(
                     f"{name} must be a number, or None where unknown, not {type(value).__name__}."
                 )
+        if self.aperture_mm is not None:
+            object.__setattr__(self, "aperture_mm", _two_numbers("aperture_mm", self.aperture_mm))
+
+
+def _two_numbers(name: str, given: Any) -> tuple[float, float]:
+    """Return height and width; raises InputError where it is no two numbers."""
+    several = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str | bytes)
+    numbers = tuple(map(plain_number, given)) if several and len(given) == 2 else ()
+    if not numbers or not all(isinstance(n, Real) for n in numbers):
+        shown = repr(given) if isinstance(given, str | Real) else type(given).__name__
+        raise InputError(f"{name} must be (height, width), two numbers, or None where unknown, not {shown}.")
+    height, width = numbers
+    return height, width
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +131,15 @@ class Calibration:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.geometry, Geometry):
+            raise InputError(
+                f"geometry must be a Geometry, not {type(self.geometry).__name__}: "
+                "Geometry(pixel_pitch_um=..., diffuser_distance_mm=...)."
+            )
+        for name in ("quality", "provenance"):
+            if not isinstance(getattr(self, name), Mapping):
+                given = type(getattr(self, name)).__name__
+                raise InputError(f"{name} must be a dict, values by their names, not {given}.")
         for name, dtype in _DTYPES.items():
             given = getattr(self, name)
             if (given is not None or name != "background") and getattr(given, "dtype", None) != dtype:

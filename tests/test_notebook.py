@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 
 import diffuserbench as db
 from instrument.bench.config_file import template
@@ -95,6 +96,24 @@ def test_a_result_shows_draws_and_saves_itself(scene: tuple[np.ndarray, np.ndarr
     opened = db.open_result(tmp_path / "b.tif")
     assert opened.facts()
     assert repr(opened).startswith(f"<{tmp_path / 'b.tif'}: 48 x 48 pixels")
+
+
+def test_what_it_takes_is_told_before_as_the_terminal_tells_it(
+    scene: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    told = db.forecast(*plain(scene), iterations=20, tolerance=0.0, judged=False)
+    assert (told.settles, told.counted) == (20, True)
+    assert told.seconds > 0
+    assert " ms an iteration, 20 of them" in repr(told)
+    for name, image in zip(("photo.tif", "psf.tif"), scene, strict=True):
+        write_image(tmp_path / name, image)
+    files = tmp_path / "photo.tif", tmp_path / "psf.tif"
+    assert db.forecast(*files, iterations=20, tolerance=0.0, binning=2).settles == 20
+    assert {"binning", "prior", "z_um"} <= set(inspect.signature(db.forecast).parameters)
+    with pytest.raises(InputError, match=r"no option 'itterations'.* mean 'iterations'"):
+        db.forecast(*files, itterations=3)
+    shown = db.forecast_hologram("portrait", "display", slm=(32, 32), iterations=3)
+    assert " ms an iteration, 3 of them" in str(shown)
 
 
 def test_options_are_completed_and_nothing_is_ignored(scene: tuple[np.ndarray, np.ndarray]) -> None:
@@ -188,6 +207,12 @@ def test_what_a_mask_of_numpys_hides_is_not_used(scene: tuple[np.ndarray, np.nda
     np.testing.assert_array_equal(found.image, db.reconstruct(photo, psf, erasures=hidden, **given).image)
     with pytest.raises(InputError, match="PSF holds 1 values that are not finite"):
         db.reconstruct(photo, np.ma.masked_greater_equal(psf, psf.max()), **given)
+
+
+def test_what_a_mask_hides_is_not_written_either(tmp_path: Path) -> None:
+    hidden = np.ma.masked_equal(np.array([[1, 2], [3, 4000]], np.uint16), 4000)
+    write_image(tmp_path / "seen.tif", hidden)
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "seen.tif"), [[1, 2], [3, np.nan]])
 
 
 def test_refusals_name_options_as_python_does(scene: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
@@ -321,11 +346,15 @@ def test_a_pictures_transparency_is_left_out_of_arrays_as_of_files_and_true_is_l
 def test_a_chart_of_a_result_is_drawn(
     scene: tuple[np.ndarray, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def at_once(problem: Any, setting: Any, *_: Any) -> Any:
+    def at_once(problem: Any, setting: Any, _left_s: float, tell: Any) -> Any:
+        tell(4.0)  # as often as it looks whether there is a result
         return problem.run(setting, counts=(2,)) if setting.name.startswith("wiener") else "left out"
 
     monkeypatch.setattr("instrument.evaluation.chart.in_own_process", at_once)
-    made = db.chart(db.reconstruct(*plain(scene), iterations=2, judged=False), budget_s=5)
+    said = list[str]()
+    result = db.reconstruct(*plain(scene), iterations=2, judged=False)
+    made = db.chart(result, budget_s=5, on_progress=lambda setting, _left_s: said.append(setting))
+    assert len(said) == len(set(said)) > 1, "once before each"
     assert repr(made).startswith("<Chart of Reconstructions, speed against accuracy: an array")
     assert {path.name for path in made.save(tmp_path)} == {
         "chart.json",
@@ -385,10 +414,18 @@ WRONG = {
     "db.chart('beads', size=1.5)": "size must be a whole number, 1 or more, not 1.5",
     "db.chart('beads', folder=3)": "folder must be the name of a folder, not 3",
     "db.Calibration(None, None)": "psfs must hold real numbers",
+    "db.Calibration(SQUARE[None, None], [[0, 0, 1e4]], geometry=3)": "geometry must be a Geometry, not int",
+    "db.Calibration(SQUARE[None, None], [[0, 0, 1e4]], quality=3)": "quality must be a dict, .* not int",
+    "db.Geometry(aperture_mm='x')": r"aperture_mm must be \(height, width\), two numbers, .* not 'x'",
+    "db.Geometry(aperture_mm=(1, 'a'))": "aperture_mm must be .* not tuple",
+    "db.metrics.psnr(SQUARE.astype(object), SQUARE)": r"object; array.astype\(float\) makes numbers",
+    "db.reconstruct(SQUARE, SQUARE.astype(object))": r"object; array.astype\(float\) makes numbers",
+    "db.L1(-1)": "A prior's weight must be a number, 0 or more, not -1",
+    "db.L1(True)": "A prior's weight must be a number, 0 or more, not True",
     "db.Geometry('6.5')": "pixel_pitch_um must be a number, or None where unknown, not str",
     "db.NoiseModel(SQUARE, 1)": "read_noise must be a number, in counts",
-    "db.L1('a')": "A prior's weight must be a number, not 'a'",
-    "db.TotalVariation(SQUARE)": r"must be a number, not an array of shape \(9, 9\)",
+    "db.L1('a')": "A prior's weight must be a number, 0 or more, not 'a'",
+    "db.TotalVariation(SQUARE)": r"must be a number, 0 or more, not an array of shape \(9, 9\)",
     "db.Box('a', 1)": "The lower limit must be a number, not 'a'",
     "db.Convolution('psf.tif', (9, 9))": "psfs must be an array .* not str",
     "db.Convolution(SQUARE[None], 9)": r"sensor_shape must be \(height, width\), two whole numbers, not 9",
@@ -429,6 +466,9 @@ TAKEN = (
     "db.write_image('number.npy', np.array(2.0))",
     "require_hooks(None, multiprocessing.Event())",
     "db.Geometry(np.array(6.5))",
+    "db.Geometry(aperture_mm=[5.5, np.array(7)])",
+    "db.Geometry(aperture_mm=np.array([5.5, 7]))",
+    "db.Box(np.array(0.0), float('inf'))",
     "depths_of(np.array(0.0), 2)",
     "db.PointSweep(points_um=[[0, 0, 1e4], [1, 0, 1e4]])",
     "db.PointSweep(points_um=np.array([[0, 0, 1e4], [1, 0, 1e4]]))",

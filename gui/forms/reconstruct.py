@@ -18,6 +18,7 @@ from gui.jobs import JobContext
 from gui.widgets.building import button, fill, in_row, label, scrolled, share_bar
 from instrument.files.errors import BenchError
 from instrument.reconstruction.checkpointing import checkpoint_for, require_kept, settle_checkpoint
+from instrument.reconstruction.forecast import Forecast
 from instrument.reconstruction.foretold import Foretold, Like
 from instrument.reconstruction.job import Job as Prepared
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
@@ -29,6 +30,7 @@ from instrument.reconstruction.request import (
 from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
 from recon.base.declare import Imports, expression, option, options_of
 from recon.priors import PRIORS
+from recon.reconstruction.choice import Decision
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.base import IterationRecord
@@ -112,7 +114,7 @@ class ReconstructForm(QWidget):
         self.start = button(
             "Reconstruct", tip, lambda: self._ask(self.asked), shortcut="Ctrl+Return", primary=True
         )
-        tip = "Say what model auto would choose, why, and what one step up or down would be"
+        tip = "Say what would be chosen and why, and what time and memory it takes; nothing is written"
         self.explain = button("Explain", tip, lambda: self._ask(self.questioned))
         tip = "End after the iteration in progress; what there is then is kept"
         self.stop = button("Stop and keep", tip, self.stopped, enabled=False)
@@ -339,6 +341,27 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
             write_reconstruction(outputs, picture, prepared, rotate_deg=work.rotate_deg)
             settled = settle_checkpoint(keeper, [picture.stop_reason])
     return Written(outputs.image, settled)
+
+
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """What would be chosen (nothing, where a model was asked for), and what all of it takes."""
+
+    decisions: tuple[Decision, ...]
+    takes: Forecast
+
+
+def explain_job(request: PictureRequest | VolumeRequest, context: JobContext) -> Explained:
+    """Say what ``--explain`` says: what would be chosen, and time and memory by the first iterations."""
+    prepared = request.prepare()
+    context.check()
+    chosen = request.explain(prepared).decisions if request.options.model == "auto" else ()
+
+    def stage(share: float, what: str) -> None:
+        context.check()
+        context.offer(lambda: SoFar(share, what, prepared))
+
+    return Explained(chosen, request.forecast(prepared, stage))
 
 
 def lines_of(work: ReconstructionWork) -> str:

@@ -20,6 +20,7 @@ from gui.hologram_work import (
     Progress,
     compute,
     compute_lines,
+    explain,
     photograph,
     show_on_slm,
 )
@@ -27,13 +28,14 @@ from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.panels.unserved import why_not
 from gui.session import BenchSession
-from gui.widgets.building import Hint, button, fill, in_column, in_row, scrolled, share_bar, split
+from gui.widgets.building import Hint, button, fill, in_column, in_row, label, scrolled, share_bar, split
 from gui.widgets.dialogues import choose_path
 from gui.widgets.hologram_views import WEIGHTS_SHAPE, HologramViews, WeightsMode
 from instrument.bench.config_file import TEMPLATES
 from instrument.display.hologram import depth_limit_mm, expansion_side, field_picture, field_words, square
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
+from instrument.reconstruction.forecast import Forecast
 from recon.base.declare import expression, option, options_of
 from recon.errors import InputError
 from recon.holography import LOSSES, HologramOptions
@@ -109,6 +111,8 @@ class HologramsPanel(Panel):
             shortcut="Ctrl+Return",
             primary=True,
         )
+        tip = "Say what time and memory it takes, by its first iterations; nothing is written"
+        self.explain_button = button("Explain", tip, self.explain)
         tip = "End after the iteration in progress; what there is then is kept"
         self.stop_button = button("Stop and keep", tip, self.stop)
         tip = "Put the pattern on the SLM, its look-up table and flatness applied"
@@ -116,12 +120,15 @@ class HologramsPanel(Panel):
         tip = "Show it, register the camera by the mask's speckle, photograph, compare with the target"
         self.capture_button = button("Show and photograph", tip, self.photograph)
         self.progress = share_bar()
+        self.note = label(role="dim", wraps=True)
+        self.note.hide()
         yield
         below = in_column(
             self.clear,
             self.views.plane,
+            self.note,
             self.progress,
-            in_row(self.preview_button, self.compute_button, self.stop_button),
+            in_row(self.preview_button, self.compute_button, self.explain_button, self.stop_button),
             in_row(self.show_button, self.capture_button),
         )
         column = left.layout()
@@ -195,6 +202,7 @@ class HologramsPanel(Panel):
 
     def _settled(self, name: str) -> None:
         """Take over what an option of the target is now."""
+        self.note.hide()
         if name in ("picture", "fit", "srgb"):
             self._picture_changed()
         elif name in ("expansion", "distance_mm"):  # they set how far the depths reach
@@ -246,16 +254,11 @@ class HologramsPanel(Panel):
     # Doing it ------------------------------------------------------------------------------------
     def compute(self, *, preview: bool = False) -> Job | None:
         """Compute the hologram; a preview takes few iterations and writes nothing."""
-        if not self.form.check():
+        asked = self._order_and_size(preview=preview)
+        if asked is None:
             return None
-        slm = self.session.bench.slm
-        if slm is None or not self.session.is_open("slm"):
-            self.refused(None, "The bench's SLM is not open: it is not known what to compute a hologram for.")
-            return None
-        order = self.asked(lambda: self.order(preview=preview))
-        if order is None:
-            return None
-        config, size = self.session.config, (slm.shape, slm.pixel_pitch_um)
+        order, size = asked
+        config = self.session.config
         title = "Previewing a hologram" if preview else f"Computing {order.out.name}"
 
         def work(context: JobContext) -> Computed:
@@ -271,6 +274,37 @@ class HologramsPanel(Panel):
         job.progressed.connect(self._progressed)
         job.succeeded.connect(self._computed)
         return job
+
+    def explain(self) -> Job | None:
+        """Say what time and memory the hologram takes, by its first iterations."""
+        asked = self._order_and_size()
+        if asked is None:
+            return None
+        (order, size), config = asked, self.session.config
+        title = f"Explaining {order.out.name}"
+        job = self._started(
+            self.follow(self.jobs.compute(title, lambda context: explain(order, config, size, context)))
+        )
+        job.progressed.connect(lambda share: self.progress.setValue(round(1000 * share)))
+        job.succeeded.connect(self._explained)
+        return job
+
+    def _explained(self, takes: Forecast) -> None:
+        self.note.setText(f"Will take {takes}.")
+        self.note.show()
+
+    def _order_and_size(
+        self, *, preview: bool = False
+    ) -> tuple[HologramOrder, tuple[tuple[int, int], float]] | None:
+        """Return what the form asks for, and the SLM's pixels; None, and why, where it cannot be."""
+        if not self.form.check():
+            return None
+        slm = self.session.bench.slm
+        if slm is None or not self.session.is_open("slm"):
+            self.refused(None, "The bench's SLM is not open: it is not known what to compute a hologram for.")
+            return None
+        order = self.asked(lambda: self.order(preview=preview))
+        return None if order is None else (order, (slm.shape, slm.pixel_pitch_um))
 
     def stop(self) -> None:
         """End the computation, or the frames that follow each other on the SLM."""
@@ -316,6 +350,7 @@ class HologramsPanel(Panel):
     def _started(self, job: Job) -> Job:
         """Show that a job runs which the stop button ends."""
         self.job = job
+        self.note.hide()  # of other options, it may be
         self._set_running(True)
         job.ended.connect(lambda: self._set_running(False))
         return job
@@ -386,7 +421,7 @@ class HologramsPanel(Panel):
         self.target.set_mode(mode)
 
     def _set_running(self, running: bool) -> None:
-        for start in (self.preview_button, self.compute_button):
+        for start in (self.preview_button, self.compute_button, self.explain_button):
             start.setEnabled(not running)
         for use in (self.show_button, self.capture_button):
             use.setEnabled(not running and self.computed is not None)

@@ -18,7 +18,6 @@ from drivers.frame import FrameMetadata
 from gui.background import NewestOnly
 from gui.forms.options_form import FOLDED, OptionsForm
 from gui.jobs import Job, JobContext
-from gui.journey import SATURATED
 from gui.live_follower import LiveFollower
 from gui.panel import Panel, on_bench
 from gui.session import BenchSession
@@ -28,6 +27,7 @@ from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import OrientationButton, follow_orientation
 from instrument.bench.kept import KeptWithBench
+from instrument.bench.photograph import SPOILT
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.files.errors import BenchError, count, duration, percent
 from instrument.live.light_log import NOTHING_LIT
@@ -374,7 +374,7 @@ class LiveReconstructionPanel(Panel):
         """Return what is doubtful about a frame: its light, its exposure."""
         if self.session.lights.during(frame) == NOTHING_LIT:
             return "Its frame was taken with nothing lit"
-        if frame.saturated_fraction > SATURATED:
+        if frame.saturated_fraction > SPOILT:
             return f"{percent(frame.saturated_fraction)} of its frame's pixels are saturated: expose shorter"
         return ""
 

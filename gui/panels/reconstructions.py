@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import datetime
+from functools import partial
 from html import escape
 from pathlib import Path
 
@@ -15,7 +16,16 @@ from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QTab
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
 from gui.forms.options_form import OptionsForm, SuggestedName
-from gui.forms.reconstruct import CALIBRATION, PSF, ReconstructForm, SoFar, Written, reconstruct_job
+from gui.forms.reconstruct import (
+    CALIBRATION,
+    PSF,
+    Explained,
+    ReconstructForm,
+    SoFar,
+    Written,
+    explain_job,
+    reconstruct_job,
+)
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.result_export import ResultExport
@@ -33,7 +43,6 @@ from instrument.reconstruction.job import find_calibration
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.stored_result import StoredResult, open_result
 from recon.base.declare import Imports, expression, options_of
-from recon.reconstruction.choice import Choice
 from recon.reconstruction.options import ReconstructionOptions
 
 _NOTHING_OPEN = "Nothing is open: choose a result on the left, or reconstruct a photograph."
@@ -328,21 +337,14 @@ class ReconstructionsPanel(Panel):
                 self._show_nothing(f"{name}: {words}. The form says why.")
 
     def explain(self) -> Job | None:
-        """Say what the model ``auto`` would choose for the form, and why; nothing is reconstructed."""
+        """Say what would be chosen for the form, why, and what time and memory it takes."""
         request = self.asked(self.form.request)
         if request is None:
             return None
-
-        def work(context: JobContext) -> Choice:
-            prepared = request.prepare()
-            context.check()
-            choice = request.explain(prepared)
-            context.check()
-            return choice
-
-        job = self.jobs.compute(f"Explaining {request.file.name}", work)
+        job = self.jobs.compute(f"Explaining {request.file.name}", partial(explain_job, request))
         self._explaining = job
         self._begun(job, "Looking at PSFs and photograph …")
+        job.progressed.connect(lambda so_far: self.form.show_progress(so_far.share, so_far.note))
         job.succeeded.connect(self._explained)
         job.cancelled.connect(lambda _: self.form.show_progress(0.0, "Stopped."))
         job.ended.connect(lambda: setattr(self, "_explaining", None))
@@ -356,14 +358,15 @@ class ReconstructionsPanel(Panel):
         job.failed.connect(lambda why: self.form.show_progress(0.0, self.in_its_words(why).splitlines()[0]))
         job.ended.connect(lambda: self.form.set_running(False))
 
-    def _explained(self, choice: Choice) -> None:
-        facts: list[tuple[str, str]] = []
-        for decision in choice.decisions:
+    def _explained(self, explained: Explained) -> None:
+        facts = [("Will take", str(explained.takes))]
+        for decision in explained.decisions:
             facts.append((decision.name.capitalize(), f"{decision.value}: {decision.why}"))
             steps = (("up", decision.up), ("down", decision.down))
             facts += [("", f"one step {way}: {option}") for way, option in steps if option is not None]
         self.facts.show_facts([(name, self.in_its_words(words)) for name, words in facts])
-        self.form.show_progress(0.0, f"Chosen in {choice.seconds:.1f} s; the reasons are below the picture.")
+        why = "; what was chosen, and why, is below the picture" if explained.decisions else ""
+        self.form.show_progress(0.0, f"Will take {explained.takes}{why}.")
 
     def _stop(self) -> None:
         if self._explaining is not None:

@@ -22,6 +22,7 @@ from gui.widgets.building import choice, fill, narrow, offer, split
 from gui.widgets.image_view import ImageView, StretchedImage
 from gui.widgets.plots import curve_pen, plot_widget
 from gui.widgets.result_views import FactsView, ViewGrid
+from instrument.bench.photograph import SPOILT
 from instrument.display.hologram import square
 from instrument.display.hologram_files import drawn_pattern, score_words
 from instrument.files.errors import percent
@@ -239,10 +240,6 @@ def _inside(place: tuple[float, float], by: tuple[float, float]) -> tuple[float,
     return y, x
 
 
-_SATURATED = 1e-3
-"""A larger part of the camera's pixels is worth a warning."""
-
-
 class HologramViews(QWidget):
     """Shows a hologram as it is computed, and what the camera saw of it.
 
@@ -342,7 +339,7 @@ class HologramViews(QWidget):
         self.captured.show_image(np.maximum(square(photographed.capture.seen), 0), 0.0, 1.0)
         self._say_what_is_missing()
         warnings = []
-        if photographed.capture.saturated_fraction > _SATURATED:
+        if photographed.capture.saturated_fraction > SPOILT:
             warnings.append(
                 f"{percent(photographed.capture.saturated_fraction)} of the camera's pixels are saturated."
             )

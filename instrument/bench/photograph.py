@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from instrument.bench.bench import Bench
 
 
+SPOILT = 1e-3
+"""Share of saturated pixels from which a photograph is: a few are the sensor's, or a lamp's reflection."""
+
 Progress = Callable[[int, int], object]
 """Called with how many are done so far, and how many there are in all."""
 

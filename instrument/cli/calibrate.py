@@ -43,7 +43,7 @@ from instrument.cli.plan import rehearsal
 from instrument.cli.progress import keys, one_task, progress_bar
 from instrument.files import kept_times
 from instrument.files.atomic import free_bytes
-from instrument.files.errors import BenchError, duration, size
+from instrument.files.errors import BenchError, duration, percent, size
 from instrument.files.images import read_image
 from instrument.runs.acquire import abilities_of
 from instrument.runs.rehearsal import rehearsed
@@ -348,7 +348,7 @@ class _RunListener(TerminalListener):
         rate = status.done_here / status.seconds if status.seconds else 0.0
         words = [f"{rate:.1f}/s", f"{size(self._free)} free"]
         words += [f"DROPPED {status.dropped}"] if status.dropped else []
-        words += [f"SATURATED {status.saturated_fraction:.2%}"] if status.saturated_fraction else []
+        words += [f"SATURATED {percent(status.saturated_fraction)}"] if status.saturated_fraction else []
         if status.state is RunState.PAUSED:
             words = ["PAUSED, light off: p goes on, q ends"]
         self.note("  ".join(words))

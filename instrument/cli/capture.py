@@ -11,6 +11,7 @@ import typer
 
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import (
+    SPOILT,
     LightState,
     Snapshot,
     check_photograph_file,
@@ -27,7 +28,7 @@ from instrument.cli.app import (
     open_and_say,
 )
 from instrument.cli.progress import keys, one_task
-from instrument.files.errors import BenchError, duration, size
+from instrument.files.errors import BenchError, duration, percent, size
 from instrument.files.figures import Panel, check_figure, pictures_figure, save_figure
 from instrument.files.seen import as_seen
 from instrument.runs.recorder import RecordingOptions, RecordingStatus, prepare_recording
@@ -197,7 +198,7 @@ def _page(target: Path, taken: Snapshot, light: LightState, *, simulated: bool) 
         ("exposure", f"{metadata.exposure_ms:.4g} ms, gain {metadata.gain:g}"),
         ("frames", f"{taken.average}"),
         ("counts", f"{float(image.min()):g} to {float(image.max()):g} of {taken.full_scale}"),
-        ("saturated", f"{metadata.saturated_fraction:.3%} of the pixels"),
+        ("saturated", f"{percent(metadata.saturated_fraction)} of the pixels"),
     ]
     size = f"{image.shape[0]} x {image.shape[1]} {image.dtype}, as it is seen: sRGB, contrast by percentiles"
     panel = Panel("", as_seen(image, raw=True) / 255, size, white=1.0)
@@ -212,9 +213,11 @@ def _report(target: Path, taken: Snapshot, light: LightState) -> None:
         f"Wrote {target}: {height} x {width} {taken.image.dtype}, {light.value}, "
         f"{metadata.exposure_ms:g} ms, gain {metadata.gain:g}, {frames}."
     )
+    saturated = metadata.saturated_fraction
+    few = f"; {percent(saturated)} of the pixels are saturated" if 0 < saturated <= SPOILT else ""
     typer.echo(
         f"Counts {float(taken.image.min()):g} to {float(taken.image.max()):g}, "
-        f"mean {float(np.mean(taken.image, dtype=np.float64)):.1f}, of {taken.full_scale}."
+        f"mean {float(np.mean(taken.image, dtype=np.float64)):.1f}, of {taken.full_scale}{few}."
     )
     if taken.unsteadiness > _UNSTEADY:
         typer.echo(
@@ -227,11 +230,9 @@ def _report(target: Path, taken: Snapshot, light: LightState) -> None:
             f"Note: the brightest pixel is below {DIM:.0%} of full scale; lengthen --exposure-ms.",
             err=True,
         )
-    if metadata.saturated_fraction > 0:
-        typer.echo(
-            f"Warning: {metadata.saturated_fraction:.3%} of the pixels are saturated; shorten --exposure-ms.",
-            err=True,
-        )
+    if saturated > SPOILT:
+        words = f"{percent(saturated)} of the pixels are saturated; shorten --exposure-ms."
+        typer.echo(f"Warning: {words}", err=True)
 
 
 @record_app.command(
@@ -274,7 +275,7 @@ def _note(status: RecordingStatus) -> str:
     ]
     words += [f"DROPPED BY CAMERA {status.dropped_by_device}"] if status.dropped_by_device else []
     words += [f"DISK TOO SLOW, LOST {status.not_written}"] if status.not_written else []
-    words += [f"SATURATED {status.saturated_fraction:.2%}"] if status.saturated_fraction else []
+    words += [f"SATURATED {percent(status.saturated_fraction)}"] if status.saturated_fraction else []
     return "  ".join(words)
 
 
@@ -291,9 +292,10 @@ def _last_words(run: Run) -> None:
     if not_written:
         typer.echo(f"Warning: the disk was too slow for {not_written} frames.", err=True)
     if saturated := [f for r in run.records.values() if (f := r.metadata.saturated_fraction) > 0]:
-        typer.echo(
-            f"Warning: {len(saturated)} of {len(run.records)} frames have saturated pixels, up to "
-            f"{max(saturated):.3%} of them; shorten --exposure-ms.",
-            err=True,
-        )
+        most = percent(max(saturated))
+        words = f"{len(saturated)} of {len(run.records)} frames have saturated pixels, up to {most} of them"
+        if max(saturated) > SPOILT:
+            typer.echo(f"Warning: {words}; shorten --exposure-ms.", err=True)
+        else:
+            typer.echo(f"{words}.")
     typer.echo(f"Run: {run.path}")

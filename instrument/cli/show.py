@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from instrument.bench.photograph import SPOILT
 from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say
 from instrument.cli.progress import one_task
 from instrument.display.hologram import HOLOGRAM, PHOTOGRAPHED, CaptureOptions
 from instrument.files.atomic import require_new
-from instrument.files.errors import BenchError, FileError
+from instrument.files.errors import BenchError, FileError, percent
 from instrument.tasks.task import Given, saying_what_is_left
 from recon.base.declare import option
 
@@ -252,8 +253,8 @@ def _end_early(ended_by: BaseException | None) -> None:
 
 
 def _warn_of_saturation(fraction: float) -> None:
-    if fraction > 1e-3:
-        typer.echo(f"Warning: {100 * fraction:.1f} % of the camera's pixels are saturated.", err=True)
+    if fraction > SPOILT:
+        typer.echo(f"Warning: {percent(fraction)} of the camera's pixels are saturated.", err=True)
 
 
 def _capture(

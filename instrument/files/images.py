@@ -33,6 +33,7 @@ from instrument.files.ome_tiff import (
     depths_um,
     facts_of,
     film_facts,
+    imagej_time_unit,
     is_ome_name,
     ome_tiff_channels,
     photograph_fields,
@@ -259,7 +260,7 @@ def _depths(tiff: tifffile.TiffFile) -> dict[str, Any]:
 def _times(tiff: tifffile.TiffFile) -> dict[str, float]:
     """Return the time from frame to frame of ImageJ's stacks."""
     stack = tiff.imagej_metadata or {}
-    unit = SECONDS.get(str(stack.get("tunit", "")).strip().casefold(), 0.0)
+    unit = SECONDS.get(imagej_time_unit(tiff), 0.0)
     period_s, fps = unit * float(stack.get("finterval", 0)), float(stack.get("fps", 0))
     period_s = period_s or (1 / fps if fps > 0 else 0.0)
     return {"frame_period_s": period_s} if stack.get("frames", 0) > 1 and period_s > 0 else {}

@@ -40,6 +40,11 @@ SECONDS = {
 """Units of time; none is a second, which is what OME and ImageJ take then."""
 
 
+def imagej_time_unit(tiff: tifffile.TiffFile) -> str:
+    """Return what ImageJ's times are counted in, as :data:`SECONDS` has it; empty where it is not said."""
+    return str((tiff.imagej_metadata or {}).get("tunit", "")).strip().casefold()
+
+
 def is_ome_name(path: Path) -> bool:
     """Whether a name asks for OME-TIFF."""
     return path.name.lower().endswith(SUFFIXES)

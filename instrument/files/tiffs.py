@@ -17,6 +17,7 @@ import tifffile
 from instrument.files import reading
 from instrument.files.errors import FileError
 from instrument.files.named_arrays import Expect, ordered, outline
+from instrument.files.ome_tiff import SECONDS, imagej_time_unit
 from instrument.files.pictures import (
     LOSSY,
     MOST_BYTES,
@@ -133,7 +134,7 @@ def _decode(path: Path, tiff: tifffile.TiffFile, expect: Expect) -> Decoded:
     if page.photometric == _PHOTOMETRIC.MINISWHITE and array.dtype.kind == "u":
         array = (1 << page.bitspersample) - 1 - array if page.bitspersample < 16 else ~array
         notes.append(_INVERTED)
-    notes += _which(tiff, series)
+    notes += [*_which(tiff, series), *_untimed(tiff)]
     turned = int(page.tags.valueof(ORIENTATION, 1))
     if 2 <= turned <= 8:
         array = upright(array, turned, series.axes)
@@ -150,6 +151,14 @@ def _which(tiff: tifffile.TiffFile, series: Any) -> list[str]:
     number = tiff.series.index(series)
     which = "first" if number == 0 else f"number {number + 1}"
     return [f"the {which} of its {len(tiff.series)} image series taken"] if len(tiff.series) > 1 else []
+
+
+def _untimed(tiff: tifffile.TiffFile) -> list[str]:
+    """Say where the time from frame to frame is counted in what nobody knows."""
+    stack, unit = tiff.imagej_metadata or {}, imagej_time_unit(tiff)
+    if stack.get("frames", 0) < 2 or not stack.get("finterval") or stack.get("fps") or unit in SECONDS:
+        return []
+    return [f"its unit of time, {unit!r}, is not known: its time from frame to frame left out"]
 
 
 def _with_opencv(path: Path, tiff: tifffile.TiffFile, series: Any) -> Decoded:
@@ -198,7 +207,7 @@ def _with_opencv(path: Path, tiff: tifffile.TiffFile, series: Any) -> Decoded:
         notes.append(_INVERTED)
     if stack.shape[-1] == 4 and stack.dtype == np.uint8 and stack[..., 3].min() < 255:
         raise odd  # it has multiplied the colours by their alpha
-    notes += _which(tiff, series)
+    notes += [*_which(tiff, series), *_untimed(tiff)]
     if 2 <= (turned := int(page.tags.valueof(ORIENTATION, 1))) <= 8:
         notes.append(turned_in_words(turned))
     axes = series.axes + "S" if is_palette and stack.ndim == 4 else series.axes

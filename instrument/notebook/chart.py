@@ -103,8 +103,12 @@ def chart(
         kept = Path(scratch if folder is None else folder)
         kept.mkdir(parents=True, exist_ok=True)
 
-        def tell(_place: int, _total: int, setting: object, left_s: float) -> None:
-            if on_progress is not None:
+        told = -1
+
+        def tell(place: int, _total: int, setting: object, left_s: float) -> None:
+            nonlocal told
+            if on_progress is not None and place != told:  # which is told while it runs, too
+                told = place
                 on_progress(str(getattr(setting, "name", setting)), left_s)
 
         data = make_chart(problem, about, kept / "chart.json", budget_s=budget_s, on_progress=tell)

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -24,16 +24,18 @@ from instrument.display.hologram import (
     slm_size,
 )
 from instrument.display.hologram_files import HologramFiles, hologram_figure
+from instrument.display.hologram_forecast import forecast_hologram as by_its_beginning
 from instrument.files.errors import BenchError
 from instrument.files.images import ImageFile, drop_alpha
 from instrument.files.sample_images import SAMPLES
 from instrument.notebook.reconstruct import bench_config, require_hooks
 from instrument.notebook.result import figure_png, show_figure
 from instrument.notebook.words import in_python, speaking
+from instrument.reconstruction.forecast import Forecast
 from recon.base.arguments import is_several, require_argument, require_shape
-from recon.base.checks import plain_array
 from recon.base.declare import with_overrides
-from recon.holography import HologramOptions, HologramRecord
+from recon.holography import Display, HologramOptions, HologramRecord, Target
+from recon.types import plain_array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -125,31 +127,80 @@ def hologram(
 
     Raises InputError, BenchError or FileError: what was found, what was expected, what to do.
     """
-    alignment = overrides.pop("alignment", None)
-    require_argument("alignment", alignment, Path | None)
-    require_argument("options", options, HologramOptions | None, "Single ones are given by name: frames=2.")
     require_hooks(on_progress, cancel)
-    options = with_overrides(options or HologramOptions(), overrides)
-    config = bench_config(bench)
-    shape, pitch_um = slm_size(config, phases=options.mirrors is None)
-    shape = shape if slm is None else require_shape("slm", slm)
-    display = options.display_of(bench_display(config, (shape, pitch_um), expansion=options.expansion))
-    if alignment is not None:
-        display = load_alignment(Path(alignment)).of(display)
-    pictures = list(picture) if isinstance(picture, list | tuple) else [picture]
-    depths = _depths(z_mm, len(pictures))
-    images = [_image(one, options) for one in pictures]
-    said = [f"{image.path}: {note}." for image in images for note in image.notes]
-    said += list(filter(None, (field_words(image.pixels, options.fit) for image in images)))[:1]
-    if said:
-        warnings.warn(in_python(" ".join(said)), stacklevel=3)
-    targets = [
-        prepare_target(image.pixels, display, options, z_mm=z)
-        for image, z in zip(images, depths, strict=True)
-    ]
-    found = compute_and_judge(display, targets, options, callback=on_progress, cancel=cancel)
-    files = HologramFiles(Path("slm.png"), config.display.slm_binning, options, [display])
+    asked = _Asked.of(picture, bench, options, slm, z_mm, overrides)
+    if asked.said:
+        warnings.warn(in_python(asked.said), stacklevel=3)
+    found = compute_and_judge(
+        asked.display, asked.targets, asked.options, callback=on_progress, cancel=cancel
+    )
+    files = HologramFiles(Path("slm.png"), asked.config.display.slm_binning, asked.options, [asked.display])
     return HologramShown(**{f.name: getattr(found, f.name) for f in fields(HologramResult)}, files=files)
+
+
+@speaking
+def forecast_hologram(
+    picture: Picture | Sequence[Path | str | ImageFile],
+    bench: BenchConfig | Path | str | None = None,
+    options: HologramOptions | None = None,
+    *,
+    slm: tuple[int, int] | None = None,
+    z_mm: float | Sequence[float] = 0.0,
+    **overrides: Any,
+) -> Forecast:
+    """Say what time and memory a hologram will take here, as busy as this machine is now.
+
+    Its first iterations are carried out, all of it where that takes a few seconds: the same that
+    ``diffuserbench hologram --explain`` tells. Parameters and errors as of :func:`hologram`.
+    """
+    asked = _Asked.of(picture, bench, options, slm, z_mm, overrides)
+    return by_its_beginning(asked.display, asked.targets, asked.options)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What a hologram is computed for."""
+
+    config: BenchConfig
+    display: Display
+    targets: list[Target]
+    options: HologramOptions
+    said: str
+    """Of the pictures: notes on their files, what is cropped."""
+
+    @classmethod
+    def of(
+        cls,
+        picture: Any,
+        bench: Any,
+        options: HologramOptions | None,
+        slm: Any,
+        z_mm: Any,
+        overrides: dict[str, Any],
+    ) -> Self:
+        """Bring it together; errors as :func:`hologram`."""
+        alignment = overrides.pop("alignment", None)
+        require_argument("alignment", alignment, Path | None)
+        require_argument(
+            "options", options, HologramOptions | None, "Single ones are given by name: frames=2."
+        )
+        options = with_overrides(options or HologramOptions(), overrides)
+        config = bench_config(bench)
+        shape, pitch_um = slm_size(config, phases=options.mirrors is None)
+        shape = shape if slm is None else require_shape("slm", slm)
+        display = options.display_of(bench_display(config, (shape, pitch_um), expansion=options.expansion))
+        if alignment is not None:
+            display = load_alignment(Path(alignment)).of(display)
+        pictures = list(picture) if isinstance(picture, list | tuple) else [picture]
+        depths = _depths(z_mm, len(pictures))
+        images = [_image(one, options) for one in pictures]
+        said = [f"{image.path}: {note}." for image in images for note in image.notes]
+        said += list(filter(None, (field_words(image.pixels, options.fit) for image in images)))[:1]
+        targets = [
+            prepare_target(image.pixels, display, options, z_mm=z)
+            for image, z in zip(images, depths, strict=True)
+        ]
+        return cls(config, display, targets, options, " ".join(said))
 
 
 def _depths(z_mm: Any, count: int) -> list[float]:

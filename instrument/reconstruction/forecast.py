@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self, TypeVar
 
+import numpy.typing as npt
+
 from instrument.files.errors import duration
 from recon.reconstruction.course import expected_iterations
 from recon.reconstruction.measurement import Measurement
@@ -38,7 +40,7 @@ UNEVEN = 1.2
 low-rank model took 1.05 and 1.06 times the end that is told without this (docs/benchmarks/time-told.md)."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Forecast:
     """What work will take on this machine, as busy as it is now.
 
@@ -87,6 +89,10 @@ class Forecast:
     def _after(self, iterations: float) -> float:
         return self.beside_s + iterations * self.iteration_s
 
+    def __repr__(self) -> str:
+        """Say it in a line, as Python shows what it is."""
+        return f"<Forecast: {self}>"
+
     def __str__(self) -> str:
         """Say it in a line."""
         an = "an" if self.each[0] in "aeiou" else "a"
@@ -131,9 +137,14 @@ class Carried:
 
     @property
     def iteration_s(self) -> float:
-        """What an iteration of all runs takes."""
-        runs = [run for run in self.histories if len(run) > _UNCOUNTED]
-        return float(sum((r[-1].seconds - r[_UNCOUNTED - 1].seconds) / (len(r) - _UNCOUNTED) for r in runs))
+        """What an iteration of all runs takes, the first of each left out as far as others are there."""
+
+        def each_s(run: Sequence[Any]) -> float:
+            first = min(_UNCOUNTED, len(run) - 1)
+            began_s = run[first - 1].seconds if first else 0.0
+            return float((run[-1].seconds - began_s) / (len(run) - first))
+
+        return sum(each_s(run) for run in self.histories if run)
 
 
 C = TypeVar("C", bound=Carried)
@@ -154,7 +165,7 @@ def carried_out(begin: Callable[[int | None, float, float], C], soon_s: float) -
 
 def forecast(
     measurement: Measurement,
-    calibration: Calibration,
+    calibration: Calibration | npt.ArrayLike,
     options: ReconstructionOptions,
     on_stage: Stage | None = None,
 ) -> Forecast:
@@ -203,7 +214,7 @@ class Trial(Carried):
     def of(
         cls,
         measurement: Measurement,
-        calibration: Calibration,
+        calibration: Calibration | npt.ArrayLike,
         tried: ReconstructionOptions,
         on_stage: Stage,
         options: ReconstructionOptions | None = None,
@@ -254,7 +265,10 @@ class Trial(Carried):
 
 
 def _tolerance(
-    found: Reconstruction, measurement: Measurement, calibration: Calibration, options: ReconstructionOptions
+    found: Reconstruction,
+    measurement: Measurement,
+    calibration: Calibration | npt.ArrayLike,
+    options: ReconstructionOptions,
 ) -> float:
     """Return the change an iteration at which a reconstruction settles."""
     if found.choice is not None:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.calibration_file import is_calibration, load_calibration
-from instrument.files.errors import BenchError, FileError
+from instrument.files.errors import BenchError, FileError, percent
 from instrument.files.images import ImageFile, read_image
 from instrument.reconstruction.defects import mended_psf
 from instrument.reconstruction.mosaic import (
@@ -370,7 +370,7 @@ def _saturation(image: ImageFile, erased: Erased) -> tuple[str, ...]:
     count = np.count_nonzero(saturated_pixels(image.pixels))
     if not count or erased.valid is not None:
         return ()
-    share = f"{count / image.pixels.size:.2%}"
+    share = percent(count / image.pixels.size)
     are = "pixel of the image ({}) is" if count == 1 else "pixels of the image ({}) are"
     return (f"{count} {are.format(share)} saturated and used: expect halos there.",)
 

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.errors import BenchError, FileError, count
+from instrument.files.errors import BenchError, FileError, count, percent
 from instrument.files.images import ImageFile, read_image
 from instrument.reconstruction.defects import defective_pixels, whole_lines
 from recon.base.blocks import block_mean
@@ -417,7 +417,7 @@ def _saturated(image: ImageFile, psf: npt.NDArray[Any] | None) -> Erased:
     said = []
     if number := int(np.count_nonzero(saturated)):
         tops = ", ".join(f"{top:g}" for top in np.unique(image.pixels[saturated]))
-        said += [f"{count(number, 'saturated pixel')} ({number / image.pixels.size:.2%}, at {tops})"]
+        said += [f"{count(number, 'saturated pixel')} ({percent(number / image.pixels.size)}, at {tops})"]
     if number := int(np.count_nonzero(left_out & ~saturated)):
         said += [count(number, f"hot or dead {'one' if said else 'pixel'}")]
     words = f"{' and '.join(said)}; --erasures none uses them"

@@ -107,7 +107,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
     Raises FileError, BenchError or InputError when something cannot be used, or the output holds another
     video.
     """
-    _check(request)
+    require_request(request)
     run = _recording(request.run)
     frames = tuple(sorted(run.records))
     picture = _first_picture(request, run, frames[0])
@@ -238,8 +238,8 @@ def write_shown(
     write_mp4(request.film_path, shown(), fps)
 
 
-# Pieces ------------------------------------------------------------------------------------------------
-def _check(request: VideoRequest) -> None:
+def require_request(request: VideoRequest) -> None:
+    """Raise FileError or BenchError for what can be seen to be wrong before anything is read."""
     if not is_zarr_name(request.out) or not request.film_path.stem:
         raise FileError(request.out, "a video is written as OME-Zarr: the name must end in .ome.zarr.")
     if not request.out.parent.is_dir():
@@ -253,8 +253,20 @@ def _check(request: VideoRequest) -> None:
     if wrong := inapplicable(given, "video"):
         names = ", ".join(o.name for o in wrong)
         raise BenchError(f"{names}: not for a video. Leave {'it' if len(wrong) == 1 else 'them'} out.")
+    _require_spared(request)
 
 
+def done_before(request: VideoRequest, plan: VideoPlan) -> set[int]:
+    """Return the blocks of a plan that are on the disk already, where the same request goes on with them."""
+    begun = _begun(request)
+    if begun is None:
+        return set()
+    same = plain(plan) == plain(begun.plan)
+    anew: list[int] | None = [] if same else begun.goes_on_without(plan)
+    return set() if anew is None else begun.done() - set(anew)
+
+
+# Pieces ------------------------------------------------------------------------------------------------
 def _recording(path: Path) -> Run:
     """Open what is to be reconstructed; raises FileError where it is no video of a scene."""
     if path.exists() and not is_run(path):
@@ -338,11 +350,8 @@ def _digest(problem: Problem, reduction: Reduction) -> str:
 
 def _job(request: VideoRequest, plan: VideoPlan, force: bool) -> tuple[VideoJob | None, bool]:
     """Return the job begun before for the same plan; none with ``force``, which removes what there is."""
-    _require_spared(request)
-    folder = VideoJob.folder_of(request.out)
-    begun = None
-    if not force and (folder / "job.json").exists() and request.out.exists():
-        begun = VideoJob(folder)
+    begun = None if force else _begun(request)
+    if begun is not None:
         if plain(plan) == plain(begun.plan):
             return begun, True
         if (anew := begun.goes_on_without(plan)) is not None:  # frames were marked as lost since
@@ -367,10 +376,16 @@ def _job(request: VideoRequest, plan: VideoPlan, force: bool) -> tuple[VideoJob 
                 "exists, and would be replaced by what goes with the video.",
                 "Choose another name with --out, or --force to replace it.",
             )
-    for old in (folder, request.out):
+    for old in (VideoJob.folder_of(request.out), request.out):
         if old.exists():
             shutil.rmtree(old)
     return None, False
+
+
+def _begun(request: VideoRequest) -> VideoJob | None:
+    """Return the job of a film that was begun before; None where there is none."""
+    folder = VideoJob.folder_of(request.out)
+    return VideoJob(folder) if (folder / "job.json").exists() and request.out.exists() else None
 
 
 def _require_spared(request: VideoRequest) -> None:

@@ -24,8 +24,10 @@ from instrument.reconstruction.forecast import TRIED, Forecast
 from instrument.reconstruction.video import (
     PreparedVideo,
     VideoRequest,
+    done_before,
     finish_video,
     prepare_video,
+    require_request,
     solve_video,
     write_shown,
 )
@@ -45,58 +47,81 @@ class PreparedTrial:
     seconds: float
     """That preparing took."""
     meter: MemoryMeter
+    left: tuple[tuple[int, ...], ...]
+    """The frames of each block that is still to be solved: all, unless it was begun before."""
+
+    @property
+    def frames_left(self) -> int:
+        """How many they are."""
+        return sum(map(len, self.left))
 
 
 @contextmanager
-def trial_of(request: VideoRequest) -> Iterator[PreparedTrial]:
+def trial_of(request: VideoRequest, *, force: bool = False) -> Iterator[PreparedTrial]:
     """Give a film prepared in a folder of its own beside it, which is removed in the end.
 
-    Raises FileError, BenchError or InputError as :func:`~instrument.reconstruction.video.prepare_video`.
+    ``force``: what was begun before does not count.
+
+    Raises FileError, BenchError or InputError as :func:`~instrument.reconstruction.video.prepare_video`,
+    but for a film that is there.
     """
+    require_request(request)
     meter, began_s = MemoryMeter(), time.perf_counter()
     with TemporaryDirectory(prefix=f".{stem_of(request.out)}.trial-", dir=request.out.parent) as folder:
         prepared = prepare_video(replace(request, out=Path(folder) / request.out.name))
-        yield PreparedTrial(prepared, time.perf_counter() - began_s, meter)
+        done = set() if force else done_before(request, prepared.job.plan)
+        left = tuple(block for number, block in enumerate(prepared.job.blocks) if number not in done)
+        yield PreparedTrial(prepared, time.perf_counter() - began_s, meter, left)
 
 
-def forecast_video(trial: PreparedTrial, cancel: threading.Event | None = None) -> Forecast | None:
-    """Carry out the first frames of some blocks, and say what all take; None when cancelled.
+def forecast_video(
+    trial: PreparedTrial,
+    cancel: threading.Event | None = None,
+    on_progress: Callable[[float], object] = lambda _: None,
+) -> Forecast | None:
+    """Carry out the first frames of some blocks, and say what all that is left takes; None when cancelled.
 
-    Errors as of :func:`~instrument.reconstruction.video.solve_video`.
+    ``on_progress`` is told the share that is over. Errors as of
+    :func:`~instrument.reconstruction.video.solve_video`.
     """
     prepared, cancel = trial.prepared, cancel or threading.Event()
     job, video = prepared.job, prepared.request.video
-    plan, blocks = job.plan, job.blocks
+    plan, left, frames = job.plan, trial.left, trial.frames_left
     together = plan.over_time is not None
-    workers = at_once(len(blocks), video, together=together)
+    workers = at_once(max(len(left), 1), video, together=together)
+    tried = _tried(left or job.blocks[:1], workers, together=together)
+    asked = replace(plan, frames=tried)
     if together:
-        chosen = range(min(2 * workers, len(blocks)))
-        tried = tuple(index for number in chosen for index in blocks[number])
-        asked = replace(plan, frames=tried, cold_iterations=min(plan.cold_iterations, TRIED))
-    else:
-        spread = np.linspace(0, len(blocks) - 1, 2 * workers).round().astype(int)
-        tried = tuple(index for number in np.unique(spread) for index in blocks[number][:FRAMES])
-        asked = replace(plan, frames=tried)
-    run = _solved(trial, asked, cancel)
+        asked = replace(asked, cold_iterations=min(plan.cold_iterations, TRIED))
+    run = _solved(trial, asked, cancel, on_progress)
     if cancel.is_set():
         return None
     times = plan.cold_iterations / asked.cold_iterations
     pace = _together(run.reports, times) if together else _one_by_one(run.reports)
     once_s, film_s = _finished(prepared, tried)
-    frames_s = _longest(map(len, blocks), workers, pace) + film_s * len(plan.frames)
-    beside_s = trial.seconds + run.beside_s + once_s
+    film_s *= len(plan.frames)  # of all of it, whatever was done before
+    frames_s = _longest(map(len, left), workers, pace) + film_s if left else 0.0
+    beside_s = trial.seconds + once_s + (run.beside_s if left else film_s)
     elsewhere = video.workers is not None or video.scheduler is not None
     own = max(report.peak_bytes for report in run.reports)
     return Forecast(
         beside_s,
-        frames_s / len(plan.frames),
-        len(plan.frames),
+        frames_s / max(frames, 1),
+        frames,
         own if elsewhere else trial.meter.peak_mib() * 2**20,
-        settles=len(plan.frames),
+        settles=frames,
         counted=True,
         each="frame",
         where=f" in each of {count(workers, 'worker')}" if elsewhere else "",
     )
+
+
+def _tried(blocks: Sequence[Sequence[int]], workers: int, *, together: bool) -> tuple[int, ...]:
+    """Return the frames that are carried out: two blocks a worker, whole where their frames hang together."""
+    if together:
+        return tuple(index for block in blocks[: 2 * workers] for index in block)
+    spread = np.linspace(0, len(blocks) - 1, 2 * workers).round().astype(int)
+    return tuple(index for number in np.unique(spread) for index in blocks[number][:FRAMES])
 
 
 @dataclass(frozen=True)
@@ -115,12 +140,19 @@ class _Solved:
         return max(self.seconds - max(busy.values(), default=0.0), 0.0)
 
 
-def _solved(trial: PreparedTrial, plan: VideoPlan, cancel: threading.Event) -> _Solved:
+def _solved(
+    trial: PreparedTrial, plan: VideoPlan, cancel: threading.Event, on_progress: Callable[[float], object]
+) -> _Solved:
     """Solve the blocks of a shorter plan."""
     job, reports = trial.prepared.job, list[BlockReport]()
     job.go_on_without(plan, sorted(job.done()))
     began_s = time.perf_counter()
-    solve_video(trial.prepared, reports.append, cancel)
+
+    def note(report: BlockReport) -> None:
+        reports.append(report)
+        on_progress(sum(one.solved for one in reports) / len(plan.frames))
+
+    solve_video(trial.prepared, note, cancel)
     return _Solved(reports, time.perf_counter() - began_s)
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from drivers.camera import Camera
 from drivers.errors import DeviceError, DeviceTimeoutError
 from drivers.frame import Frame
-from instrument.files.errors import BenchError
+from instrument.files.errors import BenchError, percent
 from instrument.live.frame_view import SATURATED, fill_indices, histogram, index_table, percentiles
 from instrument.serve.operation import WATCHER, Operation
 
@@ -118,7 +118,7 @@ def picture(frame: Frame) -> tuple[dict[str, Any], bytes]:
         "current_s": _CURRENT_S + 3 * metadata.exposure_ms / 1e3,
         "words": f"{image.shape[0]} x {image.shape[1]} {metadata.pixel_format}, "
         f"{metadata.exposure_ms:g} ms, gain {metadata.gain:.3g}; counts {low:g} (black) to {high:g} (white); "
-        f"{100 * metadata.saturated_fraction:.2g} % saturated"
+        f"{percent(metadata.saturated_fraction)} saturated"
         f"{'; dark, nothing but noise may be here' if is_dark else ''}",
     }
     return said, encoded.tobytes()

@@ -32,13 +32,16 @@ PICTURE = Path("reconstruction.tif")
 def reconstruct_photograph(
     desk: Desk, request: PictureRequest | VolumeRequest, outputs: Outputs, output: OutputOptions
 ) -> Done:
-    """Reconstruct, tell, write. ``explain``: only say what with."""
+    """Reconstruct, tell, write. ``explain``: only say what with, and what it takes."""
     if output.explain:
         with desk.step("reading"):
             job = request.prepare()
-        with desk.step("choosing"):
-            choice = request.explain(job)
-        _tell_choice(desk, choice)
+        if request.options.model == "auto":
+            with desk.step("choosing"):
+                choice = request.explain(job)
+            _tell_choice(desk, choice)
+        else:
+            desk.fact("Model", f"{request.options.model}, as asked for: nothing is chosen")
         with desk.step("the first iterations", 100) as advance:
             told = request.forecast(job, lambda share, what: advance(round(100 * share), note=what))
         desk.fact("Will take", str(told))

@@ -57,19 +57,22 @@ def video(
         video=video,
         rotate_deg=int(output.rotate_deg),
     )
-    return explain_video(desk, request) if output.explain else make_video(desk, request, force=output.force)
+    do = explain_video if output.explain else make_video
+    return do(desk, request, force=output.force)
 
 
-def explain_video(desk: Desk, request: VideoRequest) -> Done:
-    """Only say what with, and what time and memory it will take."""
+def explain_video(desk: Desk, request: VideoRequest, *, force: bool) -> Done:
+    """Only say what with, and what time and memory what is left of it will take."""
     video = request.video
     require_crew(workers=video.workers, scheduler=video.scheduler, owner=video.scheduler_owner)
     with ExitStack() as kept:
         with desk.step("choosing"):
-            trial = kept.enter_context(trial_of(request))
+            trial = kept.enter_context(trial_of(request, force=force))
         _tell(desk, trial.prepared)
-        with desk.interruptible() as cancel, desk.step("the first frames"):
-            told = forecast_video(trial, cancel)
+        if done := len(trial.prepared.job.plan.frames) - trial.frames_left:
+            desk.fact("Resumed", f"{done} frames are done already")
+        with desk.interruptible() as cancel, desk.step("the first frames", 100) as advance:
+            told = forecast_video(trial, cancel, lambda share: advance(round(100 * share)))
     if told is None:
         return Done(kept="Interrupted: nothing is known of the time.")
     desk.fact("Will take", str(told))

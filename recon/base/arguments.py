@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from recon.base.declare import Declaration, Option
 from recon.errors import InputError
-from recon.types import plain_number
+from recon.types import numbers_of, plain_array, plain_number
 
 
 def require_argument(name: str, value: object, kind: Any, remedy: str = "", **limits: float) -> Any:
@@ -53,15 +53,18 @@ def require_shape(name: str, value: Any) -> tuple[int, int]:
 def require_numbers(
     name: str, array: npt.ArrayLike, expected: str, *, kinds: str = "uifb", least_axes: int = 1
 ) -> npt.NDArray[Any]:
-    """Return an array of numbers as it is; raises InputError for anything else, as ``expected`` says.
+    """Return an array of numbers as it is, NaN where one is masked.
 
-    ``kinds`` are NumPy's letters for them: real ones.
+    ``kinds`` are NumPy's letters for them: real ones. Raises InputError for anything else: what is
+    ``expected``, and what it is.
     """
     try:
-        found: npt.NDArray[Any] = np.asarray(array)
+        found = plain_array(array)
     except (TypeError, ValueError):
         found = np.asarray(None)
     if found.dtype.kind not in kinds or found.ndim < least_axes:
-        given = type(array).__name__ if not found.ndim else f"an array of {found.dtype}"
+        given = (
+            type(array).__name__ if not found.ndim else f"an array of {found.dtype}{numbers_of(found.dtype)}"
+        )
         raise InputError(f"{name} must be {expected}, not {given}.")
     return found

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from recon.base.blocks import block_mean
 from recon.base.noise import NoiseModel, estimate_deviation
 from recon.errors import InputError
-from recon.types import Calibration, real_array
+from recon.types import Calibration, plain_array, real_array
 
 SATURATED_SHARE = 1e-5
 """Share of pixels at exactly the maximum above which an image is taken for saturated."""
@@ -36,15 +36,6 @@ LEAST_PX = 32
 """Sides of images so small tell nothing of frequencies."""
 DETAILS = ((0.1, 0.25), (0.02, 0.06))
 """Spatial frequencies of details and of coarser structure, cycles a pixel."""
-
-
-def plain_array(given: npt.ArrayLike) -> npt.NDArray[Any]:
-    """Return an array of anything; NaN where NumPy's masks hide a value: they are not seen elsewhere."""
-    if isinstance(given, np.ma.MaskedArray) and np.ma.is_masked(given):
-        plain = np.array(given.data, np.result_type(given.dtype, np.float32))
-        plain[np.ma.getmaskarray(given)] = np.nan
-        return plain
-    return np.asarray(given)
 
 
 def as_channels(

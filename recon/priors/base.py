@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from copy import copy
 from typing import Any, Self
@@ -9,7 +10,9 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.arguments import require_argument
 from recon.errors import InputError, StructureError
+from recon.types import plain_number
 
 Array = npt.NDArray[Any]
 
@@ -123,23 +126,13 @@ class Sum(Prior):
 
 def require_weight(weight: float) -> float:
     """Return a prior's weight; raises InputError for a negative one, and for what is no number."""
-    weight = _number("A prior's weight", weight)
-    if not weight >= 0:
-        raise InputError(f"A prior's weight must not be negative; got {weight}.")
-    return weight
+    return float(require_argument("A prior's weight", weight, float, least=0))
 
 
-def _number(name: str, value: Any) -> float:
-    """Return a number, be it an array's only one, on whatever device; InputError where it is none."""
-    try:
-        if not isinstance(value, str | bytes):
-            return float(value)
-    except (TypeError, ValueError):
-        pass
-    shape = getattr(value, "shape", ())
-    raise InputError(
-        f"{name} must be a number, not {f'an array of shape {shape}' if shape else repr(value)}."
-    )
+def _limit(name: str, given: Any) -> float:
+    """Return a number, or an infinity; raises InputError for anything else."""
+    endless = isinstance(number := plain_number(given), float) and math.isinf(number)
+    return float(number if endless else require_argument(name, given, float))
 
 
 class Separable(Prior):
@@ -151,7 +144,7 @@ class Separable(Prior):
 
     def __init__(self, weight: float = 0.0, lower: float = -np.inf, upper: float = np.inf) -> None:
         self.weight = require_weight(weight)
-        self.lower, self.upper = _number("The lower limit", lower), _number("The upper limit", upper)
+        self.lower, self.upper = _limit("The lower limit", lower), _limit("The upper limit", upper)
         if not self.lower <= self.upper:
             raise InputError(f"The box's lower limit {lower:g} is above its upper limit {upper:g}.")
 

@@ -13,7 +13,6 @@ from recon.base.brief import brief
 from recon.base.checks import (
     NEIGHBOURS,
     as_channels,
-    plain_array,
     require_finite,
     require_noise,
     saturated_share,
@@ -24,7 +23,7 @@ from recon.camera.camera_model import Depths, members_of_depths, one_depth, sort
 from recon.camera.field_registration import one_psf
 from recon.errors import InputError
 from recon.reconstruction.options import ReconstructionOptions
-from recon.types import Calibration, real_array
+from recon.types import Calibration, plain_array, real_array
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]

@@ -82,11 +82,9 @@ def reconstruct(
     Raises InputError when the input is unusable, or the solver has no way for it; the text says what was
     found, what was expected and what to do.
     """
-    known, options = given(overrides, options)
-    if not isinstance(measurement, Measurement):
-        measurement = Measurement(measurement)
+    measurement, options = measured(measurement, options, overrides)
     course = Course(options, on_stage)
-    problem = Problem.of(replace(measurement, **known), calibration, options)
+    problem = Problem.of(measurement, calibration, options)
     require_two_images(problem)
     if options.uncertainty and (reason := refused(problem)) is not None:
         raise InputError(f"{reason[0].upper()}{reason[1:]}.")
@@ -111,6 +109,17 @@ def require_two_images(problem: Problem) -> None:
     """Raise InputError where a photograph is its own PSF, or the two are swapped."""
     if not problem.patterned:
         require_photograph(problem.data, problem.depths.central, problem.valid)
+
+
+def measured(
+    image: Measurement | npt.ArrayLike,
+    options: ReconstructionOptions | None,
+    overrides: Mapping[str, Any],
+) -> tuple[Measurement, ReconstructionOptions]:
+    """Return a measurement with the facts that were given by name, and options with those that were."""
+    known, options = given(overrides, options)
+    measurement = image if isinstance(image, Measurement) else Measurement(image)
+    return replace(measurement, **known), options
 
 
 def given(

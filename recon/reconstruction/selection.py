@@ -104,7 +104,8 @@ def _chosen(problem: Problem, on_stage: Stage | None = None) -> tuple[Problem, C
     restored = with_dark_restored(problem)
     if restored is problem:
         return problem, choice
-    choice, why = choice_for(restored, on_stage), "an even offset was added instead"
+    counts = -float(np.asarray(restored.measurement.background))
+    choice, why = choice_for(restored, on_stage), f"an even offset of {counts:.3g} counts is added instead"
     told = tuple(replace(d, why=why) if d.name == "background" else d for d in choice.decisions)
     return restored, replace(choice, decisions=told)
 

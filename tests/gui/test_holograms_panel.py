@@ -148,6 +148,18 @@ def test_a_preview_writes_nothing_and_is_square_as_the_field_is(qtbot: QtBot, pa
     assert panel.views.captured.image.shape == (30, 30)
 
 
+def test_what_it_takes_is_told_before_and_nothing_is_written(qtbot: QtBot, panel: HologramsPanel) -> None:
+    click(qtbot, panel.explain_button)
+    with qtbot.waitSignal(panel.job.succeeded, timeout=WAIT_MS):
+        pass
+    assert re.match(r"Will take about .* ms an iteration, 12 of them", panel.note.text())
+    assert panel.note.isVisible()
+    assert panel.computed is None
+    assert not (panel.session.runs_folder / "holograms").exists()
+    type_in(qtbot, panel.form.widgets["iterations"], "13")
+    assert not panel.note.isVisible(), "it was of other options"
+
+
 def test_photographs_of_a_preview_each_have_a_name_of_their_own(qtbot: QtBot, panel: HologramsPanel) -> None:
     computed(qtbot, panel, panel.preview_button)
     for name in ("picture-seen", "picture-seen-2"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from pathlib import Path
 
@@ -157,8 +158,19 @@ def test_explain_says_what_would_be_chosen_and_reconstructs_nothing(
     qtbot.mouseClick(panel.form.explain, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: "Model" in panel.facts.toPlainText(), timeout=WAIT_MS)
     assert panel.job is None
-    assert "Chosen in" in panel.form.note.text()
+    assert re.match(r"Will take about .* ms an iteration, \d+ of them", panel.form.note.text())
+    assert panel.facts.toPlainText().lstrip().startswith("Will take")
     assert not (panel.session.runs_folder / "reconstructions").exists()
+
+
+def test_what_a_model_that_was_asked_for_takes_is_told_too(
+    qtbot: QtBot, panel: ReconstructionsPanel, files
+) -> None:
+    fill(panel, PSF, files, "psf.tif")
+    choose(panel, model="convolution")
+    qtbot.mouseClick(panel.form.explain, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: "Will take about" in panel.form.note.text(), timeout=WAIT_MS)
+    assert "what was chosen" not in panel.form.note.text()
 
 
 def test_stopping_keeps_what_there_is(qtbot: QtBot, panel: ReconstructionsPanel, files) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from drivers.simulated.camera import SimulatedCamera
 from instrument.cli import main
 from instrument.plan import Plan
 from instrument.plan.model import load_plan, plan_toml, save_plan
@@ -246,6 +247,25 @@ def test_a_recording_that_saturates_says_so(here: Path, capsys: pytest.CaptureFi
     assert "Warning: 3 of 3 frames have saturated pixels, up to " in capsys.readouterr().err
     assert main([*words, "--exposure-ms", "0.1"]) == 0
     assert "saturated" not in capsys.readouterr().err
+
+
+def test_a_pixel_at_full_scale_is_told_and_no_warning(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (here / "sim.toml").write_text(
+        '[camera]\ndriver = "simulated"\n[scene]\ncontrol = "simulated"\n'
+        '[simulated]\npreset = "tiny"\ntime_scale = 0\n'
+    )
+    true = SimulatedCamera._read_out
+    monkeypatch.setattr(SimulatedCamera, "_read_out", lambda *given: (true(*given)[0], 2e-6))
+    words = ["--as-is", "--bench", str(here / "sim.toml"), "--exposure-ms", "1"]
+    assert main(["snap", *words, "--out", str(here / "photo.tif")]) == 0
+    told = capsys.readouterr()
+    assert "; less than 0.001 % of the pixels are saturated." in told.out
+    assert main(["record", "--scene", "--frames", "2", *words]) == 0
+    told = "".join((told.err, *capsys.readouterr()))
+    assert "2 of 2 frames have saturated pixels, up to less than 0.001 % of them." in told
+    assert "Warning" not in told
 
 
 def test_one_program_at_a_time_writes_to_a_run(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -545,6 +545,8 @@ def test_etendue_draws_what_it_says(tmp_path, capsys):
 def test_what_it_takes_is_told_before_and_nothing_is_written(capsys, monkeypatch):
     assert main(["hologram", "picture.png", "--iterations", "8", "--explain"]) == 0
     assert ", 8 of them; " in capsys.readouterr().out
+    assert main(["hologram", "picture.png", "--iterations", "3", "--explain"]) == 0
+    assert re.search(r"[1-9]\d* ms an iteration, 3 of them", capsys.readouterr().out)
     monkeypatch.setattr(hologram_forecast, "SOLVED_S", 1e-9)  # one iteration, and then the first ones
     write_image("colour.png", np.stack([read_image("picture.png").pixels] * 3, axis=-1))
     given = ["hologram", "colour.png", "--iterations", "90", "--color", "--explain"]

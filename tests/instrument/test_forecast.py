@@ -13,7 +13,7 @@ from numba.core import event
 
 from instrument.files import kept_times
 from instrument.reconstruction import forecast as module
-from instrument.reconstruction.forecast import TRIED, Forecast, Trial, forecast
+from instrument.reconstruction.forecast import TRIED, Carried, Forecast, Trial, forecast
 from instrument.reconstruction.foretold import Foretold, Like
 from instrument.reconstruction.job import Job
 from recon import Calibration, reconstruct
@@ -21,7 +21,7 @@ from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
-from recon.solvers.base import StopReason
+from recon.solvers.base import IterationRecord, StopReason
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,18 @@ def test_a_forecast_counts_iterations_of_all_channels_and_stops_at_a_time(
     assert str(Forecast(1.0, 0.1, 200, 2.0**30, 150)) == f"{words} the first; 1.00 GiB of memory"
     at_the_limit = Forecast(1.0, 0.1, 200, 2.0**30, 200)
     assert at_the_limit.between_s[1] > 1.05 * at_the_limit.seconds, "iterations are not all alike"
+    assert repr(at_the_limit).startswith("<Forecast: about 21.0 s (")
     assert str(Forecast(1.0, 0.1, 50, float("nan"))) == "at most 6.0 s, 100 ms an iteration"
+
+
+def test_a_few_iterations_tell_what_one_takes() -> None:
+    def each_s(*ends_s: float) -> float:
+        history = [IterationRecord(number + 1, end_s, 0.0) for number, end_s in enumerate(ends_s)]
+        return Carried(9.0, 0.0, [history, []], cut=False).iteration_s
+
+    assert each_s(0.5) == 0.5
+    assert each_s(0.5, 0.7, 0.9) == pytest.approx(0.2), "the first ones are slower"
+    assert each_s(5.0, 6.0, 7.0, 8.0, 8.1, 8.2) == pytest.approx(0.1)
 
 
 def test_held_out_pixels_take_a_third_of_the_iterations_more(scene: tuple[Measurement, Calibration]) -> None:

@@ -51,7 +51,9 @@ def test_imagejs_time_has_a_unit(tmp_path: Path, unit: str, written: float) -> N
     tifffile.imwrite(film, FRAMES, imagej=True, metadata=told)
     assert read_stack(film).metadata["frame_period_s"] == pytest.approx(0.02)
     tifffile.imwrite(film, FRAMES, imagej=True, metadata=told | {"tunit": "generation"})
-    assert "frame_period_s" not in read_stack(film).metadata
+    told_so = read_stack(film)
+    assert "frame_period_s" not in told_so.metadata
+    assert "its unit of time, 'generation', is not known" in " ".join(told_so.notes)
 
 
 def test_what_a_file_does_not_tell_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

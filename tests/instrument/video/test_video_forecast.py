@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from instrument.cli import main
+from instrument.files.errors import FileError
 from instrument.reconstruction import video_forecast as module
+from instrument.reconstruction.video import prepare_video, solve_video
 from instrument.reconstruction.video_forecast import forecast_video, trial_of
+from instrument.reconstruction.video_job import VideoJob
 from instrument.reconstruction.video_work import BlockReport
 from tests.instrument.video.recorded import request
 
@@ -56,6 +61,40 @@ def test_the_first_frames_are_carried_out_and_nothing_is_left(
     assert max(solved[0]) == 2
     assert solved[1] == [5, 4], "what is solved together is carried out so"
     assert not list(tmp_path.iterdir())
+
+
+def test_of_a_film_that_was_begun_what_is_left_is_told(recording: Path, tmp_path: Path) -> None:
+    asked, stop, shares = request(recording, tmp_path, block=3), threading.Event(), list[float]()
+    assert not solve_video(prepare_video(asked), lambda _: stop.set(), stop)
+    with trial_of(asked) as trial:
+        told = forecast_video(trial, on_progress=shares.append)
+    assert told is not None
+    assert 0 < told.settles == trial.frames_left < 10
+    assert {len(block) for block in trial.left} <= {2, 3}, "whole blocks, in one of which a frame was lost"
+    assert shares == sorted(shares)
+    assert shares[-1] == 1
+    with trial_of(asked, force=True) as trial:
+        assert trial.frames_left == 10
+    stop.clear()
+    assert solve_video(prepare_video(asked), lambda _: None, stop)
+    with trial_of(asked) as trial:
+        told = forecast_video(trial)
+    assert told is not None
+    assert " a frame" not in str(told), "only the MP4 is left"
+    assert VideoJob.folder_of(asked.out).exists()
+
+
+def test_what_is_wrong_is_said_of_the_film_that_was_asked_for(recording: Path, tmp_path: Path) -> None:
+    for out, problem in (
+        (tmp_path / "none" / "v.ome.zarr", "its folder .*none does not exist"),
+        (tmp_path / "v.mp4", "must end in .ome.zarr"),
+        (recording, "must end in .ome.zarr"),
+    ):
+        wanted = replace(request(recording, tmp_path), out=out)
+        with pytest.raises(FileError, match=problem) as found, trial_of(wanted):
+            pass
+        assert found.value.path == out
+        assert ".trial-" not in str(found.value)
 
 
 def test_the_command_only_says_it(

@@ -1,0 +1,173 @@
+"""What is asked for in Python: images, arrays or files, brought together as the terminal brings them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from numbers import Real
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.errors import BenchError
+from instrument.files.images import ImageFile, read
+from instrument.reconstruction.job import Job, job_from_files, job_with
+from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.request import refocused, volume_job
+from recon.base.checks import as_channels
+from recon.base.declare import options_of, require, require_known, with_overrides
+from recon.errors import InputError
+from recon.reconstruction import reconstruct as one_door
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
+from recon.types import Calibration, plain_array
+
+Image = Path | str | ImageFile | Measurement | npt.ArrayLike
+Psf = Path | str | ImageFile | Calibration | npt.ArrayLike
+
+_INPUTS = {f.name for f in fields(InputOptions)}
+_FILES_ONLY = _INPUTS - set(one_door.FACTS)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A photograph with what is known of it, PSFs, and how to reconstruct."""
+
+    measurement: Measurement
+    calibration: Any
+    """A Calibration, or an array that the one door takes."""
+    options: ReconstructionOptions
+    prepared: Job | None
+    """Where a file was among them."""
+
+    @classmethod
+    def of(cls, image: Any, psf: Any, options: Any, overrides: Mapping[str, Any]) -> Self:
+        """Bring them together; errors as :func:`~instrument.notebook.reconstruct.reconstruct`."""
+        image, psf = getattr(image, "measurement", image), getattr(psf, "calibration", psf)
+        overrides = dict(overrides)
+        require_known(overrides, ReconstructionOptions, InputOptions)
+        if not isinstance(options, ReconstructionOptions | None):
+            raise BenchError(
+                f"options are db.Options(...), not {type(options).__name__}; single ones are given by name: "
+                "prior='l1', warm=result."
+            )
+        if _is_file(image) or _is_file(psf):
+            inputs = _inputs({name: overrides.pop(name) for name in _INPUTS & set(overrides)})
+            options = with_overrides(options or ReconstructionOptions(), overrides)
+            job = _job(_opened(image, "photograph"), psf, inputs, options)
+            return cls(job.as_measurement(inputs.noise), job.calibration, options, job)
+        if about := sorted(_FILES_ONLY & set(overrides)):
+            raise BenchError(
+                f"{' and '.join(about)}: for files and images of db.read; arrays are taken as they are. "
+                "Leave it out, and do it to the arrays yourself (a dark frame: photograph - dark)."
+            )
+        _require_one(image, psf)
+        for name, given in (("photograph", image), ("PSF", psf)):
+            _require_no_alpha(given, name)
+        measurement, options = one_door.measured(image, options, overrides)
+        return cls(measurement, psf, options, None)
+
+    @property
+    def job(self) -> Job:
+        """What it is reconstructed from."""
+        return self.prepared or _job_of_arrays(self.measurement, self.calibration)
+
+
+def _require_one(image: Any, psf: Any) -> None:
+    """Raise BenchError where an array has a photograph's size behind an axis that counts photographs."""
+    shape, psf_shape = np.shape(image), np.shape(psf)
+    if len(shape) == 3 and len(psf_shape) == 2 and shape[:2] != psf_shape == shape[1:]:
+        raise BenchError(
+            f"The photograph is an array {shape}: {shape[0]} of {shape[1]} x {shape[2]} pixels. Give one of "
+            "them: photograph[0]; colours are the last axis: np.moveaxis(photograph, 0, -1)."
+        )
+
+
+def _require_no_alpha(given: Any, name: str) -> None:
+    """Raise BenchError where the fourth channel of an array is the same everywhere, as transparency is."""
+    if isinstance(given, Measurement | Calibration):
+        return
+    pixels = plain_array(given)
+    if (
+        pixels.ndim == 3
+        and pixels.shape[-1] == 4
+        and pixels.size
+        and (fourth := pixels[..., 3]).min() == fourth.max()
+    ):
+        raise BenchError(
+            f"The {name}'s fourth channel is {fourth[0, 0]:g} everywhere: transparency (RGBA), no light. "
+            f"Give the colours alone: [..., :3]."
+        )
+
+
+def _is_file(given: object) -> bool:
+    return isinstance(given, Path | str | ImageFile)
+
+
+def _opened(given: Any, name: str) -> ImageFile:
+    """Return an image of a file; an array as one, under a name for messages."""
+    if isinstance(given, ImageFile):
+        return given
+    if isinstance(given, Path | str):
+        return read(given)
+    if isinstance(given, Measurement):
+        raise BenchError(
+            "A Measurement goes with a Calibration or an array, not with a file: db.read(...).pixels is one."
+        )
+    pixels = plain_array(given)
+    if pixels.dtype.kind not in "uifb" or pixels.ndim < 2:
+        raise BenchError(
+            f"The {name} is a file, an image of db.read, or an array (height, width) of real numbers, "
+            f"not {type(given).__name__}{f' {pixels.dtype} {pixels.shape}' if pixels.ndim else ''}."
+        )
+    if pixels.dtype not in (np.uint8, np.uint16):
+        pixels = pixels.astype(np.float32)
+    return ImageFile(Path(f"the {name}, an array"), pixels)
+
+
+def _inputs(given: Mapping[str, Any]) -> InputOptions:
+    """Return options of files; words are read as the terminal reads them, and numbers in a row as words."""
+    declared = {o.name: o.declaration for o in options_of(InputOptions)}
+    read: dict[str, Any] = {}
+    for name, value in given.items():
+        if isinstance(value, str) and value == declared[name].none_word:
+            value = None
+        if isinstance(value, tuple | list) and all(isinstance(one, Real) for one in value):
+            value = ",".join(map(str, value))
+        elif name == "dark" and np.ndim(value):
+            opened = _opened(value, "dark frame")
+            value = opened if value is opened else ImageFile(Path("an array"), opened.pixels)
+        parse = declared[name].parse if isinstance(value, str) else None
+        try:
+            read[name] = value if parse is None else parse(value)
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
+    inputs = InputOptions(**read)
+    require(inputs)
+    return inputs
+
+
+def _job(image: ImageFile, psf: Any, inputs: InputOptions, options: ReconstructionOptions) -> Job:
+    """Bring a photograph and PSFs together."""
+    if isinstance(psf, Calibration):
+        job = job_with(psf, Path("the calibration"), image, inputs)
+    elif isinstance(psf, Path | str) and Path(psf).is_dir():
+        job = volume_job(Path(psf), image, inputs)
+    else:
+        file = _opened(psf, "PSF")
+        job = volume_job(file, image, inputs) if file.is_stack else job_from_files(file, image, inputs)
+    z_um, beside = options.z_um, options.refine_psf
+    return job if z_um is None else refocused(job, z_um, beside=beside)
+
+
+def _job_of_arrays(image: Any, psf: Any) -> Job:
+    """Return what arrays were reconstructed from."""
+    pixels = plain_array(image.image if isinstance(image, Measurement) else image).astype(
+        np.float32, copy=False
+    )
+    if not isinstance(psf, Calibration):
+        psf = Calibration(as_channels(psf, "PSF")[None], np.full((1, 3), np.nan))
+    simulated = bool(psf.provenance.get("simulated"))
+    return Job(pixels, psf, {}, provenance={"image": {"path": "an array"}}, simulated=simulated)
