@@ -154,7 +154,7 @@ def test_sums_that_are_not_known_are_refused():
     assert separable.lower == 0
     for weight in (-1.0, float("nan")):
         for prior in (L1, TotalVariation, HaarTotalVariation):
-            with pytest.raises(ValueError, match="must not be negative"):
+            with pytest.raises(ValueError, match="must be a number, 0 or more, not"):
                 prior(weight)
     with pytest.raises(ValueError, match="above its upper"):
         Box(1, 0)
