@@ -18,7 +18,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from calibration_routines.film_demo import FilmSettings, run_film
+from calibration_routines.demos.film import FilmSettings, run_film
 
 
 def main() -> None:

@@ -10,9 +10,11 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from calibration_routines.demo import DemoResult, DemoSettings, run_demo
-from calibration_routines.display.demo_display import DisplayDemoSettings, run_display_demo
-from calibration_routines.film_demo import FilmSettings, run_film
+from calibration_routines.demos.camera import run_demo
+from calibration_routines.demos.display import DisplayDemoSettings, run_display_demo
+from calibration_routines.demos.film import FilmSettings, run_film
+from calibration_routines.demos.result import DemoResult
+from calibration_routines.demos.settings import DemoSettings
 from instrument.cli.app import App, examples
 from instrument.cli.calibrate import TerminalListener
 

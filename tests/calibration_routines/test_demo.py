@@ -15,8 +15,10 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration_routines.demo import DemoResult, DemoSettings, read_picture, run_demo
-from calibration_routines.demo_picture import compare, scene_field
+from calibration_routines.demos.camera import run_demo
+from calibration_routines.demos.picture import compare, scene_field
+from calibration_routines.demos.result import DemoResult
+from calibration_routines.demos.settings import DemoSettings, read_picture
 from calibration_routines.procedure import Listener
 from calibration_routines.psf.sweep_plan import SweepExposures
 from drivers.errors import DeviceError
@@ -184,7 +186,7 @@ def test_whatever_ends_it_the_bench_is_safe_and_the_record_says_so(
         benches.append(open_bench(config))
         return benches[0]
 
-    monkeypatch.setattr("calibration_routines.demo.open_bench", opened)
+    monkeypatch.setattr("calibration_routines.demos.camera.open_bench", opened)
     with pytest.raises(type(trouble)):
         run_demo(tmp_path, Troubling(stage, trouble), SMALL)
     (folder,) = tmp_path.iterdir()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration_routines.demo_picture import compare, scene_field
+from calibration_routines.demos.picture import compare, scene_field
 
 
 def test_the_field_holds_the_pixels_that_lie_wholly_inside() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration_routines.demo_volume import Lights
+from calibration_routines.demos.volume import Lights
 from recon import Calibration, Geometry
 from recon.reconstruction.result import Grid, Reconstruction
 from recon.solvers.base import StopReason

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration_routines.film_figure import write_film_figure
-from calibration_routines.film_judge import judge, truth_of
+from calibration_routines.demos.film_figure import write_film_figure
+from calibration_routines.demos.film_judge import judge, truth_of
 from instrument.reconstruction.activity import Activity
 from recon.optics.animal import draw_animal
 from recon.streams.motion import Motion

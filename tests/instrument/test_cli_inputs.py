@@ -203,7 +203,7 @@ activity: write_activity_figure|atomic: clear_left|atomic: draft_folder|atomic: 
 calibration_file: _write|calibration_file: _write_ome_zarr|export: _npy|export: _tiff|images: _write_png
 images: _write_ome_tiff|images: _write_tiff|opening: _open_zarr|result: figure_png"""
 _IN_A_FOLDER_OF_ITS_OWN = """
-checkpointing: CheckpointFolder.remove|demo_display: run_display_demo|frame_array: FrameArray._write_draft
+checkpointing: CheckpointFolder.remove|display: run_display_demo|frame_array: FrameArray._write_draft
 frame_array: FrameArray.remove_draft|frame_array: FrameArray.remove_half_written|frame_array: FrameArray.write
 log: AppendOnlyLog.__init__|run_files: note_damage|screen_bench: _written
 stability_file: CellLog.add|video_files: VideoPictures.__init__|video_files: VideoPictures.remove

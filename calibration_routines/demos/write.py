@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from calibration_routines.demo import DemoResult
-    from calibration_routines.demo_picture import Viewer
+    from calibration_routines.demos.picture import Viewer
+    from calibration_routines.demos.result import DemoResult
 
 Float = npt.NDArray[np.float32]
 _SCREEN_GAMMA = 1 / 2.2  # light to the levels of a screen

@@ -12,8 +12,8 @@ from drivers.simulated.world import SimulatedWorld
 from recon.base.metrics import psnr, scale_to, ssim
 
 if TYPE_CHECKING:
-    from calibration_routines.demo import DemoSettings, Measured
-
+    from calibration_routines.demos.measured import Measured
+    from calibration_routines.demos.settings import DemoSettings
 
 Float = npt.NDArray[np.float32]
 

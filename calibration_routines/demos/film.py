@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from calibration_routines.demo import Stages, state_of, told_in, world_of
-from calibration_routines.film_figure import write_film_figure
-from calibration_routines.film_judge import FOLLOWED, ROI_UM, Judged, Truth, judge, truth_of
+from calibration_routines.demos.film_figure import write_film_figure
+from calibration_routines.demos.film_judge import FOLLOWED, ROI_UM, Judged, Truth, judge, truth_of
+from calibration_routines.demos.journal import Stages, state_of, told_in, world_of
 from calibration_routines.procedure import Listener
 from calibration_routines.psf.sweep import calibrate_sweep
 from calibration_routines.psf.sweep_options import LateralSweep

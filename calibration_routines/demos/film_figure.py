@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration_routines.film_judge import FOLLOWED, Judged, Truth
+from calibration_routines.demos.film_judge import FOLLOWED, Judged, Truth
 from instrument.files.atomic import whole_file
 from instrument.reconstruction.activity import Activity
 from recon.streams.activity import PERCENTILE
