@@ -306,8 +306,9 @@ class MainWindow(QMainWindow):
     def set_theme(self, name: str) -> None:
         """Change the looks of the whole program, a slice at a time, and remember it."""
         self._settings.setValue("theme", name)
-        wholes = [self._header, self.statusBar()]
-        wholes += [place.content for place in self._places.values() if place.content is not None]
+        wholes: list[QWidget] = [self._header, self.statusBar()]
+        for content in (place.content for place in self._places.values() if place.content is not None):
+            wholes += content.wholes() if isinstance(content, Panel) else [content]
         if self._restyling is not None:
             self._restyling.close()
         self._restyling = change_theme(name, self, wholes)

@@ -74,6 +74,13 @@ class Panel(QWidget):
         """Make the panel's widgets, with a ``yield`` at least every 20 ms of processor time."""
         yield
 
+    def wholes(self) -> Sequence[QWidget]:
+        """Return what takes a theme for itself: large forms, each in a turn; the panel where it has none.
+
+        What holds one looks as the palette says, and what is put straight into that later is to be dressed.
+        """
+        return [self]
+
     @property
     def jobs(self) -> JobRunner:
         """Where the panel's work is done."""

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QScrollArea, QStackedWidget, QWidget
+from PySide6.QtWidgets import QWidget
 
 from calibration_routines.plan_procedures import ResumeProcedure, left_unfinished, routine_of
 from calibration_routines.procedure import Outcome, Outlook, Procedure
 from calibration_routines.routine import Routine
 from gui.background import NewestOnly
+from gui.forms.form_stack import FormStack
 from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobContext
 from gui.making import REST_MS, take_slice
@@ -23,7 +24,7 @@ from gui.procedure_run import Ended, ProcedureRun, RunBar, Situation, script
 from gui.session import BenchSession
 from gui.session_news import name_of
 from gui.way_on import WayOn
-from gui.widgets.building import after_rest, button, choice, fill, label, mark, scrolled, split, text_view
+from gui.widgets.building import after_rest, button, choice, fill, label, mark, split, text_view
 from gui.widgets.tab_order import tab_in_order
 from instrument.bench.config_file import TEMPLATES
 from instrument.bench.safety import LIGHT_DOUBT, MOTION_DOUBT, UNSAFE
@@ -35,57 +36,6 @@ _SLOW_MS = 700
 """A check that takes longer than this is shown to go on: what was said of other values must not stay."""
 _FORM_WIDTH_PX = 400
 _MOST_RUNS = 3
-
-
-class _Forms(QStackedWidget):
-    """The forms of routines, each on a page of its own: begun when it is chosen, whole when it is asked for.
-
-    Parameters
-    ----------
-    routines : sequence of Routine
-    changed : callable
-        Called when something in a form was changed.
-    """
-
-    def __init__(self, routines: Sequence[Routine], changed: Callable[[], object]) -> None:
-        super().__init__()
-        self._routines = {routine.name: routine for routine in routines}
-        self._changed = changed
-        self._begun: dict[str, tuple[OptionsForm, QScrollArea]] = {}
-        self._parts: dict[str, Iterator[None]] = {}
-
-    def __getitem__(self, name: str) -> OptionsForm:
-        """Return a routine's form, made to its end now if it was not yet."""
-        for _ in self.parts(name):
-            pass
-        return self._begun[name][0]
-
-    def show_page(self, name: str) -> None:
-        """Show a routine's form, or the place that it is made in."""
-        self._begin(name)
-        self.setCurrentWidget(self._begun[name][1])
-
-    def is_whole(self, name: str) -> bool:
-        """Whether a form has all of its fields."""
-        return name in self._begun and name not in self._parts
-
-    def parts(self, name: str) -> Iterator[None]:
-        """Make what a form lacks, with a ``yield`` after each field."""
-        self._begin(name)
-        while name in self._parts:
-            try:
-                next(self._parts[name])
-            except StopIteration:
-                del self._parts[name]
-                self._begun[name][0].changed.connect(self._changed)
-            yield
-
-    def _begin(self, name: str) -> None:
-        if name not in self._begun:
-            form = OptionsForm(self._routines[name].declared, whole=False)
-            self._begun[name] = form, (page := scrolled(form))
-            self.addWidget(page)
-            self._parts[name] = form.parts()
 
 
 class ProcedurePanel(Panel):
@@ -121,7 +71,11 @@ class ProcedurePanel(Panel):
         self.choice.setAccessibleName("Routine")
         for number, routine in enumerate(self.routines):
             self.choice.setItemData(number, routine.help, Qt.ItemDataRole.ToolTipRole)
-        self.views = _Forms(self.routines, self._typed)
+        declared = {routine.name: routine.declared for routine in self.routines}
+        self.views = FormStack(
+            lambda name: OptionsForm(declared[name], whole=False),
+            lambda name: self.views[name].changed.connect(self._typed),
+        )
         """Of the routines, by their names."""
         if len(self.routines) == 1:
             self.choice.hide()
@@ -200,6 +154,10 @@ class ProcedurePanel(Panel):
     def options_form(self) -> OptionsForm:
         """The form whose fields messages are about."""
         return self.view
+
+    def wholes(self) -> list[QWidget]:
+        """Return the pages of the forms: after a day there are many."""
+        return self.views.pages()
 
     @property
     def view(self) -> OptionsForm:

@@ -197,6 +197,8 @@ def change_theme(name: str, window: QWidget, wholes: Sequence[QWidget]) -> Gener
     yield TURN
     for part in parts:
         yield from restyled(part)
+    for holder in holding:
+        yield from _recoloured(holder)
 
 
 def restyled(part: QWidget) -> Iterator[None]:
@@ -209,13 +211,18 @@ def restyled(part: QWidget) -> Iterator[None]:
     if not isValid(part):  # it may have gone meanwhile
         return
     for widget in (part, *part.findChildren(QWidget)):
-        if isValid(widget) and hasattr(widget, "restyle"):
-            try:
-                widget.restyle()
-            except Exception:  # noqa: BLE001 - the parts after it get theirs
-                _log.exception("%s keeps the colours of the theme before", type(widget).__name__)
-            yield
+        yield from _recoloured(widget)
     _half.discard(part)
+
+
+def _recoloured(widget: QWidget) -> Iterator[None]:
+    """Have a plot or picture take over the colours of the theme in use."""
+    if isValid(widget) and hasattr(widget, "restyle"):
+        try:
+            widget.restyle()
+        except Exception:  # noqa: BLE001 - the parts after it get theirs
+            _log.exception("%s keeps the colours of the theme before", type(widget).__name__)
+        yield
 
 
 def dress(part: QWidget) -> None:
@@ -225,9 +232,11 @@ def dress(part: QWidget) -> None:
 
 
 def _is_dressed(part: QWidget) -> bool:
-    app = QApplication.instance()
+    app, around = QApplication.instance(), part
     assert isinstance(app, QApplication)
-    return (part.styleSheet() or app.styleSheet()) == sheet()
+    while not around.styleSheet() and (holder := around.parentWidget()) is not None:
+        around = holder
+    return (around.styleSheet() or app.styleSheet()) == sheet()
 
 
 def _palette() -> QPalette:
@@ -279,8 +288,15 @@ def _style(c: Colours) -> str:
     unused = faint.name(QColor.NameFormat.HexArgb)
     side = f"4px solid {c.field}"
     arrow = f"image: none; width: 0; height: 0; border-left: {side}; border-right: {side};"
-    places = ((0, c.window), (0.39, c.window), (0.4, c.line), (0.6, c.line), (0.61, c.window), (1, c.window))
-    rule = ", ".join(f"stop:{place} {colour}" for place, colour in places)
+    places = (
+        (0, "window"),
+        (0.39, "window"),
+        (0.4, "midlight"),
+        (0.6, "midlight"),
+        (0.61, "window"),
+        (1, "window"),
+    )
+    rule = ", ".join(f"stop:{place} palette({role})" for place, role in places)
     return f"""
 QWidget {{ font-size: {BODY_PT}pt; }}
 QToolTip {{ background: {c.field}; color: {c.text}; border: 1px solid {c.border}; padding: 3px; }}

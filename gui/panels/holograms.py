@@ -85,8 +85,8 @@ class HologramsPanel(Panel):
         across = split(left := QWidget())
         fill(self.body, across)
         self.form = self._make_form()
-        place = scrolled(self.form)
-        fill(left, (place, 1), margins=(0, 0, 6, 0))
+        self._place = scrolled(self.form)
+        fill(left, (self._place, 1), margins=(0, 0, 6, 0))
         yield
         yield from self.form.parts()
         self._names = SuggestedName(self.jobs, self.form, session.runs_folder / "holograms", ".png")
@@ -188,6 +188,10 @@ class HologramsPanel(Panel):
             },
             whole=False,
         )
+
+    def wholes(self) -> list[QWidget]:
+        """Return the form, which has many of the panel's widgets."""
+        return [self._place]
 
     # What is asked for ---------------------------------------------------------------------------
     def order(self, *, preview: bool = False) -> HologramOrder:

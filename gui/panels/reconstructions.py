@@ -160,6 +160,10 @@ class ReconstructionsPanel(Panel):
         """The form whose fields messages are about."""
         return self.form.options
 
+    def wholes(self) -> list[QWidget]:
+        """Return the form, which has half of the panel's widgets."""
+        return [self.form]
+
     # Results -------------------------------------------------------------------------------------
     def refresh(self) -> None:
         """List the results in the data folder."""

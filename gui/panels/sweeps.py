@@ -101,6 +101,7 @@ class SweepsPanel(ProcedurePanel):
         """Make the widgets."""
         self.path = PathPlot()
         yield
+        yield from self.path.parts()
         self.frame = ImageView(name="Newest frame")
         follow_orientation(self.session, "frames", self.frame.orient)
         yield

@@ -10,18 +10,21 @@ from typing import Any, NamedTuple, get_args
 
 from PySide6.QtCore import Qt, QUrl
 from PySide6.QtGui import QDesktopServices, QFontDatabase, QImage, QPixmap
-from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QListWidget, QListWidgetItem, QVBoxLayout, QWidget
 
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
 from gui.forms.fields import Behaviour
+from gui.forms.form_stack import FormStack
 from gui.forms.options_form import OptionsForm, SuggestedName
+from gui.making import REST_MS, take_slice
 from gui.panel import Panel
 from gui.procedure_run import RunBar
 from gui.session import BenchSession
 from gui.session_news import OwnFiles
 from gui.task_run import TaskRun, Told
 from gui.widgets.building import (
+    after_rest,
     button,
     cell,
     choice,
@@ -29,7 +32,6 @@ from gui.widgets.building import (
     in_row,
     label,
     mark,
-    scrolled,
     split,
     table,
     tabs,
@@ -68,7 +70,10 @@ class TasksPanel(Panel):
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.run = TaskRun(session.jobs, self)
+        self._tasks: dict[str, Task] = {}
+        """Those that are loaded."""
         self._pages: dict[str, _Page] = {}
+        """Those whose forms are whole."""
         self._loader = NewestOnly(session.jobs, "Preparing a form", lambda why: self.refused(None, why))
         self._reader = NewestOnly(session.jobs, "Reading a picture")
         self._newest = NewestOnly(session.jobs, "Looking for the newest calibration")
@@ -84,7 +89,8 @@ class TasksPanel(Panel):
             tip = f"{entry.help}\ndiffuserbench {name}"
             self.choice.setItemData(self.choice.count() - 1, tip, Qt.ItemDataRole.ToolTipRole)
         self.about = label(role="dim", wraps=True)
-        self.stack = QStackedWidget()
+        self.stack = FormStack(lambda name: _form_of(self._tasks[name]), self._made)
+        self._making = after_rest(self, REST_MS, self._make_form)
         tip = "Wait where it next tells how far it is; press again to go on"
         end = "End as soon as possible; what can be kept is kept"
         self.run_bar = RunBar(self.run, "Start", tips=(tip, end))
@@ -134,6 +140,10 @@ class TasksPanel(Panel):
         self._clear()
         return split(self.results, self.below, sizes=[560, 130], down=True, firm=True)
 
+    def wholes(self) -> list[QWidget]:
+        """Return the pages of the forms: after a day there are many."""
+        return self.stack.pages()
+
     # The form ------------------------------------------------------------------------------------
     @property
     def name(self) -> str:
@@ -166,21 +176,31 @@ class TasksPanel(Panel):
         name, entry = self.name, TASKS[self.name]
         self.about.setText(f"{entry.help[:1].upper()}{entry.help[1:]}.")
         if name in self._pages:
-            self._show_form(name, self._pages[name].task)
+            self._show_form(name)
             return
         self.run_bar.set_startable("Its form is being prepared.")
-        self._loader.ask(entry.load, lambda task: self._show_form(name, task), name)
+        self._loader.ask(entry.load, lambda task: self._loaded(name, task), name)
 
-    def _show_form(self, name: str, task: Task) -> None:
-        if name not in self._pages:
-            self._pages[name] = self._made(name, task)
-            self._look_for_calibration(name)
-            place = scrolled(self._pages[name].form)
-            self.stack.addWidget(place)
-            tab_in_order(place, after=self.choice)
-        if name != self.name:
-            return
-        self.stack.setCurrentIndex(list(self._pages).index(name))
+    def _loaded(self, name: str, task: Task) -> None:
+        self._tasks[name] = task
+        if name == self.name:
+            self.stack.show_page(name)
+            self._making.start()
+
+    def _make_form(self) -> None:
+        """Make the form that is shown, a slice at a time."""
+        name = self.name
+        if name not in self._tasks:
+            return  # another one was chosen meanwhile, and is being loaded
+        try:
+            take_slice(self.stack.parts(name))
+            self._making.start()
+        except StopIteration:
+            tab_in_order(self.stack.page(name), after=self.choice)
+            self._show_form(name)
+
+    def _show_form(self, name: str) -> None:
+        self.stack.show_page(name)
         page = self._pages[name]
         if self._given:
             page.form.set_values(self._given)
@@ -193,27 +213,25 @@ class TasksPanel(Panel):
             self.run_bar.clear()
             self.run_bar.set_startable()
 
-    def _made(self, name: str, task: Task) -> _Page:
-        options = [o for _, offered in task.parts.values() for o in offered]
-        out = next((o for o in options if o.name == "out"), None)
-        place = task.out or (None if out is None or not isinstance(out.default, Path) else out.default)
-        needed = (*task.needed, *(() if place is None else ("out",)))  # what has a name in the terminal
-        if place is None and out is not None and out.is_required and out.declaration.metavar == "FOLDER":
-            place = Path(name)  # a folder of its own: nothing hangs on what it is called
-        special = {o.name: _behaviour(o, needed=o.name in needed) for o in options if _names_files(o)}
-        form = OptionsForm(options, special)
+    def _made(self, name: str) -> None:
+        """Fill in what a form begins with, once it is whole."""
+        task, form = self._tasks[name], self.stack[name]
         if task.subject:
             form.show_for(task.subject)
         form.refused.connect(self.refused)
         form.settled.connect(partial(self._settled, name))
         form.set_values({"bench": self.session.config.path})
-        names = None
+        names, place = None, _place_of(task)
+        out = next((o for o in _options_of(task) if o.name == "out"), None)
+        if place is None and out is not None and out.is_required and out.declaration.metavar == "FOLDER":
+            place = Path(name)  # a folder of its own: nothing hangs on what it is called
         if place is not None:
             suffix = "".join(place.suffixes).replace(".pdf", ".png")  # what can be shown beside the form
             names = SuggestedName(self.jobs, form, self.session.runs_folder / "results", suffix)
             form.set_values({"out": None})
             names.suggest(place.name.partition(".")[0])
-        return _Page(task, form, names)
+        self._pages[name] = _Page(task, form, names)
+        self._look_for_calibration(name)
 
     def _settled(self, name: str, field: str) -> None:
         if field in _FILMS and name in self._pages:
@@ -437,6 +455,24 @@ class TasksPanel(Panel):
         self.run.abort()
         for each in (self._loader, self._reader, self._newest):
             each.forget()
+
+
+def _options_of(task: Task) -> list[Option]:
+    return [o for _, offered in task.parts.values() for o in offered]
+
+
+def _place_of(task: Task) -> Path | None:
+    """Return what a task's result is called where it names none itself; None where it needs no name."""
+    out = next((o for o in _options_of(task) if o.name == "out"), None)
+    return task.out or (None if out is None or not isinstance(out.default, Path) else out.default)
+
+
+def _form_of(task: Task) -> OptionsForm:
+    """Return a task's form, no part of it made yet."""
+    options = _options_of(task)
+    needed = (*task.needed, *(() if _place_of(task) is None else ("out",)))  # what has a name in the terminal
+    special = {o.name: _behaviour(o, needed=o.name in needed) for o in options if _names_files(o)}
+    return OptionsForm(options, special, whole=False)
 
 
 def _names_files(o: Option) -> bool:

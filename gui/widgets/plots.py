@@ -38,6 +38,12 @@ class _Plot(pg.PlotWidget):  # type: ignore[misc] # pyqtgraph has no type annota
             self.getAxis(axis).setPen(now.line)
             self.getAxis(axis).setTextPen(now.dim)
 
+    def set_axes(self, x_label: str, y_label: str, x_unit: str = "", y_unit: str = "") -> None:
+        """Say what is drawn over what."""
+        self.setAccessibleName(" over ".join(filter(None, (y_label, x_label))) or "Plot")
+        self.setLabel("bottom", _label(x_label, x_unit))
+        self.setLabel("left", _label(y_label, y_unit))
+
 
 class _Counts(pg.AxisItem):  # type: ignore[misc] # pyqtgraph has no type annotations
     """An axis of things that are counted: nothing stands between two of them."""
@@ -63,12 +69,10 @@ def plot_widget(
     """
     plot = _Plot(enableMenu=False, axisItems={"bottom": _Counts("bottom")} if counts else None)
     plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
-    plot.setAccessibleName(" over ".join(filter(None, (y_label, x_label))) or "Plot")
     plot.restyle()
     # Room for letters below the line, and for the half of a number that stands at an axis' end.
     plot.getPlotItem().layout.setContentsMargins(0, 6, 16, 4)
-    plot.setLabel("bottom", _label(x_label, x_unit))
-    plot.setLabel("left", _label(y_label, y_unit))
+    plot.set_axes(x_label, y_label, x_unit, y_unit)
     plot.showGrid(x=grid, y=grid, alpha=0.15)
     for axis in ("bottom", "left"):
         plot.getAxis(axis).enableAutoSIPrefix(False)  # units are in the labels as people here say them

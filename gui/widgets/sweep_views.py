@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite
 from typing import Any, NamedTuple
 
@@ -29,7 +29,8 @@ _MOST_SYMBOLS = 3000
 class PathPlot(QWidget):
     """Draws places one after the other, the first one marked, and where the run is now.
 
-    With lateral and axial motion there are two views: depth across, and along the axis.
+    With lateral and axial motion there are two views: depth across, and along the axis. ``parts`` makes them:
+    to make one when there is a path to be drawn would be a turn of the window's thread that is felt.
     """
 
     def __init__(self, parent: QWidget | None = None) -> None:
@@ -39,9 +40,20 @@ class PathPlot(QWidget):
         self.nothing = hint("Nothing moves.")
         self.nothing.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
         self._layout.addWidget(self.nothing)
+        self._made: list[_View] = []
         self.views: list[_View] = []
+        """Those that are shown."""
         self.places: tuple[Place, ...] = ()
         self.setMinimumHeight(140)
+
+    def parts(self) -> Iterator[None]:
+        """Make both views."""
+        for _ in range(2):
+            view = _View()
+            view.plot.hide()
+            self._layout.addWidget(view.plot)
+            self._made.append(view)
+            yield
 
     def show_path(self, places: Sequence[Place]) -> None:
         """Draw a path; an empty one says that nothing moves."""
@@ -50,13 +62,11 @@ class PathPlot(QWidget):
             return
         self.places = places
         pairs = _pairs(places)
-        if [view.axes for view in self.views] != pairs:
-            for view in self.views:
-                self._layout.removeWidget(view.plot)
-                view.plot.deleteLater()
-            self.views = [_View(*pair) for pair in pairs]
-            for view in self.views:
-                self._layout.addWidget(view.plot)
+        self.views = self._made[: len(pairs)]
+        for view, pair in zip(self.views, pairs, strict=True):
+            view.set_axes(*pair)
+        for view in self._made:
+            view.plot.setVisible(view in self.views)
         self.nothing.setVisible(not self.views)
         self.nothing.setText("Nothing moves." if not places else "The source goes to one place and stays.")
         for view in self.views:
@@ -81,14 +91,21 @@ class PathPlot(QWidget):
 class _View:
     """One plot of two axes of the path."""
 
-    def __init__(self, across: str, down: str) -> None:
-        self.axes = across, down
-        (x, x_unit, x_scale), (y, y_unit, y_scale) = (_shown(name) for name in self.axes)
-        self.plot: Any = plot_widget(x, y, x_unit=x_unit, y_unit=y_unit)
-        self._scales = (x_scale, y_scale)
+    def __init__(self) -> None:
+        self.axes = "", ""
+        self.plot: Any = plot_widget()
+        self._scales = (1.0, 1.0)
         self._line: Any = self.plot.plot([], [])
         self._first: Any = self.plot.plot([], [])
         self._now: Any = self.plot.plot([], [])
+
+    def set_axes(self, across: str, down: str) -> None:
+        if (across, down) == self.axes:
+            return
+        self.axes = across, down
+        (x, x_unit, x_scale), (y, y_unit, y_scale) = (_shown(name) for name in self.axes)
+        self.plot.set_axes(x, y, x_unit, y_unit)
+        self._scales = (x_scale, y_scale)
 
     def draw(self, places: Sequence[Place]) -> None:
         x, y = self._values(places)

@@ -6,6 +6,7 @@ import json
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
@@ -106,6 +107,11 @@ def other_bench_for(config: BenchConfig, kinds: Iterable[str], name: str) -> str
     )
 
 
+@cache
+def _tables(name: str) -> dict[str, Any]:
+    return tomllib.loads(template(name))
+
+
 def not_tried_on(config: BenchConfig, kinds: Iterable[str], name: str) -> list[str]:
     """Return the devices of a simulated bench that would see nothing of what is tried on another one.
 
@@ -123,7 +129,7 @@ def not_tried_on(config: BenchConfig, kinds: Iterable[str], name: str) -> list[s
         Empty where the devices are that bench's, or some of them are no simulated ones.
     """
     present = {kind: device.driver_name for kind, device in config.devices.items() if kind in set(kinds)}
-    tables = tomllib.loads(template(name))
+    tables = _tables(name)
     wrong: list[str] = [k for k, driver in present.items() if tables.get(k, {}).get("driver") != driver]
     return wrong if all(driver.startswith("simulated") for driver in present.values()) else []
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from PySide6.QtCore import QSettings, Qt
 from PySide6.QtGui import QColor
-from PySide6.QtWidgets import QApplication, QMessageBox
+from PySide6.QtWidgets import QApplication, QLabel, QMessageBox, QWidget
 from pytestqt.qtbot import QtBot
 
 from calibration_routines.procedure import Outlook, Procedure
@@ -18,9 +18,10 @@ from gui.jobs import JobContext, JobState
 from gui.main_window import MainWindow
 from gui.panels import PANELS, PanelEntry
 from gui.panels.live import LivePanel
+from gui.panels.tasks import TasksPanel
 from gui.procedure_panel import ProcedurePanel
 from gui.session import BenchSession
-from gui.theme import THEMES
+from gui.theme import RED, THEMES
 from gui.widgets.building import every
 from gui.widgets.dialogues import Question, TextWindow, choose_path
 from instrument.bench.bench import Bench
@@ -246,6 +247,35 @@ def test_the_log_filters_by_level_and_words(window: MainWindow) -> None:
     panel.words.setText("STAGE")  # type: ignore[attr-defined]
     assert "a warning of the stage" in view.toPlainText()
     assert "a detail" not in view.toPlainText()
+
+
+def test_no_part_that_takes_a_theme_at_once_has_hundreds_of_widgets(
+    qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = window.panel("tasks")
+    assert isinstance(files, TasksPanel)
+    window.panel("holograms")
+    reconstructions = window.panel("reconstructions")
+    for name in ("video", "patterned"):  # as in a day's work
+        files.choose(name)
+        qtbot.waitUntil(lambda name=name: name in files._pages, timeout=WAIT_MS)
+    sizes: list[int] = []
+    monkeypatch.setattr("gui.theme.dress", lambda part: sizes.append(len(part.findChildren(QWidget))))
+    window.set_theme("light")
+    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
+    monkeypatch.undo()
+    assert len(files.findChildren(QWidget)) > 400
+    assert len(reconstructions.findChildren(QWidget)) > 300
+    assert max(sizes) < 250
+    window.set_theme("red")
+    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
+    files.choose("activity")  # made under another theme than those beside it
+    qtbot.waitUntil(lambda: "activity" in files._pages, timeout=WAIT_MS)
+    for name in ("video", "activity"):
+        words = next(each for each in files._pages[name].form.findChildren(QLabel) if each.text())
+        assert words.palette().windowText().color().name() in (RED.text, RED.dim), name
+    window.set_theme("dark")
+    qtbot.waitUntil(lambda: not window.is_restyling, timeout=WAIT_MS)
 
 
 @pytest.mark.parametrize("name", sorted(THEMES))

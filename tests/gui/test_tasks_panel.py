@@ -51,6 +51,16 @@ def calibration(folder: Path, seed: int) -> Path:
     return save_calibration(Calibration(psf, np.array([(0.0, 0.0, 2e4)]), geometry=geometry), folder)
 
 
+def test_a_long_form_is_made_in_many_turns(
+    qtbot: QtBot, panel: TasksPanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gui.making._SLICE_S", 0.0)
+    turns: list[None] = []
+    panel._making.timeout.connect(lambda: turns.append(None))
+    shown(qtbot, panel, "video")
+    assert len(turns) > len(panel._pages["video"].form.fields)
+
+
 def test_every_task_has_a_form_of_its_own_declarations(qtbot: QtBot, panel: TasksPanel) -> None:
     panel.resize(SIZES["1366x768"].width() - 480, 600)  # beside the live reconstruction
     panel.show()
@@ -61,7 +71,7 @@ def test_every_task_has_a_form_of_its_own_declarations(qtbot: QtBot, panel: Task
         offered = {o.name for _, options in panel._pages[name].task.parts.values() for o in options}
         assert {n for n in offered if n in form.fields} == set(form.fields)
         assert all(field.tip for field in form.fields.values())
-        assert not list(cut_off(form)), name
+        qtbot.waitUntil(lambda form=form: not list(cut_off(form)), timeout=5000)  # a layout settles
         told = [
             form.widgets[n].toolTip() + getattr(form.widgets[n], "placeholderText", str)()
             for n in form.fields
