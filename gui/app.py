@@ -23,6 +23,7 @@ from instrument.bench.config import BenchConfig
 from instrument.bench.config_file import no_bench
 from instrument.files import kept_times
 from instrument.files.errors import BenchError, in_words
+from instrument.live.frame_view import compile_for_frames
 from recon.optics.jit import extensions_put_off
 
 _FRAME = QSize(16, 40)
@@ -107,6 +108,14 @@ def show_and_open(window: MainWindow) -> None:
         if not window.session.is_closing:
             window.session.jobs.watch("Loading extensions", lambda _: load())
 
+    def compile_now() -> None:  # not before: what computes a simulated scene would wait for it
+        if not window.session.is_closing:
+            window.session.jobs.watch("Compiling what shows frames", lambda _: compile_for_frames())
+
+    if "camera" in window.session.kinds:
+        window.session.pictured.connect(compile_now)
+    else:
+        QTimer.singleShot(PICTURE_MS, window, compile_now)
     window.session.pictured.connect(settle)
     QTimer.singleShot(PICTURE_MS, window, settle)  # where no picture comes
     window.session.opened.connect(gc.freeze)

@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QButtonGroup, QWidget
 
@@ -32,7 +31,7 @@ from instrument.bench.photograph import (
     write_snapshot,
 )
 from instrument.files.errors import duration
-from instrument.live.frame_view import fill_indices, index_table, sensor_roi
+from instrument.live.frame_view import sensor_roi
 from instrument.live.live_camera import LiveCameraStatus
 from recon.base.declare import Imports, expression
 
@@ -67,15 +66,6 @@ class LivePanel(Panel):
         """When it had."""
         self._pictured = False
         """Whether there was a frame in the light that it begins with, or a coarse picture of it."""
-
-    @classmethod
-    def prepare(cls) -> None:
-        """Compile what shows a frame, and one that is turned."""
-        for dtype in (np.uint8, np.uint16):
-            blank = np.zeros((2, 2), dtype)
-            blank.flags.writeable = False  # as a frame's
-            for turned in (blank, blank.T, blank[::-1]):
-                fill_indices(turned, index_table(dtype, 0, 1), 1, np.zeros((2, 2), np.uint8))
 
     def parts(self) -> Iterator[None]:
         """Make the widgets."""

@@ -16,7 +16,7 @@ from PySide6.QtWidgets import QLabel, QWidget
 from gui.theme import colours, grey_indices, indices_of, spares_hues, table
 from gui.widgets.building import fill
 from instrument.files.orientation import AS_IT_IS, Orientation
-from instrument.live.frame_view import SATURATED, fill_indices, index_table
+from instrument.live.frame_view import SATURATED, index_table, show_indices
 
 Image = npt.NDArray[Any]
 
@@ -291,7 +291,7 @@ class ImageView(QWidget):
             if image.ndim == 2:
                 image = image.view()
                 image.flags.writeable = False  # as a frame is: for another kind it would be compiled here
-                fill_indices(image, self._table, step, self._indices)
+                show_indices(image, self._table, step, self._indices)
                 return
             height, width = self._indices.shape[:2]
             np.take(self._table, image[::step, ::step][:height, :width], out=self._indices, mode="clip")

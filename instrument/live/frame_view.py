@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,6 +75,38 @@ def fill_indices(
                     highest = max(highest, image[y * step + dy, x * step + dx])
             index = table[highest]
             out[y, x] = index if index == 255 else table[image[y * step, x * step]]
+
+
+_compiled = threading.Event()
+
+
+def compile_for_frames() -> None:
+    """Compile, or load, what shows a frame as cameras give it, and one that is turned; in any thread."""
+    for dtype in (np.uint8, np.uint16):
+        blank = np.zeros((2, 2), dtype)
+        blank.flags.writeable = False
+        for turned in (blank, blank.T, blank[::-1]):
+            fill_indices(turned, index_table(dtype, 0, 1), 1, np.zeros((2, 2), np.uint8))
+    _compiled.set()
+
+
+def show_indices(
+    image: npt.NDArray[Any], table: npt.NDArray[np.uint8], step: int, out: npt.NDArray[np.uint8]
+) -> None:
+    """Do what :func:`fill_indices` does, by NumPy as long as that is not compiled: who waited would hang.
+
+    The image is read only, as a frame is: of another kind it would be compiled anew.
+    """
+    if _compiled.is_set():
+        fill_indices(image, table, step, out)
+        return
+    height, width = out.shape
+    parts = [
+        image[dy : height * step : step, dx : width * step : step] for dy in range(step) for dx in range(step)
+    ]
+    np.take(table, parts[0], out=out, mode="clip")
+    if step > 1:
+        out[table[functools.reduce(np.maximum, parts)] == SATURATED] = SATURATED
 
 
 def histogram(image: Counts) -> npt.NDArray[np.float32]:
