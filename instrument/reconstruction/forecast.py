@@ -6,6 +6,7 @@ What is the same for all work stands here: a :class:`Forecast`, and how much is 
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -154,9 +155,13 @@ def carried_out(begin: Callable[[int | None, float, float], C], soon_s: float) -
     """Carry work out for so many seconds; where that tells too little, its first iterations anew.
 
     ``begin(iterations, time_s, done)`` carries it out up to these limits, the first none where None; ``done``
-    is the share of all that is carried out before.
+    is the share of all that is carried out before. A program's first work of a kind reads libraries and
+    kernels on its way, which the work that is told finds there: it is carried out once more.
     """
+    before = len(sys.modules)
     trial = begin(None, soon_s, 0.0)
+    if len(sys.modules) > before:
+        trial = begin(None, soon_s, 0.5)
     if not trial.cut or trial.longest >= TRIED:
         return trial
     further = begin(TRIED, TRIED_S, 0.5)
@@ -173,7 +178,14 @@ def forecast(
 
     ``on_stage`` and errors as of :func:`~recon.reconstruction.reconstruct.reconstruct`.
     """
-    tell = on_stage or (lambda *_: None)
+    over = 0.0
+
+    def tell(share: float, what: str) -> None:
+        nonlocal over
+        over = max(over, share)
+        if on_stage is not None:
+            on_stage(over, what)
+
     one_step = options.solver != "auto" and SOLVERS.named(options.solver).one_step
 
     def begin(iterations: int | None, time_s: float, done: float) -> Trial:

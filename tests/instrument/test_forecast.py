@@ -13,7 +13,7 @@ from numba.core import event
 
 from instrument.files import kept_times
 from instrument.reconstruction import forecast as module
-from instrument.reconstruction.forecast import TRIED, Carried, Forecast, Trial, forecast
+from instrument.reconstruction.forecast import TRIED, Carried, Forecast, Trial, carried_out, forecast
 from instrument.reconstruction.foretold import Foretold, Like
 from instrument.reconstruction.job import Job
 from recon import Calibration, reconstruct
@@ -90,6 +90,20 @@ def test_a_few_iterations_tell_what_one_takes() -> None:
     assert each_s(0.5) == 0.5
     assert each_s(0.5, 0.7, 0.9) == pytest.approx(0.2), "the first ones are slower"
     assert each_s(5.0, 6.0, 7.0, 8.0, 8.1, 8.2) == pytest.approx(0.1)
+
+
+def test_what_a_program_reads_once_is_no_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = list[float]()
+
+    def begin(_iterations: int | None, _time_s: float, done: float) -> Carried:
+        tried.append(done)
+        monkeypatch.setitem(sys.modules, "read_by_the_first", sys)
+        return Carried(9.0 / len(tried), 1e8 / len(tried), [[]], cut=False)
+
+    assert carried_out(begin, 5.0).seconds == 4.5
+    assert tried == [0.0, 0.5]
+    assert carried_out(begin, 5.0).memory_bytes == pytest.approx(1e8 / 3)
+    assert len(tried) == 3
 
 
 def test_held_out_pixels_take_a_third_of_the_iterations_more(scene: tuple[Measurement, Calibration]) -> None:
