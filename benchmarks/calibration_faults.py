@@ -12,8 +12,9 @@ relative to the first (a tenth of a pixel counts as 1 %); a common shift and a c
 is a photograph's brightness. Of the angular and of the field's response it is the largest difference, of the
 SLM's table in turns, of a mask's alignment the root mean square of the displacement over the mask, in mask
 pixels of which a tenth counts as 1 %. Of beads it is the photographs that are solved: what is solved of them
-is theirs alone. ``--draws`` repeats a trial with later frames of the same bench, so that what flickers or
-shakes does so otherwise; the words of a cell are then those of each draw, the change is the largest.
+is theirs alone; of a stage its play, of which 10 um are 2 %. ``--draws`` repeats a trial with later frames of
+the same bench, so that what flickers or shakes does so otherwise; the words of a cell are then those of each
+draw, the change is the largest.
 
 =========  ==============================================================================================
 harmless   the result changed by 2 % at the most, and nothing was said
@@ -226,6 +227,15 @@ def _displacement(done: Any) -> Array:
     return done.result.displacement(done.result.mask_shape)
 
 
+def _play(done: Any) -> Array:
+    return np.array([axis.play_um for axis in done.result.axes])
+
+
+def _of_play(found: Array, usual: Array) -> float:
+    """Return the largest change of a stage's play; 10 um are 2 %."""
+    return float(np.abs(found - usual).max()) / 500
+
+
 def _tenths(found: Array, usual: Array) -> float:
     return 0.1 * float(np.sqrt(np.mean(np.square(found - usual).sum(axis=-1))))
 
@@ -245,6 +255,13 @@ def _field(bench: Bench, folder: Path) -> tuple[Array, list[str], bool]:
     return np.concatenate([response(0 * at, at), response(at, 0 * at)]), words, True
 
 
+_SCREEN = (
+    template("screen")
+    .replace("color = false", "color = false\nbinning = 2\nexposure_ms = 20.0")
+    .replace("[1080, 1920]", "[140, 180]")
+    .replace("270.0", "700.0")
+    .replace('preset = "tiny"', 'preset = "tiny"\naperture_mm = [0.8, 1.0]')
+)
 _LED, _DISPLAY = template("led_microscope").replace("pixels = 384", "pixels = 160"), template("display")
 for _key, _value in {
     "shape": "[200, 280]",
@@ -283,6 +300,13 @@ TRIALS = {
     "field": Trial(TINY, _field, _largest),
     "beads": Trial(TINY + 'scene = "beads"\nscene_distance_mm = 80.0\nbeads = 20\n', _beads, _of_slides),
     "photograph": Trial(TINY, _routine("photograph", _picture), _but_for_brightness),
+    "stage": Trial(TINY, _routine("stage", _play), _of_play),
+    "screen": Trial(
+        _SCREEN,
+        _routine("screen", _psfs, pictures=6, judged=2, average=2, dark_frames=2),
+        _of_psfs,
+        display=True,
+    ),
     "dpc": Trial(
         _LED, _routine("dpc", _height, objective_na=0.1, magnification=4.0), _relative, display=True
     ),

@@ -35,6 +35,7 @@ from instrument.runs.run_control import RunControl
 from instrument.runs.writer import dated_name, free_name
 from recon.base.declare import option
 from recon.blind import BlindResult, calibrate_from_beads
+from recon.blind.made_up import LEAST_ALIKE, MOST_BEADS
 from recon.types import Calibration, Geometry
 
 Floats = npt.NDArray[np.float32]
@@ -74,7 +75,7 @@ class BeadCalibration:
     runs: tuple[Path, ...] = ()
     """Of the photographs, each with what was solved; none where they came from files."""
     findings: tuple[str, ...] = ()
-    """What is wrong with the photographs, in words."""
+    """What is wrong with the photographs and the PSFs, in words."""
 
 
 def calibrate_beads(
@@ -98,6 +99,7 @@ def calibrate_beads(
     result = calibrate_from_beads(images, window, slides.solver, on_progress=progress)
     object_um = pitch_um * z_um / (1e3 * distance_mm)
     places = [(-column * object_um, -row * object_um, z_um) for row, column in result.points]
+    findings = made_up_findings(result, slides.binning)
     record = {
         "made_by": f"diffuserbench {version('diffuserbench')}",
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -115,10 +117,34 @@ def calibrate_beads(
             "point_misfits": list(result.point_misfits),
             "stopped": result.stopped,
             "beads_found": [len(beads) for beads in result.beads],
+            "halves_alike": result.halves_alike,
+            "findings": list(findings),
+            "good": not findings,
         },
         provenance=record,
     )
-    return BeadCalibration(calibration, result)
+    return BeadCalibration(calibration, result, findings=findings)
+
+
+def made_up_findings(result: BlindResult, binning: int) -> tuple[str, ...]:
+    """Return what tells that PSFs and beads are made up, in words."""
+    finer = "bin less" if binning > 1 else "take smaller pixels, if these were binned"
+    findings = []
+    if result.halves_alike < LEAST_ALIKE:
+        findings.append(
+            f"either half of the photographs gives another PSF: {result.halves_alike:.2f} alike "
+            f"({LEAST_ALIKE:g} expected), so that it is made up in part. Spots of the pattern smaller than "
+            f"two pixels are the usual reason: {finer}. Else: more photographs, more light, some twenty "
+            "beads in each."
+        )
+    fewest, *_, most = sorted(map(len, result.beads))
+    if np.median([len(beads) for beads in result.beads]) > MOST_BEADS:
+        findings.append(
+            f"{fewest} to {most} beads were found in a photograph: more than {MOST_BEADS} are not told "
+            "apart, and PSFs off the axis come out wrong. Put some twenty on the slide; where it had no "
+            "more, take more photographs."
+        )
+    return tuple(findings)
 
 
 def needed_geometry(geometry: Geometry) -> list[float]:
@@ -209,9 +235,10 @@ def _photograph_and_solve(
 
     facts |= {"runs": [run.name for run in taken.runs]}
     solved = calibrate_beads(taken.images, slides, geometry, provenance=facts, progress=solving)
-    kept = {"scatter": plain(taken.scatter), "findings": list(taken.findings), "good": not taken.findings}
+    findings = (*taken.findings, *solved.findings)
+    kept = {"scatter": plain(taken.scatter), "findings": list(findings), "good": not findings}
     calibration = replace(solved.calibration, quality={**solved.calibration.quality, **kept})
-    solved = replace(solved, calibration=calibration, runs=taken.runs, findings=taken.findings)
+    solved = replace(solved, calibration=calibration, runs=taken.runs, findings=findings)
     out = slides.out or free_name(folder or bench.config.data_folder, dated_name("bead calibration"))
     outcome = save_beads(solved, slides, out)
     if outcome.calibration is not None:
@@ -271,6 +298,7 @@ def bead_lines(done: BeadCalibration) -> list[str]:
         f"Beads found: {', '.join(map(str, done.calibration.quality['beads_found']))}",
         f"Misfit by rank: {misfits} with beads on the pixel grid ({result.stopped});",
         f"  {between} with beads between pixels, PSFs of rank {result.rank}",
+        f"PSFs from either half of the photographs: {result.halves_alike:.3f} alike",
     ]
 
 

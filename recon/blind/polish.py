@@ -120,6 +120,11 @@ class Polished:
         return np.tensordot(self.functions.at(places).astype(np.float32), self.psfs, 1)
 
 
+def highest_degree_for(beads: int) -> int:
+    """Return the highest degree of the field's variation that so many beads tell, 2 at most."""
+    return max(d for d in range(3) if d == 0 or (d + 1) * (d + 2) / 2 * _BEADS_A_FUNCTION <= beads)
+
+
 def polish(
     data: Floats,
     beads: Sequence[Points],
@@ -151,7 +156,7 @@ def polish(
     functions: FieldFunctions | None = None
     for degree in degrees:
         places = np.concatenate([points.places for points in beads])
-        if degree and (degree + 1) * (degree + 2) / 2 * _BEADS_A_FUNCTION > len(places):
+        if degree > highest_degree_for(len(places)):
             break
         best = np.inf
         for number in range(_ROUNDS):

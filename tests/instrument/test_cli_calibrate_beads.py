@@ -9,8 +9,10 @@ import pytest
 import tifffile
 
 from calibration_routines import rehearsal
+from calibration_routines.optics import beads
 from instrument.cli import main
 from instrument.files.calibration_file import load_calibration
+from recon.blind import BlindResult, Points
 
 BENCH = """
 [bench]
@@ -87,6 +89,46 @@ def test_files_from_anywhere(files: list[str], tmp_path: Path, capsys: pytest.Ca
     assert first[1] > 0
     assert made.quality["misfits"][0] < 0.6
     assert main(words) == 2  # it is there already
+
+
+@pytest.mark.parametrize(
+    ("alike", "count", "said"),
+    [
+        (0.96, 20, ""),
+        (0.6, 20, "Quality: either half of the photographs gives another PSF: 0.60 alike"),
+        (0.96, 60, "Quality: 20 to 60 beads were found in a photograph: more than 50"),
+    ],
+)
+def test_psfs_that_are_made_up_have_a_doubtful_name(
+    alike: float,
+    count: int,
+    said: str,
+    files: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found = BlindResult(
+        psfs=np.full((1, 9, 9), 1 / 81, np.float32),
+        points=np.zeros((1, 2)),
+        beads=tuple(Points(np.zeros((n, 2)), np.ones(n)) for n in (20, count, count, count)),
+        rank=1,
+        misfits=(0.2,),
+        point_misfits=(0.18,),
+        stopped="the last rank was reached",
+        sensor_shape=(48, 48),
+        halves_alike=alike,
+    )
+    monkeypatch.setattr(beads, "calibrate_from_beads", lambda *_, **__: found)
+    words = ["calibrate", "beads", *files, "--z", "2.5", "--pixel-um", "11.6", "--distance-mm", "3.8"]
+    assert main([*words, "--window", "9x9", "--out", str(tmp_path / "calibration")]) == 0
+    words_said = " ".join(capsys.readouterr().out.split())
+    assert ("Quality: " in words_said) == bool(said)
+    assert said in words_said
+    (made,) = (path for path in tmp_path.iterdir() if path.is_dir())
+    assert made.name == ("doubtful_calibration" if said else "calibration")
+    quality = load_calibration(made).quality
+    assert (quality["good"], quality["halves_alike"]) == (not said, alike)
 
 
 @pytest.mark.parametrize(
