@@ -3,8 +3,9 @@
 Beads stand between planes and pixels, at random, planes evenly in 1/z. ``tiny`` is the simulated bench:
 wave optics, every bead at its own place, smooth diffuser, 60 to 120 mm; ``lenslets`` casts a Gaussian spot a
 lenslet (``lenslet_scene``), 10 to 20 mm. Photographs (photon and read noise) are reconstructed from PSFs
-on the axis. Beads are looked for in the volume, in its metric copy (``export --metric``), and in a "perfect"
-volume made of the places themselves, without photograph and solver. Figures are in voxels of the metric copy:
+on the axis. Beads are looked for in the volume, these then fitted to the photograph (``points --fit``), in
+its metric copy (``export --metric``), and in a "perfect" volume made of the places themselves, without
+photograph and solver. Figures are in voxels of the metric copy:
 the middle plane's pixel across, the step beside it along. "Advised" is how many of the planes that the
 calibration's analysis advises there are: half an axial step (inner product 0.8) apart. "Edge" is by how many
 voxels x or y of a direction at the field's edge changes from one plane to the next: so much more exact than
@@ -31,10 +32,11 @@ from lenslet_scene import beads as lenslet_beads
 import recon
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
-from recon.analysis.point_places import point_places
+from recon.analysis.point_places import PointPlaces, point_places
 from recon.analysis.resolution import axial_resolution
 from recon.camera.grid import Grid, metric_grid, metric_volume
 from recon.optics.scene import bead_volume
+from recon.reconstruction.point_errors import fitted_places
 from recon.types import Calibration, Geometry
 
 GREEN = (0.0, 1.0, 0.0)
@@ -131,9 +133,8 @@ def perfect(grid: Grid, places_um: np.ndarray) -> np.ndarray:
     return volume
 
 
-def offsets(volume: np.ndarray, grid: Grid, truth_um: np.ndarray, voxel_um: np.ndarray) -> np.ndarray:
+def offsets(found: PointPlaces, truth_um: np.ndarray, voxel_um: np.ndarray) -> np.ndarray:
     """Return by how many voxels beads are off, and by how many deviations, (n, 6); inf: not found."""
-    found = point_places(volume, grid)
     rays = truth_um[:, :2] / truth_um[:, 2:]
     seen = found.places_um[:, :2] / found.places_um[:, 2:]
     per_pixel = float(voxel_um[0] / np.median(truth_um[:, 2]))
@@ -166,11 +167,12 @@ def main() -> None:
     print(f"| {heads} | within half; off / deviation |\n|---|---|---|---|---|---|---|---|")
     for name, prior, planes in ((n, p, k) for n in asked.bench for p in asked.prior for k in asked.planes):
         scenes = [SCENES[name](seed, asked.photons) for seed in range(asked.seeds)]
-        off: dict[str, list[np.ndarray]] = {"volume": [], "metric": [], "perfect": []}
+        off: dict[str, list[np.ndarray]] = {"volume": [], "fitted": [], "metric": [], "perfect": []}
         for scene in scenes:
+            calibration = scene.calibration(planes)
             result = recon.reconstruct(
                 recon.Measurement(scene.photograph),
-                scene.calibration(planes),
+                calibration,
                 prior=prior,
                 model="convolution",
                 judged=False,
@@ -184,7 +186,11 @@ def main() -> None:
                 ("metric", *metric_volume(result.volume, grid)),
                 ("perfect", perfect(grid, scene.places_um), grid),
             ):
-                off[where].append(offsets(volume, on, scene.places_um, voxel_um))
+                found = point_places(volume, on)
+                off[where].append(offsets(found, scene.places_um, voxel_um))
+                if where == "volume":
+                    found = fitted_places(found, on, scene.photograph, calibration)
+                    off["fitted"].append(offsets(found, scene.places_um, voxel_um))
         edge = max(grid.shape[1:]) / 2 * metric.spacing_um[0] / metric.z_um[len(metric.z_um) // 2]
         for where, each in off.items():
             told = np.concatenate(each)

@@ -48,6 +48,7 @@ from recon.priors.named import NamedPrior as NamedPrior
 from recon.priors.total_variation import TotalVariation as TotalVariation
 from recon.reconstruction.measurement import Measurement as Measurement
 from recon.reconstruction.options import Options as Options
+from recon.reconstruction.point_errors import fitted_places as fitted_places
 from recon.reconstruction.solvers import SOLVERS as SOLVERS
 from recon.reconstruction.solvers import OfferedSolver as OfferedSolver
 from recon.solvers.admm import Admm as Admm

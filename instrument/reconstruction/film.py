@@ -148,6 +148,17 @@ def open_video(path: Path) -> VideoPictures:
     return video
 
 
+def is_film(path: Path) -> bool:
+    """Whether a path is that of a video of ``reconstruct --video`` or ``activity``."""
+    if not (is_zarr_name(path) and path.is_dir()):
+        return False
+    try:
+        open_video(path)
+    except FileError:
+        return False
+    return True
+
+
 def curves(film: Film, regions: Sequence[Window], advance: Advance | None = None) -> npt.NDArray[np.float64]:
     """Return the mean of regions in every picture, (n_regions, n_pictures); colours are averaged.
 

@@ -28,6 +28,7 @@ from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.run_files import STATE
 from instrument.volumes.grid_facts import numbers
 from recon.base.checks import require_noise, select_psf
+from recon.base.declare import record
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.camera.grid import depth_in_words
 from recon.camera.refocus_field import at_depth
@@ -43,6 +44,8 @@ from recon.reconstruction.solvers import SOLVERS, volume_priors
 from recon.solvers.base import IterationRecord, Keeper
 from recon.types import Calibration, Geometry
 
+READ_WITH = "options"
+"""What of a volume's recorded inputs tells how they were read."""
 Watch = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
 """Called after each iteration with its record and what makes the present picture or volume."""
 
@@ -168,7 +171,8 @@ class VolumeRequest(_Request):
         prior, known = self.options.prior or "tv", volume_priors()
         if isinstance(prior, str) and prior not in known:
             raise BenchError(f"--prior {prior} is not for volumes; choose one of {', '.join(known)}.")
-        return volume_job(self.psfs, self.image, self.inputs)
+        job = volume_job(self.psfs, self.image, self.inputs)
+        return replace(job, provenance={**job.provenance, READ_WITH: record(self.inputs)})
 
 
 def request_of(

@@ -196,8 +196,11 @@ class VideoPictures:
         return self._file(index).exists()
 
     def write(self, index: int, picture: Floats) -> None:
-        """Put a picture on the disk, whole or not at all."""
-        self.array[index] = np.moveaxis(picture, -1, 0) if "c" in self.axes else picture
+        """Put a picture on the disk, whole or not at all; OSError names the folder."""
+        try:
+            self.array[index] = np.moveaxis(picture, -1, 0) if "c" in self.axes else picture
+        except OSError as error:  # zarr's has no name
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
         with self._file(index).open("rb") as written:
             os.fsync(written.fileno())
 

@@ -103,7 +103,10 @@ def _version(package: str) -> str | None:
 def _disk(path: Path, what: str) -> Iterator[None]:
     """Say what could not be done where the disk refuses it, and what to do about that."""
     remedies = {
-        **dict.fromkeys(_FULL, "Free some disk space; diffuserbench resume continues the run."),
+        **dict.fromkeys(
+            _FULL,
+            "Free some disk space; diffuserbench resume continues a plan's run, and closes a recording.",
+        ),
         **dict.fromkeys(_FORBIDDEN, "Choose a folder that you may write to."),
     }
     try:

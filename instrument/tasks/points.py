@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from instrument.files.atomic import require_new, write_text
-from instrument.files.errors import FileError, count
+from instrument.files.errors import BenchError, FileError, count
+from instrument.reconstruction.film import Film, is_film
 from instrument.tasks.task import Desk, Done, task
-from recon.analysis.point_places import PointOptions, PointPlaces
+from recon.analysis.point_places import PointOptions, PointPlaces, point_places
 from recon.base.declare import option
 
 if TYPE_CHECKING:
@@ -19,18 +21,28 @@ if TYPE_CHECKING:
 
 _SHOWN = 20
 _COLUMNS = (
-    "x_um,y_um,z_um,x_deviation_um,y_deviation_um,z_deviation_um,light,plane,row,column,in_outermost_plane"
+    "x_um,y_um,z_um,x_deviation_um,y_deviation_um,z_deviation_um,light,plane,row,column,in_outermost_plane,"
+    "fitted"
 )
+_LEFT = 2.0
+"""Times the noise that points leave of a photograph of points, at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointFiles:
-    """In which volume, and where its points go."""
+    """In which volume, what of, and where its points go."""
 
     volume: Path = option(
-        help="A reconstructed volume (.ome.zarr, .tif; .npy, which keeps no places), exported ones too.",
+        help="A reconstructed volume (.ome.zarr, .tif; .npy, which keeps no places), exported ones too; or a "
+        "film of volumes (.ome.zarr).",
         metavar="VOLUME",
         positional=True,
+        group="Files",
+    )
+    fit: bool = option(
+        False,
+        help="Fit places and light to the photograph that the volume was made of, by its PSFs.",
+        label="Fit to the photograph",
         group="Files",
     )
     out: Path = option(
@@ -44,19 +56,29 @@ class PointFiles:
     force: bool = option(False, help="Overwrite a file that exists.", label="Overwrite", group="Files")
 
 
-@task("diffuserbench points volume.ome.zarr", "diffuserbench points volume.tif --least 0.3 --out beads.csv")
+@task(
+    "diffuserbench points volume.ome.zarr",
+    "diffuserbench points volume.ome.zarr --fit",
+    "diffuserbench points volume.tif --least 0.3 --out beads.csv",
+    "diffuserbench points film.ome.zarr --out tracks.csv",
+)
 def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
     """Find points of light in a volume (beads, cells): x, y, z in micrometres, how well known, and light.
 
     Places are between voxels and in the scene's coordinates: a point's light is followed along its ray
     through the diffuser. The volume as it was reconstructed serves best, not one made metric, of which
     voxels finer than the planes are summed. Deviations are one standard deviation, as points of simulated
-    photographs were off.
+    photographs were off. --fit looks for the places and lights that leave least of the photograph: better
+    known, and free of the planes that there are and of the prior. Of a film each volume's points are told,
+    with its number and time.
     """
+    from instrument.reconstruction.again import made_of
     from instrument.reconstruction.stored_result import open_result
-    from recon.analysis.point_places import point_places
+    from recon.reconstruction.point_errors import fitted_places
 
     require_new(files.out, overwrite=files.force)
+    if is_film(files.volume):
+        return _of_film(desk, files, options)
     result = open_result(files.volume)
     try:
         grid = result.grid
@@ -66,8 +88,13 @@ def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
                 "is a picture; points in depth are found in a volume.",
                 "Of pictures reconstruct --prior l1 --uncertainty tells the points.",
             )
+        made = made_of(result) if files.fit else None
         with desk.step("looking for points", 1.0) as advance:
             found = point_places(result.volume.plane, grid, options, advance)
+        seen = len(found)
+        if made is not None and seen:
+            with desk.step("fitting them", 1.0) as advance:
+                found = fitted_places(found, grid, *made, on_progress=advance)
     finally:
         result.close()
     if grid.upright and grid.is_metric and grid.made_of_um is None:
@@ -76,29 +103,95 @@ def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
             "one point is told as several: give the volume as it was reconstructed, or export it again."
         )
     known = bool(np.isfinite(found.places_um).all())
-    write_text(files.out, _table(found))
+    write_text(files.out, "\n".join([_COLUMNS, *_lines(found), ""]))
     desk.fact("Points", str(len(found)))
-    if not len(found):
+    if not seen:
         desk.warn("Warning: nothing in the volume is above 0.")
     elif known:
-        across, deep = np.median(found.deviations_um[:, :2].max(axis=1)), np.median(found.deviations_um[:, 2])
-        desk.fact("Known to", f"{across:.3g} um across, {deep:.3g} um in depth (medians)")
-        desk.table(
-            ("x (mm)", "y (mm)", "z (mm)", "light"),
-            [
-                (*(f"{at / 1e3:.5g}" for at in place), f"{light:.4g}")
-                for place, light in zip(found.places_um[:_SHOWN], found.light, strict=False)
-            ],
-            "" if len(found) <= _SHOWN else f"The brightest {_SHOWN}",
-        )
+        desk.fact("Places", _where_from(result, found))
+        _tell_places(desk, found)
     else:
         desk.warn(
             "Warning: the volume does not tell where its planes are: the table has planes, rows and columns "
             f"alone. {_why_unknown(result)}"
         )
+    if fewer := seen - len(found):
+        desk.warn(
+            f"Warning: {count(fewer, 'point')} of the volume {'is' if fewer == 1 else 'are'} left out: the "
+            "photograph does not tell them from noise, or from a point beside them."
+        )
+    if found.misfit is not None and found.misfit > _LEFT:
+        desk.warn(
+            f"Warning: these points leave {found.misfit:.1f} times the noise of the photograph: there is "
+            "more in it than points, or its PSFs are others. Places may be off by more than their deviations."
+        )
     if ends := int(found.at_end.sum()):
-        desk.warn(f"Warning: {_at_the_ends(ends, grid.shape[0])}")
+        desk.warn(f"Warning: {_at_the_ends(ends, grid.shape[0], fitted=found.misfit is not None)}")
     return Done((files.out,))
+
+
+def _of_film(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
+    """Tell the points of each volume of a film; how bright one must be goes by the brightest of all."""
+    film = Film(files.volume)
+    grid = film.grid
+    if grid is None or grid.shape[0] < 2:
+        raise FileError(files.volume, "is a film of pictures; points in depth are found in one of volumes.")
+    if files.fit:
+        raise BenchError("--fit is for the volume of one photograph: leave it out for a film.")
+    lines, numbers = [f"frame,{'time_s' if film.period_s else 'frame_number'},{_COLUMNS}"], []
+    with desk.step("Pictures", len(film)) as advance:
+        top = 0.0
+        for place in range(len(film)):
+            top = max(top, float(_brightest(film.whole(place))))
+            advance(0, len(film), note="the brightest of all")
+        for place, (index, at) in enumerate(zip(film.indices, film.times_s, strict=True)):
+            volume = film.whole(place)
+            own = _brightest(volume)
+            if own > 0 and (least := options.least * top / own) <= 1:
+                found = point_places(volume, grid, PointOptions(least=least))
+                lines += [f"{index},{at:.12g},{line}" for line in _lines(found)]
+                numbers.append(len(found))
+            else:
+                numbers.append(0)
+            advance(place + 1, len(film))
+    write_text(files.out, "\n".join([*lines, ""]))
+    desk.fact("Volumes", str(len(film)))
+    desk.fact("Points", f"{sum(numbers)}, {min(numbers)} to {max(numbers)} a volume")
+    if not sum(numbers):
+        desk.warn("Warning: nothing in the film is above 0.")
+    elif not np.isfinite(grid.z_um).all():
+        desk.warn("Warning: the film does not tell where its planes are: the table has voxels alone.")
+    return Done((files.out,))
+
+
+def _brightest(volume: npt.NDArray[np.float32]) -> float:
+    """Return the light of the brightest voxel, of all channels together."""
+    return float(np.nanmax(volume.sum(axis=3) if volume.ndim == 4 else volume))
+
+
+def _tell_places(desk: Desk, found: PointPlaces) -> None:
+    """Tell how well places are known, and the brightest."""
+    if not len(found):
+        return
+    across, deep = np.median(found.deviations_um[:, :2].max(axis=1)), np.median(found.deviations_um[:, 2])
+    desk.fact("Known to", f"{across:.3g} um across, {deep:.3g} um in depth (medians)")
+    desk.table(
+        ("x (mm)", "y (mm)", "z (mm)", "light"),
+        [
+            (*(f"{at / 1e3:.5g}" for at in place), f"{light:.4g}")
+            for place, light in zip(found.places_um[:_SHOWN], found.light, strict=False)
+        ],
+        "" if len(found) <= _SHOWN else f"The brightest {_SHOWN}",
+    )
+
+
+def _where_from(result: StoredResult, found: PointPlaces) -> str:
+    """Say what places are of."""
+    if found.misfit is not None:
+        return f"fitted to the photograph; {found.misfit:.2f} times its noise is left of it"
+    if isinstance((result.record.get("inputs") or {}).get("options"), dict):
+        return "of the volume alone (--fit: fitted to its photograph)"
+    return "of the volume alone"
 
 
 def _why_unknown(result: StoredResult) -> str:
@@ -110,19 +203,21 @@ def _why_unknown(result: StoredResult) -> str:
     return "This program's .ome.zarr and .tif keep places; other programs' tell steps at most."
 
 
-def _at_the_ends(ends: int, planes: int) -> str:
-    """Say what it means that so many points are brightest in an outermost plane."""
+def _at_the_ends(ends: int, planes: int, *, fitted: bool) -> str:
+    """Say what it means that so many points are brightest in an outermost plane, or lie beyond it."""
+    are, they = ("is", "it") if ends == 1 else ("are", "they")
+    if fitted:
+        return f"{count(ends, 'point')} {are} beyond an outermost plane, by PSFs that were made for there."
     if planes == 2:
         return "the volume has two planes; points may lie beyond either of them."
-    are, they = ("is", "it") if ends == 1 else ("are", "they")
     return f"{count(ends, 'point')} {are} brightest in an outermost plane; {they} may lie beyond it."
 
 
-def _table(found: PointPlaces) -> str:
-    """Return points as CSV; what is not known is left empty."""
+def _lines(found: PointPlaces) -> list[str]:
+    """Return points as lines of CSV; what is not known is left empty."""
     numbers = np.column_stack([found.places_um, found.deviations_um, found.light, found.voxels])
-    lines = [
-        ",".join([*(f"{value:.7g}" if np.isfinite(value) else "" for value in row), str(int(end))])
+    fitted = int(found.misfit is not None)
+    return [
+        ",".join([*(f"{value:.7g}" if np.isfinite(value) else "" for value in row), f"{int(end)},{fitted}"])
         for row, end in zip(numbers, found.at_end, strict=True)
     ]
-    return "\n".join([_COLUMNS, *lines, ""])

@@ -6,10 +6,10 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from instrument.files.errors import BenchError, FileError
+from instrument.files.errors import BenchError
 from instrument.files.images import read_stack
 from instrument.files.ome_zarr import is_zarr_name
-from instrument.reconstruction.film import Film, Window, open_video, slowed, write_film
+from instrument.reconstruction.film import Film, Window, is_film, slowed, write_film
 from instrument.runs.export import export as export_run
 from instrument.runs.imported import FilmFacts
 from instrument.runs.imported import import_film as write_recording
@@ -213,11 +213,7 @@ def export(desk: Desk, options: ExportOptions, given: Given) -> Done:
 
 def _is_film(path: Path, target: Path) -> bool:
     """Whether pictures that follow each other are written: a video's, or a run's as GIF or curves."""
-    if is_zarr_name(path) and path.is_dir():
-        try:
-            open_video(path)
-        except FileError:
-            return False
+    if is_film(path):
         return True
     return path.is_dir() and target.suffix.lower() in (".gif", ".csv")
 

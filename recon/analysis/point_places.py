@@ -69,7 +69,10 @@ class PointPlaces:
     light : ndarray, float64, (n,)
         Sum of the voxels that a point was found from, of all channels.
     at_end : ndarray, bool, (n,)
-        Brightest in the first or the last plane: such a point may lie beyond it.
+        Brightest in the first or the last plane: such a point may lie beyond it. Where fitted: beyond it.
+    misfit : float or None
+        Of points fitted to the photograph (:func:`recon.reconstruction.point_errors.fitted_places`): what
+        they leave of it, root mean square in units of its noise. None: they are of the volume alone.
     """
 
     places_um: Floats
@@ -77,6 +80,7 @@ class PointPlaces:
     voxels: Floats
     light: Floats
     at_end: npt.NDArray[np.bool_]
+    misfit: float | None = None
 
     def __len__(self) -> int:
         return len(self.light)
@@ -255,7 +259,6 @@ class _Search:
 
         ``share`` of the light has each voxel, (n,), of those ``at`` plane, row and column, (n, 3).
         """
-        planes = np.arange(self.grid.shape[0], dtype=np.float64)
         if not self.known:
             centre = share @ at
             return np.full(3, np.nan), centre, at - centre
@@ -263,14 +266,23 @@ class _Search:
         x_um, y_um = np.array([self.grid.place_um(*one)[:2] for one in at]).T
         depth = float(share @ z_um) if self.grid.is_metric else float(1 / (share @ (1 / z_um)))
         place = np.array([share @ (x_um / z_um) * depth, share @ (y_um / z_um) * depth, depth])
-        order = np.argsort(1 / self.grid.z_um)
-        plane = float(np.interp(1 / depth, 1 / self.grid.z_um[order], planes[order]))
-        nearest = round(plane)
-        further = self.grid.z_um[nearest] / depth
-        centre = np.array([plane, *self.grid.pixel_of(nearest, place[0] * further, place[1] * further)])
+        centre = voxels_of(place[None], self.grid)[0]
         rays = [self.grid.pixel_of(k, *place[:2] * self.grid.z_um[k] / depth) for k in at[:, 0]]
-        beside = np.column_stack([at[:, 0] - plane, at[:, 1:] - np.array(rays)])
+        beside = np.column_stack([at[:, 0] - centre[0], at[:, 1:] - np.array(rays)])
         return place, centre, beside
+
+
+def voxels_of(places_um: Floats, grid: Grid) -> Floats:
+    """Return ``(plane, row, column)`` of places in a grid, (n, 3): between planes on the ray through both."""
+    near = 1 / grid.z_um
+    order = np.argsort(near)
+    voxels = np.empty((len(places_um), 3))
+    for voxel, (x, y, z) in zip(voxels, places_um, strict=True):
+        voxel[0] = np.interp(1 / z, near[order], np.arange(len(near), dtype=np.float64)[order])
+        nearest = round(voxel[0])
+        further = grid.z_um[nearest] / z
+        voxel[1:] = grid.pixel_of(nearest, x * further, y * further)
+    return voxels
 
 
 def _plateaus(peaks: npt.NDArray[np.bool_]) -> tuple[Whole, Whole]:

@@ -67,8 +67,8 @@ class Points:
 
     Attributes
     ----------
-    places : ndarray, float64, (n, 2)
-        ``(row, column)`` from the axis, object pixels.
+    places : ndarray, float64, (n, 2) or (n, 3)
+        ``(row, column)`` from the axis, object pixels; of points in depth after ``plane``.
     light : ndarray, float64, (n,)
     """
 
@@ -103,24 +103,24 @@ class PointImages:
         Parameters
         ----------
         place : ndarray, (2,)
+            Row and column; of a camera in depth (:class:`recon.camera.points_in_depth.ImagesInDepth`) after
+            the plane.
         slopes : bool
-            Also its derivatives along rows and columns.
+            Also its derivatives along all of these.
 
         Returns
         -------
-        ndarray, float32, (1 or 3, rows, columns)
+        ndarray, float32, (1 or 1 + the place's coordinates, rows, columns)
             Cut to the sensor.
         (slice, slice)
         """
-        weights = self._functions.at(place[None])[0].astype(np.float32)
-        padded = np.zeros(self._shape, np.float32)
-        padded[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN] = np.tensordot(weights, self.psfs, 1)
-        whole = np.round(place).astype(int)
-        part = place - whole
-        spectrum = np.fft.rfft2(padded) * np.exp(-2j * np.pi * (self._f_y * part[0] + self._f_x * part[1]))
-        spectra = [spectrum]
+        whole = np.round(place[-2:]).astype(int)
+        part = place[-2:] - whole
+        turn = np.exp(-2j * np.pi * (self._f_y * part[0] + self._f_x * part[1]))
+        psf, changes = self._seen(place, slopes)
+        spectra = [np.fft.rfft2(self._padded(image)) * turn for image in (psf, *changes)]
         if slopes:
-            spectra += [-2j * np.pi * self._f_y * spectrum, -2j * np.pi * self._f_x * spectrum]
+            spectra += [-2j * np.pi * self._f_y * spectra[0], -2j * np.pi * self._f_x * spectra[0]]
         images = np.fft.irfft2(np.stack(spectra), s=self._shape, axes=(1, 2)).astype(np.float32)
         inside, on_sensor = [], []
         for axis in (0, 1):
@@ -130,6 +130,21 @@ class PointImages:
             inside.append(slice(low - first, high - first))
             on_sensor.append(slice(low, high))
         return images[:, inside[0], inside[1]], (on_sensor[0], on_sensor[1])
+
+    def within(self, places: Floats) -> Floats:
+        """Return places, (n, 2), as far as this camera tells of them: as they are."""
+        return places
+
+    def _seen(self, place: Floats, slopes: bool) -> tuple[Array, tuple[Array, ...]]:
+        """Return a PSF, and with ``slopes`` how it changes with what a place has before row and column."""
+        del slopes
+        weights = self._functions.at(place[None])[0].astype(np.float32)
+        return np.tensordot(weights, self.psfs, 1), ()
+
+    def _padded(self, psf: Array) -> Array:
+        padded = np.zeros(self._shape, np.float32)
+        padded[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN] = psf
+        return padded
 
     def image(self, points: Points) -> Array:
         """Return the image (height, width) of all points."""
@@ -194,7 +209,7 @@ def cleaned(camera: PointImages, points: Points, noise: float, weakest: float = 
     places: list[Floats] = []
     light: list[float] = []
     for k in order:
-        near = [i for i, place in enumerate(places) if np.hypot(*(place - points.places[k])) < _SAME_PX]
+        near = [i for i, place in enumerate(places) if np.linalg.norm(place - points.places[k]) < _SAME_PX]
         if near:
             light[near[0]] += float(points.light[k])
         else:
@@ -202,10 +217,12 @@ def cleaned(camera: PointImages, points: Points, noise: float, weakest: float = 
             light.append(float(points.light[k]))
     if not light:
         return points
-    sure = _SURE * noise / float(np.linalg.norm(camera.patch(np.zeros(2))[0]) + 1e-30)
+    sure = 0.0
+    if noise > 0:
+        sure = _SURE * noise / float(np.linalg.norm(camera.patch(np.zeros(2))[0]) + 1e-30)
     least = max(weakest * float(np.median(light)), sure)
     kept = np.array(light) >= least
-    return Points(np.array(places)[kept].reshape(-1, 2), np.array(light)[kept])
+    return Points(np.array(places)[kept].reshape(-1, points.places.shape[1]), np.array(light)[kept])
 
 
 def overlooked(camera: PointImages, left: Array, points: Points, noise: float) -> Points:

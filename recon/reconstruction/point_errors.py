@@ -1,17 +1,15 @@
-"""Points of a picture at continuous places, with error bars of place and light.
+"""Points of a picture or volume at continuous places, with error bars of place and light.
 
-The bright spots of a picture are where points are looked for. Their places and light are then fitted to the
-photograph itself, all of them together, so that neither the grid of pixels nor the prior's bias is left in
-them: Gauss-Newton steps on ``b = sum_k a_k h(u - x_k)``. With ``J`` the derivatives and ``r`` what is left of
-the data, the covariance is ``F^-1 (J^T diag(r^2) J) F^-1``, ``F = J^T J`` (White 1980, Econometrica 48:817):
-the inverse of Fisher's information where the noise is as expected, and larger where the data are off the
-model by more. What a PSF that is a little wrong (aliased between pixels, changed off the axis) leaves of the
-data shows in the residual; a share of that size passes for places and light (:data:`POSES_AS_PLACE`).
+The bright spots of a picture are where points are looked for; those of a volume are given. Their places and
+light are then fitted to the photograph itself, all of them together (:mod:`recon.camera.point_fit`), so that
+neither the grid of voxels nor the prior's bias is left in them. Of a volume each point has a continuous
+depth, too: its image is made of the PSFs of both planes beside it.
 """
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,26 +17,30 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.points import FieldFunctions, PointImages, Points, cleaned, points_on_grid
+from recon.analysis.point_places import PointPlaces, voxels_of
+from recon.camera.grid import Grid
+from recon.camera.point_fit import believed, misfit
+from recon.camera.points import FieldFunctions, PointImages, Points, points_on_grid
+from recon.camera.points_in_depth import ImagesInDepth, Rays
+from recon.errors import InputError
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.weights import is_weighted, kind_of
+from recon.types import Calibration
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
 
+COORDINATES = 4
+"""Of a point: plane, row, column and light."""
+OFF_BY_PSFS = 1.4
+"""Times the fit's own deviation: PSFs beside the axis and between planes are a little others than those they
+are made of, and pose as place where the noise hides it (``benchmarks/bead_places.py``)."""
 LEAST = 0.03
 """Light of a spot, relative to the brightest, from which it is tried as a point."""
-SURE = 5.0
-"""Times its own deviation, for a point's light to be believed."""
-ROUNDS = 3
-STEPS = 12
-LARGEST_STEP_PX = 0.5
-SETTLED_PX = 1e-3
-POSES_AS_PLACE, POSES_AS_LIGHT = 0.2, 0.35
-"""Of what the points' images leave of the data beyond the noise, relative to their light, so much passes for
-a shift and for light: 0.13 to 0.27 and 0.15 to 0.36 in most of 24 photographs of beads, in any light."""
 MOST_BYTES = 2**30
 """Of the derivatives: there are fewer points of large photographs."""
 
@@ -115,16 +117,7 @@ def _points(
     most = MOST_BYTES // (3 * 4 * part.data[0].size)
     found = points_on_grid(result.volume.reshape(result.grid.shape)[0].astype(np.float64), centre, LEAST)
     found = Points(found.places[:most], found.light[:most] / scale)
-    covariance = np.zeros((0, 3, 3))
-    for _ in range(ROUNDS):
-        found = _fitted(camera, part, cleaned(camera, found, 0.0, weakest=0.0))
-        covariance = _covariance(camera, part, found)
-        sure = found.light > SURE * np.sqrt(np.maximum(covariance[:, 2, 2], 0))
-        sure &= np.isfinite(covariance).all(axis=(1, 2))
-        if sure.all() or (cancel is not None and cancel.is_set()):
-            break
-        found = Points(found.places[sure], found.light[sure])
-        covariance = covariance[sure]
+    found, covariance = believed(camera, part, found, cancel)
     order = np.argsort(-found.light)
     units = np.array([1.0, 1.0, scale])
     return PointErrors(
@@ -132,63 +125,91 @@ def _points(
     )
 
 
-def _derivatives(camera: PointImages, part: Part, points: Points) -> tuple[Floats, Floats]:
-    """Return what is left of the data, (pixels,), and its slopes by row, column and light, (3 n, pixels)."""
-    images = np.zeros((3 * len(points), *part.data.shape[1:]), np.float32)
-    seen = np.zeros(part.data.shape[1:], np.float32)
-    for k, (place, light) in enumerate(zip(points.places, points.light, strict=True)):
-        patch, where = camera.patch(place, slopes=True)
-        seen[where] += np.float32(light) * patch[0]
-        images[3 * k][where], images[3 * k + 1][where] = light * patch[1], light * patch[2]
-        images[3 * k + 2][where] = patch[0]
-    rest = _told(part, part.data[0] - seen)
-    return rest.ravel(), np.stack([_told(part, image) for image in images]).reshape(len(images), -1)
+def fitted_places(
+    found: PointPlaces,
+    grid: Grid,
+    measurement: Measurement | npt.ArrayLike,
+    calibration: Calibration,
+    *,
+    on_progress: Callable[[float], object] | None = None,
+) -> PointPlaces:
+    """Fit points of a volume to its photograph.
 
+    Parameters
+    ----------
+    found : PointPlaces
+        As :func:`~recon.analysis.point_places.point_places` found them in the volume: where the fit begins.
+    grid : Grid
+        Of that volume.
+    measurement : Measurement or array, (height, width)
+    calibration : Calibration
+        Both as the volume was reconstructed from them; one PSF a depth, of known depths.
+    on_progress : callable, optional
+        Called with the share done at most; may raise to end the work.
 
-def _told(part: Part, image: Array) -> Floats:
-    """Return what the data tell of an image: valid pixels, without a smooth background."""
-    kept = np.where(part.valid, image, 0).astype(part.dtype)
-    told: Floats = kept[0] if part.removal is None else part.removal.forward(kept)[0]
-    return told
+    Returns
+    -------
+    PointPlaces
+        The brightest first, without those whose light is not five times its own deviation, and without
+        those that came to lie on another.
 
-
-def _fitted(camera: PointImages, part: Part, points: Points) -> Points:
-    """Fit places and light of all points together, by steps that only descend."""
-    if not len(points):
-        return points
-    rest, slopes = _derivatives(camera, part, points)
-    for _ in range(STEPS):
-        information = slopes @ slopes.T
-        information[np.diag_indices_from(information)] *= 1 + 1e-6
-        step = np.linalg.lstsq(information, slopes @ rest, rcond=None)[0].reshape(-1, 3)
-        largest = float(np.abs(step[:, :2]).max())
-        step *= min(1.0, LARGEST_STEP_PX / max(largest, 1e-12))
-        moved = Points(points.places + step[:, :2], np.maximum(points.light + step[:, 2], 0))
-        left, changed = _derivatives(camera, part, moved)
-        if float(left @ left) > float(rest @ rest):
-            break
-        points, rest, slopes = moved, left, changed
-        if largest < SETTLED_PX:
-            break
-    return points
-
-
-def _covariance(camera: PointImages, part: Part, points: Points) -> Floats:
-    """Return the covariance of row, column and light of every point, (n, 3, 3)."""
-    if not len(points):
-        return np.zeros((0, 3, 3))
-    rest, slopes = _derivatives(camera, part, points)
-    pixels = int(np.count_nonzero(part.valid))
-    inverse = np.linalg.pinv((slopes @ slopes.T).astype(np.float64))
-    scores = ((slopes * rest**2) @ slopes.T).astype(np.float64)
-    whole = inverse @ scores @ inverse * (pixels / max(pixels - len(slopes), 1))
-    at = np.arange(len(points))
-    each = np.array(whole.reshape(len(at), 3, len(at), 3)[at, :, at])
-    sizes = np.sum(slopes.reshape(len(at), 3, -1).astype(np.float64) ** 2, axis=2)
-    seen = points.light**2 * sizes[:, 2]
-    unexplained = max(float(rest @ rest) - pixels, 0) / max(float(seen.sum()), 1e-30)
-    each[:, (0, 1), (0, 1)] += (
-        POSES_AS_PLACE**2 * unexplained * seen[:, None] / np.maximum(sizes[:, :2], 1e-30)
+    Raises InputError where places or depths are not known, the photograph is in colour, PSFs vary over the
+    field, or there are more points than fit into a gibibyte.
+    """
+    problem = _problem(found, measurement, calibration)
+    psfs = problem.depths.central[:, 0] / np.float32(problem.energy[0])
+    distance_um = 1e3 * (calibration.geometry.diffuser_distance_mm or 0.0)
+    camera = ImagesInDepth(problem.depths.z_um, psfs, distance_um, problem.sensor_shape)
+    rays = Rays(problem.grid, camera)
+    scale = float(problem.image_scale.ravel()[0])
+    start = Points(np.array([rays.place_of(one) for one in found.places_um]), found.light / scale)
+    with closing(Part(problem, slice(0, 1))) as part:
+        points, covariance = believed(camera, part, start, on_step=on_progress)
+        left = misfit(camera, part, points)
+    order = np.argsort(-points.light, kind="stable")
+    places, covariance = points.places[order], covariance[order]
+    places_um = np.array([rays.um_of(one) for one in places]).reshape(-1, 3)
+    slopes = np.array([rays.slopes_of(one) for one in places]).reshape(-1, 3, 3)
+    known = np.einsum("nij,njk,nik->ni", slopes, covariance[:, :3, :3], slopes)
+    last = len(problem.depths.z_um) - 1
+    return PointPlaces(
+        places_um,
+        OFF_BY_PSFS * np.sqrt(np.maximum(known, 0)),
+        voxels_of(places_um, grid),
+        points.light[order] * scale,
+        (places[:, 0] < 0) | (places[:, 0] > last),
+        left,
     )
-    each[:, 2, 2] += POSES_AS_LIGHT**2 * unexplained * points.light**2
-    return each
+
+
+def _problem(
+    found: PointPlaces, measurement: Measurement | npt.ArrayLike, calibration: Calibration
+) -> Problem:
+    """Return photograph and PSFs in units of the noise; InputError where points cannot be fitted by them."""
+    if not len(found):
+        raise InputError("There are no points to be fitted.")
+    if not np.isfinite(found.places_um).all():
+        raise InputError("Points are fitted where the volume knows its places; this one does not.")
+    if not calibration.geometry.diffuser_distance_mm:
+        raise InputError(
+            "Points are fitted by PSFs made between depths, and the calibration does not say how far the "
+            "sensor is from the diffuser: give diffuser_distance_mm."
+        )
+    problem = Problem.of(measurement, calibration, ReconstructionOptions(model="convolution", prior="l1"))
+    if problem.depths.varies:
+        raise InputError(
+            "Points are fitted by one PSF a depth; this calibration's vary over the field, which is not "
+            "modelled here. Take the places in the volume."
+        )
+    if problem.n_channels > 1:
+        raise InputError("Points are fitted to grey photographs; this one has colours.")
+    z_um = problem.depths.z_um
+    if len(z_um) < 2 or not np.isfinite(z_um).all() or (z_um <= 0).any():
+        raise InputError("Points are fitted by PSFs of two known depths or more.")
+    height, width = problem.sensor_shape
+    if len(found) > (most := MOST_BYTES // (COORDINATES * 4 * height * width)):
+        raise InputError(
+            f"{len(found)} points of a photograph of {height} x {width} pixels are more than are fitted "
+            f"together, {most}: ask for brighter ones, or take the places in the volume."
+        )
+    return problem

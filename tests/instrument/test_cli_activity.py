@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import tracemalloc
 from pathlib import Path
@@ -41,6 +42,21 @@ def film(tmp_path: Path) -> Path:
             noise = 0.02 * rng.standard_normal(SHAPE)
             pictures.write(index, (0.4 + spot * (1 + active) + noise).astype(np.float32))
     return path
+
+
+def test_a_full_disk_is_told_with_what_could_not_be_written(
+    film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")  # zarr's names no file
+
+    out = tmp_path / "found"
+    with monkeypatch.context() as patch:
+        patch.setattr(zarr.Array, "__setitem__", full)
+        assert main(["activity", str(film), "--out", str(out)]) == 2
+    told = "".join(capsys.readouterr().err.split("\n"))
+    assert f"{out / 'dff.ome.zarr'}: no space left on the disk. Free some" in told
+    assert main(["activity", str(film), "--out", str(out)]) == 0, "the same command works once there is room"
 
 
 def test_the_command_writes_what_it_found(

@@ -1,0 +1,107 @@
+"""``diffuserbench points --fit`` and points of films: whose photograph, which frame, mistakes in words."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from instrument.cli import main
+from instrument.files.calibration_file import save_calibration
+from instrument.reconstruction.video_files import VideoPictures, create_output
+from recon.camera.grid import Grid
+from tests.recon.reconstruction.test_fitted_places import CALIBRATION, photograph, true_um
+
+Z_UM = 1 / np.linspace(1 / 10e3, 1 / 20e3, 5)
+GRID = Grid((5, 40, 50), (20, 25), Z_UM, 1e-3 * Z_UM)
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Path:
+    """A volume with the photograph and the calibration that it was reconstructed from."""
+    photo, volume = tmp_path / "photo.tif", tmp_path / "v.ome.zarr"
+    tifffile.imwrite(photo, photograph() + 100)
+    save_calibration(CALIBRATION, tmp_path / "cal")
+    argv = ["reconstruct", "--volume", str(tmp_path / "cal"), "--image", str(photo), "--prior", "l1"]
+    argv += ["--model", "convolution"]
+    assert main([*argv, "-n", "60", "--dark", "100", "--noise", "1", "--out", str(volume)]) == 0
+    return volume
+
+
+def test_places_are_fitted_to_the_photograph_that_the_record_names(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "points.csv"
+    assert main(["points", str(made), "--out", str(out)]) == 0
+    assert "of the volume alone (--fit" in " ".join(capsys.readouterr().out.split())
+    assert {row["fitted"] for row in csv.DictReader(out.read_text().splitlines())} == {"0"}
+    assert main(["points", str(made), "--out", str(out), "--force", "--fit"]) == 0
+    told = capsys.readouterr()
+    assert "fitted to the photograph; " in " ".join(told.out.split())
+    rows = list(csv.DictReader(out.read_text().splitlines()))
+    assert {row["fitted"] for row in rows} == {"1"}
+    found = np.array([[float(row[f"{axis}_um"]) for axis in "xyz"] for row in rows])
+    known = np.array([[float(row[f"{axis}_deviation_um"]) for axis in "xyz"] for row in rows])
+    for place in true_um():
+        nearest = int(np.linalg.norm(found - place, axis=1).argmin())
+        assert (np.abs(found[nearest] - place) < 4 * known[nearest] + [3, 3, 20]).all()
+    out.unlink()
+    # Another photograph by now, none, and a record that does not tell which.
+    fit = ["points", str(made), "--fit", "--out", str(out)]
+    tifffile.imwrite(tmp_path / "photo.tif", photograph(2.0) + 100)
+    assert main(fit) == 2
+    assert "is not the photograph any more that" in " ".join(capsys.readouterr().err.split())
+    (tmp_path / "photo.tif").unlink()
+    assert main(fit) == 2
+    assert "photo.tif: there is no such file" in " ".join(capsys.readouterr().err.split())
+    record = json.loads((tmp_path / "v.json").read_text())
+    del record["inputs"]["options"]
+    (tmp_path / "v.json").write_text(json.dumps(record))
+    assert main(fit) == 2
+    assert "does not tell of which photograph and PSFs it was made" in " ".join(
+        capsys.readouterr().err.split()
+    )
+    assert not out.exists()
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Path:
+    """Three volumes: a point that moves, and dims; one is lost, one is dark."""
+    path = tmp_path / "film.ome.zarr"
+    create_output(path, 5, GRID.shape, period_s=0.1, grid=GRID, attributes={})
+    volumes = VideoPictures(path, write=True)
+    for index, light in ((0, 30.0), (1, 20.0), (3, 2.0), (4, 0.0)):
+        voxels = np.zeros(GRID.shape, np.float32)
+        voxels[2, 12, 20 + index] = light
+        volumes.write(index, voxels)
+    return path
+
+
+def test_a_film_tells_points_frame_by_frame(
+    film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "tracks.csv"
+    assert main(["points", str(film), "--out", str(out)]) == 0
+    assert "Points 2, 0 to 1 a volume" in " ".join(capsys.readouterr().out.split())
+    rows = list(csv.DictReader(out.read_text().splitlines()))
+    assert [(row["frame"], row["time_s"], row["column"]) for row in rows] == [
+        ("0", "0", "20"),
+        ("1", "0.1", "21"),
+    ], "the third is a fifteenth of the brightest of all"
+    assert main(["points", str(film), "--out", str(out), "--least", "0.05", "--force"]) == 0
+    assert [row["frame"] for row in csv.DictReader(out.read_text().splitlines())] == ["0", "1", "3"]
+    capsys.readouterr()
+    assert main(["points", str(film), "--out", str(out), "--fit", "--force"]) == 2
+    assert "--fit is for the volume of one photograph" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_film_of_pictures_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "flat.ome.zarr"
+    create_output(path, 1, (8, 8), period_s=None, grid=None, attributes={})
+    VideoPictures(path, write=True).write(0, np.ones((8, 8), np.float32))
+    assert main(["points", str(path), "--out", str(tmp_path / "points.csv")]) == 2
+    assert "is a film of pictures" in " ".join(capsys.readouterr().err.split())
