@@ -241,16 +241,16 @@ def _figure(aligned: Capture, learned: Capture, colour: ColourCapture, lesson: L
             gamma=1 / 2.2,
         )
     )
-    unexplained = [100 * part for part in lesson.rounds]
+    unexplained = [100 * part**2 for part in lesson.rounds]
     rounds = Convergence(
         [float(n + 1) for n in range(len(unexplained))],
         unexplained,
         "Contrast of random patterns that is not explained, %",
-        f"{unexplained[-1]:.0f} %",
+        f"{unexplained[-1]:.1f} %",
         "rounds of learning",
     )
     facts = [
         ("learned from", f"{len(lesson.rounds)} rounds; others judge"),
-        ("unexplained of them", f"{lesson.before:.0%} before, {lesson.after:.0%} after"),
+        ("unexplained of them", f"{lesson.before**2:.1%} before, {lesson.after**2:.1%} after"),
     ]
     return summary_figure(Summary("Display demo", tuple(panels), rounds, lines=facts, simulated=True))
