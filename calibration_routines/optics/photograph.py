@@ -186,6 +186,8 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, _listener: Lis
     first = run.metadata(run.steps("scene")[0])
     facts = {"exposure_ms": taken.exposure_ms, "dark": "taken off", "scatter": taken.scatter}
     facts |= {"light": "scene", "utc": first.utc}
+    if record.binning == 1:  # binned, a mosaic's colours are mixed
+        facts["pixel_format"] = first.pixel_format
     write_image(file, taken.measurement, plain(record) | plain(facts))
     words = f"Photograph: {taken.exposure_ms:.4g} ms, {taken.saturated_pixels} saturated pixels"
     return Outcome(

@@ -249,7 +249,14 @@ def test_a_photograph_that_was_left_becomes_a_picture_when_it_goes_on(bench: Ben
     kept = read_image(done.files[0])
     assert kept.pixels.shape == (120, 160)
     assert kept.metadata["scatter"]["frames"] == 4
+    assert "pixel_format" not in kept.metadata, "binned, a mosaic's colours are mixed"
     assert left_unfinished(tmp_path, ["photograph"]) is None
+
+
+def test_a_photograph_tells_its_mosaic(bench: Bench, tmp_path: Path) -> None:
+    wanted = PhotographProcedure(exposure_ms=2.0, average=1, dark_frames=1)
+    kept = read_image(wanted.carry_out(bench, tmp_path).files[0])
+    assert kept.metadata["pixel_format"] == "Mono12"
 
 
 def test_who_interrupts_the_analysis_is_told_how_the_result_is_made(
