@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import replace
@@ -13,9 +14,9 @@ import numpy.typing as npt
 import pytest
 
 from drivers.camera import Camera, Roi
-from drivers.common.checked import call_limit_s, checked
+from drivers.common.checked import call_limit_s, checked, given_up
 from drivers.device import Device
-from drivers.errors import DeviceError, LimitError
+from drivers.errors import DeviceError, DeviceTimeoutError, LimitError
 from drivers.frame import Frame
 from drivers.led_array import OFF, LedArray, LedPattern
 from drivers.slm import Slm
@@ -334,3 +335,50 @@ def test_what_a_driver_says_in_words_and_an_interruption_pass() -> None:
         interrupted.home()
     assert isinstance(stage, MockStage)
     assert type(stage).__name__ == "MockStage"
+
+
+class Reads(MockCamera):
+    """Tells in which thread it is asked, and asks itself for something by what lies in another room."""
+
+    @property
+    def gain(self) -> float:  # type: ignore[override]
+        self.asked_in = {threading.current_thread().name}
+        return float(eval("device.exposure_ms", {"__name__": "somewhere.else"}, {"device": self}))
+
+    @property
+    def exposure_ms(self) -> float:  # type: ignore[override]
+        self.asked_in.add(threading.current_thread().name)
+        return 10.0
+
+
+@pytest.mark.parametrize(
+    ("asker", "is_its_own"),
+    [
+        ("instrument.bench.bench", False),
+        ("somewhere.drivers", False),
+        ("drivers.common.stream", False),
+        ("drivers.common.checked", False),
+        ("drivers.basler.camera", True),
+        ("tests.mocks.other", True),
+    ],
+)
+def test_what_a_driver_asks_of_its_own_device_is_not_asked_in_another_thread(
+    asker: str, is_its_own: bool
+) -> None:
+    """It may hold a lock; others are not kept waiting without end."""
+    camera = made(Reads)
+    assert eval("device.gain", {"__name__": asker}, {"device": camera}) == 10.0
+    assert camera.asked_in == {
+        threading.current_thread().name if is_its_own else f"{camera.name}: reading gain"
+    }
+
+
+def test_nothing_is_read_while_a_reading_hangs_and_all_is_while_another_call_does() -> None:
+    camera, let_go = made(Reads), threading.Event()
+    for call, is_read in ("snap", True), ("reading gain", False):
+        thread = threading.Thread(target=let_go.wait, args=(20,), name=f"{camera.name}: {call}")
+        thread.start()
+        given_up(camera).append(thread)
+        with nullcontext() if is_read else pytest.raises(DeviceTimeoutError, match="still hangs"):
+            assert eval("device.gain", {"__name__": "instrument.bench.bench"}, {"device": camera}) == 10.0
+    let_go.set()

@@ -21,7 +21,7 @@ from drivers.registry.claim import PLACE_VARIABLE, Claim, DeviceBusyError, holde
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config, template
 from instrument.bench.safety import StepsFailedError
-from tests.mocks.devices import MockStage, MockWorld
+from tests.mocks.devices import MockDevice, MockStage, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers", "own_locks")
 
@@ -267,3 +267,19 @@ def test_devices_are_claimed_by_driver_and_options_unless_the_driver_knows_bette
     assert same[0] == same[1] != same[2]
     simulated = parse_config(template(), None)
     assert all(device.driver.claims(device.options) == () for device in simulated.devices.values())
+
+
+def test_a_device_opened_alone_is_claimed_and_each_of_its_resources(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = bench_on("none", "/dev/ttyMOCK3", "none")
+    bench.open_device("stage")
+    with pytest.raises(DeviceBusyError):
+        Claim(port_claim("/dev/ttyMOCK3"), "another")
+    bench.close()
+    shared = {"camera": ("one",), "stage": ("one", "two"), "led_array": ()}
+    monkeypatch.setattr(
+        MockDevice,
+        "claims",
+        classmethod(lambda cls, _: shared[cls.kind]),  # a bus, and a line of its own
+    )
+    with bench_on("none", "none", "none").open() as bench:
+        assert [claim.resource for claim in bench._claims] == ["one", "two"]

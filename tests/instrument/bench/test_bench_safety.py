@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from statistics import fmean, stdev
 from types import SimpleNamespace
 
@@ -424,3 +425,98 @@ def test_what_cannot_do_its_part_in_a_sequence_is_named(monkeypatch: pytest.Monk
     monkeypatch.setattr(MockLedArray, "sequence_limits", SequenceLimits(8, 1.0, 2))
     assert opened(2).startswith("led_array (mock): has trigger outputs 0 to 1, not 2, which")
     assert opened(1) == ""
+
+
+def test_what_a_device_says_of_its_own_doubt_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = bench_with().open()
+
+    def off(_: object) -> None:
+        raise DeviceError("led_array (mock)", "did not answer.", "The light may be on: look.")
+
+    monkeypatch.setattr(MockLedArray, "off", off)
+    with pytest.raises(StepsFailedError) as caught:
+        bench.stop()
+    assert str(caught.value).count("The light may be on") == 1
+
+
+def test_a_lost_device_that_was_made_safe_after_all_is_safe(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = bench_with().open()
+    leds = bench.led_array
+    assert isinstance(leds, MockDevice)
+    leds._open = False
+    monkeypatch.setattr(MockLedArray, "off", lambda self: setattr(self, "_open", True))
+    bench.stop()
+    monkeypatch.undo()
+    bench.close()
+
+
+@pytest.mark.parametrize(
+    ("step", "error", "line"),
+    [
+        ("close stage", DeviceError("stage", "was unplugged."), "close stage: was unplugged."),
+        ("close camera", DeviceError("stage", "was unplugged."), "close camera: stage: was unplugged."),
+        ("close stage", ValueError("stage"), "close stage: stage"),
+        ("close stage", ValueError(), "close stage: ValueError"),
+    ],
+)
+def test_a_failed_step_is_told_without_naming_its_device_twice(
+    step: str, error: Exception, line: str
+) -> None:
+    assert str(StepsFailedError([(step, error)])).endswith(f":\n  {line}")
+
+
+def test_only_open_devices_count_as_simulated() -> None:
+    bench = bench_with()
+    bench.open_device("camera")
+    assert bench.simulated_kinds == ("camera",)
+    bench.close()
+
+
+def test_the_source_is_lit_while_its_leds_alone_are() -> None:
+    with bench_with(extra="[source]\nleds = [3]\n").open() as bench:
+        assert bench.led_array is not None
+        told = [bench.source_lit]
+        bench.source_on()
+        told.append(bench.source_lit)
+        bench.led_array.set_pattern(replace(bench.source_pattern, levels=((4, (255, 255, 255)),)))
+        told.append(bench.source_lit)
+        bench.source_on()
+        assert isinstance(bench.led_array, MockDevice)
+        bench.led_array._open = False
+        told.append(bench.source_lit)
+        bench.led_array._open = True
+        assert told == [False, True, False, False]
+    with bench_with(kinds=("camera",)).open() as bench:
+        assert not bench.source_lit
+        with pytest.raises(BenchError, match=r"has no \[stage\]"):
+            _ = bench.source_mount
+
+
+def test_times_are_foretold_by_the_sensor_and_by_what_its_light_costs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told: list[tuple[object, ...]] = []
+
+    def about(of: str, *, megapixels: float, simulated: bool, awaits_light: Callable[[], bool]) -> None:
+        told.append((of, megapixels, simulated, awaits_light()))
+
+    monkeypatch.setattr(bench_module.kept_times, "about", about)
+    with bench_with().open() as bench:
+        bench.foretell("ours")
+        monkeypatch.setattr(Bench, "simulated_kinds", ("stage",))
+        bench.foretell("yours")
+    assert told == [(of, pytest.approx(24 * 32e-6), of == "ours", False) for of in ("ours", "yours")]
+
+
+def test_a_place_as_far_as_an_axis_settles_within_is_the_one_that_it_came_to_from_below() -> None:
+    extra = '[stage]\ndriver = "mock"\nplay = { x_um = 2.0 }\n'
+    with bench_with(extra=extra, kinds=("camera",)).open() as bench:
+        assert bench.stage is not None
+        assert bench.stage.position()["x_um"] == 0
+        (axis,) = (axis for axis in bench.stage.axes if axis.name == "x_um")
+        for off, moves in (1.0, 1), (1.01, 2):
+            bench.stage.move_to({"x_um": 0.0})
+            bench._seated["x_um"] = off * bench.stage.settles_within(axis)
+            before = len(calls(bench))
+            bench.place_source(x_um=1.0)
+            assert calls(bench)[before:] == ["stage.move_to"] * moves
