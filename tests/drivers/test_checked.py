@@ -203,6 +203,15 @@ def test_a_call_has_the_time_that_its_device_needs() -> None:
     assert call_limit_s(made(type("Bare", (MockStage,), {"axes": ()})), "wait") == 600
 
 
+@pytest.mark.parametrize("said", [0.0, -1.0, 1e6, float("nan")])
+def test_a_camera_that_takes_no_time_or_weeks_for_a_frame_is_not_believed(said: float) -> None:
+    camera = made(type("Slow", (MockCamera,), {"longest_wait_s": property(lambda _: said)}))
+    with pytest.raises(DeviceError, match=r"how long a frame may take|longest_wait_s"):
+        _ = camera.longest_wait_s
+    week = made(type("Patient", (MockCamera,), {"longest_wait_s": property(lambda _: 7 * 86_400.0)}))
+    assert week.longest_wait_s == 604_800
+
+
 class Stays(MockStage):
     def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
         return dict(target)

@@ -54,6 +54,9 @@ def test_refuses_what_is_no_bayer_frame():
         split_bayer(np.zeros((4, 4)), "RGBG")
     with pytest.raises(InputError, match=r"must be .height, width."):
         split_bayer(np.zeros((4, 4, 3)), "RGGB")
+    with pytest.raises(InputError, match="at least 2 x 2"):
+        split_bayer(np.zeros((1, 5)), "RGGB")
+    assert split_bayer(np.ones((2, 2)), "RGGB")[0].sum() == 4
 
 
 @pytest.mark.parametrize("kept", [1.0, 0.5, 0.2, "bayer"])

@@ -74,6 +74,7 @@ def test_the_light_that_fits_is_never_negative() -> None:
     assert _fitted(patch, data) == pytest.approx((15 / 25, 15**2 / 25))
     assert _fitted(patch, -data) == (0.0, 0.0)
     assert _fitted(0 * patch, data) == (0.0, 0.0)
+    assert _fitted(0.1 * patch, data) == pytest.approx((10 * 15 / 25, 15**2 / 25))  # however dim the PSF
 
 
 def test_points_that_are_one_are_merged_into_the_brighter_and_dim_ones_go() -> None:
@@ -142,6 +143,9 @@ def test_blobs_on_a_grid_are_points_at_their_centroids_the_brightest_first() -> 
     beads[5, 40], beads[2, 30], beads[37, 30], beads[25, 2], beads[25, 47] = 0.91, 5.0, 5.1, 5.2, 5.3
     assert len(points_on_grid(beads, (20, 25))) == 7
     assert len(points_on_grid(beads, (20, 25), least=0.5)) == 5
+    apart = np.zeros((40, 50))
+    apart[[10, 13, 16], 20], apart[25, [20, 23, 26]] = (3, 2, 3), (3, 2, 3)  # three pixels from each other
+    assert len(points_on_grid(apart, (20, 25))) == 6
     many = np.zeros((70, 70))
     many[4:66:5, 4:66:5] = 1 + RNG.random((13, 13))
     kept = points_on_grid(many, (0, 0))
