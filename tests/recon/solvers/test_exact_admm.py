@@ -10,14 +10,17 @@ import pytest
 from recon.camera.convolution import Convolution
 from recon.camera.varying_psfs import FieldOfPsfs, local_convolution
 from recon.priors import L1, NonNegativity, TotalVariation
+from recon.solvers import volume_admm
 from recon.solvers.operator_admm import LEAST_PIXELS, OperatorAdmm
 from recon.solvers.prior_splits import balancing
 from recon.solvers.splitting import SensorData, Tuning, is_due, residual_norm
+from recon.solvers.tv_admm_volume import LeanTotalVariation
 from recon.solvers.volume_admm import FIRST_PENALTY, VolumeAdmm, is_lateral_periodic
 
 SENSOR = (7, 8)
 RNG = np.random.default_rng(5)
-CAMERA = Convolution(RNG.random((3, 1, 5, 4)) ** 3, SENSOR, dtype=np.float64)
+CAMERA_PSFS = RNG.random((3, 1, 5, 4)) ** 3
+CAMERA = Convolution(CAMERA_PSFS, SENSOR, dtype=np.float64)
 VALID = RNG.random(SENSOR) > 0.2
 DATA = RNG.random((1, *SENSOR)) ** 4
 DEPTHS = ((0.5, 1.0, 1.0), (0.4, 0.9, 1.1), (0.3, 0.8, 1.2))
@@ -218,3 +221,29 @@ def test_a_start_is_seen_and_what_is_solved_obeys_the_bounds_or_the_first_other_
     bounded = made(tv + ANOTHER + NonNegativity())
     np.testing.assert_array_equal(bounded._solved, bounded.splits[0].split)
     np.testing.assert_array_equal(made(tv)._solved, start)
+
+
+@pytest.mark.parametrize("started", [False, True])
+@pytest.mark.parametrize("isotropic", [False, True])
+@pytest.mark.parametrize("planes", [1, 3])
+def test_compiled_sweeps_are_the_same_iterations(planes: int, isotropic: bool, started: bool) -> None:
+    camera = Convolution(CAMERA_PSFS[:planes], SENSOR, dtype=np.float64)
+    start = np.random.default_rng(8).random(camera.domain_shape) if started else None
+    data, prior = SensorData(DATA, VALID), volume_tv(isotropic, DEPTHS[:planes]) + NonNegativity()
+    plain, compiled = (kind(camera, data, prior, initial=start) for kind in (VolumeAdmm, LeanTotalVariation))
+    for _ in range(5):
+        expected, found = plain.advance(), compiled.advance()
+        for name in ("objective", "data_residual", "primal_residual", "dual_residual", "change"):
+            assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-6, abs=1e-9)
+        np.testing.assert_allclose(compiled.solution, plain.solution, atol=1e-8)
+        progress = max(found.primal_residual, found.dual_residual)
+        assert compiled.system.tolerance == pytest.approx(min(max(0.02 * progress, 2.2e-15), 1e-4), rel=0.01)
+
+
+def test_a_device_is_asked_for_the_memory_of_all_volumes(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(volume_admm, "require_memory", lambda _, size: asked.append(size))
+    for prior in (volume_tv(), volume_tv() + ANOTHER):
+        VolumeAdmm(CAMERA, SensorData(DATA, VALID), prior)
+    size = 8 * np.prod(CAMERA.domain_shape)
+    assert asked == [volume_admm._VOLUMES * size, (volume_admm._VOLUMES + 3) * size]

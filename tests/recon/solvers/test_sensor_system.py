@@ -78,3 +78,10 @@ def test_the_preconditioner_follows_a_background_whose_restraint_changes():
         made.solve(right, e := np.zeros(SENSOR))
         assert made.steps <= 10  # 9 and 7 found, 18 where it stays as it was
         assert np.linalg.norm(right - e - made._bend(e)) <= 1.01e-4 * np.linalg.norm(right)
+
+
+def test_no_more_steps_are_taken_than_are_allowed():
+    made = system(None, None)
+    made.tolerance, made.max_steps = 1e-14, 3
+    made.solve(RNG.standard_normal(SENSOR), np.zeros(SENSOR))
+    assert made.steps == 3
