@@ -237,3 +237,35 @@ def test_a_wait_that_closing_ends_says_so() -> None:
     idle: Any = camera()
     with pytest.raises(DeviceError, match="no sequence runs"):
         idle.next_frame(1.0)
+
+
+def test_pixels_at_full_scale_are_counted_as_saturated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Queue, "significant_bits", 3)
+    assert camera(1).snap().metadata.saturated_fraction == 5 / 12  # 7 to 11 of 0 to 11
+
+
+def test_a_software_trigger_is_fired_in_a_sequence_that_waits_for_it_alone() -> None:
+    queue = camera()
+    for mode, streams in ("software", False), ("free_run", True), ("hardware", True):
+        queue._trigger_mode = mode  # type: ignore[assignment]
+        if streams:
+            queue.start_sequence(4)
+        with pytest.raises(DeviceError, match="takes no software trigger now"):
+            queue.trigger()
+        queue.stop_sequence()
+    queue._trigger_mode = "software"
+    queue.start_sequence(4)
+    queue.trigger()
+    assert queue.happened.count("fire") == 1
+
+
+def test_a_sequence_that_does_not_begin_is_ended_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    def begin(*_: object) -> None:
+        raise DeviceError("camera", "has no memory.")
+
+    queue = camera()
+    monkeypatch.setattr(queue, "_begin", begin)
+    with pytest.raises(DeviceError, match="has no memory"):
+        queue.start_sequence(4)
+    assert queue.happened == ["end"]
+    assert not queue.is_streaming

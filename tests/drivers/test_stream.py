@@ -428,7 +428,7 @@ def test_silence_is_counted_from_the_last_frame(monkeypatch: pytest.MonkeyPatch)
     camera, now_s, asked = finite(3), [0.0], []
     monkeypatch.setattr("drivers.common.stream.time", SimpleNamespace(monotonic=lambda: now_s[0]))
     monkeypatch.setattr(FreeRunningCamera, "longest_wait_s", 10.0)
-    answers = iter([*"....", "a frame", *"..........", "another", *"..........."])
+    answers = iter([*"..........", "a frame", *"..........", "another", *"..........."])
 
     def answer(*_: object) -> FrameMetadata:
         asked.append(next(answers))
@@ -445,7 +445,7 @@ def test_silence_is_counted_from_the_last_frame(monkeypatch: pytest.MonkeyPatch)
         assert reader.next_frame(20.0) is not None
         with pytest.raises(DeviceTimeoutError, match=r"no frame for 11\.0 s"):
             reader.next_frame(20.0)
-    assert len(asked) == 27
+    assert len(asked) == 33
     assert next(answers, None) is None
 
 
@@ -601,3 +601,30 @@ def test_who_subscribes_to_a_stream_that_does_not_run_is_told() -> None:
             time.sleep(0.001)
         with pytest.raises(DeviceError, match="unplugged"):
             failed.subscribe(lambda _: None)
+
+
+@pytest.mark.parametrize("error", [None, StoppedError("camera", "was stopped."), ValueError("first")])
+def test_a_stream_that_does_not_end_says_so_beside_what_went_wrong_before(
+    error: Exception | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = finite(3)
+    stream = FrameStream(camera).start()
+
+    def close() -> None:
+        raise DeviceError("camera", "does not stop.")
+
+    def leave() -> None:
+        with stream:
+            if error is not None:
+                raise error
+
+    with monkeypatch.context() as stuck:
+        stuck.setattr(stream, "close", close)
+        with pytest.raises((DeviceError, ValueError)) as caught:
+            leave()
+    if isinstance(error, ValueError):
+        assert caught.value is error
+        assert "does not stop" in caught.value.__notes__[0]
+    else:
+        assert "does not stop" in str(caught.value)
+    stream.close()
