@@ -36,7 +36,7 @@ def smoothed(image, reach):
 def test_an_erased_pixel_is_the_mean_by_the_narrowest_gaussian_that_sees_a_thousandth_of_what_is_known(kind):
     """What none of them sees that is narrower than the longer side is the mean of all that is known."""
     weight = np.zeros(
-        {"a block": (22, 34), "a strip": (40, 3), "a corner": (16, 16), "one side": (8, 64)}[kind]
+        {"a block": (22, 34), "a strip": (40, 3), "a corner": (32, 32), "one side": (8, 64)}[kind]
     )
     weight[0, 0] = 1
     if kind == "a block":
@@ -44,6 +44,8 @@ def test_an_erased_pixel_is_the_mean_by_the_narrowest_gaussian_that_sees_a_thous
         weight[3:20, 2:31] = 0
     elif kind == "one side":
         weight[:2, :2] = 1
+    elif kind == "a corner":
+        weight[0, 1] = 1
     image = 1 + np.random.default_rng(6).random(weight.shape)
     expected, missing = image * weight, weight == 0
     for reach in (reach for reach in (1, 2, 4, 8, 16, 32, 64) if reach < max(weight.shape)):

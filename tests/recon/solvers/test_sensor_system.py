@@ -85,3 +85,32 @@ def test_no_more_steps_are_taken_than_are_allowed():
     made.tolerance, made.max_steps = 1e-14, 3
     made.solve(RNG.standard_normal(SENSOR), np.zeros(SENSOR))
     assert made.steps == 3
+
+
+def test_what_is_solved_already_takes_no_step():
+    made = system(None, None)
+    made.solve(np.zeros(SENSOR), e := np.zeros(SENSOR))
+    assert made.steps == 0
+    made.tolerance, made.max_steps = 0.0, 1000  # less than the arithmetic can tell
+    made.solve(RNG.standard_normal(SENSOR), e)
+    assert made.steps < 1000
+    made.solve(np.full(SENSOR, np.inf), e)
+    assert np.isnan(e).all()
+
+
+def test_a_camera_that_is_no_convolution_is_preconditioned_by_its_central_one():
+    measured = SensorData(np.zeros((1, *SENSOR)), HOLES, None)
+    central = system(HOLES, None)
+    made = SensorSystem(
+        CAMERA.grid_shape,
+        CAMERA.sensor_window,
+        measured,
+        dtype=np.float64,
+        bend=lambda e: central._bend(e) * 1.1,
+    )
+    made.set_scale(2.0)
+    made.set_curvature(CAMERA.power()[0] / CAMERA.power().mean())
+    right = made.masked(RNG.standard_normal(SENSOR))
+    made.solve(right, e := np.zeros(SENSOR))
+    assert made.steps <= 12  # 10 found, 30 and no end with the inverse turned over
+    assert np.linalg.norm(right - e - made._bend(e)) <= 1.01e-4 * np.linalg.norm(right)
