@@ -130,15 +130,22 @@ def test_a_paused_run_waits_in_the_dark_until_it_is_told_to_go_on_or_to_end(
 
 @pytest.mark.parametrize("asked", ["pause", "abort", "stop"])
 def test_an_interval_is_waited_for_in_the_dark_and_ended_by_what_is_asked(
-    bench: Bench, ended: list[FinishReason], asked: str
+    bench: Bench, ended: list[FinishReason], asked: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     part = {"label": "a", "light": "source", "repeats": 2, "interval_s": 600.0}
     runner, writer = made(bench, Plan.model_validate({"label": "p", "parts": [part]}))
+    wait_for, asleep = runner._condition.wait_for, threading.Event()
+
+    def waits(*asked: Any) -> bool:
+        asleep.set()  # what is asked for from now on has to wait until it sleeps
+        return wait_for(*asked)
+
+    monkeypatch.setattr(runner._condition, "wait_for", waits)
     thread = threading.Thread(target=runner.execute)
     thread.start()
     deadline_s = time.monotonic() + 20
-    while "led_array.off" not in calls(bench) and time.monotonic() < deadline_s:
-        time.sleep(0.001)
+    assert asleep.wait(20)
+    assert "led_array.off" in calls(bench)
     assert calls(bench).count("camera.snap") == 1
     getattr(runner, asked)()
     if asked == "pause":
@@ -247,6 +254,18 @@ def test_a_refused_sequence_that_must_be_timed_by_hardware_ends_the_run(
         runner.execute()
     assert ended == [FinishReason.FAILED]
     assert "camera.snap" not in calls(bench)
+
+
+def test_a_sequence_that_was_taken_again_is_noted_with_its_steps(
+    bench: Bench, ended: list[FinishReason], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runner, writer = made(bench, plan(3), todo=[1, 2, 3])
+    in_one_sequence(monkeypatch, bench, runner, lambda *_: ([bench.snap() for _ in range(3)], ["one lost"]))
+    runner.execute()
+    writer.note.assert_called_once_with("sequence taken again", text="one lost", first=1, steps=3)
+    runner.keep_text("more.txt", "what a routine knows")
+    writer.keep_text.assert_called_once_with("more.txt", "what a routine knows")
+    assert ended == [FinishReason.COMPLETED]
 
 
 def test_after_a_sequence_the_light_is_set_anew(
