@@ -19,7 +19,7 @@ import pytest
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
 from instrument.plan import Part, Plan
-from instrument.runs import frame_array, writer
+from instrument.runs import frame_array, run_files, writer
 from instrument.runs.frame_array import FrameArray, SyncPool, description_of
 from instrument.runs.inspection import summary, verify
 from instrument.runs.log import Gap
@@ -295,7 +295,10 @@ def test_a_run_that_is_not_given_is_let_go_and_one_that_goes_on_ends_anew(tmp_pa
                 again.start()
                 state = Run.open(path).state
                 assert (state["state"], state["reason"], state["error"]) == ("running", None, "")
+                kept = list((path / "kept").rglob("*"))
                 again.write([frame(0)])  # in its own place
+                (image,) = (p for p in (path / "kept").rglob("*") if p not in kept and p.is_file())
+                assert image.stat().st_size == frame(0).image.nbytes, "what it replaces is kept beside"
             state = again.finish(reason).state
         assert (state["finished_utc"] == ended) != start
         assert state["reason"] == reason
@@ -354,3 +357,32 @@ def test_a_run_is_held_by_its_folder_and_its_file_or_where_folders_have_no_locks
         held.close()
     assert not open_below(tmp_path)
     assert (tmp_path / "lock").exists() == (folder is not False)
+
+
+def test_a_text_too_long_for_the_log_has_no_copy_and_no_log_no_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_files, "_LONGEST_COPY", 6)
+    texts = {"as long": "\u00b5\u00b5\u00b5", "longer": "\u00b5\u00b5\u00b5!"}  # in bytes
+    assert [line["name"] for line in run_files.copies_of(texts)] == ["as long"]
+    assert run_files.log_size(tmp_path) == 0
+    (tmp_path / "log.jsonl").write_text("12345")
+    assert run_files.log_size(tmp_path) == 5
+
+
+def test_a_frames_folders_are_synced_up_to_the_arrays_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[list[Path]] = []
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as opened:
+        opened.start()
+        opened.write([frame(0)])
+        array = opened._array
+        assert array is not None
+        monkeypatch.setattr(array._sync, "folders", lambda folders: synced.append(list(folders)))
+        opened.write([frame(1), frame(2)])
+    top = array.path / "0" / "c"
+    images = [array.chunk_path(index) for index in (1, 2)]
+    assert set(synced[0]) == {f for image in images for f in image.parents if f.is_relative_to(top)}
+    assert len(synced) == 1
+    assert top in synced[0]
