@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,6 +12,7 @@ from recon import Calibration, InputError
 from recon.base.metrics import psnr
 from recon.streams.live import LiveReconstructor
 from recon.streams.live_picture import Level
+from recon.streams.pace import Spent
 from recon.streams.stillness import SceneState, SceneWatch
 from tests.recon.live.streams import AMPLE_MS, NOISE, SHAPE, iterated, live, photograph, spots_psf
 
@@ -133,3 +137,57 @@ def test_a_frame_that_no_level_takes_settles_nothing(monkeypatch: pytest.MonkeyP
             reconstructor.feed(photograph(0, 0))
     assert reconstructor._shape == ()
     assert reconstructor.feed(photograph(0, 0)).method == "wiener"
+
+
+SMALL = (24, 32)
+
+
+@pytest.mark.parametrize("colours", [None, 3])
+def test_a_frame_lies_on_the_calibrations_pixels_channels_first_and_0_where_it_is_erased(
+    colours: int | None,
+) -> None:
+    rng = np.random.default_rng(0)
+    shape = SMALL if colours is None else (*SMALL, colours)
+    gone, frame = rng.random(shape) < 0.2, rng.random(shape).astype(np.float32) + 1
+    psf = spots_psf(SMALL, 5) if colours is None else np.stack([spots_psf(SMALL, 5)] * colours, axis=2)
+    reconstructor = LiveReconstructor(psf, erasures=gone, noise=NOISE, coarsest=1, background=0.25)
+    measured = reconstructor._measured(frame)
+    expected = np.where(gone, 0, frame - 0.25)
+    np.testing.assert_allclose(measured, np.atleast_3d(expected).transpose(2, 0, 1), rtol=1e-6)
+    np.testing.assert_allclose(reconstructor._as_given(measured), expected, rtol=1e-6)
+    finer = np.kron(frame, np.ones((2, 2) if colours is None else (2, 2, 1), np.float32))
+    np.testing.assert_allclose(
+        reconstructor._on_calibration_pixels(finer), np.moveaxis(np.atleast_3d(frame), 2, 0)
+    )
+    with pytest.raises(InputError, match=r"call restart\(\)"):
+        reconstructor._measured(finer)
+
+
+@pytest.mark.parametrize("plane", [None, 1])
+@pytest.mark.parametrize("done", [None, 0, 5])
+def test_a_picture_of_depths_says_which_it_shows_and_brings_all_of_them(
+    done: int | None, plane: int | None
+) -> None:
+    psfs = np.stack([spots_psf(SMALL, n) for n in (5, 8)])[:, None]
+    calibration = Calibration(psfs, np.array([[0.0, 0.0, 1e4], [0.0, 0.0, 2e4]]))
+    reconstructor = LiveReconstructor(calibration, noise=NOISE, coarsest=1, plane=plane)
+    detail = SimpleNamespace(planes=(0, 1), depths=lambda _: "these two")
+    level: Any = SimpleNamespace(
+        detail=detail,
+        binning=1,
+        method="admm",
+        solver=SimpleNamespace(iterations=9),
+        camera=lambda **_: "one",
+    )
+    volume = np.random.default_rng(0).random((2, *SMALL)).astype(np.float32)
+    picture = reconstructor._picture(level, volume, done, Spent(0.0, 0.0))
+    assert picture.volume is volume
+    np.testing.assert_array_equal(picture.image, volume.max(axis=0) if plane is None else volume[1])
+    of = "these two" if done else "2 depths"
+    shows = 1 if plane is None and not done else plane  # the filter's is the middle one
+    assert picture.shown == (f"brightest of {of}" if shows is None else f"depth {shows} of {of}")
+    assert picture.planes == ((0, 1) if done else (shows,))
+    assert (picture.iterations, picture.total_iterations) == ((5, 9) if done else (0, 0))
+    assert picture.method == {None: "", 0: "wiener", 5: "admm"}[done]
+    one = reconstructor._picture(level, volume[:1], done, Spent(0.0, 0.0))
+    assert one.volume is None

@@ -162,8 +162,10 @@ def test_the_filter_s_time_is_noted_where_frames_come_too_fast_only(monkeypatch:
     monkeypatch.setattr(Pace, "note_filter", lambda _, took: noted.append(took.wall_ms))
     assert reconstructor.feed(photograph(0, 2)[:, ::-1]).method == "wiener"
     assert noted == [], "another scene"
+    began_s = time.perf_counter()
     reconstructor.feed(photograph(0, 3)[:, ::-1])
     affordable.append(0.5)
     fast = reconstructor.feed(photograph(0.7, 4)[:, ::-1])
     assert (fast.scene, fast.method) == (SceneState.MOVING, "wiener")
     assert len(noted) == 1
+    assert 0 < noted[0] < 1e3 * (time.perf_counter() - began_s)

@@ -24,6 +24,7 @@ from recon.reconstruction.selection import choose
 from recon.solvers import SensorAdmm, memory
 from recon.solvers.base import IterationRecord, Solver, StoppingRules
 from recon.solvers.moving import move, move_spectra
+from recon.solvers.splitting import VolumeSplitting
 from recon.streams.joint import solve_together
 from recon.streams.motion import Panning
 from recon.streams.video import VideoSolver, stream_problem
@@ -438,3 +439,87 @@ def test_a_camera_that_is_named_has_the_background_that_it_needs_and_two_images(
     named = stream_problem(scene.measurement, scene.calibration, model="convolution")
     assert asked == ["images", "background"]
     assert "" not in named.warnings
+
+
+class Asked(OtherMoves):
+    """Notes what it is asked to do."""
+
+    state_names = ()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[Any] = []
+
+    def move(self, *by: float) -> None:
+        self.told.append(by)
+
+    def set_data(self, data: Any) -> None:
+        self.told.append(data)
+
+    def restart(self, data: Any) -> None:
+        self.told.append(f"anew: {data}")
+
+
+class AskedOfPicture(Asked, SensorAdmm):
+    """One of pictures."""
+
+
+class AskedOfVolume(Asked, VolumeSplitting):
+    """One of volumes, whose data term is solved exactly."""
+
+
+@pytest.mark.parametrize("by", [(0.0, 0.0), (0.0, 2.0), (1.0, 2.0)])
+@pytest.mark.parametrize("cold", [True, False])
+def test_a_frame_begins_cold_and_forgets_motion_or_moves_what_there_is_and_takes_its_data(
+    cold: bool, by: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solvers: Any = [AskedOfPicture(), AskedOfVolume(), Asked()]
+    video, forgot = video_of(*solvers), list[bool]()
+    video.parts = [SimpleNamespace(set_data=lambda _: None, data="d", sensor_data="s")] * 3  # type: ignore[list-item]
+    video._panning = SimpleNamespace(forget=lambda: forgot.append(True), next=lambda *_: by)  # type: ignore[assignment]
+    monkeypatch.setattr(VideoSolver, "_renewed", lambda _self, _part, before: ("renewed", before))
+    video._cold, video.iterations = cold, 7
+    video.take(np.asarray(small_problem().measurement.image))
+    assert forgot == [True] * cold
+    moved = [by] if any(by) else []
+    picture, volume, other = solvers
+    assert picture.told == [*moved, "anew: d" if cold else "d"]
+    assert volume.told == ([*moved] if cold else [*moved, "s"])
+    assert other.told == moved
+    renewed = [("renewed", volume)] if cold else [volume]
+    assert video.solvers == [picture, *renewed, ("renewed", other)]
+    assert (video.iterations, video._cold) == (0 if cold else 7, False)
+
+
+def test_what_a_solver_kept_on_disk_goes_once_the_next_one_is_made() -> None:
+    order: list[str] = []
+    video = video_of()
+    part: Any = SimpleNamespace(storage=SimpleNamespace(turn=lambda: lambda: order.append("removed")))
+    video._made = lambda _part, _start: order.append("made") or "solver"  # type: ignore[method-assign, assignment]
+    assert video._renewed(part, None) == "solver"
+    assert order == ["made", "removed"]
+
+
+def test_a_solver_that_cannot_be_halted_is_refused_and_the_prior_weighs_as_told() -> None:
+    one, two = (VideoSolver(small_problem(), times_noise=times) for times in (1.0, 2.0))
+    assert two.weights == pytest.approx([2 * weight for weight in one.weights])
+    assert min(one.weights) > 0
+    one._offered = SimpleNamespace(name="whole", make=lambda *_: object())  # type: ignore[assignment]
+    with pytest.raises(InputError, match="whole cannot be halted after each iteration"):
+        one._made(one.parts[0], None)
+
+
+def test_a_film_of_its_own_psf_is_refused_before_anything_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def refuse(_: Problem) -> None:
+        asked.append("images")
+        raise InputError("one image twice")
+
+    monkeypatch.setattr("recon.streams.video.require_two_images", refuse)
+    monkeypatch.setattr("recon.streams.video.choice_for", lambda *_, **__: asked.append("choice"))
+    monkeypatch.setattr("recon.streams.video._by_one_psf", lambda *_: ("doubt", "reason"))
+    scene = make_scene("sparse-picture", size=24, grid=3)
+    with pytest.raises(InputError, match="one image twice"):
+        stream_problem(scene.measurement, scene.calibration)
+    assert asked == ["images"]
