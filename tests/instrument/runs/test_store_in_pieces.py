@@ -386,3 +386,27 @@ def test_a_frames_folders_are_synced_up_to_the_arrays_own(
     assert set(synced[0]) == {f for image in images for f in image.parents if f.is_relative_to(top)}
     assert len(synced) == 1
     assert top in synced[0]
+
+
+@pytest.mark.parametrize(("first", "made"), [(0, 256), (255, 256), (256, 257), (600, 601)])
+def test_a_recordings_array_is_made_for_its_first_frames(tmp_path: Path, first: int, made: int) -> None:
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as opened:
+        opened.start()
+        opened.write([frame(first)])
+        assert opened._array is not None
+        assert opened._array.n_frames == made
+
+
+def test_images_without_a_line_in_the_log_are_an_array_as_it_says_itself(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as opened:
+        opened.start()
+        opened.write([frame(0)])
+        path = opened.finish(FinishReason.STOPPED).path
+    log = path / "log.jsonl"
+    log.write_text("".join(line for line in log.read_text().splitlines(True) if "crc32" not in line))
+    run = Run.open(path)
+    assert not run.records
+    assert run.array.frame_shape == frame(0).image.shape
+    (path / "frames.ome.zarr" / "0" / "zarr.json").write_text("{}")
+    with pytest.raises(RunError, match=r"frames.ome.zarr: is damaged"):
+        _ = Run.open(path).array
