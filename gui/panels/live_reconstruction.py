@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -18,6 +17,8 @@ from drivers.frame import FrameMetadata
 from gui.background import NewestOnly
 from gui.forms.options_form import FOLDED, OptionsForm
 from gui.jobs import Job, JobContext
+from gui.live_calibration import calibration_of, depths_um, last_or_newest
+from gui.live_depth import DepthSeeker
 from gui.live_follower import LiveFollower
 from gui.panel import Panel, on_bench
 from gui.session import BenchSession
@@ -26,15 +27,13 @@ from gui.widgets.dialogues import elided, path_field
 from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
 from gui.widgets.orientation import OrientationButton, follow_orientation
-from instrument.bench.kept import KeptWithBench
 from instrument.bench.photograph import SPOILT
-from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
+from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError, count, duration, percent
 from instrument.live.light_log import NOTHING_LIT
 from instrument.live.live import LiveResult
 from instrument.reconstruction.job import find_calibration
 from recon.base.declare import Imports, expression, options_of
-from recon.camera.camera_model import members_of_depths
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS
@@ -88,6 +87,7 @@ class LiveReconstructionPanel(Panel):
         self._refining: Job | None = None
         self._holds = False
         self._shown: LiveResult | None = None
+        self._seeker = DepthSeeker(session, self._use_depth)
         self._logged: tuple[str, ...] = ()
         """Warnings of the reconstructor in use that are in the log already."""
 
@@ -112,6 +112,7 @@ class LiveReconstructionPanel(Panel):
         )
         self.plane = choice((), "Depth of the scene: which PSFs of the calibration are used")
         self.plane.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
+        self.plane.activated.connect(self._seeker.leave)
         self.plane.activated.connect(self._rebuild)
         tip = "Reconstruct the newest frame again and again"
         self.run_button = button("▶ Preview", tip, checkable=True)
@@ -156,7 +157,7 @@ class LiveReconstructionPanel(Panel):
         session.run_finished.connect(self._run_finished)
         self._timer = every(self, _LOOK_MS, self.look)
         folder = session.runs_folder
-        self._load(_NO_CALIBRATION, lambda: _last_or_newest(session.kept, folder))
+        self._load(_NO_CALIBRATION, lambda: last_or_newest(session.kept, folder))
 
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:
@@ -224,8 +225,13 @@ class LiveReconstructionPanel(Panel):
     def _got_calibration(self, read: tuple[Path, Calibration] | None) -> None:
         if read is not None:
             path, calibration = read
-            depths = _depths_um(calibration)
+            depths = depths_um(calibration)
+            self._seeker.begin()
             self._build(path, calibration, depths[len(depths) // 2] if depths else None)
+
+    def _use_depth(self, z_um: float) -> None:
+        if self.loaded is not None:
+            self._build(self.loaded.path, self.loaded.calibration, z_um)
 
     def _rebuild(self) -> None:
         if self.loaded is not None:
@@ -285,7 +291,7 @@ class LiveReconstructionPanel(Panel):
 
     def _show_depths(self, loaded: _Loaded) -> None:
         """List the depths of the calibration in use, with the one that is used."""
-        depths: list[float | None] = list(_depths_um(loaded.calibration))
+        depths: list[float | None] = list(depths_um(loaded.calibration))
         depths += [None] if depths else []
         if [self.plane.itemData(i) for i in range(self.plane.count())] != depths:
             offer(self.plane, [(_ALL_DEPTHS if z is None else f"z {z / 1e3:.4g} mm", z) for z in depths])
@@ -295,7 +301,7 @@ class LiveReconstructionPanel(Panel):
 
     def _run_finished(self, path: Path) -> None:
         if self.loaded is None:
-            self._load(_NO_CALIBRATION, lambda: _calibration_of(path))
+            self._load(_NO_CALIBRATION, lambda: calibration_of(path))
 
     def _set_budget(self, value: float) -> None:
         if self.loaded is not None:
@@ -335,7 +341,9 @@ class LiveReconstructionPanel(Panel):
         if silent:  # the old frame's picture goes on to be refined
             self._call_old(silent)
         else:
-            self.view.caution_against(self._doubt(result))
+            if self.loaded is not None:
+                self._seeker.see(result, self.loaded.reconstructor)
+            self.view.caution_against(self._seeker.words or self._doubt(result))
         self.view.set_caption(self._caption(result.metadata))
         # What is doubted stands over the picture.
         worth = result.picture.quality.removeprefix(result.picture.doubt).removeprefix(": ")
@@ -480,24 +488,3 @@ class LiveReconstructionPanel(Panel):
     def _refining_ended(self) -> None:
         self._refining = None
         self.refine_button.setText("Back to the preview" if self._holds else "Refine")
-
-
-def _last_or_newest(kept: KeptWithBench, folder: Path) -> Path | None:
-    """Return the calibration that worked last with this bench; the newest where there is none any more."""
-    with contextlib.suppress(BenchError):  # whoever opens the bench says so
-        kept.read()
-    last = kept.of("live").get("calibration")
-    return Path(last) if last and is_calibration(Path(last)) else newest_calibration(folder)
-
-
-def _calibration_of(run: Path) -> Path | None:
-    """Return the calibration that a run is or holds, if there is one."""
-    return find_calibration(run) if is_calibration(run) or any(run.glob("*/calibration.json")) else None
-
-
-def _depths_um(calibration: Calibration) -> list[float]:
-    """Return the depths to choose from, ascending; none where there is but one, or none is known."""
-    z_um = calibration.source_positions_um[:, 2]
-    groups = members_of_depths(calibration.source_positions_um)  # a stage does not come back to the same z
-    depths = sorted(float(z_um[group[0]]) for group in groups if np.isfinite(z_um[group[0]]))
-    return depths if len(depths) > 1 else []

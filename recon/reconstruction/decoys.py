@@ -98,6 +98,28 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
     return replace(check, cause=_cause(problem, check.better)) if check is not None and known else check
 
 
+@linear_algebra_on_one_thread()
+def fitting_depth(problem: Problem, now: int) -> int:
+    """Return which of a problem's depths explains it better than all others, each taken alone.
+
+    ``now``, counted from 0, unless another one does so certainly: a scene that has depth, noise or a white
+    wall speak for none.
+    """
+    small = _small(problem, QUICK[0], most=problem.n_depths)
+    if problem.n_depths < 2 or small.varies or small.fine() < STRUCTURED:
+        return now
+    psfs, places = small.calibration.psfs, small.calibration.source_positions_um
+    scores = []
+    for depth in range(problem.n_depths):
+        alone = replace(
+            small.calibration, psfs=psfs[depth : depth + 1], source_positions_um=places[depth : depth + 1]
+        )
+        one = replace(small, calibration=alone)
+        scores.append(one.score(GIVEN, iterations=QUICK[1], background=problem.smooth))
+    best = int(np.argmin([score.objective for score in scores]))
+    return best if is_ahead(scores[best], (scores[now],), small.pixels, NEARLY) else now
+
+
 def _checked(problem: Problem, on_stage: Stage | None) -> CalibrationCheck | None:
     done = count(1)
 
@@ -264,8 +286,11 @@ def _minima(
             yield Transformation(scale=one.scale**at, rotation_deg=at * one.rotation_deg)
 
 
-def _small(problem: Problem, longest_px: int) -> _Small:
-    """Return the channel that has most signal on blocks of pixels, as large ones as erasures allow."""
+def _small(problem: Problem, longest_px: int, most: int = MOST_PLANES) -> _Small:
+    """Return the channel that has most signal on blocks of pixels, as large ones as erasures allow.
+
+    ``most``: of its depths.
+    """
     channel = int(np.argmax([d[v].std() for d, v in zip(problem.data, problem.valid, strict=True)]))
     own = slice(channel, channel + 1)
     factor = max(1, round(max(problem.sensor_shape) / longest_px))
@@ -283,7 +308,7 @@ def _small(problem: Problem, longest_px: int) -> _Small:
         if over.mean() < ALL_ERASED:
             photograph = replace(photograph, erasures=over)
     depths = problem.depths
-    planes = np.unique(np.linspace(0, problem.n_depths - 1, MOST_PLANES).round().astype(int))
+    planes = np.unique(np.linspace(0, problem.n_depths - 1, most).round().astype(int))
     if local := depths.varies and depths.field_error > VARIED:
         calibration = reduced_calibration(problem.calibration, 1, tuple(planes.tolist()))
     else:  # depths by number: they only have to differ

@@ -16,6 +16,7 @@ from recon.base.checks import as_channels, require_finite
 from recon.base.declare import inapplicable, with_overrides
 from recon.camera.camera_model import members_of_depths
 from recon.errors import InputError
+from recon.reconstruction.decoys import fitting_depth
 from recon.reconstruction.measurement import Floats, Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
@@ -254,6 +255,22 @@ class LiveReconstructor:
         pixels = pixels[..., 0] if image.ndim == 2 else pixels
         measurement = Measurement(pixels, **self._known)
         return reconstruct(measurement, self._given, self.options, on_progress=on_progress, cancel=cancel)
+
+    def fitting_depth_um(self, image: Array) -> float | None:
+        """Return the depth of the calibration that explains a frame best, from any thread; um.
+
+        The one in use unless another explains it certainly better; None: of all depths, or of one alone.
+        """
+        now_um = self.options.z_um
+        if now_um is None or not isinstance(self._given, Calibration):
+            return now_um
+        pixels = np.moveaxis(self._on_calibration_pixels(image), 0, -1)
+        measurement = Measurement(pixels[..., 0] if image.ndim == 2 else pixels, **self._known)
+        z_um = self._given.source_positions_um[:, 2]
+        depths = [float(z_um[group[0]]) for group in members_of_depths(self._given.source_positions_um)]
+        now = int(np.argmin(np.abs(np.array(depths) - now_um)))
+        options = ReconstructionOptions(prior="tv", model="convolution", drop_empty=False)
+        return depths[fitting_depth(Problem.of(measurement, self._given, options), now)]
 
     def shown(self, volume: Floats, planes: tuple[int, ...] | None = None) -> Floats:
         """Return the picture of depths (n_z, ...): of the one chosen, else each pixel's brightest.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from gui.panels.live import LivePanel
 from gui.panels.live_reconstruction import LiveReconstructionPanel
 from gui.session import BenchSession
 from instrument.files.calibration_file import load_calibration, save_calibration
+from recon.camera.transformed import Transformation, transformed
 from recon.errors import InputError
 from recon.types import Calibration
 
@@ -354,3 +356,24 @@ def test_a_preview_that_is_not_seen_ends_and_goes_on_when_it_is_shown(
     )
     window.show_panel("live_reconstruction")
     qtbot.waitUntil(lambda: panel._shown is not shown, timeout=WAIT_MS)
+
+
+def test_the_scenes_depth_is_found_among_those_calibrated_until_one_is_chosen(
+    qtbot: QtBot, panel: LiveReconstructionPanel, tmp_path: Path
+) -> None:
+    qtbot.waitUntil(lambda: panel._shown is not None, timeout=WAIT_MS)
+    one = load_calibration(tmp_path / "calibration")
+    sizes = (1.0, 0.95, 0.9)  # of the patterns of farther points
+    psfs = np.concatenate([transformed(one.psfs, Transformation(scale=size)) for size in sizes])
+    places = np.array([[0.0, 0.0, z_um] for z_um in (1e5, 1.6e5, 2.5e5)])
+    save_calibration(replace(one, psfs=psfs, source_positions_um=places), tmp_path / "three")
+    panel.file.setText(str(tmp_path / "three"))
+    qtbot.keyClick(panel.file, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: panel.loaded is not None and panel.loaded.z_um == 1e5, timeout=WAIT_MS)
+    assert panel.plane.currentData() == 1e5
+    panel.plane.setCurrentIndex(1)
+    panel.plane.activated.emit(1)
+    qtbot.waitUntil(lambda: panel.loaded is not None and panel.loaded.z_um == 1.6e5, timeout=WAIT_MS)
+    shown = panel._shown
+    qtbot.waitUntil(lambda: panel._shown is not shown and panel._loading is None, timeout=WAIT_MS)
+    assert not panel._seeker.words, "what was chosen by hand stays"
