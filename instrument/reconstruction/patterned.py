@@ -30,6 +30,9 @@ from recon.types import Calibration
 
 Floats = npt.NDArray[np.float32]
 
+WHOLE_COLOURS = (
+    "each with all colours of the mosaic (--bin 1: the sensor's own, a quarter of them red or blue)"
+)
 SHEET_ITERATIONS = 60
 """A sheet's picture is smooth, and smoothed afterwards: more add nothing."""
 
@@ -86,7 +89,10 @@ def prepare_patterned(
     folder = find_calibration(request.calibration)
     calibration = replace(load_calibration(folder), background=None)
     run = Run.open(request.run)
-    lit = _Lit.of(run, calibration, folder, request.inputs)
+    from_file = request.sheet.suffix.lower() == ".npy"
+    # A file's patterns have the frames' own pixels.
+    inputs = request.inputs if from_file else _whole_colours(request.inputs, run)
+    lit = _Lit.of(run, calibration, folder, inputs)
     job = replace(
         lit.job,
         measurement=lit.frames.sum(axis=0),
@@ -106,7 +112,9 @@ def prepare_patterned(
     if request.options.z_um is not None:
         job = refocused(job, request.options.z_um)
     warnings = [*job.warnings, *_saturation(run)]
-    if request.sheet.suffix.lower() == ".npy":
+    if inputs is not request.inputs:
+        job = replace(job, notes={**job.notes, "Pixels": f"{job.notes['Pixels']}; {WHOLE_COLOURS}"})
+    if from_file:
         patterns = _patterns_from_file(request.sheet, lit.frames.shape[:3])
     else:
         sheet = Run.open(request.sheet)
@@ -118,7 +126,7 @@ def prepare_patterned(
             )
         _require_same_plan(run, sheet)
         warnings += _saturation(sheet)
-        white = _Lit.of(sheet, calibration, folder, request.inputs)
+        white = _Lit.of(sheet, calibration, folder, inputs)
         patterns, rough = _patterns_of(white, job, request, on_progress)
         even = None if lit.erased is None else lit.erased.any(axis=0)
         if rough > SWAPPED * _roughness(_look(Measurement(job.measurement, erasures=even), job, request)):
@@ -129,6 +137,20 @@ def prepare_patterned(
     noise = job.binned_noise(request.inputs.noise)
     measurement = Measurement(lit.frames, noise, erasures=lit.erased, patterns=patterns)
     return PreparedPatterned(replace(job, warnings=tuple(warnings)), measurement, request)
+
+
+def _whole_colours(inputs: InputOptions, run: Run) -> InputOptions:
+    """Return how a mosaic's raw frames are read where nothing is said of pixels: every colour in each.
+
+    Red and blue have a quarter of the sensor's own pixels, by which the iterations come on slowly.
+    """
+    steps = [] if run.plan is None else run.steps(PATTERN)
+    if inputs.binning is not None or not steps or steps[0].index not in run.records:
+        return inputs
+    told = {"pixel_format": run.metadata(steps[0].index).pixel_format}
+    frame = ImageFile(run.path, run.frame(steps[0]), metadata=told)
+    mosaic = None if frame.is_colour else pattern_of(inputs.mosaic, frame)
+    return inputs if mosaic is None else replace(inputs, binning=2)
 
 
 def solve_patterned(

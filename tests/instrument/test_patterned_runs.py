@@ -130,6 +130,14 @@ def test_a_colour_camera_in_patterned_light(files: tuple[Path, Path, Path], tmp_
     np.testing.assert_allclose(light / light[0], tint, rtol=0.1)
     truth = (scene() * lights().sum(axis=0))[:, 1:29].reshape(12, 2, 14, 2).mean(axis=(1, 3))
     assert psnr(image[..., 0], truth, fit_scale=True) > 13  # of a quarter of the pixels
+    by_itself = PatternedRequest(run=run, sheet=sheet, calibration=calibration)
+    prepared = prepare_patterned(by_itself)
+    assert np.shape(prepared.measurement.image) == (3, 12, 15, 3), "each pixel has all colours"
+    assert not np.any(prepared.measurement.erasures)
+    assert "binned 2 x 2" in prepared.job.notes["Pixels"]
+    assert "--bin 1" in prepared.job.notes["Pixels"]
+    own = replace(by_itself, inputs=InputOptions(binning=1))
+    assert np.shape(prepare_patterned(own).measurement.image) == (3, *SHAPE, 3)
     asked = PatternedRequest(run=run, sheet=tmp_path / "patterns.npy", calibration=calibration)
     np.save(tmp_path / "patterns.npy", lights())
     whole = prepare_patterned(asked).measurement
