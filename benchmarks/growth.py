@@ -1,6 +1,6 @@
 """Draw time and memory of reconstructions against pixels, planes, PSFs, frames and threads, with slopes.
 
-    python benchmarks/growth.py [--most 1.0] [--out growth] [--iterations 30]
+    python benchmarks/growth.py [--most 1.0] [--out growth] [--iterations 30] [--times 1]
     python benchmarks/growth.py --told            # what reconstructions say early, and what they took
     python benchmarks/growth.py --before          # memory that is said before it is taken
     python benchmarks/growth.py --explained       # what --explain says of each kind, and what all of it takes
@@ -88,6 +88,7 @@ def cases(most: float) -> dict[str, list[tuple[int, Case]]]:
         "planes": [(n, Case(planes=n)) for n in (4, 8, 16, 32)],
         "PSFs": [(n * n, Case(side=128, psfs=n)) for n in (2, 3, 5)],
         "frames": [(n, Case(side=128, frames=n)) for n in (32, 96, 288)],
+        "small films": [(n, Case(side=64, frames=n)) for n in (64, 128)],
         "frames together": [(n, Case(side=64, frames=n, over_time="tv")) for n in (32, 96)],
         "holograms": [(n * n, Case(side=n, expansion=4)) for n in (128, 256, 512)],
         "expansions": [(n, Case(side=128, expansion=n)) for n in (1, 4, 16)],
@@ -430,6 +431,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--most", type=float, default=1.0, help="pixels, times those of 1024 x 1024")
     parser.add_argument("--iterations", type=int, default=30)
+    parser.add_argument("--times", type=int, default=1, help="how often each; medians are drawn")
     parser.add_argument("--told", action="store_true", help="only: what is told early, by default options")
     parser.add_argument("--before", action="store_true", help="only: memory said before the first iteration")
     parser.add_argument("--explained", action="store_true", help="only: what --explain says, and takes")
@@ -457,15 +459,18 @@ def main() -> None:
     rows = []
     for axes, (what, grown) in zip(panels, wanted.items(), strict=True):
         sizes = [size for size, _ in grown]
-        found = [measured(case, options.iterations) for _, case in grown]
+        found = []
+        for size, case in grown:
+            runs = [measured(case, options.iterations) for _ in range(options.times)]
+            found.append(tuple(map(float, np.median(runs, axis=0))))
+            for told_s, told_bytes, took_s, took_bytes in runs:
+                rows.append([what, size, took_s, told_s, took_bytes / 2**20, told_bytes / 2**20])
+                print(
+                    f"{what:<8}{size:>9}  {took_s:8.2f} s (forecast {told_s / took_s - 1:+.0%})  "
+                    f"{took_bytes / 2**20:8.1f} MiB (forecast {told_bytes / took_bytes - 1:+.0%})",
+                    flush=True,
+                )
         seconds, memory = [f[2] for f in found], [f[3] for f in found]
-        for size, (told_s, told_bytes, took_s, took_bytes) in zip(sizes, found, strict=True):
-            rows.append([what, size, took_s, told_s, took_bytes / 2**20, told_bytes / 2**20])
-            print(
-                f"{what:<8}{size:>9}  {took_s:8.2f} s (forecast {told_s / took_s - 1:+.0%})  "
-                f"{took_bytes / 2**20:8.1f} MiB (forecast {told_bytes / took_bytes - 1:+.0%})",
-                flush=True,
-            )
         time_slope, memory_slope = slope(sizes, seconds), slope(sizes, memory)
         words = f"time ~ size^{time_slope:.2f}, memory ~ size^{memory_slope:.2f}"
         each = (memory[-1] - memory[-2]) / (sizes[-1] - sizes[-2])

@@ -158,7 +158,7 @@ def run_display_demo(
         nominal = bench_display(bench.config, (require_slm(bench).shape, require_slm(bench).pixel_pitch_um))
         io = DisplayBench(bench, 1)
         began = time.perf_counter()
-        listener.step("aligning the mask")
+        listener.step("aligning the demo's mask")
         report = _aligned(io, nominal, bench, listener)
         seconds["align"] = time.perf_counter() - began
         alignment = alignment_of(report, bench, nominal.mask.shape)
