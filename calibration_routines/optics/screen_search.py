@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -14,6 +15,7 @@ from calibration_routines.optics.screen_pictures import LEAST_MARKS, Levels, Scr
 from calibration_routines.procedure import Listener
 from calibration_routines.psf.exposure import ExposureOutcome, TooDarkError, auto_expose, hot_pixels
 from calibration_routines.purpose import CalibrationError
+from calibration_routines.scatter import compare
 from instrument.bench.bench import Bench
 from instrument.files.errors import duration
 from instrument.reconstruction.mosaic import in_colours
@@ -28,9 +30,12 @@ _BARS = (9, 16)  # rows, columns
 _MARKS = 5  # along each side of the part that is seen
 _MARKS_WITHIN = 0.8  # of it
 _MARK = 1 / 20  # of its height is a mark's side
-SEARCH = sum(_BARS) + _MARKS**2
-"""Photographs that it takes, besides those that find an exposure."""
+SEARCH = sum(_BARS) + 1 + _MARKS**2 + 2
+"""Photographs that it takes, besides those that find an exposure: of bars and black again, of the marks, and
+of that in the middle first and last."""
+_MOVED_PX = 0.5  # pixels of the camera by which that mark may lie elsewhere
 _DIMMEST = 0.05  # of full scale
+_OTHER_LIGHT = 0.2  # of the brightest bar's light, by which black may change
 _FOUND_PX = 300  # rows of the images that marks are found on
 
 
@@ -75,7 +80,18 @@ class ScreenView:
         taken = self._bench.snap()
         image = in_colours(np.asarray(taken.image, np.float32), taken.metadata.pixel_format)
         grey = image.mean(axis=-1, dtype=np.float32) if image.ndim == 3 else image
-        return grey if self._black is None else grey - self._black
+        # A pixel that turned hot stays where it is: registered, it would hold the picture in its place.
+        seen = np.asarray(cv2.medianBlur(np.ascontiguousarray(grey), 3), np.float32)
+        return seen if self._black is None else seen - self._black
+
+    def require_darkness(self, light: float) -> None:
+        """Raise CalibrationError where black is no longer as dark as it was, by a picture's mean light."""
+        other = float(self.light(np.zeros(self.slm.shape, np.uint8)).mean()) / max(light, 1e-9)
+        if abs(other) > _OTHER_LIGHT:
+            raise CalibrationError(
+                f"While the screen was looked for, other light changed by {abs(other):.0%} of a bar's: "
+                "keep daylight, lamps and other screens out, and let this one warm up."
+            )
 
 
 @contextlib.contextmanager
@@ -112,6 +128,7 @@ def find_screen(bench: Bench, control: RunControl, listener: Listener) -> Screen
             light.append(float(screen.light(levels).mean()))
             listener.share(done := done + 1, total)
         seen.append(field_along(np.array(light), shape[axis]))
+    screen.require_darkness(max(light))
     (top, bottom), (left, right) = seen
     side = max(2, round(_MARK * (bottom - top)))
     spread = np.linspace(-_MARKS_WITHIN / 2, _MARKS_WITHIN / 2, _MARKS)
@@ -128,10 +145,12 @@ def find_screen(bench: Bench, control: RunControl, listener: Listener) -> Screen
     middle = len(corners) // 2
     screen.expose(mark(corners[middle]), 0.7)
     factor = max(1, bench.camera.frame_shape[0] // _FOUND_PX)
+    first = screen.light(mark(corners[middle]))
     photographs = []
     for corner in corners:
         photographs.append(block_mean(screen.light(mark(corner)), factor))
         listener.share(done := done + 1, total)
+    _require_rest(first, screen.light(mark(corners[middle])))
     places, shifts = [], []
     for corner, photograph in zip(corners, photographs, strict=True):
         found = register(photograph, photographs[middle])
@@ -147,6 +166,21 @@ def find_screen(bench: Bench, control: RunControl, listener: Listener) -> Screen
             "the camera, and check that nothing moves."
         )
     return found_map
+
+
+def _require_rest(first: Floats, last: Floats) -> None:
+    """Raise CalibrationError where the same mark lies elsewhere in the end: all marks are off then."""
+    moved_px = compare(last, first).shift_px
+    if not np.isfinite(moved_px):
+        raise CalibrationError(
+            "While the screen was looked for, one bright square was not found again where it had been: other "
+            "light came, or something moved. Keep daylight, lamps and other screens out, clamp what can move."
+        )
+    if moved_px > _MOVED_PX:
+        raise CalibrationError(
+            f"While the screen was looked for, its picture moved by {moved_px:.1f} pixels: it creeps or "
+            "shakes. Clamp screen, diffuser and camera, let them warm up, take the table off what vibrates."
+        )
 
 
 def _centroid(photograph: Floats) -> npt.NDArray[np.float64]:

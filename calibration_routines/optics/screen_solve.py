@@ -17,6 +17,7 @@ from calibration_routines.options import MM, Checked
 from calibration_routines.procedure import Listener, Outcome
 from calibration_routines.psf.analysis import binned, channels_first, dark_model, replace_hot
 from calibration_routines.purpose import CalibrationError, Purpose
+from calibration_routines.scatter import compare, pooled, scatter_of
 from instrument.bench.bench import Bench
 from instrument.files.atomic import named_by_worth
 from instrument.files.calibration_file import save_calibration
@@ -40,6 +41,12 @@ TONES = (24, 48, 80, 112, 144, 176, 208, 232, 255)
 FLICKER, DRIFT = 0.01, 0.02
 """Change of the screen's light, from frame to frame and from picture to picture or over the run, from which
 on it is told of."""
+PLACE_PX = 0.1
+"""Pixels of the camera to which the place of a picture is known, beyond which a shaking picture is told of: a
+PSF from pictures that are 0.28 apart is another one by a tenth."""
+MOVED_PX, _SURE = 0.7, 3.0
+"""Pixels of the camera by which the white picture may lie elsewhere in the end (evenly over the run it blurs
+the PSF by a fifth of a pixel), and the standard deviations of its place that this must be."""
 _SOLVER = PictureSettings(beyond=0.0, saturated=None, gamma=1.0, foreign=False, rounds=1, psf_iterations=300)
 """Nothing is unknown but the PSF: black is taken off, the tone is measured, and nothing else shines."""
 SOLVING = "solving for the PSF"
@@ -160,6 +167,29 @@ class _Frames:
         light = in_colours(light, metadata.pixel_format)
         return block_mean(channels_first(light), self._record.asked.binning)
 
+    def unsteady(self) -> list[str]:
+        """Return what moved, and other light between the frames of a picture, in words."""
+        scatters = []
+        for frames in self.of[PICTURE].values():
+            seen = np.stack([self.mean([n]).mean(axis=0) for n in frames])
+            scatters.append(scatter_of(seen)[0])
+        shaken = pooled(scatters)
+        by = self._record.asked.binning
+        shaken = replace(shaken, flicker=0.0, motion_px=by * shaken.motion_px)
+        words = shaken.findings("picture", put_back=False)
+        if not words and shaken.place_error_px > PLACE_PX:
+            words = shaken.causes("frame")
+        found = [sentence.rstrip(".") for sentence in words]
+        white = list(self.of[TONE].values())[-1]
+        (again,) = self.of[AGAIN].values()
+        change = compare(self.mean(again).mean(axis=0), self.mean(white).mean(axis=0))
+        if by * change.shift_px > max(MOVED_PX, _SURE * by * change.place_noise):
+            found.append(
+                f"the picture moved by {by * change.shift_px:.1f} pixels during the run: clamp screen, "
+                "diffuser and camera, let them warm up"
+            )
+        return found
+
     def level(self, label: str) -> list[float]:
         """Return the light of each photograph of a kind, counts a pixel."""
         return [float(self.mean(frames).mean()) for frames in self.of[label].values()]
@@ -244,6 +274,7 @@ def solve_screen(
         "flicker": frames.flicker(),
         "drift": frames.level(AGAIN)[0] / tones[-1] - 1,
         "saturated_frames": frames.saturated(),
+        "unsteady": frames.unsteady(),
     }
     made = {"bench": record.bench, "simulated": record.simulated, "run": str(run.path)}
     calibration, path = saved(
@@ -323,7 +354,7 @@ def findings_of(quality: Mapping[str, Any]) -> list[str]:
     findings = []
     if quality["flicker"] > FLICKER:
         findings.append(
-            f"the screen's light changes by {quality['flicker']:.1%} from frame to frame: dim it, so that "
+            f"the screen's light flickers by {quality['flicker']:.1%} from frame to frame: dim it, so that "
             "the exposure is longer than a few of its refreshes"
         )
     changed = max(abs(quality["drift"]), quality["wander"])
@@ -334,6 +365,7 @@ def findings_of(quality: Mapping[str, Any]) -> list[str]:
         )
     if quality["saturated_frames"]:
         findings.append(f"{quality['saturated_frames']} frames have saturated pixels: dim the screen")
+    findings += quality["unsteady"]
     if any(one["psnr_db"] < one["even_db"] + POOR_DB for one in quality["left_out"]):
         findings.append(
             "pictures that it was not made from are hardly reconstructed with it: did screen, diffuser or "

@@ -107,7 +107,7 @@ def test_who_interrupts_the_search_is_told_that_it_begins_anew(tmp_path: Path) -
     with small_bench() as bench, pytest.raises(EndedEarlyError) as ended:
         ScreenProcedure(ASKED).carry_out(bench, tmp_path, control=control, listener=Stop())
     assert "nothing is kept" in ended.value.__notes__[0]
-    assert "50 photographs are taken anew" in ended.value.__notes__[0]
+    assert "53 photographs are taken anew" in ended.value.__notes__[0]
     assert not list(tmp_path.iterdir())
 
 
@@ -144,6 +144,29 @@ def test_a_bench_without_a_screen_and_a_dark_screen_are_said_in_words(tmp_path: 
         ScreenProcedure(ASKED).carry_out(bench, tmp_path)
     assert not hasattr(no.value, "__notes__")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("creep_px_per_min = 8", "its picture moved by"),
+        ("ambient_e_per_s = 80000\nambient_period_s = 120", "other light"),
+    ],
+)
+def test_what_moves_or_shines_while_the_screen_is_looked_for_is_said(
+    fault: str, said: str, tmp_path: Path
+) -> None:
+    with small_bench(f"{SMALL.rstrip()}\n{fault}\n") as bench, pytest.raises(CalibrationError, match=said):
+        ScreenProcedure(ASKED).carry_out(bench, tmp_path)
+
+
+def test_pixels_that_turn_hot_do_not_mislead_the_search_and_shaking_is_said(tmp_path: Path) -> None:
+    faults = "late_hot_pixels = 300\nlate_hot_e_per_s = 1e6\nlate_hot_after_s = 1\nvibration_px = 0.4\n"
+    with small_bench(f"{SMALL.rstrip()}\n{faults}") as bench:
+        done = ScreenProcedure(replace(ASKED, pictures=4, binning=2)).carry_out(bench, tmp_path)
+    assert not done.good
+    assert any("the picture shakes by" in line for line in done.verdict)
+    assert done.result.calibration.quality["registration_px"] < 2
 
 
 def test_a_map_is_found_from_marks_but_for_one_that_is_wrong() -> None:
@@ -207,12 +230,13 @@ def test_pictures_are_as_asked_and_the_same_for_a_seed() -> None:
         ({"drift": -0.04}, "changed by 4.0% during the run"),
         ({"wander": 0.03}, "changed by 3.0% during the run"),
         ({"saturated_frames": 2}, "2 frames have saturated pixels"),
+        ({"unsteady": ["the picture moved by 2.0 pixels"]}, "the picture moved by 2.0 pixels"),
         ({"left_out": [{"psnr_db": 11.0, "even_db": 10.0}]}, "hardly reconstructed"),
         ({}, None),
     ],
 )
 def test_what_is_wrong_with_the_light_is_named(changed: dict[str, object], words: str | None) -> None:
-    good = {"flicker": 1e-4, "drift": 0.0, "wander": 0.0, "saturated_frames": 0}
+    good = {"flicker": 1e-4, "drift": 0.0, "wander": 0.0, "saturated_frames": 0, "unsteady": []}
     said = findings_of({**good, "left_out": [{"psnr_db": 20.0, "even_db": 10.0}], **changed})
     assert len(said) == (words is not None)
     assert words is None or words in said[0]
