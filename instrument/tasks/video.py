@@ -28,6 +28,9 @@ from recon.reconstruction.options import ReconstructionOptions
 VIDEO = Path("video.ome.zarr")
 """Where a video goes when nothing else is said."""
 
+LITTLE = 0.05
+"""Share of a film's time that its model's choice may take without a word."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
@@ -84,7 +87,9 @@ def make_video(desk: Desk, request: VideoRequest, *, force: bool) -> Done:
     video = request.video
     # Before anything is written:
     require_crew(workers=video.workers, scheduler=video.scheduler, owner=video.scheduler_owner)
+    started_s = time.monotonic()
     prepared = prepare_video(request, force=force)
+    preparing_s = time.monotonic() - started_s
     _tell(desk, prepared)
     if prepared.resumed:
         desk.fact("Resumed", f"{_frames_done(prepared)} frames are done already")
@@ -95,6 +100,8 @@ def make_video(desk: Desk, request: VideoRequest, *, force: bool) -> Done:
     if done > before:
         rate = (done - before) / seconds
         desk.fact("Done", f"{done - before} frames in {duration(seconds)}: {rate:.1f} frames/s")
+        if complete and not prepared.resumed and (cost := choice_in_words(prepared, preparing_s, seconds)):
+            desk.fact("Choosing", cost)
     if not complete:
         total = len(prepared.job.plan.frames)
         kept = f"Interrupted: {done} of {total} frames are in {request.out}. "
@@ -104,6 +111,18 @@ def make_video(desk: Desk, request: VideoRequest, *, force: bool) -> Done:
         desk.warn(f"Warning: {share} hold nothing but noise: was the scene lit?")
     with _told_what_is_kept(prepared), desk.step("film", len(prepared.job.plan.frames)) as advance:
         return Done(tuple(finish_video(prepared, advance)))
+
+
+def choice_in_words(prepared: PreparedVideo, preparing_s: float, solving_s: float) -> str:
+    """Say what a film paid for its model's being chosen; empty where that is little or nothing was chosen."""
+    share = preparing_s / (preparing_s + solving_s)
+    model = prepared.notes["Model"].partition(":")[0]
+    if prepared.request.options.model != "auto" or model == "convolution" or share < LITTLE:
+        return ""
+    return (
+        f"reading, and choosing a model by some frames, took {duration(preparing_s)}, {share:.0%} of it all: "
+        f"what a short film pays, a longer one no more. --model {model} leaves it out."
+    )
 
 
 def _tell(desk: Desk, prepared: PreparedVideo) -> None:

@@ -33,6 +33,7 @@ from instrument.reconstruction.video_files import VideoPictures, levels_of, requ
 from instrument.reconstruction.video_job import VideoJob
 from instrument.reconstruction.video_work import BlockReport
 from instrument.runs.run import Run
+from instrument.tasks.video import choice_in_words
 from recon import reconstruct
 from recon.base.metrics import psnr
 from recon.errors import InputError
@@ -329,6 +330,7 @@ def test_prepared_is_what_the_window_shows(recording: Path, tmp_path: Path) -> N
     assert prepared.left == [0, 1, 2]
     assert any("1 of 11 frames were lost" in warning for warning in prepared.warnings)
     assert prepared.notes["Dark"].startswith("20 counts")
+    assert choice_in_words(prepared, 5.0, 1.0) == "", "one PSF: nothing was chosen"
 
 
 def test_auto_takes_the_model_that_the_film_asks_for_and_depths_become_volumes(tmp_path: Path) -> None:
@@ -350,6 +352,11 @@ def test_auto_takes_the_model_that_the_film_asks_for_and_depths_become_volumes(t
     )
     prepared = prepare_video(wanted)
     assert prepared.notes["Model"].startswith(("local: by the mean of 4 frames", "lowrank: by the mean of 4"))
+    model = prepared.notes["Model"].partition(":")[0]
+    paid = choice_in_words(prepared, 2.0, 18.0)
+    assert "took 2.0 s, 10% of it all" in paid
+    assert f"--model {model} leaves it out" in paid
+    assert choice_in_words(prepared, 2.0, 60.0) == "", "a long film pays next to nothing"
     again = VideoJob(prepared.job.folder).problem
     assert again.extent.psf_window is not None
     assert ("where PSFs were measured" in prepared.notes["Model"]) == (again.extent.margin is not None)
