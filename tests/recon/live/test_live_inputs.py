@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 
 from recon import Calibration, InputError
 from recon.base.metrics import psnr
+from recon.streams import live as live_module
 from recon.streams.live import LiveReconstructor
 from recon.streams.live_picture import Level
 from recon.streams.pace import Spent
@@ -191,3 +193,82 @@ def test_a_picture_of_depths_says_which_it_shows_and_brings_all_of_them(
     assert picture.method == {None: "", 0: "wiener", 5: "admm"}[done]
     one = reconstructor._picture(level, volume[:1], done, Spent(0.0, 0.0))
     assert one.volume is None
+
+
+def test_a_level_that_is_being_made_is_waited_for_until_a_newer_frame_is_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: Any = SimpleNamespace(solver="a solver")
+    for answers, newer, found, asked in (
+        ([False, False, True], [False, False], made, 2),
+        ([True], [], made, 0),
+        ([False, False], [False, True], None, 2),
+    ):
+        reconstructor, left, told = live(), list(answers), list(newer)
+        reconstructor._level = SimpleNamespace(solver=None)  # type: ignore[assignment]
+        reconstructor._coming = SimpleNamespace(wait=lambda _, left=left: left.pop(0))  # type: ignore[assignment]
+        monkeypatch.setattr(
+            reconstructor, "_take_up", lambda _, of=reconstructor: setattr(of, "_level", made)
+        )
+        assert reconstructor._solving_level(lambda told=told: told.pop(0)) is found
+        assert (left, told, len(newer)) == ([], [], asked)
+    reconstructor._level, reconstructor._coming = SimpleNamespace(solver=None), None  # type: ignore[assignment]
+    assert reconstructor._solving_level(lambda: False) is None
+
+
+def test_a_frame_that_is_fed_has_all_its_iterations_whatever_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    reconstructor, newer = live(budget_ms=AMPLE_MS), list[bool]()
+    iterated(reconstructor, photograph(0, 0))
+
+    def iterate(_level: object, _began: object, _most: object, asked: Any) -> tuple[int, Spent]:
+        newer.append(asked())
+        return 1, Spent(0.0, 0.0)
+
+    monkeypatch.setattr(reconstructor, "_iterate", iterate)
+    reconstructor.feed(photograph(0, 1))
+    assert newer == [False]
+
+
+def test_colours_keep_their_place_in_backgrounds_and_in_whole_reconstructions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(0)
+    psfs, behind = np.stack([spots_psf(SMALL, 5)] * 3)[None], rng.random((3, *SMALL)).astype(np.float32)
+    calibration = Calibration(psfs, np.array([[0.0, 0.0, 1e4]]), background=behind)
+    reconstructor = LiveReconstructor(calibration, noise=NOISE, coarsest=1)
+    np.testing.assert_array_equal(reconstructor._known["background"], behind.transpose(1, 2, 0))
+    monkeypatch.setattr("recon.streams.live.reconstruct", lambda measurement, *_, **__: measurement)
+    frame = rng.random((*SMALL, 3)).astype(np.float32)
+    np.testing.assert_allclose(reconstructor.full(frame).image, frame)
+
+
+def test_no_camera_model_is_chosen_for_a_level_of_fewer_depths(monkeypatch: pytest.MonkeyPatch) -> None:
+    psfs = np.stack([spots_psf(SMALL, n) for n in (5, 8)])[:, None]
+    reconstructor = LiveReconstructor(
+        Calibration(psfs, np.array([[0.0, 0.0, 1e4], [0.0, 0.0, 2e4]])), noise=NOISE, coarsest=1
+    )
+    made, told = live_module.stream_problem, list[tuple[int, bool]]()
+
+    def problem(frame: Any, calibration: Calibration, options: Any, *, choosing: bool = True) -> Any:
+        told.append((len(calibration.psfs), choosing))
+        return made(frame, calibration, options, choosing=choosing)
+
+    monkeypatch.setattr(live_module, "stream_problem", problem)
+    reconstructor._measured(np.random.default_rng(0).random(SMALL))
+    detail = replace(next(iter(reconstructor._details.values())), planes=(1,))
+    level = reconstructor._level_of(detail, np.random.default_rng(0).random((1, *SMALL)).astype(np.float32))
+    assert told == [(2, False), (1, False)]
+    assert level.whole.n_planes == 2
+
+
+def test_without_memory_for_a_level_a_coarser_one_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    reconstructor, made = live(), list[str]()
+    reconstructor._level = SimpleNamespace(solver=None, detail=SimpleNamespace(coarseness=2))  # type: ignore[assignment]
+    reconstructor._pace = SimpleNamespace(levels=(1, 2, 4, 8))  # type: ignore[assignment]
+    reconstructor._details = {1: "1", 2: "2", 4: "4", 8: "8"}  # type: ignore[dict-item]
+    monkeypatch.setattr(reconstructor, "_make", lambda detail, _: made.append(detail))
+    reconstructor._level_for(np.zeros((1, *SHAPE), np.float32))
+    assert made == ["4"]
+    reconstructor._pace = SimpleNamespace(levels=(1, 2))  # type: ignore[assignment]
+    reconstructor._level_for(np.zeros((1, *SHAPE), np.float32))
+    assert made == ["4"], "there is none"

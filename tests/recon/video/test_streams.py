@@ -422,6 +422,9 @@ def test_what_is_chosen_for_a_film_is_taken_and_said(
     said = "A smooth background is estimated as well: why background."
     assert (said in problem.warnings) == (background and asked is None)
     assert "" not in problem.warnings
+    stream_problem(frame, scene.calibration, others=[frame + 4, frame + 2])
+    alone = Measurement(frame)
+    assert seen[-1].measurement.noise == pytest.approx(float(alone.deviations(alone.counts())[0]))
 
 
 def test_a_camera_that_is_named_has_the_background_that_it_needs_and_two_images(
@@ -478,7 +481,7 @@ def test_a_frame_begins_cold_and_forgets_motion_or_moves_what_there_is_and_takes
     video.parts = [SimpleNamespace(set_data=lambda _: None, data="d", sensor_data="s")] * 3  # type: ignore[list-item]
     video._panning = SimpleNamespace(forget=lambda: forgot.append(True), next=lambda *_: by)  # type: ignore[assignment]
     monkeypatch.setattr(VideoSolver, "_renewed", lambda _self, _part, before: ("renewed", before))
-    video._cold, video.iterations = cold, 7
+    video._cold, video.iterations, video._calm = cold, 7, 3
     video.take(np.asarray(small_problem().measurement.image))
     assert forgot == [True] * cold
     moved = [by] if any(by) else []
@@ -488,7 +491,7 @@ def test_a_frame_begins_cold_and_forgets_motion_or_moves_what_there_is_and_takes
     assert other.told == moved
     renewed = [("renewed", volume)] if cold else [volume]
     assert video.solvers == [picture, *renewed, ("renewed", other)]
-    assert (video.iterations, video._cold) == (0 if cold else 7, False)
+    assert (video.iterations, video._cold, video._calm) == (0 if cold else 7, False, 0)
 
 
 def test_what_a_solver_kept_on_disk_goes_once_the_next_one_is_made() -> None:
@@ -523,3 +526,11 @@ def test_a_film_of_its_own_psf_is_refused_before_anything_is_chosen(monkeypatch:
     with pytest.raises(InputError, match="one image twice"):
         stream_problem(scene.measurement, scene.calibration)
     assert asked == ["images"]
+
+
+def test_closing_gives_up_the_solvers_and_what_each_part_keeps() -> None:
+    video, closed = video_of(Moves()), list[int]()
+    video.parts = [SimpleNamespace(close=lambda n=n: closed.append(n)) for n in range(2)]  # type: ignore[misc]
+    with video:
+        pass
+    assert (closed, video.solvers) == ([0, 1], [None, None])
