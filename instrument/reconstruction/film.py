@@ -17,6 +17,7 @@ from instrument.files.errors import FileError, ranges
 from instrument.files.films import as_shown, write_mp4
 from instrument.files.ome_zarr import is_zarr_name
 from instrument.files.orientation import AS_IT_IS, Kind, Orientation
+from instrument.files.reading import MOST_TEXT_BYTES, require_file
 from instrument.reconstruction.video_files import (
     DEFAULT_FPS,
     VideoPictures,
@@ -69,7 +70,7 @@ class Film:
         self._video = open_video(path) if is_zarr_name(path) else None
         self._run = None if self._video is not None else Run.open(path)
         if self._video is not None:
-            self.indices = tuple(i for i in range(len(self._video)) if self._video.is_written(i))
+            self.indices = self._video.written
             self.period_s = self._video.period_s
             self.simulated = bool(self.facts.get("simulated"))
         else:
@@ -138,13 +139,16 @@ class Film:
 
 
 def open_video(path: Path) -> VideoPictures:
-    """Open a video; FileError where it is something else."""
+    """Open a video; FileError where it is something else, or damaged."""
     try:
+        for name in ("zarr.json", "0/zarr.json"):
+            require_file(path / name, MOST_TEXT_BYTES)
         video = VideoPictures(path)
-        if video.axes not in ("tyx", "tcyx", "tzyx", "tczyx"):
-            raise KeyError("t")
-    except (FileNotFoundError, KeyError, IndexError, ValueError, TypeError) as error:
-        raise FileError(path, "is no video of 'reconstruct --video'.", "See docs/video.md.") from error
+        video.require_sound()
+    except Exception as error:
+        why = error.problem if isinstance(error, FileError) else ""
+        words = "is no video of 'reconstruct --video'" + (f": it {why}" if why else ".")
+        raise FileError(path, words, "See docs/video.md.") from error
     return video
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,8 @@ from instrument.files.atomic import whole_folder
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import FileError
 from instrument.files.ome_zarr import ome_attributes, ome_channels
+from instrument.files.pieces import piece_bytes, require_pieces
+from instrument.files.reading import MOST_TEXT_BYTES, require_file, require_plausible
 from instrument.runs.run import Run
 from instrument.volumes.grid_facts import grid_facts, grid_of, origin_um, voxel_um
 
@@ -181,9 +184,39 @@ class VideoPictures:
     def __len__(self) -> int:
         return int(self.array.shape[0])
 
+    def require_sound(self) -> None:
+        """Refuse what is no film: other axes, other chunks than a picture each, figures that are none.
+
+        Raises FileError, or whatever reading such figures raises.
+        """
+        if self.axes not in ("tyx", "tcyx", "tzyx", "tczyx") or len(self.axes) != self.array.ndim:
+            raise FileError(self.path, f"has the axes {self.axes!r:.40} of {self.array.ndim}: no film's.")
+        if self.array.chunks != (1, *self.array.shape[1:]):
+            raise FileError(self.path, f"has chunks of {self.array.chunks}: a film has one a picture.")
+        _ = self.grid, [float(edge) for edge in self.calibrated_px or ()]
+        if self.period_s is not None and not 0 < self.period_s < np.inf:
+            raise FileError(self.path, f"says {self.period_s:g} s from picture to picture.")
+
+    @property
+    def written(self) -> tuple[int, ...]:
+        """Which pictures are on the disk."""
+        folder = self.path / "0" / "c"
+        names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+        indices = sorted(int(name) for name in names if name.isascii() and name.isdecimal())
+        return tuple(index for index in indices if index < len(self) and self.is_written(index))
+
     def read(self, index: int) -> Floats:
-        """Return one picture or volume, ([n_z,] height, width[, 3]); NaN where there is none."""
-        picture = np.asarray(self.array[index], np.float32)
+        """Return one picture or volume, ([n_z,] height, width[, 3]); NaN where there is none.
+
+        Raises FileError when it is damaged.
+        """
+        try:
+            self._require_picture(index)
+            picture = np.asarray(self.array[index], np.float32)
+        except FileError:
+            raise
+        except Exception as error:
+            raise FileError(self.path, f"picture {index} cannot be read: {error!s:.200}.") from error
         return np.ascontiguousarray(np.moveaxis(picture, 0, -1)) if "c" in self.axes else picture
 
     def flat(self, index: int) -> Floats:
@@ -222,10 +255,20 @@ class VideoPictures:
         for begun in self.path.rglob("*.partial"):  # zarr's own name for it
             begun.unlink(missing_ok=True)
 
+    def _require_picture(self, index: int) -> None:
+        """Refuse a picture that is no file, or inflates to more than a picture, before memory is taken."""
+        file, holds = self._file(index), piece_bytes(self.array)
+        if os.path.lexists(file):
+            require_file(file, 2 * holds + MOST_TEXT_BYTES)
+            require_plausible(self.path, holds, file.stat().st_size, most=_MOST_EXPANSION)
+            require_pieces(self.path, [(file.stat().st_size, partial(file.open, "rb"))], holds)
+
     def _file(self, index: int) -> Path:
         return self.path / "0" / "c" / "/".join(map(str, (index, *(0,) * (self.array.ndim - 1))))
 
 
+_MOST_EXPANSION = 50_000
+"""Zeros shrink 32,000-fold by zstd, nothing more."""
 DEFAULT_FPS = 25.0
 SAMPLES = 24
 """Pictures looked at to find black and white of all."""

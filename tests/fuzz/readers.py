@@ -19,7 +19,9 @@ from instrument.files.images import read_image, read_stack
 from instrument.files.slm_image import load_slm_correction
 from instrument.files.stability_file import read_stability
 from instrument.plan.model import load_plan
+from instrument.reconstruction.film import Film
 from instrument.reconstruction.stored_result import open_result
+from instrument.reconstruction.video_files import VideoPictures, create_output
 from instrument.runs.inspection import verify
 from instrument.runs.run import Run
 from instrument.volumes.opening import open_volume
@@ -113,6 +115,24 @@ def _calibration(folder: Path) -> Path:
     return save_calibration(made, folder / "calibration")
 
 
+def _video(folder: Path) -> Path:
+    folder.mkdir(exist_ok=True)
+    path = folder / "film.ome.zarr"
+    made = {"calibrated_px": [1.0, 1.0, 11.0, 15.0], "simulated": True}
+    create_output(path, 2, (12, 16), period_s=0.1, grid=None, attributes=made)
+    pictures = VideoPictures(path, write=True)
+    for index in range(2):
+        pictures.write(index, _pixels().astype(np.float32))
+    return path
+
+
+def _film(path: Path) -> None:
+    film = Film(path)
+    film.levels()
+    film.whole(0)
+    _ = film.grid, film.fps, film.facts
+
+
 def _volume(path: Path) -> None:
     source = open_volume(path)
     try:
@@ -171,6 +191,7 @@ READERS: dict[str, Reader] = {
     "ome-zarr": Reader(
         lambda folder: _calibration(folder) / "psfs.ome.zarr", _volume, ("zarr.json", "0/zarr.json")
     ),
+    "video": Reader(_video, _film, ("zarr.json", "0/zarr.json", "0/c/0/0/0")),
     "alignment": Reader(_copied("alignment.json"), load_alignment),
     "slm-calibration": Reader(_copied("slm-calibration.json"), load_slm_correction),
     "stability": Reader(_copied("stability/stability.json"), read_stability),

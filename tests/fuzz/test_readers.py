@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import lzma
 import os
 import struct
@@ -24,6 +25,7 @@ from instrument.files.errors import BenchError
 from instrument.files.images import read_image, write_image
 from instrument.files.ome_zarr import ome_attributes
 from instrument.plan.model import load_plan
+from instrument.reconstruction.film import Film
 from instrument.reconstruction.stored_result import open_result
 from instrument.volumes.opening import open_volume
 from tests.fuzz.__main__ import CORPUS, fuzz
@@ -325,3 +327,34 @@ def test_a_log_of_gigabytes_of_nothing_is_refused(tmp_path: Path) -> None:
         file.truncate(20 << 30)
     with pytest.raises(BenchError, match=r"log.jsonl: says that it holds 21.5 GB"):
         READERS["run"].read(run)
+
+
+def _film_that_says(folder: Path, shape: list[int]) -> Path:
+    film = READERS["video"].make(folder)
+    said = json.loads((film / "0/zarr.json").read_text())
+    said["shape"] = shape
+    said["chunk_grid"]["configuration"]["chunk_shape"] = [1, *shape[1:]]
+    (film / "0/zarr.json").write_text(json.dumps(said))
+    return film
+
+
+def test_a_film_that_says_more_than_it_has_is_not_believed(tmp_path: Path) -> None:
+    assert len(Film(_film_that_says(tmp_path / "long", [10**12, 12, 16]))) == 2
+    large = Film(_film_that_says(tmp_path / "large", [2, 10**5, 10**5]))
+    with pytest.raises(BenchError, match=r"says that it holds 40 GB in .* damaged, or made to fill"):
+        large.read(0)
+
+
+def test_a_picture_of_a_film_that_is_a_pipe_or_damaged_is_a_sentence(tmp_path: Path) -> None:
+    film = READERS["video"].make(tmp_path)
+    picture = film / "0/c/0/0/0"
+    picture.write_bytes(b"no zstd")
+    with pytest.raises(BenchError, match=r"film.ome.zarr: picture 0 cannot be read"):
+        Film(film).read(0)
+    picture.unlink()
+    os.mkfifo(picture)
+    with pytest.raises(BenchError, match="pipe"):
+        Film(film).read(0)
+    (film / "0/zarr.json").write_text('{"a": ' * 5000)
+    with pytest.raises(BenchError, match="is no video of 'reconstruct --video'"):
+        Film(film)
