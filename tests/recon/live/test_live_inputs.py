@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -193,6 +194,9 @@ def test_a_picture_of_depths_says_which_it_shows_and_brings_all_of_them(
     assert picture.method == {None: "", 0: "wiener", 5: "admm"}[done]
     one = reconstructor._picture(level, volume[:1], done, Spent(0.0, 0.0))
     assert one.volume is None
+    np.testing.assert_array_equal(reconstructor.shown(volume), picture.image)
+    if plane == 1:
+        np.testing.assert_array_equal(reconstructor.shown(volume, (1, 2)), volume[0])
 
 
 def test_a_level_that_is_being_made_is_waited_for_until_a_newer_frame_is_there(
@@ -224,9 +228,13 @@ def test_a_frame_that_is_fed_has_all_its_iterations_whatever_comes(monkeypatch: 
         newer.append(asked())
         return 1, Spent(0.0, 0.0)
 
+    noted: list[float] = []
     monkeypatch.setattr(reconstructor, "_iterate", iterate)
+    monkeypatch.setattr(reconstructor._pace, "note", lambda fixed, *_: noted.append(fixed.wall_ms))
+    began_s = time.perf_counter()
     reconstructor.feed(photograph(0, 1))
     assert newer == [False]
+    assert 0 < noted[0] < 1e3 * (time.perf_counter() - began_s)
 
 
 def test_colours_keep_their_place_in_backgrounds_and_in_whole_reconstructions(
@@ -272,3 +280,54 @@ def test_without_memory_for_a_level_a_coarser_one_is_made(monkeypatch: pytest.Mo
     reconstructor._pace = SimpleNamespace(levels=(1, 2))  # type: ignore[assignment]
     reconstructor._level_for(np.zeros((1, *SHAPE), np.float32))
     assert made == ["4"], "there is none"
+
+
+@pytest.mark.parametrize(("binning", "coarseness"), [(2, 2), (2, 3), (4, 4)])
+def test_another_level_is_told_to_the_pace_and_other_pixels_know_nothing_of_the_scene(
+    binning: int, coarseness: int
+) -> None:
+    reconstructor, told = live(), list[object]()
+    before: Any = SimpleNamespace(
+        binning=2,
+        detail=SimpleNamespace(coarseness=2),
+        solver=SimpleNamespace(close=lambda: told.append("closed")),
+    )
+    after: Any = SimpleNamespace(binning=binning, detail=SimpleNamespace(coarseness=coarseness))
+    reconstructor._level, reconstructor._greeted = before, False
+    reconstructor._watch = SimpleNamespace(forget=lambda: told.append("forgotten"))  # type: ignore[assignment]
+    reconstructor._pace = SimpleNamespace(enter=told.append)  # type: ignore[assignment]
+    reconstructor._enter(after)
+    other, anew = coarseness != 2, binning != 2
+    assert told == [*["forgotten"] * anew, *[coarseness] * other, "closed"]
+    assert (reconstructor._level, reconstructor._greeted) == (after, anew)
+
+
+def test_the_first_level_is_told_to_the_pace_and_the_next_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reconstructor, told, frame = live(), list[object](), np.zeros((1, *SHAPE), np.float32)
+    first: Any = SimpleNamespace(detail=SimpleNamespace(coarseness=3), solving="solving")
+    monkeypatch.setattr(reconstructor, "_level_of", lambda *_: first)
+    monkeypatch.setattr(
+        live_module, "ComingLevel", lambda *what: SimpleNamespace(what=what, wait=told.append)
+    )
+    reconstructor._pace = SimpleNamespace(enter=told.append, levels=(1,))  # type: ignore[assignment]
+    assert reconstructor._level_for(frame) is first
+    assert reconstructor._coming.what == (first.detail, "solving")  # type: ignore[union-attr]
+    assert reconstructor._level_for(frame) is first
+    assert told == [3, 0]
+
+
+@pytest.mark.parametrize("follows", [True, False])
+def test_a_solver_that_does_not_know_the_frame_begins_with_it_when_it_is_refined(
+    follows: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reconstructor, told = live(), list[str]()
+    solver = SimpleNamespace(begin=lambda: told.append("begins"), take=lambda _: told.append("takes"))
+    reconstructor._level = SimpleNamespace(solver=solver, solved=lambda: "volume")  # type: ignore[assignment]
+    reconstructor._watch = SimpleNamespace(mean=np.zeros((1, *SHAPE)))  # type: ignore[assignment]
+    reconstructor._follows = follows
+    monkeypatch.setattr(reconstructor, "_iterate", lambda *_: (4, Spent(0.0, 0.0)))
+    monkeypatch.setattr(reconstructor, "_picture", lambda _level, volume, done, _began: (volume, done))
+    assert reconstructor.refine() == ("volume", 4)
+    assert told == ([] if follows else ["begins", "takes"])

@@ -477,13 +477,15 @@ def test_a_frame_begins_cold_and_forgets_motion_or_moves_what_there_is_and_takes
     cold: bool, by: tuple[float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     solvers: Any = [AskedOfPicture(), AskedOfVolume(), Asked()]
-    video, forgot = video_of(*solvers), list[bool]()
-    video.parts = [SimpleNamespace(set_data=lambda _: None, data="d", sensor_data="s")] * 3  # type: ignore[list-item]
+    video, forgot, given = video_of(*solvers), list[bool](), list[Problem]()
+    assert video._cold
+    video.parts = [SimpleNamespace(set_data=given.append, data="d", sensor_data="s")] * 3  # type: ignore[list-item]
     video._panning = SimpleNamespace(forget=lambda: forgot.append(True), next=lambda *_: by)  # type: ignore[assignment]
     monkeypatch.setattr(VideoSolver, "_renewed", lambda _self, _part, before: ("renewed", before))
     video._cold, video.iterations, video._calm = cold, 7, 3
     video.take(np.asarray(small_problem().measurement.image))
     assert forgot == [True] * cold
+    assert given == [video.problem] * 3
     moved = [by] if any(by) else []
     picture, volume, other = solvers
     assert picture.told == [*moved, "anew: d" if cold else "d"]
@@ -534,3 +536,29 @@ def test_closing_gives_up_the_solvers_and_what_each_part_keeps() -> None:
     with video:
         pass
     assert (closed, video.solvers) == ([0, 1], [None, None])
+
+
+@pytest.mark.parametrize(
+    ("cold", "before", "expected"),
+    [
+        (True, "stateful", ["made from None"]),
+        (True, "none", ["made from None"]),
+        (False, "none", ["made from None"]),
+        (False, "stateful", ["made from None", "all that it knew"]),
+        (False, "other", ["made from 5.0"]),
+    ],
+)
+def test_a_solver_made_anew_knows_what_the_one_before_knew_unless_the_frame_begins_cold(
+    cold: bool, before: str, expected: list[str]
+) -> None:
+    told: list[str] = []
+    solver, video = Asked(), video_of()
+    solver.state_names = ("_y",) if before == "stateful" else ()  # type: ignore[misc]
+    solver.checkpoint = lambda *, copy: "all that it knew"  # type: ignore[method-assign, assignment]
+    new = SimpleNamespace(restore=told.append)
+    storage = SimpleNamespace(turn=lambda: lambda: None)
+    part: Any = SimpleNamespace(storage=storage, lifted=lambda _: 5.0)
+    video._made = lambda _, start: told.append(f"made from {start}") or new  # type: ignore[method-assign, assignment]
+    video._cold = cold
+    assert video._renewed(part, None if before == "none" else solver) is new
+    assert told == expected
