@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -261,7 +260,7 @@ class VideoPictures:
         if os.path.lexists(file):
             require_file(file, 2 * holds + MOST_TEXT_BYTES)
             require_plausible(self.path, holds, file.stat().st_size, most=_MOST_EXPANSION)
-            require_pieces(self.path, [(file.stat().st_size, partial(file.open, "rb"))], holds)
+            require_pieces(self.path, [(file.stat().st_size, lambda: file.open("rb"))], holds)
 
     def _file(self, index: int) -> Path:
         return self.path / "0" / "c" / "/".join(map(str, (index, *(0,) * (self.array.ndim - 1))))

@@ -27,7 +27,7 @@ from instrument.runs.run import FinishReason, Run
 from instrument.runs.run_files import RunError
 from instrument.runs.writer import RunWriter
 from tests.instrument.files.test_atomic import open_below
-from tests.instrument.runs.test_store import BENCH, frame
+from tests.instrument.runs.test_store import BENCH, frame, new_run
 
 
 @pytest.mark.parametrize(
@@ -410,3 +410,36 @@ def test_images_without_a_line_in_the_log_are_an_array_as_it_says_itself(tmp_pat
     (path / "frames.ome.zarr" / "0" / "zarr.json").write_text("{}")
     with pytest.raises(RunError, match=r"frames.ome.zarr: is damaged"):
         _ = Run.open(path).array
+
+
+def test_what_a_run_cannot_be_read_without_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with new_run(tmp_path) as opened:
+        opened.start(steps=5)
+        with pytest.raises(RunError, match="has no frames yet"):
+            _ = Run.open(opened.path).array
+        opened.write([frame(0)])
+        path = opened.finish(FinishReason.STOPPED).path
+    (path / "frames.ome.zarr" / "0" / "zarr.json").write_text("{}")
+    assert Run.open(path).array.frame_shape == frame(0).image.shape
+
+    def refuse(*_: object) -> None:
+        raise ValueError("no frames have that shape")
+
+    with monkeypatch.context() as damaged:
+        damaged.setattr("instrument.runs.run.description_of", refuse)
+        with pytest.raises(RunError, match=r"log.jsonl: is damaged: frame 0: no frames have that shape"):
+            _ = Run.open(path).array
+    log = path / "log.jsonl"
+    (path / "plan.json").unlink()
+    log.write_text("".join(line for line in log.read_text().splitlines(True) if '"plan.json"' not in line))
+    with pytest.raises(RunError, match=r"plan.json: is gone, and the log has no copy of it"):
+        _ = Run.open(path).plan
+
+
+def test_a_recordings_damaged_frames_are_marked_as_lost_in_words(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, label="r", bench=BENCH) as opened:
+        opened.start()
+        opened.write([frame(0), frame(1)])
+        assert opened.settle({}) == []
+        (words,) = opened.settle({1: "damaged"})
+        assert words == "marked as lost: frame 1"
