@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -398,6 +398,13 @@ class SuggestedName:
         """Name the result after what it is made of."""
         self._take(self._folder / f"{stem}{self._suffix}")
         self._reader.ask(lambda: free_result(self._folder, stem, self._suffix), self._take)
+
+    def once_known(self, call: Callable[[], object]) -> bool:
+        """Have something called when the name is known; returns whether it still is looked for."""
+        if not self._reader.is_reading:
+            return False
+        self._reader.ask(lambda: None, lambda _: QTimer.singleShot(0, self._form, call), "then")
+        return True
 
     def make_room(self, out: Path) -> None:
         """Make the folder of suggested names where a result goes there; for a job's thread."""

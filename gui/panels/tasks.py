@@ -292,8 +292,11 @@ class TasksPanel(Panel):
 
     # Carrying out --------------------------------------------------------------------------------
     def start(self) -> None:
-        """Carry out what the form asks for."""
-        if self.run.is_running:
+        """Carry out what the form asks for, as soon as the result has a name that no file has."""
+        names = self._pages[self.name].names if self.name in self._pages else None
+        if self.run.is_running or (
+            names is not None and names.once_known(partial(self._start_of, self.name))
+        ):
             return
         objects = self.objects()
         if objects is None:
@@ -316,6 +319,10 @@ class TasksPanel(Panel):
         self.choice.setEnabled(False)
         seen = {kind: orientation_of(self.session, kind) for kind in get_args(Kind)}
         self.run.start(TASKS[self.name].title, do, seen)
+
+    def _start_of(self, name: str) -> None:
+        if name == self.name:  # no other was chosen meanwhile
+            self.start()
 
     def _clear(self) -> None:
         self._reader.forget()  # a picture of what was there before

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from gui.session_news import OwnFiles
 from gui.widgets.tab_order import stops_of
 from instrument.files.calibration_file import save_calibration
 from instrument.files.images import write_image
+from instrument.files.results import free_result
 from instrument.reconstruction.video_files import VideoPictures, create_output
 from instrument.tasks import TASKS
 from instrument.tasks.task import Desk, Done
@@ -59,6 +61,28 @@ def test_a_long_form_is_made_in_many_turns(
     panel._making.timeout.connect(lambda: turns.append(None))
     shown(qtbot, panel, "video")
     assert len(turns) > len(panel._pages["video"].form.fields)
+
+
+def test_a_task_that_is_started_at_once_waits_for_a_name_that_no_file_has(
+    qtbot: QtBot, panel: TasksPanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = panel.session.runs_folder / "results"
+    results.mkdir(parents=True)
+    (results / "analysis.png").write_bytes(b"of before")
+    looked, started = threading.Event(), list[object]()
+
+    def slow(*asked: Any) -> Path:
+        looked.wait(30)
+        return free_result(*asked)
+
+    monkeypatch.setattr("gui.forms.options_form.free_result", slow)
+    monkeypatch.setattr(panel.run, "start", lambda *_: started.append(panel._out))
+    shown(qtbot, panel, "analyze", calibration=calibration(results.parent / "mine", 0))
+    panel.start()
+    assert not started
+    looked.set()
+    qtbot.waitUntil(lambda: bool(started), timeout=WAIT_MS)
+    assert started == [results / "analysis-2.png"]
 
 
 def test_every_task_has_a_form_of_its_own_declarations(qtbot: QtBot, panel: TasksPanel) -> None:
