@@ -191,14 +191,14 @@ def change_theme(name: str, window: QWidget, wholes: Sequence[QWidget]) -> Gener
         for part in parts:
             if isValid(part) and part.isVisible():
                 yield from restyled(part)
+        for holder in holding:
+            yield from _recoloured(holder)
     finally:
         if isValid(window):
             window.setUpdatesEnabled(True)
     yield TURN
     for part in parts:
         yield from restyled(part)
-    for holder in holding:
-        yield from _recoloured(holder)
 
 
 def restyled(part: QWidget) -> Iterator[None]:

@@ -226,8 +226,8 @@ class DisplacementPlot:
         ends_x, ends_y = x + factor * field[..., 1], y + factor * field[..., 0]
         across = np.stack([x.ravel(), ends_x.ravel()], axis=1).ravel()
         down = np.stack([y.ravel(), ends_y.ravel()], axis=1).ravel()
-        self._arrows.setData(across, down, connect="pairs", pen=pg.mkPen(colours().accent, width=1.5))
-        self._tails.setData(x.ravel(), y.ravel(), pen=None, **dots(colours().text, 4))
+        self._arrows.setData(across, down, connect="pairs", **self._lines())
+        self._tails.setData(x.ravel(), y.ravel(), pen=None, **self._dots())
         rms = float(np.sqrt(np.mean(size**2)))
         self._say(f"{self.words}: {rms:.2f} mask pixels rms, {size.max():.2f} at most (drawn {factor:.0f}x)")
         self.plot.autoRange()
@@ -235,6 +235,14 @@ class DisplacementPlot:
     def restyle(self) -> None:
         """Take over another theme."""
         self._say(self.title)
+        self._arrows.setPen(self._lines()["pen"])
+        self._tails.setSymbolBrush(self._dots()["symbolBrush"])
+
+    def _lines(self) -> dict[str, Any]:
+        return {"pen": pg.mkPen(colours().accent, width=1.5)}
+
+    def _dots(self) -> dict[str, Any]:
+        return dots(colours().text, 4)
 
     def _say(self, title: str) -> None:
         self.title = title

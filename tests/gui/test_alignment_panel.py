@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 from PySide6.QtCore import Qt
+from PySide6.QtGui import QColor
 from pytestqt.qtbot import QtBot
 
 from calibration_routines.display.mask_alignment import AlignmentReport
 from calibration_routines.procedure import Outcome
 from gui.main_window import MainWindow
-from gui.panels.alignment import AlignmentPanel
+from gui.panels.alignment import AlignmentPanel, DisplacementPlot
 from gui.procedure_run import ProcedureRun, RunBar, Situation
 from gui.session import BenchSession
+from gui.theme import RED
 from instrument.bench.config_file import template
 from recon.holography.pose import NODES, Pose
 
@@ -118,3 +120,14 @@ def test_a_report_shows_displacement_and_pose_with_errors(qtbot: QtBot, panel: A
     assert "0.03" in panel.after.title
     qtbot.mouseClick(panel.tabs.tabBar(), LEFT, pos=panel.tabs.tabBar().tabRect(2).center())
     assert panel.pose.isVisible()
+
+
+def test_arrows_that_were_drawn_take_over_the_theme(qtbot: QtBot, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = DisplacementPlot("Before")
+    qtbot.addWidget(drawn.plot)
+    drawn.show_field(np.ones((3, 4, 2)), (30, 40))
+    monkeypatch.setattr("gui.theme._now", [RED])
+    drawn.restyle()
+    assert drawn._arrows.curve.opts["pen"].color() == QColor(RED.accent)
+    brushes = [spot.brush().color() for spot in drawn._tails.scatter.points()]
+    assert brushes == [QColor(RED.text)] * 12
