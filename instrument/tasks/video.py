@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from instrument.files.errors import FileError, duration, os_reason
+from instrument.files.errors import FileError, count, duration, os_reason
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.video import (
     PreparedVideo,
@@ -136,7 +136,7 @@ def _tell(desk: Desk, prepared: PreparedVideo) -> None:
         if plan.over_time is None
         else f"{plan.cold_iterations} iterations, prior over time {plan.over_time}"
     )
-    blocks = f"{len(prepared.job.blocks)} blocks of {plan.block}"
+    blocks = f"{count(len(prepared.job.blocks), 'block')} of {plan.block}"
     desk.fact("Video", f"{len(plan.frames)} frames in {blocks}: {how}")
     for warning in prepared.warnings:
         desk.warn(f"Warning: {warning}")
