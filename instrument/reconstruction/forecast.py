@@ -156,16 +156,22 @@ def carried_out(begin: Callable[[int | None, float, float], C], soon_s: float) -
 
     ``begin(iterations, time_s, done)`` carries it out up to these limits, the first none where None; ``done``
     is the share of all that is carried out before. A program's first work of a kind reads libraries and
-    kernels on its way, which the work that is told finds there: it is carried out once more.
+    kernels on its way, which the work that is told finds there: what it took does not count.
     """
+
+    def tells(trial: Carried) -> bool:
+        return not trial.cut or trial.longest >= TRIED
+
     before = len(sys.modules)
     trial = begin(None, soon_s, 0.0)
-    if len(sys.modules) > before:
-        trial = begin(None, soon_s, 0.5)
-    if not trial.cut or trial.longest >= TRIED:
+    is_first = len(sys.modules) > before
+    if is_first and tells(trial):
+        trial, is_first = begin(None, soon_s, 0.5), False
+    if tells(trial):
         return trial
     further = begin(TRIED, TRIED_S, 0.5)
-    return replace(further, memory_bytes=max(trial.memory_bytes, further.memory_bytes))
+    most = further.memory_bytes if is_first else max(trial.memory_bytes, further.memory_bytes)
+    return replace(further, memory_bytes=most)
 
 
 def forecast(
