@@ -12,9 +12,10 @@ import pytest
 
 from recon import Calibration, InputError
 from recon.base.metrics import psnr
+from recon.evaluation.scene import make_scene
 from recon.streams import live as live_module
 from recon.streams.live import LiveReconstructor
-from recon.streams.live_picture import Level
+from recon.streams.live_picture import DARK, UNLIT, UNLIT_SO_FAR, Level
 from recon.streams.pace import Spent
 from recon.streams.stillness import SceneState, SceneWatch
 from tests.recon.live.streams import AMPLE_MS, NOISE, SHAPE, iterated, live, photograph, spots_psf
@@ -331,3 +332,24 @@ def test_a_solver_that_does_not_know_the_frame_begins_with_it_when_it_is_refined
     monkeypatch.setattr(reconstructor, "_picture", lambda _level, volume, done, _began: (volume, done))
     assert reconstructor.refine() == ("volume", 4)
     assert told == ([] if follows else ["begins", "takes"])
+
+
+@pytest.mark.parametrize(
+    ("dark", "doubt", "words"),
+    [(True, "", DARK), (True, "why", DARK), (False, "why", UNLIT), (False, "", UNLIT_SO_FAR)],
+)
+def test_a_black_picture_says_why(dark: bool, doubt: str, words: str) -> None:
+    reconstructor = live()
+    reconstructor._dark = dark
+    reconstructor._fit = SimpleNamespace(doubt=doubt)  # type: ignore[assignment]
+    assert reconstructor._unlit() == words
+
+
+@pytest.mark.parametrize(("model", "psfs"), [("local", 4), ("convolution", 1)])
+def test_a_first_pictures_work_is_told_by_the_psfs_that_are_used(model: str, psfs: int) -> None:
+    scene = make_scene("sparse-picture", size=24, grid=2)
+    reconstructor = LiveReconstructor(
+        scene.calibration, noise=NOISE, coarsest=1, model=model, estimate_background=False
+    )
+    assert len(scene.calibration.psfs) == 4
+    assert reconstructor._first_work == psfs * 24 * 24
