@@ -353,3 +353,8 @@ def test_a_first_pictures_work_is_told_by_the_psfs_that_are_used(model: str, psf
     )
     assert len(scene.calibration.psfs) == 4
     assert reconstructor._first_work == psfs * 24 * 24
+
+
+def test_options_that_are_not_for_live_pictures_are_named() -> None:
+    with pytest.raises(InputError, match="iterations: not for live pictures, which take what fits"):
+        live(iterations=5)

@@ -114,3 +114,12 @@ def test_a_camera_that_is_no_convolution_is_preconditioned_by_its_central_one():
     made.solve(right, e := np.zeros(SENSOR))
     assert made.steps <= 12  # 10 found, 30 and no end with the inverse turned over
     assert np.linalg.norm(right - e - made._bend(e)) <= 1.01e-4 * np.linalg.norm(right)
+
+
+@pytest.mark.parametrize(
+    ("progress", "tolerance"), [(1.0, 1e-4), (4e-3, 8e-5), (1e-6, 2e-8), (0.0, 2.22e-15)]
+)
+def test_the_system_is_solved_ahead_of_the_solver_around_it(progress, tolerance):
+    made = system(None, None)
+    made.follow(progress)
+    assert made.tolerance == pytest.approx(tolerance, rel=1e-3)
