@@ -42,6 +42,7 @@ from instrument.reconstruction.preparation import (
     reduce_valid,
     saturated_pixels,
 )
+from instrument.reconstruction.straightened import straightened
 from recon.base.noise import NoiseModel, averaged_noise
 from recon.camera.factors import Pattern
 from recon.reconstruction.measurement import Measurement
@@ -142,6 +143,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
     psf = replace(raw_psf, pixels=pixels)
     warnings = check_psf(psf, allow_saturated=inputs.allow_saturated)
     check_pair(psf, image, allow_mixed_depth=inputs.allow_mixed_depth, mosaic=pattern is not None)
+    psf, image = _in_proportion(psf, image, inputs)
     level = dark_level(inputs.dark, psf, image)
     window = _window(crop, image)
     factor = auto_binning(window) if binning is None else binning
@@ -171,6 +173,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
             "Pixels": describe_window(crop, binning, factor, measurement),
             "Erased": erased.reason,
             **mosaic_note(pattern),
+            **srgb_note(inputs),
             **noise_note(noise_of(image)),
         },
         valid,
@@ -188,6 +191,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
             "binning": factor,
             "erased": erased.reason,
             "mosaic": pattern,
+            "srgb": inputs.srgb,
         },
         psf.is_simulated or image.is_simulated,
         reduction,
@@ -212,6 +216,9 @@ def job_with(
     image = read_image(image_file, holes=True)
     crop = inputs.crop
     _refuse_constant(image)
+    if inputs.srgb in ("psf", "both"):
+        raise FileError(folder, "a calibration's PSFs are in proportion to the light.", "--srgb photograph.")
+    image = straightened(image) if inputs.srgb == "photograph" else image
     shape = calibration.psfs.shape[-2:]
     match = _matching_binning(image, shape, folder)
     pattern = pattern_of(inputs.mosaic, image)
@@ -250,6 +257,7 @@ def job_with(
             "binning": factor,
             "erased": erased.reason,
             "mosaic": pattern,
+            "srgb": inputs.srgb,
         },
         bool(calibration.provenance.get("simulated")) or image.is_simulated,
         reduction,
@@ -366,6 +374,15 @@ def _converted(psf: ImageFile, image: ImageFile) -> tuple[str, ...]:
     )
 
 
+def _in_proportion(psf: ImageFile, image: ImageFile, inputs: InputOptions) -> tuple[ImageFile, ImageFile]:
+    """Return a PSF and an image, those that are coded for the eye straightened."""
+    which = inputs.srgb
+    return (
+        straightened(psf) if which in ("psf", "both") else psf,
+        straightened(image) if which in ("photograph", "both") else image,
+    )
+
+
 def _saturation(image: ImageFile, erased: Erased) -> tuple[str, ...]:
     count = np.count_nonzero(saturated_pixels(image.pixels))
     if not count or erased.valid is not None:
@@ -401,6 +418,11 @@ def noise_note(noise: NoiseModel | None) -> dict[str, str]:
         return {}
     known = f"read noise {noise.read_noise:.3g} counts, {noise.counts_per_electron:.3g} counts an electron"
     return {"Noise": f"{known}, as the photograph's metadata say, unless --noise is given"}
+
+
+def srgb_note(inputs: InputOptions) -> dict[str, str]:
+    """Tell of files for the eye that were straightened."""
+    return {} if inputs.srgb == "none" else {"sRGB": f"{inputs.srgb}: made proportional to the light"}
 
 
 def mosaic_note(pattern: Pattern | None) -> dict[str, str]:

@@ -9,6 +9,7 @@ from typing import Literal
 
 from instrument.reconstruction.mosaic import MosaicChoice, mosaic_named
 from instrument.reconstruction.preparation import Crop, DarkChoice, ErasuresChoice
+from instrument.reconstruction.straightened import SrgbChoice
 from recon.base.declare import RARE, option
 from recon.base.noise import NoiseModel
 from recon.camera.factors import PATTERNS
@@ -195,6 +196,13 @@ class InputOptions:
         above=0,
         applies=("volume",),
         label="Diffuser to sensor, of PSF files",
+        group=RARE,
+    )
+    srgb: SrgbChoice = option(
+        "none",
+        help="sRGB files to straighten.",
+        label="Files coded for the eye (sRGB)",
+        applies=("picture",),
         group=RARE,
     )
     allow_saturated: bool = option(

@@ -36,6 +36,7 @@ from recon.verdict.calibration_check import (
     is_told,
     near_decoys,
 )
+from recon.verdict.coded import SPEAKS, STRAIGHTER, coded
 
 Floats = npt.NDArray[np.float32]
 
@@ -73,10 +74,6 @@ ALIKE = 0.7
 PART = 0.5
 """Of a near decoy's step, from which the minimum between it and the given one is tried as well: less is no
 other calibration."""
-GAMMA, STRAIGHTER = 2.2, 0.9
-"""Of photographs that are no raw frames, and what is unexplained of them falls to at most, relatively, where
-they are taken for such: the measured hand 0.66, bars by propagation 0.80, with a coded PSF 0.42. Of those in
-proportion to the light, right, turned, larger or mirrored, it is 1.7 times as much and more."""
 VARIED = 0.35
 """Difference of a field's PSFs from the central one, relative to it, beyond which that one explains little
 more than any other pattern: then all of them are tried, or, where one was chosen, nobody is accused."""
@@ -94,8 +91,13 @@ def check_calibration(problem: Problem, *, on_stage: Stage | None = None) -> Cal
     if problem.patterned or problem.model in CAMERAS:
         return None
     check = _checked(problem, on_stage)
-    known = check is not None and check.wrong and check.better not in FAR
-    return replace(check, cause=_cause(problem, check.better)) if check is not None and known else check
+    if check is None or (check.wrong and check.better in FAR):
+        return check
+    if check.wrong:
+        return replace(check, cause=_cause(problem, check.better))
+    # Coded ones may well be explained by their own calibration better than by any other.
+    cause = _coded(problem) if problem.n_planes == 1 and not _is_explained(check, problem) else None
+    return check if cause is None else replace(check, fit=Fit.OFF, better=None, cause=cause)
 
 
 @linear_algebra_on_one_thread()
@@ -324,39 +326,53 @@ def _small(problem: Problem, longest_px: int, most: int = MOST_PLANES) -> _Small
 
 
 def _cause(problem: Problem, better: Transformation | None) -> tuple[str, str] | None:
-    """Return what keeps a calibration from fitting and is no other calibration, in words, and what to do.
+    """Return what keeps a calibration from fitting and is no other calibration, in words, and what to do."""
+    light = max(saturated_light(psf) for depth in _given(problem).depths.central for psf in depth)
+    if light > SATURATED_LIGHT:
+        return "its PSF is saturated", "Take the PSF again with a shorter exposure"
+    return _coded(problem, better, asked=True)
+
+
+def _is_explained(check: CalibrationCheck, problem: Problem) -> bool:
+    """Whether a calibration left so little, in few iterations without a background, that nothing is coded."""
+    contrast = max(float(np.std(d[v])) for d, v in zip(problem.data, problem.valid, strict=True))
+    beyond = max(as_given(check.scores).misfit - 1, 0.0) if check.scores else 0.0
+    return not problem.smooth and beyond**0.5 < SPEAKS * contrast
+
+
+def _coded(
+    problem: Problem, better: Transformation | None = None, *, asked: bool = False
+) -> tuple[str, str] | None:
+    """Return that something is coded for the eye, in words, and what to do; None where nothing is.
 
     A photograph of few bright points is explained better by anything once it is raised to a power. What was
     coded is explained clearly worse then by the calibration that was ``better`` (None: by a mirrored one).
     """
-    light = max(saturated_light(psf) for depth in _given(problem).depths.central for psf in depth)
-    if light > SATURATED_LIGHT:
-        return "its PSF is saturated", "Take the PSF again with a shorter exposure"
-    small = _small(problem, QUICK[0])
+    small, lit = _small(problem, QUICK[0]), problem.n_planes > 1
     if small.model == "local":
         return None
-    straight = replace(small.photograph, image=_straight(small.photograph.image), noise=None)
-    psfs = replace(small.calibration, psfs=_straight(small.calibration.psfs))
-    lit = problem.smooth or problem.n_planes > 1
-    left = small.unexplained(background=lit)
-    for which, calibration in (("the photograph is", small.calibration), ("both are", psfs)):
-        tried = replace(small, photograph=straight, calibration=calibration)
-        least = tried.unexplained(background=lit)
-        if least >= STRAIGHTER * left:
-            continue
-        if least < STRAIGHTER * tried.otherwise(better or FAR[0]).unexplained(background=lit):
-            return (
-                f"its PSF explains it better where {which} gamma-coded",
-                "Take raw frames, or files in proportion to the light: JPEG files and webcams' are not",
-            )
-    return None
 
+    def tried(photograph: Floats, psfs: Floats) -> _Small:
+        raw = photograph is small.photograph.image
+        seen = small.photograph if raw else replace(small.photograph, image=photograph, noise=None)
+        return replace(small, photograph=seen, calibration=replace(small.calibration, psfs=psfs))
 
-def _straight(image: npt.ArrayLike) -> Floats:
-    """Return what was gamma-coded in proportion to the light."""
-    values = np.maximum(np.asarray(image, np.float32), 0)
-    top = max(float(values.max()), 1e-30)
-    return np.asarray((values / top) ** GAMMA * top, np.float32)
+    def left(photograph: Floats, psfs: Floats) -> float:
+        return tried(photograph, psfs).unexplained(background=lit)
+
+    both = np.asarray(small.photograph.image), small.calibration.psfs
+    how = coded(*both, left, asked=asked)
+    if how is None:
+        return None
+    straightened = tried(*how.straightened(*both))
+    other = straightened.otherwise(better or FAR[0]).unexplained(background=lit)
+    if straightened.unexplained(background=lit) >= STRAIGHTER * other:
+        return None
+    return (
+        f"its PSF explains it better where {how.words} gamma-coded",
+        "Take raw frames, or files in proportion to the light (JPEG files and webcams' are not). What is "
+        f"sRGB is straightened by --srgb {how.option}",
+    )
 
 
 def _given(problem: Problem) -> Problem:

@@ -54,6 +54,9 @@ class Measurement:
     patterns : array, (n_patterns, height, width), optional
         Relative light on the pixels of the picture in each frame, not negative: a reconstruction of a plain
         sheet lit by it (see :mod:`recon.camera.factors`). One pattern of ones is the ordinary photograph.
+    vignetting : array, (height, width) or as ``image``, optional
+        Relative light on the pixels, which the PSF does not have: the image less its background is divided by
+        it. None: looked for where light is missing (:mod:`recon.reconstruction.background`).
     """
 
     image: npt.ArrayLike
@@ -61,6 +64,7 @@ class Measurement:
     background: npt.ArrayLike | None = None
     erasures: npt.ArrayLike | None = None
     patterns: npt.ArrayLike | None = None
+    vignetting: npt.ArrayLike | None = None
 
     __repr__ = brief
 
@@ -121,8 +125,7 @@ class Measurement:
         """
         require_noise(self.noise)
         counts = self.channels()
-        background = self.background
-        data = counts if background is None else counts - self.like(background, counts, "background")
+        data = self.light_of(counts)
         valid = np.ones(data.shape, bool) if self.erasures is None else ~self._erased(data)
         if not valid.any(axis=(1, 2)).all():
             raise InputError("The erasures leave no pixel (True marks an erased one): is the mask inverted?")
@@ -133,6 +136,20 @@ class Measurement:
             if (said := _doubt(channel, values[kept]))
         )
         return Counts(data, valid, warnings)
+
+    def light_of(self, counts: Floats) -> Floats:
+        """Return channels less their background, and divided by the vignetting.
+
+        Raises InputError where either is shaped otherwise, or the vignetting is no relative light.
+        """
+        if self.background is not None:
+            counts = counts - self.like(self.background, counts, "background")
+        if self.vignetting is not None:
+            shade = self.like(self.vignetting, counts, "vignetting")
+            if not shade.min() > 0:
+                raise InputError(f"The vignetting is relative light, above 0; found {shade.min():g}.")
+            counts = counts / shade
+        return counts
 
     def like(self, image: npt.ArrayLike, data: Floats, name: str) -> Floats:
         """Broadcast a number, one image, or one for each channel (under patterns: each frame) to the data.

@@ -287,7 +287,7 @@ class ReconstructionOptions:
     )
     precision: Literal["auto"] | Precision = option(
         "auto",
-        help="auto: float32, unless that would show. float64: twice the memory, up to twice the time.",
+        help="auto: float32 unless it shows; else float64.",
         choices=("auto", *PRECISIONS),
         group=_COMPUTE,
         applies=("picture", "volume", "live picture", "patterned picture"),

@@ -205,9 +205,7 @@ class Problem:
             raise InputError(
                 f"The frame is {np.shape(image)}, those before {np.shape(self.measurement.image)}."
             )
-        if measurement.background is not None:
-            counts = counts - measurement.like(measurement.background, counts, "background")
-        data = counts / self.noise[:, None, None]
+        data = measurement.light_of(counts) / self.noise[:, None, None]
         if not self.valid.all():
             data = np.where(self.valid, data, 0)
         other = replace(self, measurement=measurement, data=data)

@@ -15,13 +15,14 @@ from recon.errors import InputError
 from recon.reconstruction.background import (
     DARKEST,
     DARKEST_PERCENTILE,
+    EXPLAINS,
     FLOOR,
     Trial,
     background_of,
     beyond_of,
     floor,
     trial_of,
-    with_dark_restored,
+    with_light_restored,
 )
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import channels_of, merged
@@ -96,16 +97,19 @@ def choose(
 
 
 def _chosen(problem: Problem, on_stage: Stage | None = None) -> tuple[Problem, Choice]:
-    """Return what is chosen, and the problem: with its dark level restored where no light explains that."""
+    """Return what is chosen, and the problem: with the light that it lacks where no light explains that."""
     choice = choice_for(problem, on_stage)
     (smooth,) = (d for d in choice.decisions if d.name == "background")
-    if choice.background and smooth.numbers.get("least", 0.0) > -BELOW_ZERO:
+    is_light = choice.background and smooth.numbers.get("least", 0.0) > -BELOW_ZERO
+    if is_light and smooth.numbers.get("held_out_without", 0.0) <= EXPLAINS:
         return problem, choice
-    restored = with_dark_restored(problem)
+    restored = with_light_restored(problem, offset=not is_light)
     if restored is problem:
         return problem, choice
-    counts = -float(np.asarray(restored.measurement.background))
-    choice, why = choice_for(restored, on_stage), f"an even offset of {counts:.3g} counts is added instead"
+    choice, added = choice_for(restored, on_stage), restored.measurement.background
+    if added is None:
+        return restored, choice
+    why = f"an even offset of {-float(np.asarray(added)):.3g} counts is added instead"
     told = tuple(replace(d, why=why) if d.name == "background" else d for d in choice.decisions)
     return restored, replace(choice, decisions=told)
 
@@ -126,10 +130,12 @@ def with_background(problem: Problem, calibration: Calibration) -> Problem:
     restored, choice = _chosen(seen)
     if restored is not seen:
         problem = Problem.of(restored.measurement, problem.calibration, options)
-        return replace(problem, warnings=tuple(dict.fromkeys((*problem.warnings, *restored.warnings))))
+        problem = replace(problem, warnings=tuple(dict.fromkeys((*problem.warnings, *restored.warnings))))
     if choice.background != problem.smooth:
         options = replace(options, estimate_background=choice.background)
+        told = problem.warnings
         problem = Problem.of(problem.measurement, problem.calibration, options)
+        problem = replace(problem, warnings=tuple(dict.fromkeys((*told, *problem.warnings))))
     if not choice.background:
         return problem
     (why,) = (d.why for d in choice.decisions if d.name == "background")

@@ -11,6 +11,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from recon import Calibration, Geometry, reconstruct
+from recon.base.blocks import block_mean
 from recon.camera.transformed import Transformation, transformed
 from recon.errors import InputError
 from recon.evaluation.measured_sets import data_folder, measured_set
@@ -363,3 +364,24 @@ def test_where_the_better_copy_explains_little_more_it_may_be_anothers(misfit: f
     scores = {how: Score(m, m, (m,), (m,)) for how, m in ((GIVEN, 100.0), (turned, misfit))}
     _, what_to_do = CalibrationCheck(Fit.OFF, scores, 1000, turned).sentences
     assert ("another diffuser's" in what_to_do) is said
+
+
+def coded_for_the_eye(image: Image) -> Image:
+    """Return 8 bit such as a camera writes for the eye, binned, less their darkest."""
+    coded = block_mean(np.round(255 * (np.maximum(image, 0) / image.max()) ** (1 / 2.2)), 8)
+    return np.asarray(coded - coded.min(), np.float32)
+
+
+@pytest.mark.skipif(
+    not (data_folder() / "diffusercam_hand").is_dir(), reason=f"the hand is not in {data_folder()}"
+)
+@pytest.mark.parametrize("coded", [False, True])
+def test_a_measured_photograph_that_is_coded_is_named_though_its_own_psf_wins(coded: bool) -> None:
+    psfs, photograph = measured_set("hand")
+    photograph = coded_for_the_eye(photograph) if coded else block_mean(photograph, 8)
+    check = check_calibration(choose(Problem.of(photograph, block_mean(psfs[0], 8))))
+    assert check is not None
+    assert check.fit is (Fit.OFF if coded else Fit.FITS)
+    if coded:
+        assert "the photograph is gamma-coded" in check.sentences[0]
+        assert "--srgb photograph" in check.sentences[1]

@@ -1,0 +1,98 @@
+"""Light that falls off where the PSF does not: the shade is found, and none where there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from recon import reconstruct
+from recon.base.blocks import block_mean
+from recon.camera.vignetting import shade_of
+from recon.errors import InputError
+from recon.evaluation.measured_sets import data_folder, measured_set
+from recon.evaluation.scene import make_scene
+from recon.reconstruction.background import with_light_restored
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.problem import Problem
+
+Image = npt.NDArray[np.float32]
+BINNING = 16
+
+measured = pytest.mark.skipif(
+    not (data_folder() / "diffusercam_hand").is_dir(), reason=f"the measured hand is not in {data_folder()}"
+)
+
+
+@pytest.fixture(scope="module")
+def hand() -> tuple[Image, Image]:
+    """The measured hand and its PSF, binned."""
+    psfs, photograph = measured_set("hand")
+    return block_mean(photograph, BINNING), block_mean(psfs[0], BINNING)
+
+
+def cos4(shape: tuple[int, int], corner: float) -> Image:
+    """Return light that falls off round about the middle, to so much in the corners."""
+    y, x = ((np.arange(n) - (n - 1) / 2) for n in shape)
+    r2 = (y[:, None] ** 2 + x**2) / (y[0] ** 2 + x[0] ** 2)
+    return np.asarray(1 / (1 + (corner**-0.5 - 1) * r2) ** 2, np.float32)
+
+
+@measured
+@pytest.mark.parametrize("corner", [0.3, 0.6])
+def test_the_shade_of_a_measured_photograph_is_found(hand: tuple[Image, Image], corner: float) -> None:
+    photograph, psf = hand
+    shade = cos4(photograph.shape, corner)
+    restored = with_light_restored(Problem.of(photograph * shade, psf))
+    found = np.asarray(restored.measurement.vignetting)
+    assert found.min() == pytest.approx(corner, rel=0.2)
+    assert np.abs(found - shade).max() < 0.1
+    assert "falls off" in restored.warnings[-1]
+
+
+def test_the_shade_of_a_scene_is_found_and_where_there_is_none_none_is() -> None:
+    scene = make_scene("sparse-picture", size=40, photons=3000.0, seed=4)
+    shade = cos4(scene.measurement.shape[:2], 0.4)
+    restored = with_light_restored(Problem.of(Measurement(scene.measurement * shade), scene.calibration))
+    found = np.asarray(restored.measurement.vignetting)
+    assert found.min() == pytest.approx(0.4, abs=0.15)
+    clear = Problem.of(Measurement(scene.measurement), scene.calibration)
+    assert with_light_restored(clear) is clear
+
+
+@measured
+def test_a_shaded_photograph_is_as_good_as_one_that_is_not(hand: tuple[Image, Image]) -> None:
+    photograph, psf = hand
+    clear = reconstruct(photograph, psf, judged=False).image
+    shaded = reconstruct(photograph * cos4(photograph.shape, 0.5), psf, judged=False).image
+    assert np.corrcoef(clear.ravel(), shaded.ravel())[0, 1] > 0.99
+
+
+@measured
+def test_what_is_clear_or_lost_its_dark_level_is_not_shaded(hand: tuple[Image, Image]) -> None:
+    photograph, psf = hand
+    for taken_off in (0.0, 0.14):
+        restored = with_light_restored(
+            Problem.of(photograph - np.float32(taken_off * photograph.mean()), psf)
+        )
+        assert restored.measurement.vignetting is None
+
+
+def test_a_known_shade_is_divided_by_and_none_is_looked_for() -> None:
+    rng = np.random.default_rng(0)
+    image, psf = rng.random((2, 24, 32), np.float32)
+    shade = cos4(image.shape, 0.5)
+    counts = Measurement(image + 2, background=2.0, vignetting=shade).counts().data[0]
+    np.testing.assert_allclose(counts, image / shade, rtol=1e-4)
+    problem = Problem.of(Measurement(image, vignetting=shade), psf)
+    assert with_light_restored(problem) is problem
+    np.testing.assert_allclose(problem.with_data(image).data, problem.data, rtol=1e-5)
+    with pytest.raises(InputError, match="above 0"):
+        Problem.of(Measurement(image, vignetting=0.0), psf)
+
+
+def test_a_shade_is_brightest_where_it_is_1_and_the_same_on_coarser_pixels() -> None:
+    numbers = np.array([0.3, 0.4, 0.1, 0.2, -0.1])
+    fine, coarse = shade_of(numbers, (60, 80)), shade_of(numbers, (15, 20))
+    assert fine.max() == 1
+    np.testing.assert_allclose(block_mean(fine, 4), coarse, rtol=0.02)
