@@ -34,6 +34,7 @@ SEARCH = sum(_BARS) + 1 + _MARKS**2 + 2
 """Photographs that it takes, besides those that find an exposure: of bars and black again, of the marks, and
 of that in the middle first and last."""
 _MOVED_PX = 0.5  # pixels of the camera by which that mark may lie elsewhere
+_SURE = 3.0  # standard deviations of its place that this must be
 _DIMMEST = 0.05  # of full scale
 _OTHER_LIGHT = 0.2  # of the brightest bar's light, by which black may change
 _FOUND_PX = 300  # rows of the images that marks are found on
@@ -170,13 +171,14 @@ def find_screen(bench: Bench, control: RunControl, listener: Listener) -> Screen
 
 def _require_rest(first: Floats, last: Floats) -> None:
     """Raise CalibrationError where the same mark lies elsewhere in the end: all marks are off then."""
-    moved_px = compare(last, first).shift_px
+    change = compare(last, first)
+    moved_px = change.shift_px
     if not np.isfinite(moved_px):
         raise CalibrationError(
             "While the screen was looked for, one bright square was not found again where it had been: other "
             "light came, or something moved. Keep daylight, lamps and other screens out, clamp what can move."
         )
-    if moved_px > _MOVED_PX:
+    if moved_px > max(_MOVED_PX, _SURE * change.place_noise):
         raise CalibrationError(
             f"While the screen was looked for, its picture moved by {moved_px:.1f} pixels: it creeps or "
             "shakes. Clamp screen, diffuser and camera, let them warm up, take the table off what vibrates."

@@ -65,7 +65,8 @@ def phase_from_halves(
 ) -> Image:
     """Return the phase of a thin sample in radians, float32 (height, width), mean and mean slope zero.
 
-    Halves of unequal brightness look like a tilted sample; the tilt is taken off.
+    Halves of unequal brightness look like a sample tilted up to its edges: each is brought to its opposite's
+    mean, and the tilt that is left is taken off.
 
     Raises InputError when a half is missing, shapes differ, or there is no light.
 
@@ -159,6 +160,9 @@ def _contrast(first: Floats, second: Floats) -> Floats:
     total = first + second
     if not (total.mean() > 0 and (total > 0).mean() > 0.99):
         raise InputError("The halves show no light above dark: are the LEDs on, and is the exposure right?")
+    if min(first.mean(), second.mean()) > 0:  # in between the light may have changed
+        second = second * float(first.mean() / second.mean())
+        total = first + second
     contrast = (first - second) / np.maximum(total, 1e-3 * float(total.mean()))
     return np.asarray(contrast)
 

@@ -153,6 +153,13 @@ def test_a_weak_phase_comes_back() -> None:
     assert error.std() < 0.12 * level(truth[inside]).std()
 
 
+def test_light_that_changes_between_the_halves_leaves_the_phase_as_it_is() -> None:
+    halves = halves_of(weak_phase((48, 64), 0.5), OPTICS)
+    usual = phase_from_halves(halves, OPTICS)
+    dimmer = phase_from_halves({**halves, "left": 0.6 * halves["left"], "top": 1.3 * halves["top"]}, OPTICS)
+    np.testing.assert_allclose(dimmer, usual, atol=1e-4 * float(usual.std()))
+
+
 def test_half_circles_that_just_fill_the_pupil_lose_slope() -> None:
     """Why the array is lit beyond the objective's aperture (docs/decisions/0016-dpc.md)."""
     truth = weak_phase((96, 128), 5.0)
