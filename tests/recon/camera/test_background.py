@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import optimize
 from scipy.fft import dctn
 
 from recon.camera.convolution import Convolution
@@ -84,6 +85,31 @@ def test_non_negative_background_is_the_nearest():
             assert miss(other) >= 0.999 * miss(found)
     positive = np.full((1, 24, 20), 5.0)
     np.testing.assert_allclose(removal.non_negative(positive), positive)
+
+
+@pytest.mark.parametrize("times", [1.0, 1e4])
+def test_a_non_negative_background_is_that_of_a_general_optimiser(times):
+    rng = np.random.default_rng(8)
+    shape = (1, 60, 50)
+    valid = rng.random(shape[1:]) > 0.3
+    removal = BackgroundRemoval(shape, (3, 3), valid, np.float64)
+    y = times * (rng.standard_normal(shape) + np.linspace(-2, 3, 50) + np.linspace(1, -1, 60)[:, None])
+    rows, columns, _ = removal.basis(0)
+    basis = np.einsum("ay,bx->yxab", rows, columns).reshape(60 * 50, 9) * 50
+    inner, wanted = basis[valid.ravel()], y[0][valid] / times
+    found = optimize.minimize(
+        lambda c: float(np.mean((inner @ c - wanted) ** 2)),
+        np.r_[1.0, np.zeros(8)],
+        jac=lambda c: 2 * inner.T @ (inner @ c - wanted) / wanted.size,
+        constraints={"type": "ineq", "fun": lambda c: (basis @ c)[::7], "jac": lambda c: basis[::7]},
+        method="SLSQP",
+        options={"ftol": 1e-7, "maxiter": 300},
+    )
+    assert found.success
+    smooth = removal.non_negative(y)
+    assert smooth.min() >= -1e-12 * times
+    assert np.mean((smooth[0][valid] / times - wanted) ** 2) <= 1.002 * found.fun
+    assert removal.background(y).min() < -0.5 * times
 
 
 @pytest.mark.parametrize("erased", [0.0, 0.3])
