@@ -91,7 +91,7 @@ def _(o: Operator) -> None:
 def _(o: Operator) -> None:
     panel = o.panel("reconstructions")
     o.click(panel.form.explain)
-    o.wait(lambda: "Chosen in" in panel.form.note.text())
+    o.wait(lambda: "Will take" in panel.form.note.text())
 
 
 @step("the first calibrated reconstruction")
