@@ -28,10 +28,10 @@ Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]
 
-_GRID_SHARE = 0.5
+_GRID_SHARE = 0.49
 """Of the time, on the grid. Nine slides binned 4 x 4: 0.45, 0.51, five 8 x 8: 0.51."""
-_POINTS_SHARE = 0.48
-"""Of the time, with points; the rest for the halves of the images. Nine slides binned 4 x 4: 0.02."""
+_POINTS_SHARE = 0.47
+"""Of the time, with points; the rest for the halves of the images and of noise, 0.02 each."""
 _BEADS_SHARE = 0.45
 """Of a rank's time, for beads; the rest for PSFs. Nine slides binned 4 x 4, by rank: 0.52, 0.37, 0.44."""
 
@@ -95,7 +95,7 @@ class BlindResult:
         Why the rounds on the grid ended.
     sensor_shape : (int, int)
     halves_alike : float
-        Cosine similarity of the mean PSFs that either half of the images gives.
+        Cosine similarity of the mean PSFs that either half of the images gives, their noise taken off.
     """
 
     psfs: Floats

@@ -18,6 +18,8 @@ Floats = npt.NDArray[np.float32]
 
 LEAST_ALIKE = 0.93
 """Likeness of both halves' PSFs below which PSFs are not to be relied on."""
+_DIMMEST = 0.1
+"""Share of the pixels from which noise is read."""
 MOST_BEADS = 50
 """Beads of a slide beyond which they are hardly separate ones: of 40, found as 57 to 88 or as 22 to 32, PSFs
 off the axis were wrong."""
@@ -26,7 +28,9 @@ off the axis were wrong."""
 def alike_by_halves(data: Floats, polished: Polished, iterations: int) -> float:
     """Return the cosine similarity of the mean PSFs that two halves of the images give, 1 at best.
 
-    Each half is fitted where the PSFs have light, with the beads that all images together gave.
+    Each half is fitted where the PSFs have light, with the beads that all images together gave. What noise
+    alone gives in the same fit is taken off the energy of either PSF: few and dim images of beads that are
+    right agree no worse than many. Where it is more than half of that energy, nothing is taken off.
 
     Parameters
     ----------
@@ -44,12 +48,27 @@ def alike_by_halves(data: Floats, polished: Polished, iterations: int) -> float:
     fewest = min(sum(map(len, points)) for points in beads)
     degree = min(polished.functions.degree, highest_degree_for(fewest))
     functions = FieldFunctions(degree, np.concatenate([points.places for points in polished.beads]))
-    found = []
+    noise = np.random.default_rng(0).normal(0, _deviation(data, polished), data.shape).astype(np.float32)
+    found, energies = [], []
     for half, points in zip(halves, beads, strict=True):
         mixer = PointMixer(points, functions, (window[0], window[1]), (sensor[0], sensor[1]))
         start = np.zeros((functions.count, *window), np.float32)
-        psfs, _ = solve_smooth(mixer, data[half], start, lit, iterations)
-        found.append(psfs[0].astype(np.float64))
-    one, other = found
-    lengths = float(np.linalg.norm(one) * np.linalg.norm(other))
-    return float(np.vdot(one, other)) / lengths if lengths > 0 else 0.0
+        psf, of_noise = (
+            solve_smooth(mixer, images[half], start, lit, iterations)[0][0].astype(np.float64)
+            for images in (data, noise)
+        )
+        found.append(psf)
+        energies.append((float(np.vdot(psf, psf)), float(np.vdot(of_noise, of_noise))))
+    told = all(by_noise <= energy / 2 for energy, by_noise in energies)
+    lengths = np.prod([np.sqrt(energy - by_noise * told) for energy, by_noise in energies])
+    return min(float(np.vdot(*found) / lengths), 1.0) if lengths > 0 else 0.0
+
+
+def _deviation(data: Floats, polished: Polished) -> float:
+    """Return the noise where the model has least light, by the median: what is not explained there.
+
+    Less than the noise where photons make most of it: too little is then taken off.
+    """
+    seen = polished.images((data.shape[1], data.shape[2]))
+    left = (data - seen)[seen <= np.quantile(seen, _DIMMEST)]
+    return float(np.median(np.abs(left))) / 0.6745  # a Gaussian's median magnitude, in deviations

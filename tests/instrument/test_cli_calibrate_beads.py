@@ -202,8 +202,10 @@ def test_the_simulated_bench_changes_its_slides(
     words = ["calibrate", "beads", "--z", "2.5", "--images", "2", "--average", "1", "--binning", "8"]
     words += ["--psfs", "2x2", "--rank", "1", "-n", "5", "--out", "made"]
     assert main(words) == 0
-    assert "SIMULATED" in capsys.readouterr().out
-    made = load_calibration(tmp_path / "made")
+    said = capsys.readouterr().out
+    assert "SIMULATED" in said
+    assert "beads were found in a photograph: more than 50" in said  # of too coarse pixels
+    made = load_calibration(tmp_path / "doubtful_made")
     assert made.provenance["simulated"] is True
     assert made.geometry.pixel_pitch_um == pytest.approx(8 * 2.9)
     assert len(list((tmp_path / "runs").iterdir())) == 2

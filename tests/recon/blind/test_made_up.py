@@ -29,6 +29,18 @@ def test_halves_agree_where_beads_are_right_and_not_where_they_were_made_up(imag
     assert alike_by_halves(data, polished(made_up, degree), 60) < LEAST_ALIKE
 
 
+@pytest.mark.parametrize(("images", "beads", "noise"), [(9, 6, 0.3), (4, 12, 0.3), (3, 6, 0.2), (2, 12, 0.2)])
+def test_few_and_noisy_photographs_of_beads_that_are_right_agree(
+    images: int, beads: int, noise: float
+) -> None:
+    rng = np.random.default_rng(4)
+    seen = [slide(rng, beads, noise) for _ in range(images)]
+    data, degree = np.stack([image for image, _ in seen]), int(images * beads >= 12)
+    assert alike_by_halves(data, polished([points for _, points in seen], degree), 60) > 0.98
+    made_up = [Points(rng.uniform(-10, 10, (8, 2)), rng.uniform(0.5, 1, 8)) for _ in seen]
+    assert alike_by_halves(data, polished(made_up, degree), 60) < 0.8
+
+
 def test_noise_alone_is_not_taken_for_agreement() -> None:
     rng = np.random.default_rng(4)
     beads = [slide(rng)[1] for _ in range(4)]
