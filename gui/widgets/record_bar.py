@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import shutil
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtWidgets import QLineEdit, QProgressBar, QWidget
 
+from drivers.errors import StoppedError
 from gui.background import NewestOnly
-from gui.jobs import Job, JobContext
+from gui.jobs import Job, JobCancelledError, JobContext
 from gui.panel import Panel
 from gui.widgets.building import button, every, fill, label
 from gui.widgets.entry import NumberEdit
@@ -75,6 +77,7 @@ class RecordBar(QWidget):
         every(self, _DISK_MS, self._look_at_disk)
         self._look_at_disk()
         self._look_for_rest()
+        panel.session.device_changed.connect(self._device_changed)
 
     def toggle(self) -> None:
         """Start a recording, or end the one that runs."""
@@ -105,18 +108,16 @@ class RecordBar(QWidget):
 
             frames = None if rest is None else rest.n_frames
             asked = RecordingOptions(label=label, seconds=seconds, n_frames=frames)
-            before = Lit.now(session.bench)
-            try:
-                if rest is not None:
-                    rest.set_up(session.bench)
+
+            def report(status: RecordingStatus) -> None:
+                try:
+                    context.report(status)
+                except JobCancelledError:  # STOP, where Ctrl+C of the terminal ends a recording on purpose
+                    raise StoppedError(session.bench.camera.name, "its recording was stopped.") from None
+
+            with nullcontext() if rest is None else rest.set_up(session.bench):
                 lit = Lit.now(session.bench)
-                recorder = prepare_recording(
-                    session.bench, session.runs_folder, asked, on_progress=context.report
-                )
-            except BaseException:
-                if rest is not None:  # what STOP had darkened stays dark
-                    before.put_back(session.bench)
-                raise
+                recorder = prepare_recording(session.bench, session.runs_folder, asked, on_progress=report)
             self._recorder, self._taken = recorder, recorder.path
             with session.live.watching(recorder.newest):
                 run = recorder.execute()
@@ -178,15 +179,22 @@ class RecordBar(QWidget):
         self._look_for_rest()
 
     def _look_for_rest(self) -> None:
-        """Offer what the newest recording lacks where it was cut, by a kill or on an earlier day as well."""
-        folder = self._session.runs_folder
+        """Offer what the newest recording lacks where it was cut, by a kill or on an earlier day as well.
+
+        Only with the camera that it was taken with, and so once a camera is connected.
+        """
+        folder, camera = self._session.runs_folder, self._session.bench.devices.get("camera")
 
         def read() -> RecordingRest | None:
             from instrument.runs.recording_rest import newest_rest
 
-            return newest_rest(folder)
+            return newest_rest(folder, camera.identity) if camera is not None and camera.is_open else None
 
         self._rests.ask(read, self._offer_rest)
+
+    def _device_changed(self, kind: str) -> None:
+        if kind == "camera" and self.job is None and self.rest is None and self._session.is_open(kind):
+            self._look_for_rest()
 
     def _offer_rest(self, rest: RecordingRest | None) -> None:
         if rest is None or self.job is not None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from drivers.device import DeviceIdentity
 from instrument.bench.bench import Bench
-from instrument.bench.camera_settings import restore_camera
+from instrument.bench.camera_settings import camera_settings, restore_camera
 from instrument.bench.photograph import Lit
 from instrument.files.errors import BenchError
 from instrument.files.record import value_of
@@ -19,7 +20,8 @@ from instrument.runs.run_files import PLAN
 
 _LEAST_S = 0.1
 """Less than that is not worth a film of its own."""
-_CUT = (RunCondition.CRASHED, RunCondition.FAILED, RunCondition.STOPPED, RunCondition.ABORTED)
+_CUT = (RunCondition.CRASHED, RunCondition.FAILED, RunCondition.STOPPED)
+"""Not one that was aborted: Ctrl+C ended it on purpose, or ``resume`` closed it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,14 +38,25 @@ class RecordingRest:
     """How long the rest is, whichever end comes first; None: no such end was asked for."""
     lit: Lit | None
     """What was lit; None: as it is."""
+    taken_with: str
+    """Which camera, and whether simulated, as it said of itself."""
     camera: Mapping[str, Any]
     """The camera's settings; empty: as they are."""
 
-    def set_up(self, bench: Bench) -> None:
-        """Bring camera and light to what they were; raises DeviceError or BenchError where that fails."""
-        restore_camera(bench.camera, self.camera)
-        if self.lit is not None:
-            self.lit.put_back(bench)
+    @contextlib.contextmanager
+    def set_up(self, bench: Bench) -> Iterator[None]:
+        """Bring camera and light to what they were; where that or what follows fails, to what they are now.
+
+        Raises DeviceError or BenchError where they cannot be brought there.
+        """
+        with contextlib.ExitStack() as back:
+            back.callback(Lit.now(bench).put_back, bench)
+            back.callback(restore_camera, bench.camera, camera_settings(bench.camera))
+            restore_camera(bench.camera, self.camera)
+            if self.lit is not None:
+                self.lit.put_back(bench)
+            yield
+            back.pop_all()
 
 
 def rest_of(path: Path) -> RecordingRest | None:
@@ -65,7 +78,8 @@ def rest_of(path: Path) -> RecordingRest | None:
         camera: Mapping[str, Any] = {}
         with contextlib.suppress(LookupError):
             camera = dict(run.provenance["camera"])
-        return RecordingRest(path, run.label, len(run.records), seconds, n_frames, lit, camera)
+        taken_with = str(run.provenance["devices"]["camera"])
+        return RecordingRest(path, run.label, len(run.records), seconds, n_frames, lit, taken_with, camera)
     except (BenchError, OSError, LookupError, TypeError, ValueError):
         return None
 
@@ -78,7 +92,8 @@ def _lasted_s(run: Run) -> float:
     return max(last - first, 0) / 1e9
 
 
-def newest_rest(folder: Path) -> RecordingRest | None:
-    """Return what the newest recording in a folder lacks; None where that came to its end."""
+def newest_rest(folder: Path, camera: DeviceIdentity) -> RecordingRest | None:
+    """Return what the newest recording in a folder lacks; None where it ended, or is of another camera."""
     newest = next((path for path in reversed(run_paths(folder)) if not (path / PLAN).exists()), None)
-    return None if newest is None else rest_of(newest)
+    rest = None if newest is None else rest_of(newest)
+    return rest if rest is not None and rest.taken_with == str(camera) else None

@@ -520,6 +520,7 @@ def test_a_recording_that_was_stopped_is_kept_in_the_dark_and_goes_on_in_its_lig
         qtbot.mouseClick(bar.rest_button, Qt.MouseButton.LeftButton)
         qtbot.waitUntil(lambda: bar.job is None and bar.rest_button.isVisible(), timeout=WAIT_MS)
     assert not live.session.bench.scene_lit, "as dark as it was before"
+    assert camera.exposure_ms == pytest.approx(2 * exposure_ms)
     assert bar.note.text() == said, "there is no other film"
     assert bar.look_button.isVisible()
     qtbot.mouseClick(bar.rest_button, Qt.MouseButton.LeftButton)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from calibration_routines.plan_procedures import left_unfinished
+from drivers.errors import DeviceError
 from drivers.led_array import LedPattern
+from instrument.bench.camera_settings import camera_settings
 from instrument.runs.recorder import RecordingStatus, record
 from instrument.runs.recording_rest import newest_rest, rest_of
 from instrument.runs.run import Run, RunCondition
 from tests.instrument.runs.test_recorder import bench_with, camera_of
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")
+MOCK = camera_of(1).identity
 LIT = LedPattern("two of them", ((3, (0, 255, 0)), (7, (9, 0, 0))))
 
 
@@ -44,13 +48,14 @@ def killed(run: Run) -> Run:
     return run
 
 
-@pytest.mark.parametrize("by", [OSError, KeyboardInterrupt])
-@pytest.mark.parametrize("then", [lambda run: run, killed])
+@pytest.mark.parametrize(
+    ("by", "then"), [(OSError, lambda run: run), (OSError, killed), (KeyboardInterrupt, killed)]
+)
 def test_a_cut_recording_tells_how_many_frames_it_lacks(
     tmp_path: Path, by: type[BaseException], then: Callable[[Run], Run]
 ) -> None:
     run = then(cut_recording(tmp_path, by, n_frames=4000))
-    rest = newest_rest(tmp_path)
+    rest = newest_rest(tmp_path, MOCK)
     assert rest is not None
     assert (rest.run, rest.label, rest.stored) == (run.path, "cells", len(run.records))
     assert (rest.seconds, rest.n_frames) == (None, 4000 - run.n_frames)
@@ -69,10 +74,35 @@ def test_of_seconds_it_lacks_what_is_after_its_last_frame_and_the_bench_is_set_u
     with bench_with(camera_of(10)) as bench:
         exposure_ms = bench.camera.exposure_ms
         bench.camera.set_exposure_ms(3 * exposure_ms)
-        rest.set_up(bench)
+        with rest.set_up(bench):
+            pass
         assert bench.camera.exposure_ms == exposure_ms
         assert bench.led_array is not None
         assert bench.led_array.pattern == LIT
+
+
+def test_settings_that_are_refused_half_way_leave_the_camera_as_it_was(tmp_path: Path) -> None:
+    rest = rest_of(cut_recording(tmp_path, OSError, seconds=60.0).path)
+    assert rest is not None
+    wanted = {**rest.camera, "gain": 2.0, "exposure_ms": 1e9}
+    with bench_with(camera_of(10)) as bench:
+        before = camera_settings(bench.camera)
+        assert before["gain"] != 2.0
+        with pytest.raises(DeviceError, match="exposure"), replace(rest, camera=wanted).set_up(bench):
+            pytest.fail("it is refused")
+        assert camera_settings(bench.camera) == before
+        assert bench.led_array is not None
+        assert bench.led_array.pattern != LIT
+
+
+def test_one_that_was_ended_on_purpose_or_is_of_another_camera_is_not_offered(tmp_path: Path) -> None:
+    run = cut_recording(tmp_path, KeyboardInterrupt, n_frames=4000)
+    assert run.condition is RunCondition.ABORTED
+    assert newest_rest(tmp_path, MOCK) is None
+    killed(run)
+    assert newest_rest(tmp_path, MOCK) is not None
+    assert newest_rest(tmp_path, replace(MOCK, serial_number="008")) is None
+    assert newest_rest(tmp_path, replace(MOCK, simulated=False)) is None
 
 
 def test_one_that_came_to_its_end_lacks_nothing_and_those_before_it_are_not_offered_again(
@@ -85,5 +115,5 @@ def test_one_that_came_to_its_end_lacks_nothing_and_those_before_it_are_not_offe
     later = tmp_path / "9999-later"
     next(path for path in tmp_path.iterdir() if path != cut.path).rename(later)
     assert rest_of(later) is None
-    assert newest_rest(tmp_path) is None
-    assert newest_rest(tmp_path / "nowhere") is None
+    assert newest_rest(tmp_path, MOCK) is None
+    assert newest_rest(tmp_path / "nowhere", MOCK) is None
