@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -65,6 +65,8 @@ class ImageFile:
     """What reading left out or converted, in sentences without full stop."""
     metadata: Mapping[str, Any] = field(default_factory=dict)
     """What :func:`write_image` kept with the image; empty for images from elsewhere."""
+    array: str = ""
+    """Which of a file's arrays, where it was named (``FILE::NAME``)."""
 
     @property
     def is_simulated(self) -> bool:
@@ -125,10 +127,11 @@ def read_image(path: Path | str | ImageFile, *, holes: bool = False, several: st
         _refuse_non_finite(path.path, path.pixels, holes=holes)
         return path
     one = partial(_one_image, several=several)
+    _, name = _array_of(Path(path))
     path, array, notes = _decoded(_only_image(Path(path)), one)
     array, more = one(path, array)
     pixels, converted = _standard_dtype(path, array, holes=holes)
-    return ImageFile(path, pixels, (*notes, *more, *converted), image_metadata(path))
+    return ImageFile(path, pixels, (*notes, *more, *converted), image_metadata(path), name)
 
 
 def read_stack(path: Path | str, *, leave_out: Path | None = None) -> ImageFile:
@@ -142,7 +145,7 @@ def read_stack(path: Path | str, *, leave_out: Path | None = None) -> ImageFile:
     path = Path(path)
     if path.is_dir():
         return _read_folder(path, leave_out)
-    return _as_stack(*_decoded(path))
+    return replace(_as_stack(*_decoded(path)), array=_array_of(path)[1])
 
 
 def read(path: Path | str) -> ImageFile:
@@ -351,11 +354,14 @@ def _decoded(
     """
     if is_zarr(path):
         return path, *read_zarr(path, expect=partial(expect, path))
+    file, inside = _array_of(path)
+    return file, *decode(file, inside, partial(expect, file))
+
+
+def _array_of(path: Path) -> tuple[Path, str]:
+    """Return a file and the name of its array, empty where none is named."""
     file, _, inside = str(path).partition("::")
-    if not inside or path.exists():
-        file = str(path)
-        inside = ""
-    return Path(file), *decode(Path(file), inside, partial(expect, Path(file)))
+    return (Path(file), inside) if inside and not path.exists() else (path, "")
 
 
 # Shapes and dtypes ---------------------------------------------------------------------------------

@@ -226,8 +226,8 @@ def _reader(kind: Any) -> Reader:
     """Return what turns JSON's value into one of ``kind``."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
-        others = [_reader(one) for one in arguments if one is not type(None)]
-        read = others[0] if len(others) == 1 else _as_it_is
+        others = [one for one in arguments if one is not type(None)]
+        read = _reader(others[0]) if len(others) == 1 else _one_of(others)
         return lambda data, unknown, at: None if data is None else read(data, unknown, at)
     if origin is tuple:
         return _tuple_reader(arguments)
@@ -259,6 +259,22 @@ def _as_it_is(data: Any, _unknown: Unknown, _at: str) -> Any:
 def _converter(convert: Callable[[Any], Any]) -> Reader:
     """Return the reader of a value that holds no dataclass."""
     return lambda data, _unknown, _at: convert(data)
+
+
+def _one_of(kinds: Sequence[Any]) -> Reader:
+    """Return the reader of a value of several types: tables are their dataclass, words of none are a path."""
+    tables = [kind for kind in kinds if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
+    words = [
+        word for kind in kinds if typing.get_origin(kind) is typing.Literal for word in typing.get_args(kind)
+    ]
+
+    def read(data: Any, unknown: Unknown, at: str) -> Any:
+        if isinstance(data, Mapping) and len(tables) == 1:
+            return _reader(tables[0])(data, unknown, at)
+        is_path = isinstance(data, str) and Path in kinds and str not in kinds and data not in words
+        return Path(data) if is_path else data
+
+    return read
 
 
 def _tuple_reader(arguments: tuple[Any, ...]) -> Reader:

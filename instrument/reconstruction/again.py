@@ -4,59 +4,125 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from instrument.files.errors import FileError
+from instrument.files.record import value_of
+from instrument.reconstruction.job import prepared_record
 from instrument.reconstruction.options import InputOptions
-from instrument.reconstruction.preparation import Crop
-from instrument.reconstruction.request import READ_WITH, volume_job
+from instrument.reconstruction.request import PREPARED, PSF_STACK, READ_WITH, volume_job
 from instrument.reconstruction.stored_result import StoredResult
-from recon.base.noise import NoiseModel
+from recon.base.declare import require, with_overrides
 from recon.reconstruction.measurement import Measurement
 from recon.types import Calibration
 
-_PATHS = ("dark", "erasures")
-_WORDS = ("auto", "none", "saturated")
+NOT_CHECKED = (
+    "the volume's record, of a version before 2026-12, does not tell its PSFs and dark frame from others: "
+    "whether they have changed since was not checked."
+)
 
 
-def made_of(result: StoredResult) -> tuple[Measurement, Calibration]:
+class MadeOf(NamedTuple):
+    """What a volume was made of, and what is doubtful about that, in a sentence or empty."""
+
+    measurement: Measurement
+    calibration: Calibration
+    doubt: str
+
+
+def tells(result: StoredResult) -> bool:
+    """Whether a volume's record names the photograph and the PSFs it was made of, and how they were read."""
+    told = _inputs_of(result)
+    kinds = {"image": Mapping, "calibration": str, READ_WITH: Mapping}
+    return all(isinstance(told.get(name), kind) for name, kind in kinds.items())
+
+
+def made_of(result: StoredResult) -> MadeOf:
     """Return the photograph and the PSFs that a volume was made of.
 
-    Raises FileError where its record does not tell them, they are not there any more, or the photograph is
-    another one by now; BenchError and InputError as :func:`~instrument.reconstruction.request.volume_job`.
+    Files that are not where they were are looked for beside the volume. Raises FileError where its record
+    does not tell them, they are not there any more, or are others by now; BenchError and InputError as
+    :func:`~instrument.reconstruction.request.volume_job`.
     """
-    told = result.record.get("inputs")
-    told = told if isinstance(told, Mapping) else {}
-    image, psfs, options = told.get("image"), told.get("calibration"), told.get(READ_WITH)
-    if not (isinstance(image, Mapping) and isinstance(psfs, str) and isinstance(options, Mapping)):
+    if not tells(result):
         raise FileError(
             result.path,
             "does not tell of which photograph and PSFs it was made, and how these were read.",
             "Give the volume as reconstruct wrote it, its .json beside it; one of a version before 2026-12 "
             "is to be reconstructed again.",
         )
-    inputs = _inputs_of(result.path, options)
-    job = volume_job(Path(psfs), Path(str(image.get("path"))), inputs)
-    if job.provenance["image"]["pixels_sha256"] != image.get("pixels_sha256"):
+    told = _inputs_of(result)
+    inputs = _options_of(result.path, told[READ_WITH])
+    image = _there(_named(told["image"].get("path"), told["image"]), result.path)
+    psfs = _there(_named(told["calibration"], told.get(PSF_STACK)), result.path)
+    job = volume_job(psfs, image, inputs)
+    if job.provenance["image"]["pixels_sha256"] != told["image"].get("pixels_sha256"):
         raise FileError(
-            Path(str(image["path"])),
+            image,
             f"is not the photograph any more that {result.path} was made of: its pixels differ.",
             "Put the photograph back, or reconstruct this one.",
         )
-    return job.as_measurement(inputs.noise), job.calibration
+    then, now = told.get(PREPARED), prepared_record(job)
+    if not isinstance(then, Mapping):
+        return MadeOf(job.as_measurement(inputs.noise), job.calibration, NOT_CHECKED)
+    if then.get("psfs_sha256") != now["psfs_sha256"]:
+        raise FileError(
+            psfs,
+            f"holds other PSFs than those that {result.path} was made of.",
+            "Put those back, or reconstruct the volume again.",
+        )
+    if then.get("measurement_sha256") != now["measurement_sha256"]:
+        raise FileError(
+            result.path,
+            "was made of the same photograph, but not of what is left of it now: its dark frame, the "
+            "calibration's background or the mask of --erasures has changed since.",
+            "Put back what changed, or reconstruct the volume again.",
+        )
+    return MadeOf(job.as_measurement(inputs.noise), job.calibration, "")
 
 
-def _inputs_of(path: Path, told: Mapping[str, Any]) -> InputOptions:
-    """Return options as :func:`recon.base.declare.record` told them."""
-    values = dict(told)
+def _inputs_of(result: StoredResult) -> Mapping[str, Any]:
+    """Return what a record tells of a volume's inputs; nothing where it is another kind of record."""
+    told = result.record.get("inputs")
+    return told if isinstance(told, Mapping) else {}
+
+
+def _options_of(path: Path, told: Mapping[str, Any]) -> InputOptions:
+    """Return options as :func:`recon.base.declare.record` told them, their files found again."""
+    unknown: dict[str, Any] = {}
     try:
-        if isinstance(crop := values.get("crop"), Mapping):
-            values["crop"] = Crop(**crop)
-        if isinstance(noise := values.get("noise"), Mapping):
-            values["noise"] = NoiseModel(**noise)
-        for name in _PATHS:
-            if isinstance(value := values.get(name), str) and value not in _WORDS:
-                values[name] = Path(value)
-        return InputOptions(**values)
-    except TypeError as error:
-        raise FileError(path, f"has a record of other options than this version knows: {error}.") from error
+        options = value_of(InputOptions, told, unknown)
+        require(options)
+        if unknown:
+            raise ValueError(f"{', '.join(unknown)} is not known")
+    except (LookupError, TypeError, ValueError, AttributeError) as error:  # InputError among them
+        raise FileError(
+            path,
+            f"has a record of options that this version does not know: {error}",
+            "Reconstruct the volume again.",
+        ) from error
+    files = {name: getattr(options, name) for name in ("dark", "erasures")}
+    found = {name: _there(file, path) for name, file in files.items() if isinstance(file, Path)}
+    return with_overrides(options, found)
+
+
+def _named(file: object, told: object) -> Path:
+    """Return a file, with the name of its array (``FILE::NAME``) where that is told."""
+    array = told.get("array") if isinstance(told, Mapping) else None
+    return Path(f"{file}::{array}" if isinstance(array, str) else str(file))
+
+
+def _there(recorded: Path, volume: Path) -> Path:
+    """Return a file or folder where it was, else of its name beside the volume."""
+    if recorded.exists():
+        return recorded
+    file, sign, array = str(recorded).partition("::")
+    own = Path(file)
+    found = next((path for path in (own, volume.absolute().with_name(own.name)) if path.exists()), None)
+    if found is None:
+        raise FileError(
+            own,
+            f"there is no such file any more, and none of its name beside {volume}, which was made of it.",
+            "Put it back, or a copy beside the volume.",
+        )
+    return Path(f"{found}{sign}{array}")

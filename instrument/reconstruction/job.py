@@ -458,7 +458,26 @@ def source_record(file: ImageFile) -> dict[str, Any]:
     digest = hashlib.sha256(np.ascontiguousarray(file.pixels).data).hexdigest()
     taken = {name: file.metadata[name] for name in ("utc", "exposure_ms", "light") if name in file.metadata}
     told = {"path": str(file.path.resolve()), "pixels": file.describe(), "pixels_sha256": digest}
-    return told | ({"taken": taken} if taken else {})
+    return told | ({"array": file.array} if file.array else {}) | ({"taken": taken} if taken else {})
+
+
+def prepared_record(job: Job) -> dict[str, str]:
+    """Return what tells a job's measurement, and its PSFs with their places, from others."""
+    calibration, geometry = job.calibration, job.calibration.geometry
+    lengths = np.array([geometry.pixel_pitch_um, geometry.diffuser_distance_mm], np.float64)
+    return {
+        "measurement_sha256": _digest(job.measurement, *(() if job.valid is None else (job.valid,))),
+        "psfs_sha256": _digest(calibration.psfs, calibration.source_positions_um, lengths),
+    }
+
+
+def _digest(*arrays: npt.NDArray[Any]) -> str:
+    """Return a checksum of arrays and their shapes."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(f"{array.dtype} {array.shape};".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
 
 
 def dark_record(dark: Dark) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ from instrument.reconstruction.job import (
     job_from_files,
     job_with,
     mended_note,
+    prepared_record,
 )
 from instrument.reconstruction.mosaic import pattern_of
 from instrument.reconstruction.options import InputOptions, SourceOptions
@@ -44,8 +46,8 @@ from recon.reconstruction.solvers import SOLVERS, volume_priors
 from recon.solvers.base import IterationRecord, Keeper
 from recon.types import Calibration, Geometry
 
-READ_WITH = "options"
-"""What of a volume's recorded inputs tells how they were read."""
+READ_WITH, PREPARED, PSF_STACK = "options", "prepared", "psf_stack"
+"""What of a volume's recorded inputs tells how they were read, what came of them, and of PSFs from files."""
 Watch = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
 """Called after each iteration with its record and what makes the present picture or volume."""
 
@@ -172,7 +174,20 @@ class VolumeRequest(_Request):
         if isinstance(prior, str) and prior not in known:
             raise BenchError(f"--prior {prior} is not for volumes; choose one of {', '.join(known)}.")
         job = volume_job(self.psfs, self.image, self.inputs)
-        return replace(job, provenance={**job.provenance, READ_WITH: record(self.inputs)})
+        read_with = record(
+            replace(
+                self.inputs, dark=_whole_name(self.inputs.dark), erasures=_whole_name(self.inputs.erasures)
+            )
+        )
+        made = {READ_WITH: read_with, PREPARED: prepared_record(job)}
+        return replace(job, provenance={**job.provenance, **made})
+
+
+def _whole_name(choice: Any) -> Any:
+    """Return a file's whole name, which tells it in any folder; any other choice as it is."""
+    if isinstance(choice, ImageFile):
+        choice = Path(f"{choice.path}::{choice.array}") if choice.array else choice.path
+    return choice.resolve() if isinstance(choice, Path) else choice
 
 
 def request_of(
@@ -252,7 +267,10 @@ def volume_job(psfs: Path | ImageFile, image: Path | ImageFile, inputs: InputOpt
     return replace(
         job,
         notes={**job.notes, **({"PSFs": words} if words else {})},
-        provenance={**job.provenance, "psf_stack": dict(psfs.metadata)},
+        provenance={
+            **job.provenance,
+            PSF_STACK: {**psfs.metadata, **({"array": psfs.array} if psfs.array else {})},
+        },
     )
 
 

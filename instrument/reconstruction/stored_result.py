@@ -326,7 +326,7 @@ def _record_of(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise FileError(beside, f"cannot be read as JSON: {error}.") from error
     # Another program's JSON, or that of another kind of file of ours, is no record of this one.
-    return record if isinstance(record, dict) and "grid" in record else {}
+    return record if isinstance(record, dict) and isinstance(record.get("grid"), dict) else {}
 
 
 def _is_volume(path: Path, record: Mapping[str, Any]) -> bool:

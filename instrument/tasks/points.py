@@ -94,7 +94,7 @@ def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
         seen = len(found)
         if made is not None and seen:
             with desk.step("fitting them", 1.0) as advance:
-                found = fitted_places(found, grid, *made, on_progress=advance)
+                found = fitted_places(found, grid, made.measurement, made.calibration, on_progress=advance)
     finally:
         result.close()
     if grid.upright and grid.is_metric and grid.made_of_um is None:
@@ -102,6 +102,8 @@ def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
             "Warning: this metric volume does not tell the planes it was made of. Where voxels are finer, "
             "one point is told as several: give the volume as it was reconstructed, or export it again."
         )
+    if made is not None and made.doubt:
+        desk.warn(f"Warning: {made.doubt}")
     known = bool(np.isfinite(found.places_um).all())
     write_text(files.out, "\n".join([_COLUMNS, *_lines(found), ""]))
     desk.fact("Points", str(len(found)))

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ import tifffile
 from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.reconstruction.video_files import VideoPictures, create_output
+from instrument.volumes.grid_facts import grid_facts
 from recon.camera.grid import Grid
 from tests.recon.reconstruction.test_fitted_places import CALIBRATION, photograph, true_um
 
@@ -66,6 +70,88 @@ def test_places_are_fitted_to_the_photograph_that_the_record_names(
         capsys.readouterr().err.split()
     )
     assert not out.exists()
+
+
+@pytest.fixture
+def moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A volume of a named array and a dark frame by relative names, looked at from another folder."""
+    data, volume = tmp_path / "data", tmp_path / "volumes" / "w.ome.zarr"
+    for folder in (data, volume.parent, tmp_path / "elsewhere"):
+        folder.mkdir()
+    save_calibration(CALIBRATION, tmp_path / "cal")
+    photo = np.rint(photograph() + 100).astype(np.uint16)
+    np.savez(data / "two.npz", other=photo[::-1], photo=photo)
+    tifffile.imwrite(data / "dark.tif", np.full(photo.shape, 100, np.uint16))
+    tifffile.imwrite(tmp_path / "elsewhere" / "dark.tif", np.full(photo.shape, 160, np.uint16))
+    monkeypatch.chdir(data)
+    argv = ["reconstruct", "--volume", "../cal", "--image", "two.npz::photo", "--prior", "l1", "-n", "20"]
+    argv += ["--model", "convolution", "--dark", "dark.tif", "--noise", "1", "--out", str(volume)]
+    assert main(argv) == 0
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    return volume
+
+
+def test_what_a_volume_was_made_of_is_found_again_and_refused_where_it_has_changed(
+    moved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, calibration, fit = tmp_path / "data", tmp_path / "cal", ["points", str(moved), "--fit", "--force"]
+
+    def said(returns: int) -> str:
+        capsys.readouterr()
+        assert main(fit) == returns
+        told = capsys.readouterr()
+        return " ".join((told.out + told.err).split())
+
+    assert "fitted to the photograph" in said(0)
+    (data / "two.npz").rename(moved.parent / "two.npz")
+    assert "fitted to the photograph" in said(0), "beside the volume"
+    shutil.copytree(calibration, tmp_path / "kept")
+    shutil.rmtree(calibration)
+    save_calibration(replace(CALIBRATION, psfs=np.roll(CALIBRATION.psfs, 3, axis=3)), calibration)
+    assert "cal: holds other PSFs than those that" in said(2)
+    shutil.rmtree(calibration)
+    (tmp_path / "kept").rename(calibration)
+    dark = tifffile.imread(data / "dark.tif")
+    tifffile.imwrite(data / "dark.tif", dark + 7)
+    assert "its dark frame, the calibration's background or the mask" in said(2)
+    record = json.loads((moved.parent / "w.json").read_text())
+    del record["inputs"]["prepared"]
+    (moved.parent / "w.json").write_text(json.dumps(record))
+    assert "whether they have changed since was not checked" in said(0)
+    (moved.parent / "two.npz").unlink()
+    words = said(2)
+    assert "two.npz: there is no such file any more" in words
+    assert "a copy beside the volume" in words
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        (("options", "binning"), "x", "binning must be"),
+        (("options", "noise"), {"a": 1}, "options that this version does not know"),
+        (("options", "crop"), [1, 2], "options that this version does not know"),
+        (("options", "mosaic"), 5, "mosaic must be"),
+        (("options", "sharpness"), 5, "sharpness is not known"),
+        (("options", "erasures"), "none.tif", "none.tif: there is no such file"),
+        (("options",), [1], "does not tell of which photograph"),
+        ((), [1], "does not tell of which photograph"),
+    ],
+)
+def test_a_damaged_record_is_refused_in_words(
+    place: tuple[str, ...], value: object, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    volume = tmp_path / "v.npy"
+    np.save(volume, np.ones(GRID.shape, np.float32))
+    inputs = {"image": {"path": "photo.tif"}, "calibration": "cal", "options": {}}
+    record = {"inputs": inputs, "grid": grid_facts(GRID)}
+    *to, last = ("inputs", *place)
+    inside: Any = record
+    for name in to:
+        inside = inside[name]
+    inside[last] = value
+    (tmp_path / "v.json").write_text(json.dumps(record))
+    assert main(["points", str(volume), "--fit", "--out", str(tmp_path / "p.csv")]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.fixture

@@ -204,6 +204,24 @@ def test_a_union_is_read_as_its_only_type_and_pairs_by_place() -> None:
         value_of(Local, data | {"pair": ["c"]})
 
 
+def test_a_union_of_a_table_words_and_a_file_is_told_apart() -> None:
+    @dataclass(frozen=True)
+    class Choice:
+        of: Literal["auto"] | float | Inner | Path | None = None
+
+    for value in (
+        Choice("auto"),
+        Choice(2.5),
+        Choice(Inner(1.0, (2, "b"))),
+        Choice(Path("dark.tif")),
+        Choice(),
+    ):
+        assert value_of(Choice, json.loads(json.dumps(plain(value)))) == value
+    unknown: dict[str, Any] = {}
+    value_of(Choice, {"of": {"x": 1, "z": 5}}, unknown)
+    assert unknown == {"of.z": 5}
+
+
 def test_unknown_fields_of_values_are_handed_over() -> None:
     unknown: dict[str, Any] = {}
     assert value_of(Inner, {"x": 1, "y": 2}, unknown) == Inner(1.0)
