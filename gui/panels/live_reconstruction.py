@@ -343,7 +343,7 @@ class LiveReconstructionPanel(Panel):
         else:
             if self.loaded is not None:
                 self._seeker.see(result, self.loaded.reconstructor)
-            self.view.caution_against(self._seeker.words or self._doubt(result))
+            self.view.caution_against(self._doubt(result))
         self.view.set_caption(self._caption(result.metadata))
         # What is doubted stands over the picture.
         worth = result.picture.quality.removeprefix(result.picture.doubt).removeprefix(": ")
@@ -376,7 +376,7 @@ class LiveReconstructionPanel(Panel):
         of_pixels, of_frame = result.picture.doubt, self._frame_doubt(result.metadata)
         if of_pixels and self.session.lights.during(result.metadata) == NOTHING_LIT:
             return of_pixels  # which says it
-        return ". ".join(filter(None, (of_frame, of_pixels)))
+        return ". ".join(filter(None, (of_frame, self._seeker.words or of_pixels)))
 
     def _frame_doubt(self, frame: FrameMetadata) -> str:
         """Return what is doubtful about a frame: its light, its exposure."""
