@@ -15,6 +15,7 @@ from instrument.files.calibration_file import is_calibration, load_calibration
 from instrument.files.errors import BenchError, FileError, percent
 from instrument.files.images import ImageFile, read_image
 from instrument.reconstruction.defects import mended_psf
+from instrument.reconstruction.matching import check_pair, matched, matched_calibration, matched_dark
 from instrument.reconstruction.mosaic import (
     in_colour,
     matched_mosaic,
@@ -34,9 +35,7 @@ from instrument.reconstruction.preparation import (
     bin_image,
     both_raw,
     calibrated_dark,
-    check_pair,
     check_psf,
-    dark_level,
     erasures_of,
     reduce,
     reduce_valid,
@@ -144,14 +143,15 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
     warnings = check_psf(psf, allow_saturated=inputs.allow_saturated)
     check_pair(psf, image, allow_mixed_depth=inputs.allow_mixed_depth, mosaic=pattern is not None)
     psf, image = _in_proportion(psf, image, inputs)
-    level = dark_level(inputs.dark, psf, image)
-    window = _window(crop, image)
+    pair = matched(psf, image, mosaic=pattern is not None)
+    level, psf, match = matched_dark(inputs.dark, psf, image, pair), pair.psf, pair.image_binning
+    window = _window(crop, (psf.pixels.shape[0], psf.pixels.shape[1]))
     factor = auto_binning(window) if binning is None else binning
     if pattern is not None and binning is None and factor > 1:
         factor += factor % 2
     erased = erasures_of(inputs.erasures, image, None if pattern else psf.pixels)
-    reduction = Reduction(1, level.image, crop, factor, pattern)
-    measurement, valid = reduction.seen(image.pixels, _reduced_valid(erased, crop, factor))
+    reduction = Reduction(match, level.image, crop, factor, pattern)
+    measurement, valid = reduction.seen(image.pixels, _reduced_valid(_on(erased, match), crop, factor))
     if pattern is None:
         psf_pixels = reduce(psf.pixels, level.psf, crop, factor)
     else:
@@ -179,6 +179,7 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
         valid,
         (
             *warnings,
+            *pair.warnings,
             *(_converted(psf, image) if inputs.dark == "auto" else ()),
             *_saturation(image, erased),
             *_suspicion(inputs, image),
@@ -187,8 +188,10 @@ def job_from_files(psf_file: Path | ImageFile, image_file: Path | ImageFile, inp
             "psf": source_record(raw_psf) | ({"mended_pixels": n_mended} if n_mended else {}),
             "image": source_record(image),
             "dark": dark_record(level),
-            "crop": crop_record(crop, image),
+            "crop": None if crop is None else slices_record(crop.slices(psf.pixels.shape[:2])),
             "binning": factor,
+            **({"image_binning": match} if match > 1 else {}),
+            **({"psf_binning": pair.psf_binning} if pair.psf_binning > 1 else {}),
             "erased": erased.reason,
             "mosaic": pattern,
             "srgb": inputs.srgb,
@@ -222,15 +225,13 @@ def job_with(
     shape = calibration.psfs.shape[-2:]
     match = _matching_binning(image, shape, folder)
     pattern = pattern_of(inputs.mosaic, image)
-    if calibration.psfs.shape[1] > 1 and not (image.is_colour or pattern):
-        raise FileError(image.path, f"is grey, but the calibration {folder} is colour.")
+    calibration, grey = matched_calibration(calibration, image, mosaic=pattern is not None)
     level = calibrated_dark(inputs.dark, image, calibration, match)
     factor = inputs.binning or 1
     nearest = np.moveaxis(calibration.psfs[calibration.nearest_to_axis()], 0, -1)
     erased = erasures_of(inputs.erasures, image, None if pattern else nearest)
-    matched = replace(erased, valid=None if erased.valid is None else reduce_valid(erased.valid, None, match))
     reduction = Reduction(match, level.image, crop, factor, pattern)
-    measurement, valid = reduction.seen(image.pixels, _reduced_valid(matched, crop, factor))
+    measurement, valid = reduction.seen(image.pixels, _reduced_valid(_on(erased, match), crop, factor))
     if pattern is not None:
         calibration = in_colour(calibration, pattern, match)
     return Job(
@@ -247,7 +248,7 @@ def job_with(
             **noise_note(noise_of(image)),
         },
         valid,
-        (*_saturation(image, erased), *_suspicion(inputs, image)),
+        (*((grey,) if grey else ()), *_saturation(image, erased), *_suspicion(inputs, image)),
         {
             "calibration": str(folder.resolve()),
             "image": source_record(image),
@@ -348,11 +349,17 @@ def _reduced_valid(erased: Erased, crop: Crop | None, factor: int) -> npt.NDArra
     return valid
 
 
-def _window(crop: Crop | None, image: ImageFile) -> tuple[int, int]:
-    height, width = image.pixels.shape[:2]
+def _on(erased: Erased, binning: int) -> Erased:
+    """Return which binned pixels take part."""
+    if erased.valid is None or binning == 1:
+        return erased
+    return replace(erased, valid=reduce_valid(erased.valid, None, binning))
+
+
+def _window(crop: Crop | None, shape: tuple[int, int]) -> tuple[int, int]:
     if crop is None:
-        return height, width
-    crop.slices((height, width))
+        return shape
+    crop.slices(shape)
     return crop.height, crop.width
 
 
@@ -487,14 +494,6 @@ def dark_record(dark: Dark) -> dict[str, Any]:
         for name, value in (("image_counts", dark.image), ("psf_counts", dark.psf))
     }
     return {**values, "from": dark.reason}
-
-
-def crop_record(crop: Crop | None, image: ImageFile) -> dict[str, int] | None:
-    """Return the window that was cut out of an image, pixels."""
-    if crop is None:
-        return None
-    height, width = image.pixels.shape[:2]
-    return slices_record(crop.slices((height, width)))
 
 
 def slices_record(slices: tuple[slice, slice]) -> dict[str, int]:

@@ -98,40 +98,6 @@ class Dark:
     reason: str
 
 
-def check_pair(
-    psf: ImageFile, image: ImageFile, *, allow_mixed_depth: bool = False, mosaic: bool = False
-) -> None:
-    """Refuse a PSF and an image that cannot belong together.
-
-    ``mosaic``: the image is a colour sensor's raw frame, so that a PSF in colour may belong to it.
-
-    Raises FileError when shape, channels or bit depth differ.
-    """
-    psf_shape, shape = psf.pixels.shape[:2], image.pixels.shape[:2]
-    if psf_shape != shape:
-        turned = " One of them may be rotated." if psf_shape == shape[::-1] else ""
-        raise FileError(
-            psf.path,
-            f"the PSF is {psf.describe()}, but the image {image.path} is {image.describe()}: "
-            f"both must have one shape.{turned}",
-            "Take both with the same camera, region of interest and binning.",
-        )
-    if psf.is_colour and not (image.is_colour or mosaic):
-        raise FileError(
-            psf.path,
-            f"the PSF is colour, but the image {image.path} is grey.",
-            "Give a grey PSF, or the image in colour.",
-        )
-    depths = psf.pixels.dtype, image.pixels.dtype
-    if depths[0] != depths[1] and all(d.kind == "u" for d in depths) and not allow_mixed_depth:
-        raise FileError(
-            psf.path,
-            f"the PSF has {8 * depths[0].itemsize} bit, but the image {image.path} has "
-            f"{8 * depths[1].itemsize} bit: one of them has probably been converted.",
-            "Use the raw files of both, or --mixed-depth if it is meant so.",
-        )
-
-
 def check_psf(psf: ImageFile, *, allow_saturated: bool = False) -> tuple[str, ...]:
     """Refuse a PSF that nothing can be reconstructed with; return warnings in sentences.
 

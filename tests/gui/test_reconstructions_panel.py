@@ -217,7 +217,7 @@ def test_a_wrong_entry_is_refused_at_its_field(
 
 
 def test_a_mistake_that_only_the_work_finds_is_told(qtbot: QtBot, panel: ReconstructionsPanel, files) -> None:
-    write_image(files / "small.tif", np.arange(100, dtype=np.uint16).reshape(10, 10))
+    write_image(files / "small.tif", np.arange(100, dtype=np.uint16).reshape(5, 20))
     fill(panel, PSF, files, "small.tif")
     qtbot.mouseClick(panel.form.start, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: "both must have one shape" in panel._note.toolTip(), timeout=WAIT_MS)

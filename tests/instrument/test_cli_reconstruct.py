@@ -241,7 +241,6 @@ BAD = {
     "shape": (["--psf", "small.tif"], "10 x 10 grey uint16, but the image raw.tif is 48 x 64"),
     "empty": (["--psf", "zero.tif"], "zero.tif: the PSF is empty"),
     "constant": (["--psf", "flat.tif"], "flat.tif: the PSF is constant"),
-    "channels": (["--psf", "colour.tif"], "colour.tif: the PSF is colour"),
     "bit depth": (["--psf", "eight.png"], "8 bit, but the image raw.tif has 16 bit"),
     "saturated": (["--psf", "burnt.tif"], "are saturated (at 4095)"),
     "nan psf": (["--psf", "nan.npy"], "no finite number"),

@@ -15,13 +15,13 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, write_image
 from instrument.reconstruction.defects import defective_pixels, mended_psf, mended_stack
 from instrument.reconstruction.job import find_calibration, job_from_calibration, job_from_files
+from instrument.reconstruction.matching import check_pair
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import (
     Crop,
     auto_binning,
     bin_image,
     both_raw,
-    check_pair,
     check_psf,
     dark_from_corners,
     dark_from_file,
@@ -137,7 +137,10 @@ def test_an_image_darker_than_the_psfs_corners_keeps_its_own_offset() -> None:
     [
         (psf_pixels(), psf_pixels(shape=(60, 90)), "both must have one shape"),
         (psf_pixels(), psf_pixels(shape=(80, 60)), "may be rotated"),
-        (np.dstack([psf_pixels()] * 3), psf_pixels(), "the PSF is colour"),
+        (np.dstack([psf_pixels()] * 3), psf_pixels(), None),
+        (psf_pixels(), psf_pixels()[::2, ::2], None),
+        (psf_pixels()[::2, ::2], psf_pixels(), None),
+        (psf_pixels(), psf_pixels()[::2], "a whole multiple"),
         (psf_pixels() // 20, psf_pixels(), None),
         ((psf_pixels() // 20).astype(np.uint8), psf_pixels(), "8 bit, but the image .* 16 bit"),
         (psf_pixels("float32"), psf_pixels(), None),

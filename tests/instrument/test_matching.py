@@ -1,0 +1,125 @@
+"""PSF and photograph of different binnings or colours come to the same pixels, and that is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from instrument.files.images import ImageFile
+from instrument.reconstruction.job import Job, job_from_files, job_with
+from instrument.reconstruction.matching import whole_binnings
+from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.preparation import Crop
+from recon import reconstruct
+from recon.base.blocks import block_mean
+from recon.evaluation.measured_sets import data_folder, measured_set
+from recon.evaluation.scene import make_scene
+
+Pixels = npt.NDArray[Any]
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[Pixels, Pixels]:
+    """A PSF and a photograph through it, counts on an offset of 100, every 2 x 2 of them alike."""
+    scene = make_scene("sparse-picture", size=48)
+    psf, photograph = (
+        (100 + 40_000 * np.clip(image / image.max(), 0, 1)).astype(np.uint16)
+        for image in (scene.calibration.psfs[0, 0], np.asarray(scene.measurement))
+    )
+    return fine(psf), fine(photograph)
+
+
+def fine(pixels: Pixels) -> Pixels:
+    return np.repeat(np.repeat(pixels, 2, axis=0), 2, axis=1)
+
+
+def job(psf: Pixels, photograph: Pixels, **inputs: Any) -> Job:
+    asked = InputOptions(**{"binning": 1, "erasures": "none", "dark": 100.0} | inputs)
+    return job_from_files(ImageFile(Path("psf.tif"), psf), ImageFile(Path("raw.tif"), photograph), asked)
+
+
+def test_whichever_has_more_pixels_is_binned_and_that_is_said(pair: tuple[Pixels, Pixels]) -> None:
+    psf, photograph = pair
+    both = job(psf, photograph, binning=2)
+    for ours, theirs, which in (
+        (psf, photograph[::2, ::2], "PSF"),
+        (psf[::2, ::2], photograph, "photograph"),
+    ):
+        made = job(ours, theirs)
+        np.testing.assert_allclose(made.measurement, both.measurement, rtol=1e-5)
+        np.testing.assert_allclose(made.calibration.psfs, both.calibration.psfs, rtol=1e-5)
+        assert f"the {which} is binned 2 x 2" in made.warnings[0]
+    assert made.provenance["image_binning"] == 2  # its noise is less
+    assert not both.warnings
+
+
+def test_the_window_is_on_the_pixels_that_both_come_to(pair: tuple[Pixels, Pixels]) -> None:
+    psf, photograph = pair
+    window = Crop(8, 4, 24, 32)
+    made = job(psf[::2, ::2], photograph, crop=window)
+    assert made.measurement.shape == made.calibration.psfs.shape[-2:] == (24, 32)
+    np.testing.assert_allclose(made.measurement, photograph[::2, ::2][8:32, 4:36] - 100.0)
+
+
+def test_a_dark_frame_of_the_photograph_leaves_the_psf_its_own_level(pair: tuple[Pixels, Pixels]) -> None:
+    psf, photograph = pair
+    for ours, theirs in ((psf, photograph[::2, ::2]), (psf[::2, ::2], photograph)):
+        made = job(ours, theirs, dark=ImageFile(Path("dark.tif"), np.full_like(theirs, 60)))
+        np.testing.assert_allclose(made.measurement, photograph[::2, ::2] - 60.0)
+        assert made.calibration.psfs.min() == 0
+        assert "from the PSF" in made.notes["Dark"]
+
+
+def test_a_binned_pixel_is_erased_where_one_of_its_pixels_is_saturated(pair: tuple[Pixels, Pixels]) -> None:
+    psf, photograph = pair
+    bright = photograph.copy()
+    bright[10, 20:23] = 65535
+    made = job(psf[::2, ::2], bright, erasures="saturated")
+    assert made.valid is not None
+    assert [tuple(int(n) for n in place) for place in np.argwhere(~made.valid)] == [(5, 10), (5, 11)]
+
+
+def test_of_a_psf_with_colours_a_grey_photograph_takes_the_mean(pair: tuple[Pixels, Pixels]) -> None:
+    psf, photograph = pair
+    grey = job(psf, photograph)
+    tinted = np.stack([100 + (psf - 100.0) * gain for gain in (1.0, 0.6, 0.2)], axis=-1).astype(np.uint16)
+    made = job(tinted, photograph)
+    np.testing.assert_allclose(made.calibration.psfs, 0.6 * grey.calibration.psfs, atol=1)
+    assert "their mean is taken" in made.warnings[0]
+    image = ImageFile(Path("raw.tif"), photograph)
+    calibration = replace(grey.calibration, psfs=np.concatenate([grey.calibration.psfs] * 3, axis=1))
+    by_folder = job_with(calibration, Path("cal"), image, InputOptions(binning=1))
+    assert by_folder.calibration.psfs.shape[1] == 1
+    assert "their mean is taken" in by_folder.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("psf", "image", "binnings"),
+    [
+        ((60, 80), (60, 80), (1, 1)),
+        ((61, 81), (30, 40), (2, 1)),
+        ((20, 26), (61, 80), (1, 3)),
+        ((60, 80), (30, 80), None),
+        ((60, 80), (40, 60), None),
+        ((900, 900), (100, 100), None),
+    ],
+)
+def test_binnings_are_whole_and_few(psf: Any, image: Any, binnings: Any) -> None:
+    assert whole_binnings(psf, image) == binnings
+
+
+@pytest.mark.skipif(
+    not (data_folder() / "diffusercam_hand").is_dir(), reason=f"the measured hand is not in {data_folder()}"
+)
+def test_a_region_of_interest_that_was_taken_for_a_binned_photograph_is_not_called_reliable() -> None:
+    psfs, photograph = measured_set("hand")
+    psf, raw = (np.maximum(block_mean(a, 16), 0) for a in (psfs[0], photograph))
+    made = job(psf, raw[19:56, 25:75], dark=0.0)
+    verdict = reconstruct(made.as_measurement(None), made.calibration).verdict
+    assert verdict is not None
+    assert not verdict.sentences[0].startswith("reliable"), verdict.sentences
