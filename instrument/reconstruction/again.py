@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from instrument.files.errors import FileError
 from instrument.files.record import value_of
@@ -13,6 +16,7 @@ from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import PREPARED, PSF_STACK, READ_WITH, volume_job
 from instrument.reconstruction.stored_result import StoredResult
 from recon.base.declare import require, with_overrides
+from recon.base.noise import NoiseModel
 from recon.reconstruction.measurement import Measurement
 from recon.types import Calibration
 
@@ -30,11 +34,25 @@ class MadeOf(NamedTuple):
     doubt: str
 
 
-def tells(result: StoredResult) -> bool:
+def can_be_fitted(result: StoredResult) -> bool:
+    """Whether points of a volume can be fitted, as far as its record tells: of one PSF a depth, and grey."""
+    grey = result.volume is not None and (result.volume.n_channels == 1 or _is_merged(result))
+    return grey and result.record.get("model") == "convolution" and _tells(result)
+
+
+def _tells(result: StoredResult) -> bool:
     """Whether a volume's record names the photograph and the PSFs it was made of, and how they were read."""
     told = _inputs_of(result)
     kinds = {"image": Mapping, "calibration": str, READ_WITH: Mapping}
     return all(isinstance(told.get(name), kind) for name, kind in kinds.items())
+
+
+def _is_merged(result: StoredResult) -> bool:
+    """Whether a volume's channels were reconstructed as one."""
+    found: Any = result.record
+    for name in ("provenance", "auto", "channels_merged"):
+        found = found.get(name) if isinstance(found, Mapping) else None
+    return found is True
 
 
 def made_of(result: StoredResult) -> MadeOf:
@@ -44,7 +62,7 @@ def made_of(result: StoredResult) -> MadeOf:
     does not tell them, they are not there any more, or are others by now; BenchError and InputError as
     :func:`~instrument.reconstruction.request.volume_job`.
     """
-    if not tells(result):
+    if not _tells(result):
         raise FileError(
             result.path,
             "does not tell of which photograph and PSFs it was made, and how these were read.",
@@ -63,8 +81,11 @@ def made_of(result: StoredResult) -> MadeOf:
             "Put the photograph back, or reconstruct this one.",
         )
     then, now = told.get(PREPARED), prepared_record(job)
+    measurement, calibration = job.as_measurement(inputs.noise), job.calibration
+    if _is_merged(result):
+        measurement, calibration = _in_grey(measurement, calibration)
     if not isinstance(then, Mapping):
-        return MadeOf(job.as_measurement(inputs.noise), job.calibration, NOT_CHECKED)
+        return MadeOf(measurement, calibration, NOT_CHECKED)
     if then.get("psfs_sha256") != now["psfs_sha256"]:
         raise FileError(
             psfs,
@@ -78,7 +99,24 @@ def made_of(result: StoredResult) -> MadeOf:
             "calibration's background or the mask of --erasures has changed since.",
             "Put back what changed, or reconstruct the volume again.",
         )
-    return MadeOf(job.as_measurement(inputs.noise), job.calibration, "")
+    return MadeOf(measurement, calibration, "")
+
+
+def _in_grey(measurement: Measurement, calibration: Calibration) -> tuple[Measurement, Calibration]:
+    """Return a photograph's channels added up, as points' light is told, and PSFs of their mean."""
+    image = np.asarray(measurement.image)
+    if image.ndim == 2:
+        return measurement, calibration
+    noise, n = measurement.noise, image.shape[2]
+    if isinstance(noise, NoiseModel):
+        noise = replace(noise, read_noise=noise.read_noise * n**0.5)
+    elif noise is not None:
+        noise = noise * n**0.5
+    erased = measurement.erasures
+    if erased is not None and np.ndim(erased) == 3:
+        erased = np.asarray(erased).any(axis=2)
+    grey = replace(measurement, image=image.sum(axis=2), noise=noise, erasures=erased)
+    return grey, replace(calibration, psfs=calibration.psfs.mean(axis=1, keepdims=True), background=None)
 
 
 def _inputs_of(result: StoredResult) -> Mapping[str, Any]:

@@ -10,11 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.atomic import require_new, write_text
-from instrument.files.errors import BenchError, FileError, count
+from instrument.files.errors import BenchError, FileError, count, ranges
 from instrument.reconstruction.film import Film, is_film
 from instrument.tasks.task import Desk, Done, task
 from recon.analysis.point_places import PointOptions, PointPlaces, point_places
 from recon.base.declare import option
+from recon.errors import InputError
 
 if TYPE_CHECKING:
     from instrument.reconstruction.stored_result import StoredResult
@@ -25,7 +26,9 @@ _COLUMNS = (
     "fitted"
 )
 _LEFT = 2.0
-"""Times the noise that points leave of a photograph of points, at most."""
+_UNEXPLAINED = 0.04
+"""Of a photograph of points they leave so many times the noise, or beyond it so much of what is seen of them,
+root mean square, at most (0258)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +77,7 @@ def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
     """
     from instrument.reconstruction.again import made_of
     from instrument.reconstruction.stored_result import open_result
-    from recon.reconstruction.point_errors import fitted_places
+    from recon.reconstruction.point_errors import LEAST, fitted_places
 
     require_new(files.out, overwrite=files.force)
     if is_film(files.volume):
@@ -89,12 +92,15 @@ def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
                 "Of pictures reconstruct --prior l1 --uncertainty tells the points.",
             )
         made = made_of(result) if files.fit else None
+        sought = options if made is None else PointOptions(least=min(options.least, LEAST))
         with desk.step("looking for points", 1.0) as advance:
-            found = point_places(result.volume.plane, grid, options, advance)
+            found = point_places(result.volume.plane, grid, sought, advance)
         seen = len(found)
         if made is not None and seen:
+            seen = len(found.of_at_least(options.least))
             with desk.step("fitting them", 1.0) as advance:
                 found = fitted_places(found, grid, made.measurement, made.calibration, on_progress=advance)
+            found = found.of_at_least(options.least)
     finally:
         result.close()
     if grid.upright and grid.is_metric and grid.made_of_um is None:
@@ -117,15 +123,16 @@ def points(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
             "Warning: the volume does not tell where its planes are: the table has planes, rows and columns "
             f"alone. {_why_unknown(result)}"
         )
-    if fewer := seen - len(found):
+    if (fewer := seen - len(found)) > 0:
         desk.warn(
             f"Warning: {count(fewer, 'point')} of the volume {'is' if fewer == 1 else 'are'} left out: the "
             "photograph does not tell them from noise, or from a point beside them."
         )
-    if found.misfit is not None and found.misfit > _LEFT:
+    if found.misfit is not None and found.misfit > _LEFT and (found.unexplained or 0.0) > _UNEXPLAINED:
         desk.warn(
-            f"Warning: these points leave {found.misfit:.1f} times the noise of the photograph: there is "
-            "more in it than points, or its PSFs are others. Places may be off by more than their deviations."
+            f"Warning: these points leave {found.misfit:.1f} times the noise of the photograph, "
+            f"{found.unexplained:.0%} of what is seen of them: there is more in it than points, or its PSFs "
+            "are others. Places may be off by more than their deviations."
         )
     if ends := int(found.at_end.sum()):
         desk.warn(f"Warning: {_at_the_ends(ends, grid.shape[0], fitted=found.misfit is not None)}")
@@ -141,6 +148,7 @@ def _of_film(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
     if files.fit:
         raise BenchError("--fit is for the volume of one photograph: leave it out for a film.")
     lines, numbers = [f"frame,{'time_s' if film.period_s else 'frame_number'},{_COLUMNS}"], []
+    refused: dict[int, str] = {}
     with desk.step("Pictures", len(film)) as advance:
         top = 0.0
         for place in range(len(film)):
@@ -149,26 +157,36 @@ def _of_film(desk: Desk, files: PointFiles, options: PointOptions) -> Done:
         for place, (index, at) in enumerate(zip(film.indices, film.times_s, strict=True)):
             volume = film.whole(place)
             own = _brightest(volume)
+            told: list[str] = []
             if own > 0 and (least := options.least * top / own) <= 1:
-                found = point_places(volume, grid, PointOptions(least=least))
-                lines += [f"{index},{at:.12g},{line}" for line in _lines(found)]
-                numbers.append(len(found))
-            else:
-                numbers.append(0)
+                try:
+                    told = _lines(point_places(volume, grid, PointOptions(least=least)))
+                except InputError as error:  # the others are told nevertheless
+                    refused[index] = str(error)
+            lines += [f"{index},{at:.12g},{line}" for line in told]
+            numbers.append(len(told))
             advance(place + 1, len(film))
+    if len(refused) == len(film):
+        raise InputError(next(iter(refused.values())))
     write_text(files.out, "\n".join([*lines, ""]))
     desk.fact("Volumes", str(len(film)))
     desk.fact("Points", f"{sum(numbers)}, {min(numbers)} to {max(numbers)} a volume")
-    if not sum(numbers):
+    if refused:
+        first = next(iter(refused.values()))
+        desk.warn(
+            f"Warning: no points are told of frame{'s' * (len(refused) > 1)} {ranges(list(refused))}: {first}"
+        )
+    elif not sum(numbers):
         desk.warn("Warning: nothing in the film is above 0.")
-    elif not np.isfinite(grid.z_um).all():
+    if sum(numbers) and not np.isfinite(grid.z_um).all():
         desk.warn("Warning: the film does not tell where its planes are: the table has voxels alone.")
     return Done((files.out,))
 
 
 def _brightest(volume: npt.NDArray[np.float32]) -> float:
     """Return the light of the brightest voxel, of all channels together."""
-    return float(np.nanmax(volume.sum(axis=3) if volume.ndim == 4 else volume))
+    grey = volume.sum(axis=3) if volume.ndim == 4 else volume
+    return float(np.max(grey, where=~np.isnan(grey), initial=0.0))
 
 
 def _tell_places(desk: Desk, found: PointPlaces) -> None:
@@ -189,9 +207,11 @@ def _tell_places(desk: Desk, found: PointPlaces) -> None:
 
 def _where_from(result: StoredResult, found: PointPlaces) -> str:
     """Say what places are of."""
+    from instrument.reconstruction.again import can_be_fitted
+
     if found.misfit is not None:
         return f"fitted to the photograph; {found.misfit:.2f} times its noise is left of it"
-    if isinstance((result.record.get("inputs") or {}).get("options"), dict):
+    if can_be_fitted(result):
         return "of the volume alone (--fit: fitted to its photograph)"
     return "of the volume alone"
 

@@ -9,7 +9,7 @@ instead, dim ends of its light are missed, and what is missed in depth moves the
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from recon.analysis.whole_steps import in_whole_steps
 from recon.base.declare import option
-from recon.camera.grid import Grid
+from recon.camera.grid import Grid, plane_of
 from recon.errors import InputError
 
 Floats = npt.NDArray[np.float64]
@@ -47,7 +47,8 @@ class PointOptions:
 
     least: float = option(
         0.1,
-        help="Brightest voxel of a point, relative to the brightest of all, from which it is told.",
+        help="Brightest voxel of a point (fitted: its light), relative to the brightest of all, from which "
+        "it is told.",
         above=0,
         most=1,
         label="Dimmest",
@@ -73,6 +74,8 @@ class PointPlaces:
     misfit : float or None
         Of points fitted to the photograph (:func:`recon.reconstruction.point_errors.fitted_places`): what
         they leave of it, root mean square in units of its noise. None: they are of the volume alone.
+    unexplained : float or None
+        What they leave of it beyond its noise, relative to what is seen of them, root mean square.
     """
 
     places_um: Floats
@@ -81,9 +84,18 @@ class PointPlaces:
     light: Floats
     at_end: npt.NDArray[np.bool_]
     misfit: float | None = None
+    unexplained: float | None = None
 
     def __len__(self) -> int:
         return len(self.light)
+
+    def of_at_least(self, least: float) -> PointPlaces:
+        """Return the points of so much light at least, relative to the brightest."""
+        return self._first(int(np.count_nonzero(self.light >= least * self.light.max(initial=0))))
+
+    def _first(self, count: int) -> PointPlaces:
+        names = ("places_um", "deviations_um", "voxels", "light", "at_end")
+        return replace(self, **{name: getattr(self, name)[:count] for name in names})
 
 
 def point_places(
@@ -273,13 +285,14 @@ class _Search:
 
 
 def voxels_of(places_um: Floats, grid: Grid) -> Floats:
-    """Return ``(plane, row, column)`` of places in a grid, (n, 3): between planes on the ray through both."""
-    near = 1 / grid.z_um
-    order = np.argsort(near)
+    """Return ``(plane, row, column)`` of places in a grid, (n, 3): between planes on the ray through both.
+
+    Beyond the outermost planes numbers go on: -0.2 is a fifth of a plane before the first.
+    """
     voxels = np.empty((len(places_um), 3))
     for voxel, (x, y, z) in zip(voxels, places_um, strict=True):
-        voxel[0] = np.interp(1 / z, near[order], np.arange(len(near), dtype=np.float64)[order])
-        nearest = round(voxel[0])
+        voxel[0] = plane_of(z, grid.z_um)
+        nearest = min(max(round(voxel[0]), 0), len(grid.z_um) - 1)
         further = grid.z_um[nearest] / z
         voxel[1:] = grid.pixel_of(nearest, x * further, y * further)
     return voxels

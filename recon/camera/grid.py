@@ -372,3 +372,12 @@ def _seen_by(n: int, centre: int, upright: bool, offsets: Floats, step: float) -
     used = (weights > 0) & (near >= 0) & (near < n)
     rows = np.broadcast_to(np.arange(len(at))[:, None], near.shape)
     return sparse.csr_array((weights[used].astype(np.float32), (rows[used], near[used])), shape=(len(at), n))
+
+
+def plane_of(z_um: float, planes_um: Floats) -> float:
+    """Return the number of the plane at a depth, between two or more and beyond them evenly in ``1 / z``."""
+    order = np.argsort(1 / planes_um)
+    near = 1 / planes_um[order]
+    first = int(np.clip(np.searchsorted(near, 1 / z_um) - 1, 0, len(near) - 2))
+    share = (1 / z_um - near[first]) / (near[first + 1] - near[first])
+    return float((1 - share) * order[first] + share * order[first + 1])

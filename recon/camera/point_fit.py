@@ -31,6 +31,8 @@ LARGEST_STEP_PX = 0.5
 DAMPED, MOST_DAMPED = 1e-6, 1e2
 """Of the information's diagonal, so much is added at first, and a hundred times more where a step ascends."""
 SETTLED_PX = 1e-3
+HELD = 2
+"""Sets of derivatives that are in memory at once: of a step and of the one before."""
 POSES_AS_PLACE, POSES_AS_LIGHT = 0.2, 0.35
 """Of what the points' images leave of the data beyond the noise, relative to their light, so much passes for
 a shift and for light: 0.13 to 0.27 and 0.15 to 0.36 in most of 24 photographs of beads, in any light."""
@@ -100,10 +102,17 @@ def _tell(on_step: Callable[[float], object], number: int, share: float) -> None
     on_step((number + share) / ROUNDS)
 
 
-def misfit(camera: PointImages, part: Photograph, points: Points) -> float:
-    """Return what points leave of a part's data, root mean square in units of the noise."""
-    rest = _told(part, part.data[0] - camera.image(points))
-    return float(np.sqrt(np.sum(rest.astype(np.float64) ** 2) / max(int(np.count_nonzero(part.valid)), 1)))
+def misfit(camera: PointImages, part: Photograph, points: Points) -> tuple[float, float]:
+    """Return what points leave of a part's data, root mean square: in units of the noise, and beyond it.
+
+    What is left beyond the noise is relative to the points' images: 0 where there is nothing but noise.
+    """
+    seen = camera.image(points)
+    left, light = (
+        float(np.sum(_told(part, image).astype(np.float64) ** 2)) for image in (part.data[0] - seen, seen)
+    )
+    pixels = max(int(np.count_nonzero(part.valid)), 1)
+    return (left / pixels) ** 0.5, (max(left - pixels, 0.0) / max(light, 1e-30)) ** 0.5
 
 
 def _derivatives(camera: PointImages, part: Photograph, points: Points) -> tuple[Floats, Floats]:
@@ -112,7 +121,7 @@ def _derivatives(camera: PointImages, part: Photograph, points: Points) -> tuple
     Slopes are (n * (coordinates + 1), pixels).
     """
     count = points.places.shape[1] + 1
-    images = np.zeros((count * len(points), *part.data.shape[1:]), np.float32)
+    images = np.zeros((count * len(points), *part.data.shape[1:]), part.dtype)
     seen = np.zeros(part.data.shape[1:], np.float32)
     for k, (place, light) in enumerate(zip(points.places, points.light, strict=True)):
         patch, where = camera.patch(place, slopes=True)
@@ -121,7 +130,9 @@ def _derivatives(camera: PointImages, part: Photograph, points: Points) -> tuple
         of_point[(slice(-1), *where)] = np.float32(light) * patch[1:]
         of_point[(-1, *where)] = patch[0]
     rest = _told(part, part.data[0] - seen)
-    return rest.ravel(), np.stack([_told(part, image) for image in images]).reshape(len(images), -1)
+    for image in images:  # in place: they are what takes the memory
+        image[...] = _told(part, image)
+    return rest.ravel(), images.reshape(len(images), -1)
 
 
 def _told(part: Photograph, image: Array) -> Floats:
@@ -174,7 +185,7 @@ def _covariance(camera: PointImages, part: Photograph, points: Points) -> Floats
     whole = inverse @ scores @ inverse * (pixels / max(pixels - len(slopes), 1))
     at = np.arange(len(points))
     each = np.array(whole.reshape(len(at), count, len(at), count)[at, :, at])
-    sizes = np.sum(slopes.reshape(len(at), count, -1).astype(np.float64) ** 2, axis=2)
+    sizes = np.array([np.vdot(one, one) for one in slopes], np.float64).reshape(len(at), count)
     seen = points.light**2 * sizes[:, -1]
     unexplained = max(float(rest @ rest) - pixels, 0) / max(float(seen.sum()), 1e-30)
     along = np.arange(count - 1)

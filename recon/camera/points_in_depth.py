@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 import numpy.typing as npt
 
 from recon.camera.depth_mixture import mixture_at
-from recon.camera.grid import Grid
+from recon.camera.grid import Grid, plane_of
 from recon.camera.points import Array, FieldFunctions, Floats, PointImages
 
 STEPS = 4
@@ -16,6 +14,8 @@ STEPS = 4
 BEYOND = 0.5
 """Planes beyond the first and the last that points may lie at: patterns are scaled from there on."""
 
+KEPT_BYTES = 2**28
+"""Of PSFs that were made: further ones take the place of the oldest."""
 SHORT = 0.01
 """Part of a plane over which slopes of depth and direction are taken."""
 
@@ -44,12 +44,12 @@ class ImagesInDepth(PointImages):
         sensor_shape: tuple[int, int],
     ) -> None:
         super().__init__(psfs, FieldFunctions(0, np.zeros((1, 2))), sensor_shape)
-        self._numbers = np.arange(len(z_um), dtype=np.float64)
         self._near = 1 / z_um
         self._order = np.argsort(z_um)
         self._depths = z_um[self._order]
         self._distance_um = distance_um
-        self._made = lru_cache(maxsize=None)(self._make)
+        self._kept: dict[int, Array] = {}
+        self._most_kept = max(KEPT_BYTES // psfs[0].nbytes, 2)
 
     def depth_um(self, plane: float) -> float:
         """Return the depth of a plane's number."""
@@ -59,11 +59,7 @@ class ImagesInDepth(PointImages):
 
     def plane_of(self, z_um: float) -> float:
         """Return the number of a depth's plane."""
-        order = np.argsort(self._near)
-        near, numbers = self._near[order], self._numbers[order]
-        first = int(np.clip(np.searchsorted(near, 1 / z_um) - 1, 0, len(near) - 2))
-        share = (1 / z_um - near[first]) / (near[first + 1] - near[first])
-        return float((1 - share) * numbers[first] + share * numbers[first + 1])
+        return plane_of(z_um, 1 / self._near)
 
     def within(self, places: Floats) -> Floats:
         """Return places, (n, 3), none farther beyond the outermost planes than :data:`BEYOND`."""
@@ -77,6 +73,14 @@ class ImagesInDepth(PointImages):
         share = np.float32(at - first)
         psf = np.asarray((1 - share) * before + share * after, np.float32)
         return psf, ((np.asarray(STEPS * (after - before), np.float32),) if slopes else ())
+
+    def _made(self, step: int) -> Array:
+        """Return the PSF of a part of a plane, made or kept."""
+        if step not in self._kept:
+            if len(self._kept) >= self._most_kept:
+                del self._kept[next(iter(self._kept))]
+            self._kept[step] = self._make(step)
+        return self._kept[step]
 
     def _make(self, step: int) -> Array:
         """Return the PSF of a part of a plane."""

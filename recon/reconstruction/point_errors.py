@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from recon.analysis.point_places import PointPlaces, voxels_of
 from recon.camera.grid import Grid
-from recon.camera.point_fit import believed, misfit
+from recon.camera.point_fit import HELD, believed, misfit
 from recon.camera.points import FieldFunctions, PointImages, Points, points_on_grid
 from recon.camera.points_in_depth import ImagesInDepth, Rays
 from recon.errors import InputError
@@ -41,8 +41,8 @@ OFF_BY_PSFS = 1.4
 are made of, and pose as place where the noise hides it (``benchmarks/bead_places.py``)."""
 LEAST = 0.03
 """Light of a spot, relative to the brightest, from which it is tried as a point."""
-MOST_BYTES = 2**30
-"""Of the derivatives: there are fewer points of large photographs."""
+MOST_BYTES = 2**31
+"""Of all derivatives that are held at once: there are fewer points of large photographs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ def _points(
     camera = PointImages(psf[None], FieldFunctions(0, np.zeros((1, 2))), problem.sensor_shape)
     centre = result.grid.centre
     scale = float(problem.image_scale.ravel()[0])
-    most = MOST_BYTES // (3 * 4 * part.data[0].size)
+    most = _most(3, part.data[0].size, part.dtype.itemsize)
     found = points_on_grid(result.volume.reshape(result.grid.shape)[0].astype(np.float64), centre, LEAST)
     found = Points(found.places[:most], found.light[:most] / scale)
     found, covariance = believed(camera, part, found, cancel)
@@ -154,7 +154,7 @@ def fitted_places(
         those that came to lie on another.
 
     Raises InputError where places or depths are not known, the photograph is in colour, PSFs vary over the
-    field, or there are more points than fit into a gibibyte.
+    field, or there are more points than fit into two gibibytes.
     """
     problem = _problem(found, measurement, calibration)
     psfs = problem.depths.central[:, 0] / np.float32(problem.energy[0])
@@ -165,7 +165,7 @@ def fitted_places(
     start = Points(np.array([rays.place_of(one) for one in found.places_um]), found.light / scale)
     with closing(Part(problem, slice(0, 1))) as part:
         points, covariance = believed(camera, part, start, on_step=on_progress)
-        left = misfit(camera, part, points)
+        left, unexplained = misfit(camera, part, points)
     order = np.argsort(-points.light, kind="stable")
     places, covariance = points.places[order], covariance[order]
     places_um = np.array([rays.um_of(one) for one in places]).reshape(-1, 3)
@@ -179,7 +179,13 @@ def fitted_places(
         points.light[order] * scale,
         (places[:, 0] < 0) | (places[:, 0] > last),
         left,
+        unexplained,
     )
+
+
+def _most(coordinates: int, pixels: int, bytes_each: int) -> int:
+    """Return how many points fit into memory, of which so many numbers are fitted."""
+    return MOST_BYTES // (HELD * coordinates * pixels * bytes_each)
 
 
 def _problem(
@@ -207,9 +213,10 @@ def _problem(
     if len(z_um) < 2 or not np.isfinite(z_um).all() or (z_um <= 0).any():
         raise InputError("Points are fitted by PSFs of two known depths or more.")
     height, width = problem.sensor_shape
-    if len(found) > (most := MOST_BYTES // (COORDINATES * 4 * height * width)):
+    if len(found) > (most := _most(COORDINATES, height * width, np.dtype(problem.precision).itemsize)):
         raise InputError(
             f"{len(found)} points of a photograph of {height} x {width} pixels are more than are fitted "
-            f"together, {most}: ask for brighter ones, or take the places in the volume."
+            f"together, {most}: take the places in the volume, or reconstruct it of a binned or cropped "
+            "photograph. Fewer points of it do not help: what the others show would pass for these."
         )
     return problem

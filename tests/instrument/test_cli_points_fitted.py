@@ -17,8 +17,9 @@ from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.reconstruction.video_files import VideoPictures, create_output
 from instrument.volumes.grid_facts import grid_facts
+from recon.analysis import point_places
 from recon.camera.grid import Grid
-from tests.recon.reconstruction.test_fitted_places import CALIBRATION, photograph, true_um
+from tests.recon.reconstruction.test_fitted_places import CALIBRATION, LIGHT, photograph, true_um
 
 Z_UM = 1 / np.linspace(1 / 10e3, 1 / 20e3, 5)
 GRID = Grid((5, 40, 50), (20, 25), Z_UM, 1e-3 * Z_UM)
@@ -46,6 +47,7 @@ def test_places_are_fitted_to_the_photograph_that_the_record_names(
     assert main(["points", str(made), "--out", str(out), "--force", "--fit"]) == 0
     told = capsys.readouterr()
     assert "fitted to the photograph; " in " ".join(told.out.split())
+    assert "times the noise of the photograph, " not in " ".join((told.out + told.err).split())
     rows = list(csv.DictReader(out.read_text().splitlines()))
     assert {row["fitted"] for row in rows} == {"1"}
     found = np.array([[float(row[f"{axis}_um"]) for axis in "xyz"] for row in rows])
@@ -53,6 +55,9 @@ def test_places_are_fitted_to_the_photograph_that_the_record_names(
     for place in true_um():
         nearest = int(np.linalg.norm(found - place, axis=1).argmin())
         assert (np.abs(found[nearest] - place) < 4 * known[nearest] + [3, 3, 20]).all()
+    assert main(["points", str(made), "--out", str(out), "--force", "--fit", "--least", "0.95"]) == 0
+    assert list(csv.DictReader(out.read_text().splitlines())) == rows[:1], "told are fewer, fitted all"
+    capsys.readouterr()
     out.unlink()
     # Another photograph by now, none, and a record that does not tell which.
     fit = ["points", str(made), "--fit", "--out", str(out)]
@@ -183,6 +188,43 @@ def test_a_film_tells_points_frame_by_frame(
     capsys.readouterr()
     assert main(["points", str(film), "--out", str(out), "--fit", "--force"]) == 2
     assert "--fit is for the volume of one photograph" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_frame_of_too_many_points_is_left_out_and_said(
+    film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "tracks.csv"
+    monkeypatch.setattr(point_places, "MOST", 1)
+    voxels = np.zeros(GRID.shape, np.float32)
+    voxels[2, 12, 5::20] = 20.0
+    VideoPictures(film, write=True).write(1, voxels)
+    assert main(["points", str(film), "--out", str(out), "--least", "0.05"]) == 0
+    assert [row["frame"] for row in csv.DictReader(out.read_text().splitlines())] == ["0", "3"]
+    assert "no points are told of frame 1: There are more than 1 points" in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
+def test_channels_that_were_merged_are_fitted_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo, volume, out = tmp_path / "photo.tif", tmp_path / "v.ome.zarr", tmp_path / "points.csv"
+    noise = np.random.default_rng(1).normal(0, 1, (3, 64, 64))
+    colours = np.array([1.0, 0.7, 0.4])[:, None, None] * photograph(0.0) + noise + 100
+    tifffile.imwrite(photo, np.moveaxis(np.rint(colours), 0, -1).astype(np.uint16), photometric="rgb")
+    save_calibration(CALIBRATION, tmp_path / "cal")
+    argv = ["reconstruct", "--volume", str(tmp_path / "cal"), "--image", str(photo), "--prior", "l1"]
+    argv += ["-n", "30", "--dark", "100", "--noise", "1", "--out", str(volume), "--choose", "channels=merged"]
+    assert main(argv) == 0
+    assert main(["points", str(volume), "--out", str(out)]) == 0
+    assert "(--fit: fitted to its photograph)" in " ".join(capsys.readouterr().out.split())
+    assert main(["points", str(volume), "--out", str(out), "--fit", "--force"]) == 0
+    rows = list(csv.DictReader(out.read_text().splitlines()))
+    found = np.array([[float(row[f"{axis}_um"]) for axis in "xyz"] for row in rows])
+    for place, light in zip(true_um(), LIGHT, strict=True):
+        nearest = int(np.linalg.norm(found - place, axis=1).argmin())
+        assert (np.abs(found[nearest] - place) < [15, 15, 100]).all()
+        assert float(rows[nearest]["light"]) == pytest.approx(2.1 * light, rel=0.1)
 
 
 def test_a_film_of_pictures_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

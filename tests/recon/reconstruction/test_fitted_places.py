@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from recon.analysis.point_places import PointPlaces, point_places
+from recon.analysis.point_places import PointPlaces, point_places, voxels_of
+from recon.camera import point_fit, points_in_depth
 from recon.camera.grid import Grid
 from recon.camera.points_in_depth import ImagesInDepth
 from recon.errors import InputError
+from recon.reconstruction import point_errors
+from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.point_errors import fitted_places
 from recon.types import Calibration, Geometry
 
@@ -117,3 +121,60 @@ def test_what_cannot_be_fitted_is_said() -> None:
     ):
         with pytest.raises(InputError, match=words):
             fitted_places(found, GRID, seen_, calibration)
+
+
+def test_what_is_left_is_judged_by_the_points_light() -> None:
+    """Bright photographs leave many times their noise; a point that is missing leaves much of the light."""
+    bright = photograph() * np.float32(9)
+    found = fitted_places(beside(), GRID, Measurement(bright, noise=9.0), CALIBRATION)
+    assert found.misfit is not None
+    assert found.misfit > 2
+    assert found.unexplained == pytest.approx(0.018, abs=0.01)
+    fewer = fitted_places(beside()._first(2), GRID, Measurement(bright, noise=9.0), CALIBRATION)
+    assert fewer.unexplained is not None
+    assert fewer.unexplained > 0.1
+    assert len(beside().of_at_least(0.5)) == 2
+    assert len(beside().of_at_least(1.0)) == 1
+
+
+def test_planes_go_on_beyond_the_outermost_as_the_fit_counts_them() -> None:
+    camera = ImagesInDepth(PLANES_UM, CALIBRATION.psfs[:, 0], DISTANCE_UM, (SIZE, SIZE))
+    for z in (9.6e3, 10e3, 13e3, 20e3, 21e3):
+        plane, row, _ = voxels_of(np.array([[0.0, 300.0, z]]), GRID)[0]
+        assert plane == pytest.approx(camera.plane_of(z), abs=1e-9)
+        assert row == pytest.approx(SIZE // 2 - 300 / z * DISTANCE_UM / PITCH_UM)
+    assert camera.plane_of(9.6e3) < 0
+    assert camera.plane_of(21e3) > 3
+
+
+def test_memory_is_what_the_limit_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    start = beside()
+    of = np.arange(60) % 3
+    many = replace(
+        start, places_um=start.places_um[of] + np.random.default_rng(1).normal(0, (300, 300, 800), (60, 3)),
+        deviations_um=start.deviations_um[of], voxels=start.voxels[of], light=start.light[of],
+        at_end=start.at_end[of],
+    )  # fmt: skip
+    counted = 60 * 4 * 4 * SIZE**2 * point_fit.HELD
+    fitted_places(start, GRID, photograph(), CALIBRATION)  # imports once
+    tracemalloc.start()
+    fitted_places(many, GRID, Measurement(photograph(), noise=1.0), CALIBRATION)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1.3 * counted
+    monkeypatch.setattr(point_errors, "MOST_BYTES", counted)
+    fitted_places(start, GRID, photograph(), CALIBRATION)
+    monkeypatch.setattr(point_errors, "MOST_BYTES", counted // 30)
+    with pytest.raises(InputError, match="more than are fitted together, 2: take the places in the volume"):
+        fitted_places(start, GRID, photograph(), CALIBRATION)
+
+
+def test_few_patterns_made_between_planes_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras = []
+    for kept in (2**28, 0):
+        monkeypatch.setattr(points_in_depth, "KEPT_BYTES", kept)
+        cameras.append(ImagesInDepth(PLANES_UM, CALIBRATION.psfs[:, 0], DISTANCE_UM, (SIZE, SIZE)))
+    for plane in (0.3, 1.7, 0.3, 2.6):
+        patches = [camera.patch(np.array([plane, 0.2, 0.0]))[0] for camera in cameras]
+        np.testing.assert_array_equal(*patches)
+    assert [len(camera._kept) for camera in cameras] == [6, 2]
