@@ -20,7 +20,7 @@ from scipy import ndimage
 from calibration_routines.options import MM, Checked
 from calibration_routines.planned import home_if_needed, outlook_of
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
-from calibration_routines.psf.analysis import dark_model, light_of
+from calibration_routines.psf.analysis import dark_model, late_hot_lines, light_of
 from calibration_routines.psf.exposure import expose_source
 from calibration_routines.psf.sampling import known, source_limits
 from calibration_routines.psf.sweep_plan import DARK
@@ -77,7 +77,7 @@ class StageCheck(Checked):
     )
     turns: int = option(4, least=2, help="Times that each axis goes to and fro.")
     average: int = option(2, least=1, label="Frames a place", help="Frames a place, averaged.")
-    dark_frames: int = option(4, least=1, help="Dark frames.", group=RARE)
+    dark_frames: int = option(4, least=1, help="Dark frames, at the beginning and at the end.", group=RARE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +111,8 @@ class StagePlay:
     """Play that bench.toml has."""
     bench: str = ""
     simulated: bool = False
+    late_hot: int = 0
+    """Pixels that turned hot meanwhile; they were replaced like the others."""
 
     @property
     def play(self) -> dict[str, float]:
@@ -212,7 +214,10 @@ def planned(bench: Bench, asked: StageCheck) -> StageRecord:
 
 
 def stage_plan(record: StageRecord, asked: StageCheck, exposure_ms: float) -> Plan:
-    """Return the plan: dark frames; of each axis its turns; a last return of all axes from below."""
+    """Return the plan: dark frames; of each axis its turns; a last return of it from below; dark frames.
+
+    Those at the end tell which pixels turned hot meanwhile.
+    """
 
     def visit(label: str, axes: tuple[str, ...], off_um: float) -> Part:
         places = {name: at + (off_um if name in axes else 0.0) for name, at in record.place.items()}
@@ -225,7 +230,8 @@ def stage_plan(record: StageRecord, asked: StageCheck, exposure_ms: float) -> Pl
         )
 
     reach = record.reach_um
-    parts = [Part(label=DARK, light=(OFF,), exposures_ms=(exposure_ms,), repeats=asked.dark_frames)]
+    dark = Part(label=DARK, light=(OFF,), exposures_ms=(exposure_ms,), repeats=asked.dark_frames)
+    parts = [dark]
     parts.append(visit("start", record.axes, -reach))
     for name in record.axes:
         parts.append(visit("start", (name,), -reach))
@@ -233,6 +239,7 @@ def stage_plan(record: StageRecord, asked: StageCheck, exposure_ms: float) -> Pl
             for label, off_um in zip(_TURN, (0.0, reach, 0.0, -reach), strict=True):
                 parts.append(visit(f"{name} {label}", (name,), off_um))
         parts.append(visit(f"{name} last", (), 0.0))
+    parts.append(dark)
     return Plan(label="stage check", parts=tuple(parts))
 
 
@@ -291,6 +298,7 @@ def judged(run: Run, record: StageRecord) -> StagePlay:
         record.configured,
         record.bench,
         record.simulated,
+        dark.late_hot,
     )
 
 
@@ -362,6 +370,7 @@ def stage_lines(found: StagePlay) -> list[str]:
             f"{axis.repeatability_um:.2g} um, scale {axis.scale_error:+.2%} of d/z, last return "
             f"{axis.slip_um:+.2g} um"
         )
+    lines += late_hot_lines(found.late_hot, "check")
     listed = ", ".join(f"{name} = {play:g}" for name, play in found.play.items())
     lines.append(f"For [stage] of bench.toml: play = {{ {listed} }}" if listed else "No axis has play.")
     return lines

@@ -25,6 +25,7 @@ from calibration_routines.psf.structure import Structure, fit_structure
 from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import DARK, FEATURE_PX, PSF, REFERENCE
 from calibration_routines.scatter import STEADY, TOLERATED, Scatter, Steadied, pooled, steadied
+from instrument.files.errors import count
 from instrument.runs.run import Run
 from recon.base.blocks import block_mean
 from recon.types import Geometry
@@ -381,6 +382,14 @@ def dark_model(run: Run) -> DarkModel:
         early_and_late[step.part != first].append(step.index)
     stacks = [np.stack([run.frame(index) for index in early + late]) for early, late in taken.values()]
     return DarkModel(list(taken), stacks, full_scale(run), [len(early) for early, _ in taken.values()])
+
+
+def late_hot_lines(pixels: int, during: str) -> list[str]:
+    """Return the line that says how many pixels turned hot, where any did."""
+    return [
+        f"Sensor: {count(pixels, 'pixel')} turned hot during the {during} (replaced by the "
+        "neighbours' median, like the others): let the camera warm up."
+    ][: pixels > 0]
 
 
 def light_of(run: Run, indices: Sequence[int], dark: DarkModel) -> Steadied:

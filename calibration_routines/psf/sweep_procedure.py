@@ -8,6 +8,7 @@ from pathlib import Path
 
 from calibration_routines.planned import outlook_of
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure
+from calibration_routines.psf.analysis import late_hot_lines
 from calibration_routines.psf.mount_fit import off_middle
 from calibration_routines.psf.psf_quality import place_of
 from calibration_routines.psf.sampling import reachable_depths_um, standing_depth_um
@@ -26,7 +27,6 @@ from calibration_routines.psf.sweep_watch import SourceVisit, SweepEvent
 from calibration_routines.routine import Routine
 from calibration_routines.scatter import TOLERATED, Scatter
 from instrument.bench.bench import Bench
-from instrument.files.errors import count
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 
@@ -161,12 +161,7 @@ def quality_lines(done: SweepCalibration) -> list[str]:
     central = [q for q in done.quality if q.similarity is None]
     if words := off_middle(central, done.calibration.geometry):
         lines.append(words)
-    if done.late_hot:
-        lines.append(
-            f"Sensor: {count(done.late_hot, 'pixel')} turned hot during the sweep (replaced by the "
-            "neighbours' median, like the others): let the camera warm up."
-        )
-    return lines
+    return [*lines, *late_hot_lines(done.late_hot, "sweep")]
 
 
 def _crept(drift: Drift) -> str:

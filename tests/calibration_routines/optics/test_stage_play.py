@@ -75,6 +75,14 @@ def test_play_and_scale_of_each_axis_are_found_and_said(tmp_path: Path) -> None:
         StageProcedure(StageCheck(z_um=8.2e3)).outlook(bench)
 
 
+def test_pixels_that_turn_hot_meanwhile_are_not_taken_for_the_stages(tmp_path: Path) -> None:
+    hot = TINY.format(stage="") + "late_hot_pixels = 600\nlate_hot_e_per_s = 1e6\nlate_hot_after_s = 8\n"
+    with open_bench(parse_config(hot, None)) as bench:
+        done = StageProcedure(StageCheck(turns=2, average=1, dark_frames=2)).carry_out(bench, tmp_path)
+    assert done.good, done.verdict
+    assert any(line.startswith("Sensor: 600 pixels turned hot") for line in done.verdict)
+
+
 def test_a_check_that_goes_on_comes_to_its_places_from_where_it_came() -> None:
     asked = StageCheck(turns=2, average=1)
     with tiny(LOOSE) as bench:
