@@ -136,7 +136,7 @@ def _options_of(path: Path, told: Mapping[str, Any]) -> InputOptions:
     except (LookupError, TypeError, ValueError, AttributeError) as error:  # InputError among them
         raise FileError(
             path,
-            f"has a record of options that this version does not know: {error}",
+            f"has a record of options that this version does not know: {str(error).rstrip('.')}.",
             "Reconstruct the volume again.",
         ) from error
     files = {name: getattr(options, name) for name in ("dark", "erasures")}

@@ -208,7 +208,10 @@ def _problem(
             "modelled here. Take the places in the volume."
         )
     if problem.n_channels > 1:
-        raise InputError("Points are fitted to grey photographs; this one has colours.")
+        raise InputError(
+            "Points are fitted to grey photographs, or channels that were merged; this one has colours: take "
+            "the places in the volume."
+        )
     z_um = problem.depths.z_um
     if len(z_um) < 2 or not np.isfinite(z_um).all() or (z_um <= 0).any():
         raise InputError("Points are fitted by PSFs of two known depths or more.")

@@ -218,6 +218,7 @@ def test_channels_that_were_merged_are_fitted_together(
     assert main(argv) == 0
     assert main(["points", str(volume), "--out", str(out)]) == 0
     assert "(--fit: fitted to its photograph)" in " ".join(capsys.readouterr().out.split())
+    record = json.loads((tmp_path / "v.json").read_text())
     assert main(["points", str(volume), "--out", str(out), "--fit", "--force"]) == 0
     rows = list(csv.DictReader(out.read_text().splitlines()))
     found = np.array([[float(row[f"{axis}_um"]) for axis in "xyz"] for row in rows])
@@ -225,6 +226,13 @@ def test_channels_that_were_merged_are_fitted_together(
         nearest = int(np.linalg.norm(found - place, axis=1).argmin())
         assert (np.abs(found[nearest] - place) < [15, 15, 100]).all()
         assert float(rows[nearest]["light"]) == pytest.approx(2.1 * light, rel=0.1)
+    record["provenance"]["auto"]["channels_merged"] = False
+    (tmp_path / "v.json").write_text(json.dumps(record))
+    capsys.readouterr()
+    assert main(["points", str(volume), "--out", str(out), "--force"]) == 0
+    assert "--fit" not in capsys.readouterr().out, "of colours it is not named"
+    assert main(["points", str(volume), "--out", str(out), "--fit", "--force"]) == 2
+    assert "take the places in the volume" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_film_of_pictures_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
