@@ -12,7 +12,9 @@ relative to the first (a tenth of a pixel counts as 1 %); a common shift and a c
 is a photograph's brightness. Of the angular and of the field's response it is the largest difference, of the
 SLM's table in turns, of a mask's alignment the root mean square of the displacement over the mask, in mask
 pixels of which a tenth counts as 1 %. Of beads it is the photographs that are solved: what is solved of them
-is theirs alone; of a stage its play, of which 10 um are 2 %. ``--draws`` repeats a trial with later frames of
+is theirs alone; of a stage its play, of which 10 um are 2 %; of a display that is learned the part of the
+contrast that it leaves unexplained of photographs of a bench without faults, patterns that it never saw.
+``--draws`` repeats a trial with later frames of
 the same bench, so that what flickers or shakes does so otherwise; the words of a cell are then those of each
 draw, the change is the largest.
 
@@ -37,12 +39,17 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.display_learning import configuration
+from calibration_routines.display.display_io import DisplayBench, require_slm
+from calibration_routines.display.display_learning import photograph_looks
+from calibration_routines.display.hologram_photograph import HologramCamera
 from calibration_routines.display.mask_alignment import AlignmentReport
 from calibration_routines.optics.angular_response import AngularResponse
 from calibration_routines.optics.bead_photographs import BeadSlides, photograph_slides
@@ -54,10 +61,12 @@ from calibration_routines.routine import routines
 from calibration_routines.scatter import compare
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config, template
+from instrument.display.hologram import bench_display
 from instrument.files.errors import BenchError
 from instrument.runs.run_control import RunControl
 from recon.camera.registration import moved
 from recon.errors import InputError
+from recon.holography.learn import Lesson, Look, unexplained
 
 Array = npt.NDArray[np.floating]
 TOLERATED = 0.02
@@ -191,7 +200,7 @@ def _largest(found: Array, usual: Array) -> float:
 
 def _routine(name: str, result: Callable[[Any], Array], **asked: Any) -> Callable[..., Any]:
     def carry_out(bench: Bench, folder: Path) -> tuple[Array, list[str], bool]:
-        out = {"out": folder / f"{name}.json"} if name in ("slm", "mask") else {}
+        out = {"out": folder / f"{name}.json"} if name in ("slm", "mask", "display") else {}
         done = routines[name].asked(asked | out).carry_out(bench, folder)
         return result(done), list(done.verdict), done.good
 
@@ -225,6 +234,21 @@ def _table(done: Any) -> Array:
 def _displacement(done: Any) -> Array:
     assert isinstance(done.result, AlignmentReport)
     return done.result.displacement(done.result.mask_shape)
+
+
+@cache
+def _true_looks() -> list[Look]:
+    """Return photographs of patterns that nobody learns from, on the bench without faults."""
+    with open_bench(parse_config(_LEARNED, None)) as bench:
+        slm, config = require_slm(bench), bench.config
+        known = bench_display(config, (slm.shape, slm.pixel_pitch_um))
+        seen = HologramCamera.registered(DisplayBench(bench, config.display.slm_binning), known)
+        return photograph_looks(seen, 3, seed=7)
+
+
+def _left(done: Any) -> Array:
+    assert isinstance(done.result, Lesson)
+    return np.array([unexplained(done.result.display, _true_looks()) ** 2])
 
 
 def _play(done: Any) -> Array:
@@ -269,6 +293,7 @@ for _key, _value in {
     "shift_um": "[31.0, -42.0]",
 }.items():
     _DISPLAY = re.sub(rf"(?m)^{_key} = [^#\n]*", f"{_key} = {_value} ", _DISPLAY)
+_LEARNED = configuration("errors", expansion=4, seed=0)
 _SPOTS = {"reach": 8.0, "depth_um": 100.0, "spots": 25, "refinements": 2, "section_pictures": 2}
 _SLIDE = 'scene = "beads"\nscene_distance_mm = 80.0\nbeads = 20\n'
 _NEAR = {"z_min_um": 60e3, "z_max_um": 150e3}
@@ -312,6 +337,7 @@ TRIALS = {
     ),
     "slm": Trial(_DISPLAY, _routine("slm", _table), _largest, display=True),
     "mask": Trial(_DISPLAY, _routine("mask", _displacement, **_SPOTS), _tenths, display=True),
+    "display": Trial(_LEARNED, _routine("display", _left, patterns=8), _largest, display=True),
 }
 
 

@@ -254,6 +254,11 @@ def learn_display(
     return Lesson(learned if helps else display, before, after, tuple(rounds), helps)
 
 
+def unexplained(display: Display, looks: Sequence[Look]) -> float:
+    """Return the rms part of photographs' contrast that a display leaves unexplained."""
+    return _Fit(display, looks).unexplained(display, looks)
+
+
 HOPELESS = 0.8
 """Unexplained part of photographs beyond which nothing was learned."""
 

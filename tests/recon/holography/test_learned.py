@@ -18,7 +18,7 @@ from recon.holography import (
     compute_hologram,
     random_mask,
 )
-from recon.holography.learn import Look, learn_display
+from recon.holography.learn import Look, learn_display, unexplained
 from recon.holography.learned import Learned, Panel
 from recon.holography.optimise import HologramStop
 from recon.holography.spot_list import SpotField
@@ -126,10 +126,15 @@ def test_spots_see_what_was_learned_as_pictures_do():
 
 def test_errors_are_found_again_and_holograms_are_better_for_it():
     true = wrong()
-    lesson = learn_display(PLAIN, looks_of(true, 7))
+    looks = looks_of(true, 7)
+    lesson = learn_display(PLAIN, looks)
     assert lesson.helps
     assert lesson.before > 0.5
     assert lesson.after < 0.06
+    judges = looks[-3:]
+    assert [unexplained(display, judges) for display in (PLAIN, lesson.display)] == pytest.approx(
+        [lesson.before, lesson.after], rel=0.02
+    )
     assert lesson.display.learned is not None
     assert lesson.display.learned.crosstalk_px == pytest.approx([0.2, 0.16], abs=0.03)
     shown = []
